@@ -1,0 +1,1 @@
+"""Optimization-based cooperative localization with learned-gain comparisons."""

@@ -1,0 +1,29 @@
+"""Exceptions that say which field is wrong, what is allowed and how to mend it."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """A value that cannot be used: names the field, the value, what is allowed, and the mend.
+
+    >>> print(InputError("max_neighbours", -1, "must be >= 0", "Use 0 for no neighbours."))
+    max_neighbours = -1: must be >= 0. Use 0 for no neighbours.
+    """
+
+    def __init__(self, field: str, value: object, allowed: str, mend: str) -> None:
+        self.field, self.value, self.allowed, self.mend = field, value, allowed, mend
+        super().__init__(f"{field} = {value}: {allowed.rstrip('.')}. {mend}")
+
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, object, str, str]]:
+        return type(self), (self.field, self.value, self.allowed, self.mend)
+
+
+class MissingLibraryError(ImportError):
+    """An optional library is not installed: the message carries the pip line that installs it."""
+
+    def __init__(self, library: str, needed_for: str, pip: str) -> None:
+        self.args3 = (library, needed_for, pip)
+        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: pip install {pip}")
+
+    def __reduce__(self) -> tuple[type[MissingLibraryError], tuple[str, str, str]]:
+        return type(self), self.args3

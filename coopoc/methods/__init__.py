@@ -1,0 +1,1 @@
+"""Methods: each turns a Recording into a Track."""

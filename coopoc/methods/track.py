@@ -1,0 +1,71 @@
+"""Track: what a method says about its egos, and what saying it cost. Method: the protocol that all methods follow."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from ..arrays import Floats, frozen
+from ..errors import InputError
+from ..world.recording import Recording
+from ..world.v2x import Message
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Estimates of E egos over T steps in R runs.
+
+    Args:
+        t: (T,) s. egos: (E,) columns of the Recording.
+        x: (R, T, E, 3) m.
+        covariance: (R, T, E, 3, 3) m^2, or None if the method claims none.
+        received_bytes, sent_bytes: (R, E) bytes over the drive, payload and overhead.
+        seconds: wall time of the method.
+        neighbours: (R, L, 3) m estimate of the neighbour of each link of the Recording at the link's step, NaN where the
+            method makes none; or None.
+        notes: labels for tables and figures, such as "reconstruction".
+    """
+
+    t: Floats
+    egos: tuple[int, ...]
+    x: Floats
+    covariance: Floats | None
+    received_bytes: Floats
+    sent_bytes: Floats
+    seconds: float
+    neighbours: Floats | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("t", "x", "covariance", "received_bytes", "sent_bytes", "neighbours"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, frozen(getattr(self, name)))
+        if not np.isfinite(self.x).all():
+            run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
+            raise InputError(
+                "x", f"not finite in run {run} at step {step} of ego {self.egos[ego]}", "an estimate must be finite",
+                "The method diverged: lower its gain, or check the assumed standard deviations.",
+            )  # fmt: skip
+
+
+@runtime_checkable
+class Method(Protocol):
+    """A frozen dataclass that is callable: recording, egos -> Track."""
+
+    @property
+    def name(self) -> str:
+        """Name in tables, figures and the command line."""
+
+    @property
+    def cooperative(self) -> bool:
+        """True if it uses other vehicles while it decides."""
+
+    @property
+    def message(self) -> Message:
+        """What each vehicle broadcasts for it."""
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Estimates of the egos."""

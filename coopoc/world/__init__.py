@@ -1,0 +1,1 @@
+"""What happens on the road, and what vehicles may see of it."""

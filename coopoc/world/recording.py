@@ -1,0 +1,100 @@
+"""Recording: all that vehicles may see of a drive, in R noise realisations. It holds no truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints, frozen
+from ..errors import InputError
+from .sensors import Sensors
+from .v2x import V2X
+
+
+@dataclass(frozen=True, eq=False)
+class Links:
+    """Who measured whom, the same in all runs, sorted by (step, observer, distance).
+
+    Args:
+        step: (L,) step of the link. observer, neighbour: (L,) columns of the Recording.
+    """
+
+    step: Ints
+    observer: Ints
+    neighbour: Ints
+
+    def of(self, observer: int) -> Ints:
+        """Indices of the links of one observer, in time order and nearest first within a step."""
+        return np.flatnonzero(self.observer == observer)
+
+    def __len__(self) -> int:
+        return len(self.step)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Measurements of N vehicles over T steps in R runs, in the local east-north-up frame.
+
+    Args:
+        ids: (N,) names. t: (T,) s.
+        gnss: (R, T, N, 3) m. velocity: (R, T, N, 3) m/s, with x_t ~ x_{t-1} + dt u_t; NaN where absent.
+        links: L directed links; `observers` are the columns whose links were recorded.
+        relative: (R, L, 3) range m, world azimuth rad, inclination rad of the neighbour as the observer sees it.
+        sent: (L,) True where the neighbour broadcasts at the link's step.
+        arrival: (R, L) step at which that broadcast arrives, -1 if it is lost or not sent.
+        sensors, v2x: what a method may know (the bias is not among it).
+        notes: labels that every table and figure carries (what is simulated, what uses truth).
+    """
+
+    ids: tuple[str, ...]
+    t: Floats
+    gnss: Floats
+    velocity: Floats
+    links: Links
+    relative: Floats
+    sent: Bools
+    arrival: Ints
+    sensors: Sensors
+    v2x: V2X
+    observers: tuple[int, ...]
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("t", "gnss", "velocity", "relative"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        self.sensors.check_assumed()
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval, s."""
+        return round(float((self.t[-1] - self.t[0]) / (len(self.t) - 1)), 9)
+
+    @property
+    def runs(self) -> int:
+        """R."""
+        return int(self.gnss.shape[0])
+
+    def columns(self, egos: Sequence[int | str]) -> list[int]:
+        """Columns of the egos; InputError if one is unknown, is no observer of this recording, or is absent at times."""
+        cols = []
+        for ego in egos:
+            col = self.ids.index(ego) if isinstance(ego, str) and ego in self.ids else ego
+            if isinstance(col, str) or not 0 <= col < len(self.ids):
+                known = f"0..{len(self.ids) - 1} or an id"
+                raise InputError("egos", repr(ego), f"must be one of {known}", "See recording.ids.")
+            if col not in self.observers:
+                raise InputError("egos", repr(ego), f"has no links here, only {list(self.observers)} have",
+                                 "Name it in observe(..., observers=[...]).")  # fmt: skip
+            if not np.isfinite(self.gnss[0, :, col]).all():
+                mend = "Choose another ego or cut the drive with fleet.between(...)."
+                raise InputError("egos", repr(ego), "is absent at some steps", mend)
+            cols.append(int(col))
+        return cols
+
+    def __repr__(self) -> str:
+        return (
+            f"Recording({self.runs} runs x {len(self.t)} steps x {len(self.ids)} vehicles, {len(self.links)} links, "
+            f"K <= {self.v2x.max_neighbours})"
+        )

@@ -1,0 +1,144 @@
+"""observe: a Fleet seen through Sensors and a V2X channel becomes a Recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from ..errors import InputError
+from .fleet import Fleet
+from .noise import stream
+from .recording import Links, Recording
+from .sensors import Sensors
+from .spherical import spherical, wrap
+from .v2x import V2X, lost
+
+
+def observe(
+    fleet: Fleet,
+    sensors: Sensors,
+    v2x: V2X | None = None,
+    *,
+    runs: int = 1,
+    seed: int = 0,
+    observers: Sequence[int | str] | None = None,
+    assumed: Sensors | None = None,
+) -> Recording:
+    """Measurements of a drive in `runs` noise realisations.
+
+    GNSS z = x + n + b, velocity u + e, relative (d, az, inc) + n of the K nearest within the radius. Noise is keyed by
+    (seed, sensor, run, vehicle, partner) and step: 30 runs are a prefix of 100, K = 2 is a subset of K = 10.
+    A noisy range that would be negative is reflected, as in the authors' public code.
+
+    Args:
+        fleet: the truth. sensors: the noise that acts. v2x: neighbourhood and channel, default V2X.ideal().
+        runs: R. seed: of all draws.
+        observers: vehicles whose links are recorded (default all); fewer is faster and changes nobody's draws.
+        assumed: what methods may know, default `sensors` without its bias.
+
+    Raises:
+        InputError: runs < 1, an unknown observer, or an assumed std of zero.
+
+    >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
+    >>> observe(fleet, Sensors(), V2X(max_neighbours=1), runs=3)
+    Recording(3 runs x 2 steps x 2 vehicles, 4 links, K <= 1)
+    """
+    if runs < 1:
+        raise InputError("runs", runs, "must be >= 1", "Use at least one noise run.")
+    v2x = v2x or V2X.ideal()
+    columns = list(range(len(fleet.ids))) if observers is None else sorted({fleet.index(o) for o in observers})
+    links = find_links(fleet, columns, v2x.max_neighbours, v2x.radius, sensors.min_range)
+    sent, arrival = _messages(fleet, links, v2x, runs, seed)
+    return Recording(
+        ids=fleet.ids, t=fleet.t,
+        gnss=_gnss(fleet, sensors, runs, seed), velocity=_velocity(fleet, sensors, runs, seed),
+        links=links, relative=_relative(fleet, links, sensors, runs, seed), sent=sent, arrival=arrival,
+        sensors=assumed or sensors.without_bias(), v2x=v2x, observers=tuple(columns),
+    )  # fmt: skip
+
+
+def find_links(fleet: Fleet, observers: Sequence[int], most: int, radius: float, min_range: float = 0.0) -> Links:
+    """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance."""
+    found = [np.empty((0, 3), dtype=np.int64)]
+    for observer in observers if most else ():
+        gap = np.linalg.norm(fleet.position - fleet.position[:, observer : observer + 1], axis=2)
+        gap[:, observer] = np.inf
+        gap[~((gap <= radius) & (gap >= min_range))] = np.inf
+        order = np.argsort(gap, axis=1, kind="stable")[:, :most]
+        step, rank = np.nonzero(np.isfinite(np.take_along_axis(gap, order, axis=1)))
+        found.append(np.column_stack([step, np.full(len(step), observer), order[step, rank]]))
+    rows = np.concatenate(found)
+    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
+    return Links(rows[:, 0], rows[:, 1], rows[:, 2])
+
+
+def _normals(fleet: Fleet, sensor: str, runs: int, seed: int) -> Floats:
+    """(R, T, N, 3) standard normals, one stream per run and vehicle."""
+    shape = (len(fleet.t), 3)
+    return np.stack(
+        [np.stack([stream(seed, sensor, r, i).standard_normal(shape) for i in fleet.ids], axis=1) for r in range(runs)]
+    )
+
+
+def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
+    fixes: Floats = fleet.position + _normals(fleet, "gnss", runs, seed) * np.array(sensors.gnss_std)
+    low, high = sensors.gnss_bias
+    if high > 0:
+        steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
+        for r in range(runs):
+            for column, name in enumerate(fleet.ids):
+                fixes[r, :, column] += stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3))
+    return fixes
+
+
+def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
+    velocity: Floats = fleet.velocity + _normals(fleet, "velocity", runs, seed) * sensors.velocity_std(fleet.velocity)
+    return velocity
+
+
+def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
+    """(observer id, neighbour id, link indices in time order) of every pair that is ever linked."""
+    key = links.observer * len(fleet.ids) + links.neighbour
+    order = np.argsort(key, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
+    return [(fleet.ids[links.observer[g[0]]], fleet.ids[links.neighbour[g[0]]], g) for g in groups]
+
+
+def _relative(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
+    """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
+    vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
+    exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
+    relative = np.repeat(exact[None], runs, axis=0)
+    for observer, neighbour, index in _pairs(fleet, links):
+        last = int(links.step[index[-1]]) + 1
+        for r in range(runs):
+            draws = stream(seed, "relative", r, observer, neighbour).standard_normal((last, 3))
+            relative[r, index] += draws[links.step[index]] * sensors.relative_std
+    relative[..., 0] = np.abs(relative[..., 0])
+    relative[..., 1] = wrap(relative[..., 1])
+    return relative
+
+
+def _messages(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
+    """Sending schedule (L,) and arrival step (R, L) of the neighbour's broadcast over each link."""
+    per_step = v2x.rate * fleet.dt
+    if per_step > 1 + 1e-9:
+        limit = f"must be <= 1/dt = {1 / fleet.dt:g} Hz"
+        raise InputError("rate", f"{v2x.rate} Hz", limit, "Broadcast at most once a step.")
+    phase = np.array([stream(seed, "phase", 0, name).uniform() for name in fleet.ids])
+    count = np.floor((np.arange(-1, len(fleet.t))[:, None] + 1e-9) * per_step + phase)
+    sends = np.diff(count, axis=0) > 0
+    sent = sends[links.step, links.neighbour]
+    delay = int(np.ceil(v2x.latency / fleet.dt - 1e-9))
+    arrival = np.where(sent, links.step + delay, -1)[None].repeat(runs, axis=0)
+    if v2x.loss > 0:
+        number = (np.cumsum(sends, axis=0) - 1)[links.step, links.neighbour]
+        for observer, neighbour, pair in _pairs(fleet, links):
+            index = pair[sent[pair]]
+            size = int(number[index].max(initial=-1)) + 1
+            draws = np.stack([stream(seed, "loss", r, observer, neighbour).uniform(size=size) for r in range(runs)])
+            gone = lost(draws, v2x.loss, v2x.burst)[:, number[index]]
+            arrival[:, index] = np.where(gone, -1, arrival[:, index])
+    return sent, arrival

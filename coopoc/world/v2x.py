@@ -1,0 +1,103 @@
+"""V2X: who may talk to whom, how often, how late, how reliably and within how many bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ..arrays import Bools, Floats
+from ..errors import InputError
+
+
+@dataclass(frozen=True)
+class V2X:
+    """Neighbourhood and channel. Neighbours are the nearest by true distance, as an on-board sensor would find them."""
+
+    max_neighbours: int = 6
+    """K: at most this many neighbours, nearest first."""
+    radius: float = 30.0
+    """m, the paper's range."""
+    rate: float = 10.0
+    """Hz at which each vehicle broadcasts; relative measurements are on board and come at every step."""
+    latency: float = 0.0
+    """s from sending to arrival, rounded up to whole steps."""
+    loss: float = 0.0
+    """Share of messages that never arrive."""
+    burst: float = 1.0
+    """Mean length of a run of losses, in messages (Gilbert-Elliott); 1/(1 - loss) or less means independent losses."""
+    bytes_per_second: float = float("inf")
+    """Cap on what one vehicle receives: messages beyond it are dropped, farthest neighbour first."""
+    overhead: int = 0
+    """Bytes per message on air beyond the payload (headers, signature)."""
+
+    def __post_init__(self) -> None:
+        limits = {"max_neighbours": (0, 1e6, ">= 0"), "radius": (0, np.inf, ">= 0 m"), "rate": (1e-3, 1e4, "> 0 Hz"),
+                  "latency": (0, 3600, ">= 0 s"), "loss": (0, 1, "in [0, 1]"), "burst": (1, 1e6, ">= 1 message"),
+                  "bytes_per_second": (0, np.inf, ">= 0"), "overhead": (0, 1e6, ">= 0 bytes")}  # fmt: skip
+        for field in fields(self):
+            low, high, words = limits[field.name]
+            value = getattr(self, field.name)
+            if not low <= value <= high:
+                mend = "Use 0 for no neighbours." if field.name == "max_neighbours" else f"Give V2X({field.name}=...)."
+                raise InputError(field.name, value, f"must be {words}", mend)
+        if self.max_neighbours != int(self.max_neighbours):
+            raise InputError("max_neighbours", self.max_neighbours, "must be a whole number", "Use an int.")
+
+    @classmethod
+    def ideal(cls, max_neighbours: int = 6) -> V2X:
+        """Every message at every step, at once, for free: what the paper's baselines assume."""
+        return cls(max_neighbours=max_neighbours)
+
+
+@dataclass(frozen=True)
+class Message:
+    """What one broadcast carries: its payload is `numbers` float32, 4 bytes each.
+
+    >>> Message("fix and velocity", 8).payload
+    32
+    """
+
+    name: str
+    numbers: int
+
+    @property
+    def payload(self) -> int:
+        """Bytes."""
+        return 4 * self.numbers
+
+
+NO_MESSAGE = Message("none", 0)
+FIX_AND_VELOCITY = Message("fix and velocity", 8)
+"""GNSS fix (3), velocity (3), id and time (2): LKF-SA's star and the joint filter (methods.md section 3.3)."""
+ESTIMATE = Message("estimate", 8)
+"""Position estimate (3), the receiver's own relative measurement is on board; velocity (3), id and time (2)."""
+ESTIMATE_AND_COV = Message("estimate and covariance", 14)
+"""As ESTIMATE with the six numbers of a symmetric covariance (methods.md section 2.2)."""
+
+
+def lost(draws: Floats, loss: float, burst: float) -> Bools:
+    """Gilbert-Elliott losses: a two-state chain with stationary share `loss` and mean bad run `burst`.
+
+    P(good -> bad) = loss / (burst (1 - loss)), P(bad -> good) = 1 / burst; burst <= 1/(1 - loss) is independent loss.
+
+    Args:
+        draws: (R, M) uniforms in [0, 1), one per message in sending order.
+
+    Returns:
+        (R, M) True where lost.
+
+    >>> bool(lost(np.full((1, 4), 0.5), 0.2, 1.0).any())
+    False
+    """
+    if loss in (0.0, 1.0):
+        return np.full(draws.shape, bool(loss))
+    mean_run = max(burst, 1.0 / (1.0 - loss))
+    to_bad, stay_bad = loss / (mean_run * (1.0 - loss)), 1.0 - 1.0 / mean_run
+    bad = np.empty(draws.shape, dtype=bool)
+    state = draws[:, 0] < loss if draws.shape[1] else np.zeros(len(draws), dtype=bool)
+    for k in range(draws.shape[1]):
+        if k:
+            state = draws[:, k] < np.where(state, stay_bad, to_bad)
+        bad[:, k] = state
+    return bad
