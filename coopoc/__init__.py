@@ -1,1 +1,48 @@
-"""Optimization-based cooperative localization with learned-gain comparisons."""
+"""Optimization-based cooperative localization with learned-gain comparisons.
+
+A Fleet drives. `observe` turns it into a Recording under Sensors and a V2X budget. A Method turns a Recording into a
+Track. `rt_le` compares Track and Fleet. A Study does this over a grid and yields Results.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .errors import InputError as InputError
+    from .errors import MissingLibraryError as MissingLibraryError
+    from .methods.gnss import Gnss as Gnss
+    from .methods.kalman import Kalman as Kalman
+    from .methods.knowledge import Knowledge as Knowledge
+    from .methods.track import Method as Method
+    from .methods.track import Track as Track
+    from .world.fleet import Fleet as Fleet
+    from .world.recording import Links as Links
+    from .world.recording import Recording as Recording
+    from .world.sensing import observe as observe
+    from .world.sensors import Sensors as Sensors
+    from .world.v2x import V2X as V2X
+    from .world.v2x import Message as Message
+
+_HOME = {
+    "InputError": "errors", "MissingLibraryError": "errors",
+    "Fleet": "world.fleet", "Links": "world.recording", "Recording": "world.recording", "observe": "world.sensing",
+    "Sensors": "world.sensors", "V2X": "world.v2x", "Message": "world.v2x",
+    "Gnss": "methods.gnss", "Kalman": "methods.kalman", "Knowledge": "methods.knowledge",
+    "Method": "methods.track", "Track": "methods.track",
+}  # fmt: skip
+
+__version__ = "0.1.0"
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from its home when it is first used: `import coopoc` stays quick."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'coopoc' has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOME[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOME])

@@ -1,1 +1,1 @@
-"""."""
+"""What a Track is worth: errors, consistency, bounds and intervals."""

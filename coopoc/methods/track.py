@@ -24,8 +24,7 @@ class Track:
         covariance: (R, T, E, 3, 3) m^2, or None if the method claims none.
         received_bytes, sent_bytes: (R, E) bytes over the drive, payload and overhead.
         seconds: wall time of the method.
-        neighbours: (R, L, 3) m estimate of the neighbour of each link of the Recording at the link's step, NaN where the
-            method makes none; or None.
+        neighbours: (R, L, 3) m estimate of each link's neighbour at the link's step, NaN where there is none; or None.
         notes: labels for tables and figures, such as "reconstruction".
     """
 

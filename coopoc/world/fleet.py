@@ -73,7 +73,9 @@ class Fleet:
             return int(vehicle)
         known = ", ".join(self.ids[:8]) + (", ..." if len(self.ids) > 8 else "")
         raise InputError(
-            "vehicle", repr(vehicle), f"must be an index in 0..{len(self.ids) - 1} or one of the ids {known}",
+            "vehicle",
+            repr(vehicle),
+            f"must be an index in 0..{len(self.ids) - 1} or one of the ids {known}",
             "List them with fleet.ids.",
         )
 
@@ -104,18 +106,24 @@ def _check(fleet: Fleet) -> None:
     for field in ("position", "velocity"):
         if getattr(fleet, field).shape != (steps, vehicles, 3):
             raise InputError(
-                field, getattr(fleet, field).shape, f"must have shape (T, N, 3) = ({steps}, {vehicles}, 3)",
+                field,
+                getattr(fleet, field).shape,
+                f"must have shape (T, N, 3) = ({steps}, {vehicles}, 3)",
                 "Axis order is time, vehicle, component.",
             )
     gaps = np.diff(fleet.t)
     if not np.all(gaps > 0):
         raise InputError(
-            "dt", f"{gaps.min():g} s at step {int(np.argmin(gaps)) + 1}", "must be > 0",
+            "dt",
+            f"{gaps.min():g} s at step {int(np.argmin(gaps)) + 1}",
+            "must be > 0",
             "Sort the rows by time and drop repeated stamps.",
         )
     if np.ptp(gaps) > 1e-3 * gaps.mean() + 1e-6:
         raise InputError(
-            "t", f"steps between {gaps.min():g} and {gaps.max():g} s", "must be equally spaced",
+            "t",
+            f"steps between {gaps.min():g} and {gaps.max():g} s",
+            "must be equally spaced",
             "Resample first: coopoc data convert --dt 0.1.",
         )
     numbers = np.concatenate([fleet.position, fleet.velocity], axis=2)
@@ -123,7 +131,8 @@ def _check(fleet: Fleet) -> None:
     if bad.any():
         step, vehicle = np.argwhere(bad)[0]
         raise InputError(
-            "position/velocity", f"{numbers[step, vehicle]} of vehicle {fleet.ids[vehicle]} at step {step}",
+            "position/velocity",
+            f"{numbers[step, vehicle]} of vehicle {fleet.ids[vehicle]} at step {step}",
             "must be finite, or NaN in all six numbers where the vehicle is absent",
             "Interpolate the gap or drop the row.",
         )

@@ -77,7 +77,7 @@ class Recording:
         return int(self.gnss.shape[0])
 
     def columns(self, egos: Sequence[int | str]) -> list[int]:
-        """Columns of the egos; InputError if one is unknown, is no observer of this recording, or is absent at times."""
+        """Columns of the egos; InputError if one is unknown, no observer of this recording, or absent at times."""
         cols = []
         for ego in egos:
             col = self.ids.index(ego) if isinstance(ego, str) and ego in self.ids else ego

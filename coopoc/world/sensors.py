@@ -57,7 +57,9 @@ class Sensors:
                 raise InputError(name, repr(getattr(self, name)), f"must be one of {get_args(allowed)}", "Pick one.")
         if self.azimuth_std > np.pi or self.inclination_std > np.pi:
             raise InputError(
-                "azimuth_std/inclination_std", (self.azimuth_std, self.inclination_std), "must be <= pi rad",
+                "azimuth_std/inclination_std",
+                (self.azimuth_std, self.inclination_std),
+                "must be <= pi rad",
                 "Angles are in radians: use np.deg2rad.",
             )
 
@@ -88,7 +90,9 @@ class Sensors:
         for name, value in stds.items():
             if value <= 0:
                 raise InputError(
-                    name, getattr(self, name), "is zero: noise may act with zero std but not be assumed with it",
+                    name,
+                    getattr(self, name),
+                    "is zero: noise may act with zero std but not be assumed with it",
                     "Pass observe(..., assumed=Sensors(...)) with positive standard deviations.",
                 )
         return self

@@ -1,0 +1,87 @@
+"""Errors of a Track against its Fleet: RT-LE, maximum, CDF, NEES with its band."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from ..arrays import Bools, Floats
+from ..errors import InputError
+from ..methods.track import Track
+from ..world.fleet import Fleet
+from ..world.recording import Recording
+
+
+def errors(track: Track, fleet: Fleet) -> Floats:
+    """Distance between estimate and truth, (R, T, E) m."""
+    if len(track.t) != len(fleet.t):
+        raise InputError(
+            "track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps",
+            "Score a track against the fleet that its recording was observed from.",
+        )  # fmt: skip
+    distance: Floats = np.linalg.norm(track.x - fleet.position[:, list(track.egos)], axis=-1)
+    return distance
+
+
+def rt_le(track: Track, fleet: Fleet) -> Floats:
+    """Root mean square localization error over time, sqrt(mean_t |x_t - truth_t|^2), (R, E) m (paper, section IV.A).
+
+    >>> from coopoc import Gnss, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> rt_le(Gnss()(observe(fleet, Sensors(), runs=5)), fleet).shape
+    (5, 1)
+    """
+    return np.asarray(np.sqrt(np.mean(errors(track, fleet) ** 2, axis=1)))
+
+
+def max_error(track: Track, fleet: Fleet) -> Floats:
+    """Largest error over time of each run and ego, (R, E) m; a reported maximum is the mean of these over runs."""
+    return np.asarray(errors(track, fleet).max(axis=1))
+
+
+def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
+    """Error of what the egos think of their neighbours, sqrt(mean over links |x_j - truth_j|^2), (R, E) m.
+
+    NaN where an ego has no neighbour or the method says nothing about them.
+    """
+    out = np.full((len(track.x), len(track.egos)), np.nan)
+    if track.neighbours is None:
+        return out
+    links = recording.links
+    truth = fleet.position[links.step, links.neighbour]
+    square = ((track.neighbours - truth) ** 2).sum(axis=-1)
+    for e, ego in enumerate(track.egos):
+        mine = square[:, links.of(ego)]
+        known = np.isfinite(mine).any(axis=1)
+        out[known, e] = np.sqrt(np.nanmean(mine[known], axis=1))
+    return out
+
+
+def nees(track: Track, fleet: Fleet) -> Floats:
+    """Normalised estimation error squared, e^T P^-1 e, (R, T, E); its mean is 3 for a consistent filter."""
+    if track.covariance is None:
+        raise InputError(
+            "covariance", None, "this method claims none", "NEES needs a method that reports a covariance."
+        )
+    error = track.x - fleet.position[:, list(track.egos)]
+    return np.asarray(np.einsum("rtei,rtei->rte", error, np.linalg.solve(track.covariance, error[..., None])[..., 0]))
+
+
+def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, float]:
+    """Two-sided chi-square band of the run-averaged NEES of one step, for `runs` runs (Bar-Shalom, section 5.4).
+
+    Steps of one run are not independent, so the band is of each step's average over runs, never of a pool of steps.
+
+    >>> [round(b, 2) for b in nees_band(30)]
+    [1.97, 4.28]
+    """
+    low, high = stats.chi2.ppf([(1 - level) / 2, (1 + level) / 2], size * runs) / runs
+    return float(low), float(high)
+
+
+def nees_inside(track: Track, fleet: Fleet, level: float = 0.99) -> Floats:
+    """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
+    low, high = nees_band(len(track.x), level)
+    average = nees(track, fleet).mean(axis=0)
+    inside: Bools = (average >= low) & (average <= high)
+    return np.asarray(inside.mean(axis=0))

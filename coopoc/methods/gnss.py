@@ -1,0 +1,31 @@
+"""GNSS alone: the raw fix, the floor that every filter must beat."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..world.recording import Recording
+from ..world.v2x import NO_MESSAGE, Message
+from .track import Track
+
+
+@dataclass(frozen=True)
+class Gnss:
+    """The latest fix, x_t = z_t, with the assumed GNSS covariance."""
+
+    name: str = "gnss"
+    cooperative: bool = False
+    message: Message = NO_MESSAGE
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent."""
+        began = time.perf_counter()
+        columns = recording.columns(egos)
+        x = recording.gnss[:, :, columns]
+        cov = np.broadcast_to(np.diag(np.square(recording.sensors.gnss_std)), (*x.shape, 3))
+        free = np.zeros((recording.runs, len(columns)))
+        return Track(recording.t, tuple(columns), x, cov, free, free, time.perf_counter() - began)

@@ -1,0 +1,147 @@
+"""The joint cooperative filter: ego and neighbours in one state, with one exact Gauss-Newton step."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from ..world.inbox import inbox
+from ..world.recording import Recording
+from ..world.spherical import spherical, to_vector, wrap
+from ..world.v2x import FIX_AND_VELOCITY, Message
+from .knowledge import Knowledge, resolve
+from .star import FORGOTTEN, StarStep, rows, star_steps
+from .track import Track
+
+
+@dataclass(frozen=True, eq=False)
+class JointFilter:
+    """Kalman filter of the star {ego} + neighbours in information form; axes couple through the relative covariances.
+
+    Lambda = P^-1 + blkdiag(GNSS^-1) + B blkdiag(C_e^-1) B^T with C_e the rotated covariance of the converted vector
+    (methods.md section 3.5), then, if `exact`, one Gauss-Newton step on (range, azimuth, inclination) themselves, which
+    is within 3e-5 of the maximum-likelihood cost (performance.md section 1.1). Who joins or leaves resets nobody else.
+
+    Args:
+        knowledge: "identity", "nominal" or a Knowledge. exact: False stops at the linear update (LKF-SA's edge form).
+    """
+
+    knowledge: Knowledge | str = "nominal"
+    exact: bool = True
+    name: str = "joint"
+    cooperative: bool = True
+    message: Message = FIX_AND_VELOCITY
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
+        began = time.perf_counter()
+        columns = recording.columns(egos)
+        known = resolve(self.knowledge, recording)
+        shape = (recording.runs, len(recording.t), len(columns), 3)
+        x, cov = np.empty(shape), np.empty((*shape, 3))
+        neighbours = np.full_like(recording.relative, np.nan)
+        received, sent = np.zeros((2, recording.runs, len(columns)))
+        for e, ego in enumerate(columns):
+            box = inbox(recording, ego, self.message)
+            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
+            state: Floats = np.empty((recording.runs, 0, 3))
+            spread: Floats = np.empty((recording.runs, 0, 0))
+            for star in star_steps(recording, ego, box, known):
+                state, spread = predict(state, spread, star)
+                state, spread = update(state, spread, star, known, self.exact and known.exact_relative)
+                x[:, star.step, e], cov[:, star.step, e] = state[:, 0], spread[:, :3, :3]
+                neighbours[:, star.links] = state[:, 1:]
+        return Track(
+            recording.t, tuple(columns), x, cov, received, sent, time.perf_counter() - began, neighbours
+        )  # fmt: skip
+
+
+def predict(state: Floats, spread: Floats, star: StarStep) -> tuple[Floats, Floats]:
+    """Members that stay move with their velocity; who has left is marginalised, who joins starts at the ego's sighting.
+
+    Args:
+        state: (R, m, 3) m. spread: (R, 3m, 3m) m^2 of the previous star.
+
+    Returns:
+        (R, n, 3), (R, 3n, 3n) of this star.
+    """
+    runs, n = len(star.fix), len(star.kept)
+    stays = np.flatnonzero(star.kept >= 0)
+    old = star.kept[stays]
+    new_state = np.empty((runs, n, 3))
+    new_state[:, stays] = state[:, old] + star.moved[:, stays]
+    variance = np.full((runs, n, 3), FORGOTTEN)
+    variance[:, stays] = star.process[:, stays]
+    new_spread = variance.reshape(runs, 3 * n)[:, :, None] * np.eye(3 * n)
+    here, there = rows(stays), rows(old)
+    new_spread[:, here[:, None], here] += spread[:, there[:, None], there]
+    if star.kept[0] < 0:
+        new_state[:, 0] = star.fix[:, 0]
+    joins = np.flatnonzero(star.kept[1:] < 0)
+    new_state[:, 1 + joins] = new_state[:, :1] + star.vector[:, joins]
+    return new_state, new_spread
+
+
+def update(state: Floats, spread: Floats, star: StarStep, known: Knowledge, exact: bool) -> tuple[Floats, Floats]:
+    """A linear update with fixes and converted vectors, then, if `exact`, one Gauss-Newton step."""
+    n = state.shape[1]
+    prior = np.linalg.inv(spread)
+    information, pull = prior.copy(), np.zeros((len(state), 3 * n))
+    weight = np.where(star.heard[..., None], 1.0 / star.fix_variance, 0.0)
+    diagonal = np.arange(3 * n)
+    information[:, diagonal, diagonal] += weight.reshape(-1, 3 * n)
+    pull += (weight * (star.fix - state)).reshape(-1, 3 * n)
+    if n == 1:
+        cov = np.linalg.inv(information)
+        return state + (cov @ pull[..., None])[..., 0].reshape(state.shape), cov
+    edge = np.linalg.inv(known.relative_cov(star.relative))
+    linear, linear_pull = information.copy(), pull.copy()
+    gap = star.vector - (state[:, 1:] - state[:, :1])
+    add_edges(linear, linear_pull, edge, (edge @ gap[..., None])[..., 0])
+    if not exact:
+        cov = np.linalg.inv(linear)
+        return state + (cov @ linear_pull[..., None])[..., 0].reshape(state.shape), cov
+    moved = np.linalg.solve(linear, linear_pull[..., None])[..., 0]
+    point = state + moved.reshape(state.shape)
+    root, residual = exact_edges(point, star, known)
+    pull = pull - np.einsum("rij,rj->ri", information, moved)
+    add_edges(information, pull, np.swapaxes(root, -1, -2) @ root, (np.swapaxes(root, -1, -2) @ residual)[..., 0])
+    cov = np.linalg.inv(information)
+    return point + (cov @ pull[..., None])[..., 0].reshape(state.shape), cov
+
+
+def add_edges(information: Floats, pull: Floats, weight: Floats, push: Floats) -> None:
+    """Add in place the information (R, k, 3, 3) and the pull (R, k, 3) of measured x_j - x_ego for k neighbours."""
+    runs, k = push.shape[:2]
+    blocks = information.reshape(runs, k + 1, 3, k + 1, 3)
+    j = np.arange(1, k + 1)
+    blocks[:, 0, :, 0] += weight.sum(axis=1)
+    per_edge = np.moveaxis(weight, 1, 0)
+    blocks[:, j, :, j] += per_edge
+    blocks[:, 0, :, j] -= per_edge
+    blocks[:, j, :, 0] -= per_edge
+    pull[:, :3] -= push.sum(axis=1)
+    pull[:, 3:] += push.reshape(runs, 3 * k)
+
+
+def exact_edges(point: Floats, star: StarStep, known: Knowledge) -> tuple[Floats, Floats]:
+    """Whitened Jacobian (R, k, 3, 3) by x_j - x_ego and residual (R, k, 3, 1) of range, azimuth and inclination."""
+    assert known.sensors is not None
+    vector = point[:, 1:] - point[:, :1]
+    dx, dy, dz = np.moveaxis(vector, -1, 0)
+    seen = np.stack(spherical(dx, dy, dz), axis=-1)
+    residual = star.relative - seen
+    residual[..., 1:] = wrap(residual[..., 1:])
+    unit = to_vector(np.concatenate([np.ones_like(seen[..., :1]), seen[..., 1:]], axis=-1))
+    d = np.maximum(seen[..., 0], known.sensors.min_range)
+    ground = np.maximum(np.hypot(dx, dy), 1e-3 * d)
+    zero = np.zeros_like(d)
+    by_azimuth = np.stack([-dy / ground**2, dx / ground**2, zero], axis=-1)
+    by_inclination = np.stack([dx * dz / (ground * d**2), dy * dz / (ground * d**2), -ground / d**2], axis=-1)
+    jacobian = np.stack([unit, by_azimuth, by_inclination], axis=-2)
+    std = known.sensors.relative_std
+    return jacobian / std[:, None], (residual / std)[..., None]

@@ -1,0 +1,106 @@
+"""MSMV-R: a reconstruction of multi-sensor multi-vehicle localization, whose equations are not public."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from ..world.inbox import Inbox, inbox
+from ..world.recording import Recording
+from ..world.spherical import to_vector
+from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, Message
+from .kalman import solo_filter
+from .knowledge import Knowledge, resolve
+from .track import Track
+
+FLAT = 1e6
+"""m^2, prior variance before the first fix."""
+RECONSTRUCTION = "MSMV-R is a reconstruction: the equations of MSMV are not public; the paper's curve is not matched"
+
+
+@dataclass(frozen=True, eq=False)
+class Msmv:
+    """Kalman filter of the ego with one pseudo-fix per neighbour: y_j = p_j - rho(r_ij), C_j = P_j + J C_r J^T.
+
+    p_j, P_j are the neighbour's own solo estimate. P^-1 += C_p^-1 + sum C_j^-1 as in methods.md section 2.2. The errors
+    of p_j are correlated in time, so the covariance is over-confident (data incest), and NEES shows it. With identity
+    knowledge all covariances are unit matrices and the message is shorter.
+
+    Args:
+        knowledge: "identity", "nominal" or a Knowledge.
+    """
+
+    knowledge: Knowledge | str = "identity"
+    name: str = "msmv-r"
+    cooperative: bool = True
+
+    @property
+    def message(self) -> Message:
+        """Without covariance under identity knowledge, with it otherwise."""
+        name = self.knowledge if isinstance(self.knowledge, str) else self.knowledge.name
+        return ESTIMATE if name == "identity" else ESTIMATE_AND_COV
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent."""
+        began = time.perf_counter()
+        columns = recording.columns(egos)
+        known = resolve(self.knowledge, recording)
+        shape = (recording.runs, len(recording.t), len(columns), 3)
+        x, cov = np.empty(shape), np.empty((*shape, 3))
+        neighbours = np.full_like(recording.relative, np.nan)
+        received, sent = np.zeros((2, recording.runs, len(columns)))
+        process = known.process_variance(recording)
+        solo = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
+        process = np.broadcast_to(process, recording.gnss.shape)
+        for e, ego in enumerate(columns):
+            box = inbox(recording, ego, self.message)
+            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
+            x[:, 0, e] = recording.gnss[:, 0, ego]
+            cov[:, 0, e] = FLAT * np.eye(3)
+            for t in range(len(recording.t)):
+                if t > 0:
+                    x[:, t, e] = x[:, t - 1, e] + recording.dt * recording.velocity[:, t, ego]
+                    cov[:, t, e] = cov[:, t - 1, e] + process[:, t, ego, :, None] * np.eye(3)
+                theirs, pseudo, weight = _pseudo_fixes(recording, box, t, solo, process, known)
+                x[:, t, e], cov[:, t, e] = _fuse(
+                    x[:, t, e], cov[:, t, e], recording.gnss[:, t, ego], known.gnss_variance, pseudo, weight
+                )
+                neighbours[:, box.link[box.start[t] : box.start[t + 1]]] = theirs
+        seconds = time.perf_counter() - began
+        return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, (RECONSTRUCTION,))
+
+
+def _pseudo_fixes(
+    recording: Recording, box: Inbox, t: int, solo: tuple[Floats, Floats], process: Floats, known: Knowledge
+) -> tuple[Floats, Floats, Floats]:
+    """What the neighbours say of themselves (R, k, 3), hence of the ego (R, k, 3), and its information (R, k, 3, 3).
+
+    A late estimate is brought forward with its velocity; its variance grows by the process noise of each step.
+    """
+    span = slice(box.start[t], box.start[t + 1])
+    runs = np.arange(recording.runs)[:, None]
+    who, held = recording.links.neighbour[box.link[span]], box.newest[:, span] >= 0
+    sent = np.where(held, box.newest[:, span], t)
+    age = (t - sent)[..., None]
+    theirs = solo[0][runs, sent, who] + age * recording.dt * recording.velocity[runs, sent, who]
+    relative = recording.relative[:, box.link[span]]
+    pseudo_cov = known.relative_cov(relative)
+    if known.sensors is not None:
+        spread = solo[1][runs, sent, who] + age * process[runs, sent, who]
+        pseudo_cov = pseudo_cov + spread[..., None] * np.eye(3)
+    weight = np.linalg.inv(pseudo_cov) * held[..., None, None]
+    return np.where(held[..., None], theirs, np.nan), theirs - to_vector(relative), weight
+
+
+def _fuse(
+    prior: Floats, prior_cov: Floats, fix: Floats, fix_variance: Floats, pseudo: Floats, weight: Floats
+) -> tuple[Floats, Floats]:
+    """P^-1 + C_p^-1 + sum_j C_j^-1 and the weighted mean that belongs to it."""
+    information = np.linalg.inv(prior_cov) + np.diag(1.0 / fix_variance) + weight.sum(axis=1)
+    pull = (fix - prior) / fix_variance + (weight @ (pseudo - prior[:, None])[..., None])[..., 0].sum(axis=1)
+    cov = np.linalg.inv(information)
+    return prior + (cov @ pull[..., None])[..., 0], cov

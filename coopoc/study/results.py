@@ -1,0 +1,160 @@
+"""Results: the tidy frame of a study, one row per (cell, run, ego), and its means with intervals."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import pyarrow as pa
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..evaluate.statistics import Interval, mean_interval
+from ..plugins import unknown
+from . import store
+
+if TYPE_CHECKING:
+    from .tables import Table
+
+SEED = "train_seed"
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """Rows of a study and what they stand on.
+
+    Args:
+        study, question: of the study. axes: names of the parameters that vary. settings: what all cells share.
+        frame: rows of finished cells: parameters, `run`, `ego`, metrics, status "ok".
+        failures: rows of failed cells: parameters, `reason`, `traceback`. pending: cells that nobody has tried yet.
+        environment: versions, processor, revision.
+    """
+
+    study: str
+    question: str
+    axes: tuple[str, ...]
+    settings: Mapping[str, Any]
+    frame: pd.DataFrame
+    failures: pd.DataFrame
+    pending: int
+    environment: Mapping[str, str]
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Results:
+        """Results in the folder of a study, finished or not; InputError if it holds none."""
+        path = Path(folder) / "manifest.json"
+        if not path.is_file():
+            raise InputError("folder", str(folder), "holds no manifest.json", "Give a folder that coopoc run has made.")
+        manifest = json.loads(path.read_text())
+        done, failed, pending = [], [], 0
+        for cell in manifest["cells"]:
+            table = store.load(path.parent, cell["name"])
+            failure = None if table is not None else store.load_failure(path.parent, cell["name"])
+            done += [table] if table is not None else []
+            failed += [failure] if failure is not None else []
+            pending += table is None and failure is None
+        return cls(
+            manifest["study"], manifest["question"], tuple(manifest["axes"]), manifest["settings"],
+            _joined(done), _joined(failed), pending, manifest["environment"],
+        )  # fmt: skip
+
+    @property
+    def failed(self) -> int:
+        """Number of failed cells."""
+        return len(self.failures)
+
+    def select(self, where: Mapping[str, Any] | None = None, **also: Any) -> pd.DataFrame:
+        """Rows where each named column has the value, or one of a list of values.
+
+        Raises:
+            InputError: an unknown column, or a value that no row has.
+        """
+        frame = self.frame
+        for name, wanted in {**(where or {}), **also}.items():
+            if name not in frame:
+                raise unknown("column", name, frame.columns)
+            values = list(wanted) if isinstance(wanted, list | tuple | set) else [wanted]
+            for value in values:
+                if not _is(self.frame[name], value).any():
+                    known = ", ".join(map(str, self.frame[name].unique()[:12])) or "(no cell has finished)"
+                    raise InputError(name, repr(value), f"must be among {known}", "See failed cells, or widen the grid.")
+            frame = frame[np.logical_or.reduce([_is(frame[name], v) for v in values])]
+        return frame
+
+    def values(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Floats:
+        """(E, R) of one metric, sorted by ego and run: what paired comparisons take. Averaged over training seeds."""
+        frame = self.select(where, **also)
+        self._one_cell(frame, [], value)
+        return _grid(frame, value)[0]
+
+    def interval(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Interval:
+        """Mean of one metric over egos and runs with its interval."""
+        return mean_interval(self.values(value, where, **also))
+
+    def groups(self, by: Sequence[str], where: Mapping[str, Any] | None = None) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
+        """Rows of each combination of the columns `by`, in the order of the grid."""
+        frame = self.select(where)
+        for name in by:
+            if name not in frame:
+                raise unknown("column", name, frame.columns)
+        yield from frame.groupby(list(by), sort=False, dropna=False)
+
+    def summary(self, by: Sequence[str], value: str, where: Mapping[str, Any] | None = None) -> pd.DataFrame:
+        """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (egos left out).
+
+        Raises:
+            InputError: rows that differ in an axis which neither `by` nor `where` names would be mixed.
+        """
+        rows = []
+        for names, frame in self.groups(by, where):
+            self._one_cell(frame, by, value)
+            grid, missing = _grid(frame, value)
+            found = mean_interval(grid)
+            rows.append([*names, found.mean, found.low, found.high, found.n, missing])
+        return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
+
+    def table(self, rows: str | Sequence[str], columns: str, value: str, **options: Any) -> Table:
+        """Table of one metric, see `coopoc.study.tables.tabulated` for the options."""
+        from .tables import tabulated
+
+        return tabulated(self, rows, columns, value, **options)
+
+    def to_parquet(self, path: str | Path) -> None:
+        """Write all rows as Parquet."""
+        store.write(Path(path), lambda file: self.frame.to_parquet(file, index=False))
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write all rows as CSV with full precision; columns that hold lists are left to Parquet."""
+        flat = [c for c in self.frame if not self.frame[c].map(lambda v: isinstance(v, list | np.ndarray)).any()]
+        store.write(Path(path), self.frame[flat].to_csv(index=False))
+
+    def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
+        if value not in frame:
+            raise unknown("metric", value, frame.columns)
+        for axis in self.axes:
+            if axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
+                mixed = ", ".join(map(str, frame[axis].unique()))
+                raise InputError(axis, mixed, "would be averaged together", f"Name {axis} in where, rows or columns.")
+
+
+def _is(column: pd.Series[Any], value: Any) -> pd.Series[bool]:
+    return column.isna() if value is None else column == value
+
+
+def _joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
+    return pa.concat_tables(tables, promote_options="permissive").to_pandas() if tables else pd.DataFrame()
+
+
+def _grid(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
+    """(E, R) means over training seeds, and how many egos are left out because a run of theirs is missing."""
+    frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame})
+    table = frame.pivot_table(index="ego", columns="run", values=value, aggfunc="mean", sort=True, dropna=False)
+    whole = table.dropna()
+    if whole.empty:
+        raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
+    return whole.to_numpy(dtype=float), len(table) - len(whole)

@@ -1,0 +1,100 @@
+"""The folder of a study: one Parquet file per cell, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from ..errors import InputError
+from .study import Cell, Row
+
+OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
+
+
+def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
+    """Write a file atomically: a temporary neighbour, flushed to disk, then renamed onto `path`.
+
+    Whoever is killed in between leaves the old file or none, and never half a file.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            if callable(content):
+                content(file)
+            else:
+                file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def prepare(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Make the folder and write its manifest; InputError if it cannot be written."""
+    try:
+        write(folder / "manifest.json", json.dumps(manifest, indent=1, default=str) + "\n")
+    except OSError as error:
+        raise InputError("out", str(folder), f"cannot be written ({error.strerror})", "Choose another --out.") from None
+
+
+def save(folder: Path, cell: Cell, rows: Sequence[Row], seconds: float) -> None:
+    """Keep the rows of a finished cell, and forget that it failed before."""
+    own = {"cell": cell.name, "status": "ok", "reason": "", "cell_seconds": seconds}
+    table = to_table([{**cell.params, **row, **own} for row in rows])
+    write(_finished(folder, cell.name), lambda file: pq.write_table(table, file))
+    _failed(folder, cell.name).unlink(missing_ok=True)
+
+
+def save_failure(folder: Path, cell: Cell, reason: str, trace: str, seconds: float) -> None:
+    """Keep the reason of a failed cell where the next run does not take it for finished."""
+    own = {"cell": cell.name, "status": "failed", "reason": reason, "cell_seconds": seconds, "traceback": trace}
+    table = to_table([{**cell.params, **own}])
+    write(_failed(folder, cell.name), lambda file: pq.write_table(table, file))
+
+
+def load(folder: Path, name: str) -> pa.Table | None:
+    """Rows of a finished cell; None if there are none, or (with a warning) if the file is damaged."""
+    path = _finished(folder, name)
+    if not path.exists():
+        return None
+    try:
+        table = pq.read_table(path, partitioning=None)
+        if set(OWN_COLUMNS) <= set(table.column_names) and set(table["cell"].to_pylist()) == {name}:
+            return table
+        damage = "it does not hold the rows of this cell"
+    except (pa.ArrowException, OSError) as error:
+        damage = str(error)
+    warnings.warn(f"{path} is damaged and will be computed again: {damage}", RuntimeWarning, stacklevel=2)
+    return None
+
+
+def load_failure(folder: Path, name: str) -> pa.Table | None:
+    """The row of a failed cell, if that was its last outcome."""
+    path = _failed(folder, name)
+    return pq.read_table(path, partitioning=None) if path.exists() else None
+
+
+def to_table(rows: Sequence[Row]) -> pa.Table:
+    """Arrow table with the union of the rows' columns, in order of first appearance; absent values are null."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
+
+
+def _finished(folder: Path, name: str) -> Path:
+    return folder / "cells" / f"{name}.parquet"
+
+
+def _failed(folder: Path, name: str) -> Path:
+    return folder / "failed" / f"{name}.parquet"

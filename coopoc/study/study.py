@@ -1,0 +1,161 @@
+"""Study: a question, a grid of cells, and the views of its results."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from ..errors import InputError
+from ..plugins import unknown
+from .parse import parse
+
+if TYPE_CHECKING:
+    from .figures import Plot
+    from .results import Results
+    from .tables import Table
+
+Scalar: TypeAlias = str | int | float | bool | None
+Params: TypeAlias = Mapping[str, Any]
+Row: TypeAlias = dict[str, Any]
+
+
+def _no_extras(params: Params) -> Mapping[str, Any]:
+    return {}
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """A grid of cells, each a pure function of its parameters, and the tables and figures that answer one question.
+
+    Args:
+        name: of the study and of its folder.
+        question: one sentence.
+        cell: parameters -> rows, one per (run, ego). A module-level function (workers unpickle it); it gets the
+            settings and the cell's own parameters in one mapping. A value of a row is a number, a string or a list of
+            numbers. Columns that end in "seconds" are timings, all others are numbers that repeat to the last digit.
+        grid: axis -> values (their product), or a list of parameter mappings. Values are scalars.
+        settings: what all cells share (runs, seed, data, egos ...) with defaults, overridden by --set key=value.
+        key: parameters -> what else changes the numbers (fleet digest, hash of weights, revision of the methods).
+            Evaluated for every cell before any work, so an InputError raised here is reported at once.
+        where: parameters -> False for combinations that mean nothing.
+        shares: names of parameters on which the expensive part (a Recording) depends: cells that agree on them follow
+            each other in one worker, where functools.lru_cache then serves.
+        tables, figures: name -> function of Results. findings: Results -> sentences for the top of the report.
+        recipe: Results -> what the report says about the training.
+        limitations: sentences. minutes: expected on one core.
+
+    Raises:
+        InputError: an empty grid, a parameter that is no scalar, or a name that is both axis and setting.
+
+    >>> Study("demo", "Does x matter?", cell=dict, grid={"x": (1, 2)}, settings={"runs": 3}).cells()[1].params
+    {'x': 2}
+    """
+
+    name: str
+    question: str
+    cell: Callable[[Params], list[Row]]
+    grid: Mapping[str, Sequence[Scalar]] | Sequence[Mapping[str, Scalar]]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    key: Callable[[Params], Mapping[str, Any]] = _no_extras
+    where: Callable[[Params], bool] | None = None
+    shares: tuple[str, ...] = ()
+    tables: Mapping[str, Callable[[Results], Table]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[Results], Plot]] = field(default_factory=dict)
+    findings: Callable[[Results], Sequence[str]] | None = None
+    recipe: Callable[[Results], Mapping[str, Any]] | None = None
+    limitations: tuple[str, ...] = ()
+    minutes: float | None = None
+
+    def __post_init__(self) -> None:
+        both = sorted(set(self.axes) & set(self.settings))
+        if both:
+            raise InputError("settings", both, "must not name an axis of the grid", "Keep it in one of the two.")
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the parameters that vary, in order."""
+        if isinstance(self.grid, Mapping):
+            return tuple(self.grid)
+        return tuple(dict.fromkeys(name for params in self.grid for name in params))
+
+    def cells(self) -> list[Cell]:
+        """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
+        found = [_named(self, params) for params in _expand(self)]
+        if not found:
+            raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
+        return found
+
+    def override(self, changes: Mapping[str, Any]) -> Study:
+        """The same study with other settings, or other values on an axis (a list, or words split at commas).
+
+        Text is read as the type of the default. On a list of parameter mappings an axis is filtered, not replaced.
+        """
+        settings, grid = dict(self.settings), self.grid
+        for name, value in changes.items():
+            if name in settings:
+                settings[name] = parse(name, value, settings[name])
+            elif name in self.axes:
+                grid = _narrow(grid, name, value)
+            else:
+                raise unknown(f"--set {name}: setting", name, [*settings, *self.axes])
+        return replace(self, settings=settings, grid=grid)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of the grid. `params` are its own parameters, `given` those and the settings, `name` their hash."""
+
+    params: Mapping[str, Scalar]
+    given: Params
+    name: str
+
+
+def digest(content: Any) -> str:
+    """First 20 hex digits of the SHA-256 of canonical JSON: the same content has the same name on every machine.
+
+    >>> digest({"a": 1, "b": [0.5]}) == digest({"b": (0.5,), "a": np.int64(1)})
+    True
+    """
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise InputError("settings", repr(value), "must be numbers, words, or lists of them", "Pass a name, not an object.")
+
+
+def _named(study: Study, params: Mapping[str, Scalar]) -> Cell:
+    for name, value in params.items():
+        if not isinstance(value, Scalar):
+            raise InputError(name, repr(value), "must be a number, a word, a bool or None", "Pass a name instead.")
+    given = {**study.settings, **params}
+    content = {"study": study.name, "given": given, "axes": sorted(params), "key": study.key(given)}
+    return Cell(params, given, digest({**content, "coopoc": metadata.version("coopoc")}))
+
+
+def _expand(study: Study) -> list[Mapping[str, Scalar]]:
+    grid = study.grid
+    if isinstance(grid, Mapping):
+        grid = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+    return [p for p in grid if study.where is None or study.where({**study.settings, **p})]
+
+
+def _narrow(grid: Any, name: str, value: Any) -> Any:
+    listed = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
+    known = list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
+    wanted = [parse(name, v, next((k for k in known if k is not None), None)) for v in listed]
+    if isinstance(grid, Mapping):
+        return {**grid, name: tuple(wanted)}
+    for v in wanted:
+        if v not in known:
+            raise InputError(name, repr(v), f"must be among {known}", "The grid of this study is a fixed list.")
+    return [p for p in grid if name in p and p[name] in wanted]

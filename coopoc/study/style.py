@@ -1,0 +1,95 @@
+"""One look per method in every figure and table: colour, marker and label; line style says the knowledge."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
+    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+)  # fmt: skip
+"""Okabe and Ito, Color Universal Design (2008): distinguishable under the common forms of colour blindness."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colour, marker and label of a method."""
+
+    label: str
+    color: str
+    marker: str
+
+
+METHODS = {
+    "gnss": Look("GNSS", "#7F7F7F", "x"),
+    "kalman": Look("KF", ORANGE, "s"),
+    "okf": Look("OKF", VERMILLION, "D"),
+    "msmv": Look("MSMV (reconstruction)", YELLOW, "p"),
+    "lkf_sa_paper": Look("LKF-SA (paper)", SKY, "^"),
+    "lkf_sa_edge": Look("LKF-SA (edge form)", BLUE, "v"),
+    "joint": Look("Joint filter", GREEN, "o"),
+    "cooperative_map": Look("Cooperative MAP", "#00543C", "P"),
+    "fedkalmannet": Look("FedKalmanNet", PURPLE, "*"),
+    "centralised": Look("Centralised KalmanNet", "#8A2F63", "X"),
+    "individual": Look("Individual KalmanNet", "#B58FD0", "h"),
+    "bound": Look("Cramér-Rao bound", BLACK, ""),
+}
+_SPARE = tuple((color, marker) for marker in "<>d8H" for color in (BLUE, VERMILLION, GREEN, PURPLE, ORANGE))
+_LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "fitted": "-", "trained": "-"}
+
+UNITS = {
+    "rt_le_m": ("RT-LE", "m"), "max_error_m": ("Maximum error", "m"), "bytes_per_second": ("Received", "B/s"),
+    "nees": ("NEES", ""), "max_neighbours": ("Neighbours K", ""), "round": ("Round", ""), "seconds": ("Time", "s"),
+    "loss": ("Message loss", ""), "latency": ("Latency", "s"),
+}  # fmt: skip
+"""Column -> (words, unit)."""
+
+RC: dict[str, Any] = {
+    "figure.figsize": (5.6, 3.5), "figure.constrained_layout.use": True, "savefig.dpi": 200,
+    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.labelsize": 9, "legend.fontsize": 7.5,
+    "xtick.labelsize": 8, "ytick.labelsize": 8, "axes.spines.top": False, "axes.spines.right": False,
+    "axes.grid": True, "grid.color": "#E3E3E3", "grid.linewidth": 0.6, "axes.axisbelow": True, "lines.linewidth": 1.5,
+    "lines.markersize": 4.5, "legend.frameon": False, "pdf.fonttype": 42, "svg.hashsalt": "coopoc",
+    "svg.fonttype": "path",
+}  # fmt: skip
+
+
+def look(method: str) -> Look:
+    """The look of a method; one that is not in METHODS gets a spare one that depends on its name alone.
+
+    >>> look("okf").label
+    'OKF'
+    """
+    if method in METHODS:
+        return METHODS[method]
+    color, marker = _SPARE[zlib.crc32(method.encode()) % len(_SPARE)]
+    return Look(method, color, marker)
+
+
+def line(knowledge: object) -> Any:
+    """Line style of a knowledge: dotted identity, dashed nominal, solid fitted or trained."""
+    return _LINES.get(str(knowledge), "-")
+
+
+def words(name: str) -> str:
+    """Column name as words, with its unit if it has one.
+
+    >>> words("rt_le_m"), words("window")
+    ('RT-LE [m]', 'Window')
+    """
+    text, unit = UNITS.get(name, (name.replace("_", " ").capitalize(), ""))
+    return f"{text} [{unit}]" if unit else text
+
+
+def label(column: str, value: object) -> str:
+    """A parameter's value as words: methods by their label, whole floats without point.
+
+    >>> label("method", "okf"), label("max_neighbours", 4.0)
+    ('OKF', '4')
+    """
+    if column == "method":
+        return look(str(value)).label
+    if isinstance(value, float):
+        return f"{value:g}"
+    return str(value)

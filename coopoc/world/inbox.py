@@ -1,0 +1,95 @@
+"""Inbox: which messages one vehicle holds at each step, after loss, delay and the cap on its bytes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from .recording import Recording
+from .v2x import Message
+
+
+@dataclass(frozen=True, eq=False)
+class Inbox:
+    """Messages of one observer's neighbours, aligned with its links.
+
+    Args:
+        link: (M,) indices of its links in the Recording, in time order.
+        start: (T+1,) link[start[t]:start[t+1]] are the links of step t.
+        newest: (R, M) step at which the newest message held was sent, -1 for none.
+        fresh: (R, M) True where that message is new since the pair was last linked: a fix may be used once only.
+        received_bytes: (R,) over the drive. sent_bytes: bytes that this vehicle broadcasts over the drive.
+    """
+
+    link: Ints
+    start: Ints
+    newest: Ints
+    fresh: Bools
+    received_bytes: Floats
+    sent_bytes: float
+
+
+def inbox(recording: Recording, ego: int, message: Message, max_age: float = 1.0) -> Inbox:
+    """What `ego` has received when each neighbour broadcasts `message`.
+
+    Args:
+        recording: the links, the sending schedule and the arrivals. ego: column.
+        message: its size counts against `v2x.bytes_per_second`.
+        max_age: s, older messages are forgotten.
+
+    >>> from coopoc import Fleet, Sensors, V2X, observe
+    >>> from coopoc.world.v2x import FIX_AND_VELOCITY
+    >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
+    >>> inbox(observe(fleet, Sensors(), V2X()), 0, FIX_AND_VELOCITY).received_bytes
+    array([64.])
+    """
+    steps = len(recording.t)
+    link = recording.links.of(ego)
+    at = recording.links.step[link]
+    size = message.payload + recording.v2x.overhead
+    arrival = _within_cap(recording.arrival[:, link], size, recording)
+    newest = np.full(arrival.shape, -1, dtype=np.int64)
+    fresh = np.zeros(arrival.shape, dtype=bool)
+    for neighbour in np.unique(recording.links.neighbour[link]):
+        pair = np.flatnonzero(recording.links.neighbour[link] == neighbour)
+        held = _newest_held(arrival[:, pair], at[pair], steps)[:, at[pair]]
+        newest[:, pair] = held
+        fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0
+    too_old = at - newest > max_age / recording.dt + 1e-9
+    newest[too_old] = -1
+    broadcasts = np.floor(recording.v2x.rate * recording.dt * steps + 1e-9) if recording.v2x.max_neighbours else 0
+    arrived = (arrival >= 0) & (arrival < steps)
+    return Inbox(
+        link, np.searchsorted(at, np.arange(steps + 1)), newest, fresh & ~too_old,
+        received_bytes=arrived.sum(axis=1) * float(size), sent_bytes=float(broadcasts * size),
+    )  # fmt: skip
+
+
+def _newest_held(arrival: Ints, sent: Ints, steps: int) -> Ints:
+    """(R, T) newest sending step among the messages of one pair that have arrived by each step."""
+    held = np.full((len(arrival), steps), -1, dtype=np.int64)
+    run, k = np.nonzero((arrival >= 0) & (arrival < steps))
+    np.maximum.at(held, (run, arrival[run, k]), sent[k])
+    newest: Ints = np.maximum.accumulate(held, axis=1)
+    return newest
+
+
+def _within_cap(arrival: Ints, size: int, recording: Recording) -> Ints:
+    """Arrivals with -1 for what a token bucket of one second's worth turns away; nearest neighbours come first."""
+    cap = recording.v2x.bytes_per_second
+    if not np.isfinite(cap) or size == 0:
+        return arrival
+    kept = arrival.copy()
+    tokens, last = np.zeros(len(arrival)), 0
+    for k in range(arrival.shape[1]):
+        now = int(arrival[:, k].max())
+        if now < 0:
+            continue
+        tokens = np.minimum(tokens + cap * recording.dt * (now - last), max(cap, size))
+        last = now
+        taken = (arrival[:, k] >= 0) & (tokens >= size)
+        kept[~taken, k] = -1
+        tokens = tokens - size * taken
+    return kept

@@ -1,0 +1,157 @@
+"""load: a bundled name or a path -> Fleet. The core finds it through the entry point group `coopoc.datasets`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
+
+from . import store
+from .carla import read_carla
+from .cards import Card
+from .fcd import read_fcd
+from .mrclam import read_mrclam
+from .rows import assemble
+from .table import NEEDED, read_table, write_table
+from .tum import read_tum, tum_files, write_tum
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A bundled fleet: its file and its card.
+
+    >>> DATASETS["town10"].load()
+    Fleet(town10: 60 vehicles x 900 steps, dt 0.1 s)
+    """
+
+    path: Path
+
+    def card(self) -> Card:
+        """Provenance and statistics."""
+        return Card(**json.loads(self.path.with_suffix(".json").read_text()))
+
+    def load(self) -> Fleet:
+        """The fleet, with name, source and licence of its card."""
+        card = self.card()
+        fleet = store.load(self.path)
+        return replace(fleet, name=card.name, source=card.source, licence=card.map_licence)
+
+
+FLEETS = Path(__file__).parent / "fleets"
+DATASETS: Mapping[str, Dataset] = {path.stem: Dataset(path) for path in sorted(FLEETS.glob("*.npz"))}
+
+READERS: Mapping[str, Callable[..., Fleet]] = {
+    "table": read_table,
+    "tum": read_tum,
+    "fcd": read_fcd,
+    "carla": read_carla,
+    "mrclam": lambda path, **options: read_mrclam(path, **options).fleet,
+}
+
+
+def load(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
+    """Fleet of a bundled dataset or of a file or folder.
+
+    Args:
+        name_or_path: a key of DATASETS, or a path: CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder.
+        format: table, tum, fcd, carla or mrclam, instead of what the name and the contents tell.
+        options: of the reader, for example dt (s), columns, vehicle_length, handedness.
+
+    Raises:
+        InputError: an unknown name (the message lists all), an unknown format or option, or a file with a fault.
+
+    >>> load("town10-clients").present.sum(axis=0)
+    array([1550, 4600, 1450, 1420])
+    """
+    name = str(name_or_path)
+    if name in DATASETS and format is None:
+        return _resampled(DATASETS[name].load(), **options)
+    path = Path(name_or_path)
+    if not path.exists():
+        raise InputError(
+            "data", repr(name), f"must be one of {', '.join(DATASETS)} or the path of a file or folder",
+            "List the bundled fleets with coopoc data list, or check the path.",
+        )
+    chosen = detect(path) if format is None else format
+    if chosen not in READERS:
+        raise InputError("format", repr(chosen), f"must be one of {', '.join(READERS)}", "Or leave it out.")
+    try:
+        return READERS[chosen](path, **options)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise InputError("options", sorted(options), f"not all known to the {chosen} reader", str(error)) from None
+
+
+def detect(path: Path) -> str:
+    """Format of a file or folder by its name and, for CSV and folders, by its contents."""
+    if path.is_dir():
+        if (path / "Barcodes.dat").is_file():
+            return "mrclam"
+        if tum_files(path):
+            return "tum"
+    known = {".parquet": "table", ".xml": "fcd", ".xlsx": "carla", ".tum": "tum", ".txt": "tum"}
+    if path.suffix == ".csv":
+        with path.open(errors="replace") as file:
+            header = [word.strip().strip('"') for word in file.readline().split(",")]
+        return "carla" if len(header) >= 14 and not set(NEEDED) <= set(header) else "table"
+    if path.suffix not in known:
+        raise InputError(
+            "data", path.name, "must end in .csv, .parquet, .tum, .txt, .xml or .xlsx, or be a folder of TUM or MR.CLAM "
+            "files", f"Pass format= one of {', '.join(READERS)}.",
+        )
+    return known[path.suffix]
+
+
+def list_datasets() -> list[dict[str, Any]]:
+    """One row per bundled fleet: name, vehicles, steps, dt_s, mean speed, neighbours, licence, sha256.
+
+    >>> [row["name"] for row in list_datasets()][:2]
+    ['town04', 'town10']
+    """
+    cards = [dataset.card() for dataset in DATASETS.values()]
+    return [
+        {
+            "name": card.name, "map": card.map, "vehicles": card.vehicles, "steps": card.steps, "dt_s": card.dt,
+            "mean_speed_m_s": card.speed["mean"], "mean_neighbours": card.neighbours["mean"],
+            "licence": card.map_licence, "sha256": card.sha256,
+        }
+        for card in cards
+    ]
+
+
+def convert(
+    name_or_path: str | Path, out: str | Path, dt: float | None = None, *, format: str | None = None, **options: Any
+) -> Fleet:
+    """Load a fleet, resample it to dt seconds if given, write it, and return what was written.
+
+    Args:
+        out: .csv or .parquet file, or a folder (no suffix) that gets one TUM file per vehicle.
+
+    Raises:
+        InputError: what `load` raises, or another ending of `out`.
+    """
+    path = Path(out)
+    if path.suffix not in (".csv", ".parquet", ""):
+        raise InputError("out", path.name, "must end in .csv or .parquet, or be a folder for TUM files", "Rename it.")
+    fleet = load(name_or_path, format=format, **options, **({} if dt is None else {"dt": dt}))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    (write_table if path.suffix else write_tum)(fleet, path)
+    return fleet
+
+
+def _resampled(fleet: Fleet, dt: float | None = None) -> Fleet:
+    if dt is None:
+        return fleet
+    step, column = np.nonzero(fleet.present)
+    return assemble(
+        [fleet.ids[c] for c in column], fleet.t[step], fleet.position[step, column], dt=dt, file=fleet.name,
+        name=fleet.name, source=f"{fleet.source}, resampled at {dt:g} s", licence=fleet.licence,
+    )
