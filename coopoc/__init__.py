@@ -12,9 +12,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .errors import InputError as InputError
     from .errors import MissingLibraryError as MissingLibraryError
+    from .evaluate.bounds import bound_rt_le as bound_rt_le
+    from .evaluate.bounds import posterior_bound as posterior_bound
+    from .evaluate.metrics import max_error as max_error
+    from .evaluate.metrics import nees as nees
+    from .evaluate.metrics import rt_le as rt_le
     from .methods.gnss import Gnss as Gnss
+    from .methods.joint_filter import JointFilter as JointFilter
     from .methods.kalman import Kalman as Kalman
     from .methods.knowledge import Knowledge as Knowledge
+    from .methods.lkf_sa import LaplacianKalman as LaplacianKalman
+    from .methods.msmv import Msmv as Msmv
     from .methods.track import Method as Method
     from .methods.track import Track as Track
     from .world.fleet import Fleet as Fleet
@@ -30,6 +38,9 @@ _HOME = {
     "Fleet": "world.fleet", "Links": "world.recording", "Recording": "world.recording", "observe": "world.sensing",
     "Sensors": "world.sensors", "V2X": "world.v2x", "Message": "world.v2x",
     "Gnss": "methods.gnss", "Kalman": "methods.kalman", "Knowledge": "methods.knowledge",
+    "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
+    "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
+    "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds",
     "Method": "methods.track", "Track": "methods.track",
 }  # fmt: skip
 

@@ -3,22 +3,39 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
 from .errors import InputError
 
-GROUPS = ("coopoc.datasets", "coopoc.methods", "coopoc.studies", "coopoc.backends", "coopoc.commands")
+GROUPS = {"coopoc.datasets": "data set", "coopoc.methods": "method", "coopoc.studies": "study",
+          "coopoc.backends": "backend", "coopoc.commands": "command"}  # fmt: skip
+"""Group -> what one of its names is called."""
+
+
+def points(group: str) -> Mapping[str, metadata.EntryPoint]:
+    """Entry points of a group by name, none of them loaded; InputError if two distributions claim one name."""
+    found: dict[str, metadata.EntryPoint] = {}
+    for point in sorted(metadata.entry_points(group=group), key=lambda p: p.name):
+        other = found.setdefault(point.name, point)
+        if other.value != point.value:
+            claims = f"is claimed by {other.value} and {point.value}"
+            raise InputError(group, repr(point.name), claims, "Uninstall one of the two.")
+    return found
 
 
 def names(group: str) -> tuple[str, ...]:
-    """Sorted names that installed distributions register under a group.
+    """All names in a group. An entry point that holds a mapping stands for the names in it.
 
     >>> isinstance(names("coopoc.methods"), tuple)
     True
     """
-    return tuple(sorted({point.name for point in metadata.entry_points(group=group)}))
+    found: list[str] = []
+    for name, point in points(group).items():
+        loaded = point.load()
+        found += loaded if isinstance(loaded, Mapping) else [name]
+    return tuple(sorted(found))
 
 
 def find(group: str, name: str) -> Any:
@@ -26,23 +43,25 @@ def find(group: str, name: str) -> Any:
 
     Args:
         group: one of GROUPS, or a third party's own.
-        name: as in `names(group)`.
+        name: an entry point, or a key of an entry point that holds a mapping.
 
     Raises:
         InputError: no such name (lists the names and the nearest one), or two distributions claim it.
 
-    >>> find("coopoc.studies", "no such study")
+    >>> find("nothing", "x")
     Traceback (most recent call last):
     ...
-    coopoc.errors.InputError: study = 'no such study': ...
+    coopoc.errors.InputError: nothing = 'x': must be one of (none is installed). List all with: coopoc list.
     """
-    points = {point.value: point for point in metadata.entry_points(group=group, name=name)}
-    if len(points) == 1:
-        return next(iter(points.values())).load()
-    noun = group.rpartition(".")[2].removesuffix("s")
-    if points:
-        raise InputError(noun, repr(name), f"is claimed by {sorted(points)}", "Uninstall all but one of them.")
-    raise unknown(noun, name, names(group))
+    registered = points(group)
+    loaded = registered[name].load() if name in registered else None
+    if loaded is not None and not isinstance(loaded, Mapping):
+        return loaded
+    for point in registered.values():
+        table = point.load()
+        if isinstance(table, Mapping) and name in table:
+            return table[name]
+    raise unknown(GROUPS.get(group, group), name, names(group))
 
 
 def unknown(noun: str, name: str, known: Iterable[str]) -> InputError:

@@ -25,7 +25,7 @@ class Card:
     Args:
         name, map, map_licence, command, sumo, sha256: provenance. recipe: all fields of the Recipe.
         vehicles, steps, dt: size, steps being one number per vehicle if they differ.
-        speed: m/s, over all vehicles: min, p05, mean, p95, max, standing (share below 0.1), per vehicle [min, max] if few.
+        speed: m/s, over all vehicles: min, p05, mean, p95, max, standing (share below 0.1); [min, max] of each if few.
         neighbours: within 30 m, at most 10: mean, share of steps with one or more, per vehicle lowest and highest mean.
         height: [min, max] m. acceleration: largest, m/s^2.
     """
@@ -64,7 +64,7 @@ class Card:
             "speed": "{min:g}..{max:g} m/s, mean {mean:g}, 5..95 %: {p05:g}..{p95:g}, standing {standing:.0%}".format(
                 **self.speed
             ),
-            "neighbours": "mean {mean:g} within {radius:g} m (cap {cap:g}), one or more in {any:.0%} of the steps".format(
+            "neighbours": "mean {mean:g} within {radius:g} m (cap {cap:g}), some in {any:.0%} of the steps".format(
                 **self.neighbours
             ),
             "height": f"{self.height[0]:g}..{self.height[1]:g} m",
@@ -77,10 +77,18 @@ def card_of(fleet: Fleet, recipe: Recipe) -> Card:
     """The card of a fleet that `recipe` made."""
     lengths = sorted(set(recipe.lengths))
     return Card(
-        name=recipe.name, map=recipe.map, map_licence=MAP_LICENCE,
-        command=f"coopoc data make {recipe.name} --maps FOLDER", sumo=version("eclipse-sumo"), sha256=fleet.digest,
-        recipe=asdict(recipe), vehicles=len(fleet.ids), steps=lengths[0] if len(lengths) == 1 else list(recipe.lengths),
-        dt=fleet.dt, speed=speed_statistics(fleet), neighbours=neighbour_statistics(fleet),
+        name=recipe.name,
+        map=recipe.map,
+        map_licence=MAP_LICENCE,
+        command=f"coopoc data make {recipe.name} --maps FOLDER",
+        sumo=version("eclipse-sumo"),
+        sha256=fleet.digest,
+        recipe=asdict(recipe),
+        vehicles=len(fleet.ids),
+        steps=lengths[0] if len(lengths) == 1 else list(recipe.lengths),
+        dt=fleet.dt,
+        speed=speed_statistics(fleet),
+        neighbours=neighbour_statistics(fleet),
         height=_rounded([np.nanmin(fleet.position[..., 2]), np.nanmax(fleet.position[..., 2])]),
         acceleration=_rounded([np.nanmax(np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2)) / fleet.dt])[0],
     )

@@ -17,8 +17,8 @@ from .rows import assemble
 def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0) -> Fleet:
     """Fleet of a SUMO FCD file: positions are moved from the front bumper to the middle of the vehicle.
 
-    centre = front - length/2 (sin a cos s, cos a cos s, sin s), with the angle a in degrees clockwise from north and the
-    slope s in degrees; velocity = speed along the same direction.
+    centre = front - length/2 (sin a cos s, cos a cos s, sin s), with the angle a in degrees clockwise from north
+    and the slope s in degrees; velocity = speed along the same direction.
 
     Args:
         path: XML with id, x, y, angle, speed, and z and slope if the network has elevation.
@@ -31,7 +31,13 @@ def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0
     vehicle, t, numbers = _rows(path)
     position, velocity = centre(numbers, vehicle_length)
     return assemble(
-        vehicle, t, position, velocity, dt=dt, file=path.name, name=path.stem,
+        vehicle,
+        t,
+        position,
+        velocity,
+        dt=dt,
+        file=path.name,
+        name=path.stem,
         source=f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long",
     )
 
@@ -58,14 +64,17 @@ def _rows(path: Path) -> tuple[list[str], Floats, Floats]:
             elif event == "end" and element.tag == "vehicle":
                 a = element.attrib
                 vehicle.append(a["id"])
-                rows.append(tuple(map(float, (now, a["x"], a["y"], a.get("z", 0), a["angle"], a.get("slope", 0), a["speed"]))))
+                row = (now, a["x"], a["y"], a.get("z", 0), a["angle"], a.get("slope", 0), a["speed"])
+                rows.append(tuple(map(float, row)))
             elif event == "end" and element.tag == "timestep":
                 element.clear()
     except ElementTree.ParseError as error:
-        raise InputError(path.name, error, "must be XML as sumo --fcd-output writes it", "Write the file again.") from None
+        raise InputError(path.name, error, "must be XML of sumo --fcd-output", "Write the file again.") from None
     except KeyError as error:
         raise InputError(
-            f"{path.name}: attribute {error}", "missing", f"every vehicle needs it (time {now} s)",
+            f"{path.name}: attribute {error}",
+            "missing",
+            f"every vehicle needs it (time {now} s)",
             "Run sumo with --fcd-output.attributes x,y,z,angle,slope,speed.",
         ) from None
     table = np.array(rows).reshape(-1, 7)

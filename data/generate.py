@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -44,7 +45,7 @@ def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path, s
 
 def simulate(recipe: Recipe, map_folder: Path) -> Fleet:
     """The quantised fleet of a recipe: map, routes, SUMO, centres of the vehicles, smoothing, velocities."""
-    with tempfile.TemporaryDirectory() as folder, tqdm(total=4, desc=f"{recipe.name}: map", leave=False) as bar:
+    with tempfile.TemporaryDirectory() as folder, _progress(recipe) as bar:
         network, routes, fcd = (Path(folder) / f for f in ("net.xml", "routes.xml", "fcd.xml"))
         traffic.build_network(map_folder / recipe.map, recipe, network)
         traffic.write_routes(recipe, *traffic.read_streets(network), routes)
@@ -64,7 +65,9 @@ def _finish(raw: Fleet, recipe: Recipe) -> Fleet:
     position = raw.select(ids).position[:steps]
     if len(ids) < recipe.vehicles or len(position) < steps or np.isnan(position).any():
         raise InputError(
-            "recipe", f"{recipe.name}, seed {recipe.seed}", f"must drive {recipe.vehicles} vehicles through all steps",
+            "recipe",
+            f"{recipe.name}, seed {recipe.seed}",
+            f"must drive {recipe.vehicles} vehicles through all steps",
             f"{len(ids)} departed; use another seed, fewer vehicles, smaller platoons or a longer warm-up.",
         )
     position = smooth(position, recipe.dt, recipe.cutoff)
@@ -81,8 +84,10 @@ def _refuse_jumps(fleet: Fleet, limit: float = 8.0) -> None:
     if np.nanmax(acceleration) > limit:
         step, column = np.unravel_index(np.nanargmax(acceleration), acceleration.shape)
         raise InputError(
-            "acceleration", f"{acceleration[step, column]:.1f} m/s^2 of {fleet.ids[column]} at step {step}",
-            f"must stay below {limit} m/s^2", "Use another seed or a lower cutoff.",
+            "acceleration",
+            f"{acceleration[step, column]:.1f} m/s^2 of {fleet.ids[column]} at step {step}",
+            f"must stay below {limit} m/s^2",
+            "Use another seed or a lower cutoff.",
         )
 
 
@@ -94,6 +99,10 @@ def _recipe(recipe: str | Recipe) -> Recipe:
     return RECIPES[recipe]
 
 
-def _advance(bar: "tqdm[None]", stage: str) -> None:
+def _progress(recipe: Recipe) -> tqdm[Any]:
+    return tqdm(total=4, desc=f"{recipe.name}: map", leave=False)
+
+
+def _advance(bar: tqdm[Any], stage: str) -> None:
     bar.update()
     bar.set_description(stage)

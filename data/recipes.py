@@ -79,8 +79,15 @@ RECIPES: dict[str, Recipe] = {
         Recipe("town10", "Town10HD.xodr", vehicles=60, steps=900, seed=16, platoon=6),
         Recipe("town10-validation", "Town10HD.xodr", vehicles=60, steps=900, seed=32, platoon=6),
         Recipe(
-            "town10-clients", "Town10HD.xodr", vehicles=4, steps=(1550, 4600, 1450, 1420), seed=50,
-            top_speed=(10.7, 10.7), lights=False, dawdle=0.6, tours=(_CLOCKWISE, _ANTICLOCKWISE),
+            "town10-clients",
+            "Town10HD.xodr",
+            vehicles=4,
+            steps=(1550, 4600, 1450, 1420),
+            seed=50,
+            top_speed=(10.7, 10.7),
+            lights=False,
+            dawdle=0.6,
+            tours=(_CLOCKWISE, _ANTICLOCKWISE),
         ),
         Recipe("town04", "Town04.xodr", vehicles=60, steps=900, seed=5, top_speed=(11.0, 13.5), platoon=10),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ import numpy as np
 
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
 
 from . import store
-from .carla import read_carla
 from .cards import Card
+from .carla import read_carla
 from .fcd import read_fcd
 from .mrclam import read_mrclam
+from .mrclam_recording import recording
 from .rows import assemble
 from .table import NEEDED, read_table, write_table
 from .tum import read_tum, tum_files, write_tum
@@ -45,7 +48,9 @@ class Dataset:
 
 
 FLEETS = Path(__file__).parent / "fleets"
-DATASETS: Mapping[str, Dataset] = {path.stem: Dataset(path) for path in sorted(FLEETS.glob("*.npz"))}
+DATASETS: Mapping[str, Dataset] = {
+    n: Dataset(FLEETS / f"{n}.npz") for n in sorted(f.stem for f in FLEETS.glob("*.npz"))
+}
 
 READERS: Mapping[str, Callable[..., Fleet]] = {
     "table": read_table,
@@ -76,7 +81,9 @@ def load(name_or_path: str | Path, *, format: str | None = None, **options: Any)
     path = Path(name_or_path)
     if not path.exists():
         raise InputError(
-            "data", repr(name), f"must be one of {', '.join(DATASETS)} or the path of a file or folder",
+            "data",
+            repr(name),
+            f"must be one of {', '.join(DATASETS)} or the path of a file or folder",
             "List the bundled fleets with coopoc data list, or check the path.",
         )
     chosen = detect(path) if format is None else format
@@ -90,8 +97,24 @@ def load(name_or_path: str | Path, *, format: str | None = None, **options: Any)
         raise InputError("options", sorted(options), f"not all known to the {chosen} reader", str(error)) from None
 
 
+def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable[..., Recording] | None:
+    """For data with real measurements: (v2x, *, runs, seed) -> Recording; None where `observe` has to simulate them.
+
+    >>> recorder("town10") is None
+    True
+    """
+    path = Path(name_or_path)
+    if str(name_or_path) in DATASETS or not path.exists() or (format or detect(path)) != "mrclam":
+        return None
+    return partial(recording, read_mrclam(path))
+
+
 def detect(path: Path) -> str:
-    """Format of a file or folder by its name and, for CSV and folders, by its contents."""
+    """Format of a file or folder by its name and, for CSV and folders, by its contents.
+
+    >>> detect(Path("drive.parquet"))
+    'table'
+    """
     if path.is_dir():
         if (path / "Barcodes.dat").is_file():
             return "mrclam"
@@ -104,8 +127,10 @@ def detect(path: Path) -> str:
         return "carla" if len(header) >= 14 and not set(NEEDED) <= set(header) else "table"
     if path.suffix not in known:
         raise InputError(
-            "data", path.name, "must end in .csv, .parquet, .tum, .txt, .xml or .xlsx, or be a folder of TUM or MR.CLAM "
-            "files", f"Pass format= one of {', '.join(READERS)}.",
+            "data",
+            path.name,
+            "must end in .csv, .parquet, .tum, .txt, .xml or .xlsx, or be a folder of TUM or MR.CLAM files",
+            f"Pass format= one of {', '.join(READERS)}.",
         )
     return known[path.suffix]
 
@@ -119,9 +144,15 @@ def list_datasets() -> list[dict[str, Any]]:
     cards = [dataset.card() for dataset in DATASETS.values()]
     return [
         {
-            "name": card.name, "map": card.map, "vehicles": card.vehicles, "steps": card.steps, "dt_s": card.dt,
-            "mean_speed_m_s": card.speed["mean"], "mean_neighbours": card.neighbours["mean"],
-            "licence": card.map_licence, "sha256": card.sha256,
+            "name": card.name,
+            "map": card.map,
+            "vehicles": card.vehicles,
+            "steps": card.steps,
+            "dt_s": card.dt,
+            "mean_speed_m_s": card.speed["mean"],
+            "mean_neighbours": card.neighbours["mean"],
+            "licence": card.map_licence,
+            "sha256": card.sha256,
         }
         for card in cards
     ]
@@ -152,6 +183,12 @@ def _resampled(fleet: Fleet, dt: float | None = None) -> Fleet:
         return fleet
     step, column = np.nonzero(fleet.present)
     return assemble(
-        [fleet.ids[c] for c in column], fleet.t[step], fleet.position[step, column], dt=dt, file=fleet.name,
-        name=fleet.name, source=f"{fleet.source}, resampled at {dt:g} s", licence=fleet.licence,
+        [fleet.ids[c] for c in column],
+        fleet.t[step],
+        fleet.position[step, column],
+        dt=dt,
+        file=fleet.name,
+        name=fleet.name,
+        source=f"{fleet.source}, resampled at {dt:g} s",
+        licence=fleet.licence,
     )

@@ -12,8 +12,16 @@ from coopoc.world.fleet import Fleet
 
 
 def assemble(
-    vehicle: Sequence[str], t: Floats, position: Floats, velocity: Floats | None = None, *,
-    dt: float | None = None, file: str = "rows", name: str = "", source: str = "", licence: str = "",
+    vehicle: Sequence[str],
+    t: Floats,
+    position: Floats,
+    velocity: Floats | None = None,
+    *,
+    dt: float | None = None,
+    file: str = "rows",
+    name: str = "",
+    source: str = "",
+    licence: str = "",
 ) -> Fleet:
     """Fleet of L rows; vehicles keep the order of their first row, absence is a missing row.
 
@@ -24,7 +32,8 @@ def assemble(
         file: named in errors. name, source, licence: of the Fleet.
 
     Raises:
-        InputError: dt <= 0, no row, stamps of a vehicle that do not increase, or what Fleet refuses (stamps that are not equally spaced).
+        InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, or
+            what Fleet refuses.
 
     >>> assemble(["a", "a"], np.array([0, 0.1]), np.array([[0.0, 0, 0], [1, 0, 0]])).velocity[0, 0, 0]
     np.float64(10.0)
@@ -41,7 +50,7 @@ def assemble(
     for k, one in enumerate(names[order]):
         rows = np.flatnonzero(column == k)
         increasing(stamps[rows], lambda row, rows=rows: f"{file}: row {rows[row] + 1}", one)  # type: ignore[misc]
-    grid, table = _on_stamps(stamps, column, numbers) if dt is None else _resampled(stamps, column, numbers, dt)
+    grid, table = _on_stamps(stamps, column, numbers, file) if dt is None else _resampled(stamps, column, numbers, dt)
     ids = tuple(str(n) for n in names[order])
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
     return Fleet(ids, grid, table[..., :3], u, name=name, source=source, licence=licence)
@@ -62,7 +71,9 @@ def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: s
     if alone.any():
         step, column = np.argwhere(alone)[0]
         raise InputError(
-            f"{file}: velocity", f"none for {ids[column]} at t = {t[step]:g} s", "needs two instants in a row to be derived",
+            f"{file}: velocity",
+            f"none for {ids[column]} at t = {t[step]:g} s",
+            "needs two instants in a row to be derived",
             "Add the columns vx, vy, vz, or leave out the vehicle's single instants.",
         )
     return u
@@ -91,29 +102,38 @@ def increasing(stamps: Floats, place: Callable[[int], str], vehicle: str) -> Non
         row = int(late[0]) + 1
         twice = stamps[row] == stamps[row - 1]
         raise InputError(
-            f"{place(row)}, column t", f"{stamps[row]:g} s after {stamps[row - 1]:g} s of vehicle {vehicle}",
+            f"{place(row)}, column t",
+            f"{stamps[row]:g} s after {stamps[row - 1]:g} s of vehicle {vehicle}",
             "dt must be > 0: the stamps of a vehicle increase from row to row",
             "Remove the repeated row." if twice else "Sort the rows by time.",
         )
 
 
-def _on_stamps(stamps: Floats, column: Ints, numbers: Floats) -> tuple[Floats, Floats]:
-    grid, step = np.unique(stamps, return_inverse=True)
-    if len(grid) > 2:
-        gap = np.diff(grid).min()
-        grid = _filled(grid, gap)
-        step = np.searchsorted(grid, stamps - gap / 2)
+def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tuple[Floats, Floats]:
+    instants, step = np.unique(stamps, return_inverse=True)
+    grid, place = _regular(instants, file)
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
-    table[step, column] = numbers
+    table[place[step], column] = numbers
     return grid, table
 
 
-def _filled(grid: Floats, gap: float) -> Floats:
-    """The regular grid if every stamp lies on it (instants at which nobody is present exist too), else the stamps."""
-    count = round((grid[-1] - grid[0]) / gap)
-    regular = np.linspace(grid[0], grid[-1], count + 1)
-    nearest = regular[np.round((grid - grid[0]) / gap).astype(int).clip(0, count)]
-    return regular if np.abs(nearest - grid).max() < 1e-3 * gap and count < 100 * len(grid) else grid
+def _regular(instants: Floats, file: str) -> tuple[Floats, Ints]:
+    """Equally spaced grid and the place of every instant on it: instants at which nobody was present are filled in."""
+    gaps = np.diff(instants)
+    if not len(gaps):
+        return instants, np.zeros(1, dtype=np.int64)
+    place = np.rint((instants - instants[0]) / gaps.min()).astype(np.int64)
+    sparse = place[-1] > 50 * len(place)
+    grid = instants.copy() if sparse else np.round(np.linspace(instants[0], instants[-1], place[-1] + 1), 6)
+    if sparse or np.abs(grid[place] - instants).max() > 1e-3 * gaps.min() + 1e-6:
+        raise InputError(
+            f"{file}: t",
+            f"instants between {gaps.min():g} and {gaps.max():g} s apart",
+            "must be equally spaced",
+            "Resample: load(..., dt=0.1) or coopoc data convert --dt 0.1.",
+        )
+    grid[place] = instants
+    return grid, place
 
 
 def _resampled(stamps: Floats, column: Ints, numbers: Floats, dt: float) -> tuple[Floats, Floats]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
@@ -40,8 +40,12 @@ def save(fleet: Fleet, path: Path) -> None:
     if np.abs(second).max(initial=0) > np.iinfo(np.int16).max:
         raise InputError("fleet", fleet.name, "must not jump by more than 3 m from step to step", "Smooth it first.")
     np.savez_compressed(
-        path, ids=np.array(fleet.ids), dt=np.float64(fleet.dt), steps=present.sum(axis=0).astype(np.int32),
-        start=units[:2].astype(np.int32), second=second.transpose(1, 2, 0).astype(np.int16),
+        path,
+        ids=np.array(fleet.ids),
+        dt=np.float64(fleet.dt),
+        steps=present.sum(axis=0).astype(np.int32),
+        start=units[:2].astype(np.int32),
+        second=second.transpose(1, 2, 0).astype(np.int16),
     )
 
 
@@ -52,7 +56,7 @@ def load(path: Path, name: str = "") -> Fleet:
         second = stored["second"].transpose(2, 0, 1).astype(np.int64)
         start, dt = stored["start"].astype(np.int64), float(stored["dt"])
     speed = np.concatenate([np.diff(start, axis=0), second]).cumsum(axis=0)
-    units = np.concatenate([start[:1], speed]).cumsum(axis=0, out=np.empty((len(speed) + 1, *speed.shape[1:]), np.int64))
+    units = np.concatenate([start[:1], speed]).cumsum(axis=0)
     return _fleet(ids, units, np.arange(len(units))[:, None] < steps, dt, name)
 
 
@@ -60,7 +64,7 @@ def _units(position: Floats) -> Ints:
     return np.round(np.nan_to_num(position) / UNIT).astype(np.int64)
 
 
-def _fleet(ids: tuple[str, ...], units: Ints, present: np.ndarray, dt: float, name: str) -> Fleet:
+def _fleet(ids: tuple[str, ...], units: Ints, present: Bools, dt: float, name: str) -> Fleet:
     per_metre, per_second = round(1 / UNIT), round(1 / dt, 6)
     position = np.where(present[..., None], units / per_metre, np.nan)
     t = np.arange(len(units)) / per_second

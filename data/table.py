@@ -41,7 +41,8 @@ def read_table(path: Path, *, dt: float | None = None, columns: Mapping[str, str
     for column in wanted:
         if names.get(column, column) not in frame.columns:
             raise InputError(
-                f"{path.name}: column {names.get(column, column)}", "missing",
+                f"{path.name}: column {names.get(column, column)}",
+                "missing",
                 f"columns {', '.join(NEEDED)} are needed and {', '.join(VELOCITY)} go together; "
                 f"the file has {', '.join(map(str, frame.columns))}",
                 f'Add it, or name it: columns={{"{column}": "..."}}.',
@@ -49,8 +50,14 @@ def read_table(path: Path, *, dt: float | None = None, columns: Mapping[str, str
     numbers = np.column_stack([numeric(frame, names.get(c, c), path.name) for c in wanted[1:]])
     vehicle = _ids(frame, names.get("id", "id"), path.name)
     return assemble(
-        vehicle, numbers[:, 0], numbers[:, 1:4], numbers[:, 4:] if given else None, dt=dt, file=path.name,
-        name=path.stem, source=f"table {path.name}" + ("" if given else ", velocity by backward difference"),
+        vehicle,
+        numbers[:, 0],
+        numbers[:, 1:4],
+        numbers[:, 4:] if given else None,
+        dt=dt,
+        file=path.name,
+        name=path.stem,
+        source=f"table {path.name}" + ("" if given else ", velocity by backward difference"),
     )
 
 
@@ -76,7 +83,9 @@ def numeric(frame: pd.DataFrame, column: str, file: str) -> Floats:
     bad = np.flatnonzero(~np.isfinite(values))
     if len(bad):
         raise InputError(
-            f"{file}: row {bad[0] + 1}, column {column}", frame[column].iloc[int(bad[0])], "must be a finite number",
+            f"{file}: row {bad[0] + 1}, column {column}",
+            frame[column].iloc[int(bad[0])],
+            "must be a finite number",
             "Interpolate the value, or remove the row: a missing row means that the vehicle is absent.",
         )
     return values
@@ -86,7 +95,7 @@ def _csv(path: Path) -> pd.DataFrame:
     import pandas as pd
 
     try:
-        return pd.read_csv(path, skipinitialspace=True, float_precision="round_trip")
+        return pd.read_csv(path, skipinitialspace=True)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
         raise InputError(path.name, error, "must be comma separated text with a header", "Export it again.") from None
 

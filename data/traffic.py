@@ -21,11 +21,7 @@ VEHICLE_LENGTH = 4.6
 
 
 def program(name: str) -> Path:
-    """Path of one of SUMO's programs; MissingLibraryError if eclipse-sumo is not installed.
-
-    >>> program("sumo").name  # doctest: +SKIP
-    'sumo'
-    """
+    """Path of one of SUMO's programs; MissingLibraryError if eclipse-sumo is not installed."""
     spec = importlib.util.find_spec("sumo")
     if spec is None or spec.origin is None:
         raise MissingLibraryError("eclipse-sumo", "making a fleet", "'coopoc[sumo]'")
@@ -42,10 +38,25 @@ def build_network(map_file: Path, recipe: Recipe, out: Path) -> None:
             "map", map_file, "must be an OpenDRIVE file", "Point --maps at the folder of CARLA's .xodr files."
         )
     _run(
-        "netconvert", "--opendrive", map_file, "--output-file", out, "--tls.discard-loaded",
-        "--offset.disable-normalization", "--opendrive.curve-resolution", 0.5, "--junctions.internal-link-detail", 20,
-        "--junctions.limit-turn-speed", recipe.turn_acceleration, "--precision", 6,
-        "--tls.guess", str(recipe.lights).lower(), "--tls.default-type", "actuated",
+        "netconvert",
+        "--opendrive",
+        map_file,
+        "--output-file",
+        out,
+        "--tls.discard-loaded",
+        "--offset.disable-normalization",
+        "--opendrive.curve-resolution",
+        0.5,
+        "--junctions.internal-link-detail",
+        20,
+        "--junctions.limit-turn-speed",
+        recipe.turn_acceleration,
+        "--precision",
+        6,
+        "--tls.guess",
+        str(recipe.lights).lower(),
+        "--tls.default-type",
+        "actuated",
     )
 
 
@@ -82,15 +93,45 @@ def write_routes(recipe: Recipe, streets: Streets, length: dict[str, float], out
 def drive(recipe: Recipe, network: Path, routes: Path, out: Path) -> None:
     """Run SUMO over the warm-up and the kept steps and write positions of the front bumper, angle and slope.
 
-    A vehicle that is stuck stays stuck: teleporting is switched off, and collisions are left to the car-following model.
+    Teleporting is switched off: a vehicle that is stuck stays stuck. Collisions are left to the car-following model.
     """
     end = recipe.warmup + max(recipe.lengths) * recipe.dt
     _run(
-        "sumo", "--net-file", network, "--route-files", routes, "--begin", 0, "--end", f"{end:.3f}",
-        "--step-length", recipe.dt, "--seed", recipe.seed, "--precision", 6, "--fcd-output", out,
-        "--device.fcd.begin", recipe.warmup, "--fcd-output.attributes", "x,y,z,angle,slope,speed",
-        "--lanechange.duration", 3, "--time-to-teleport", -1, "--ignore-junction-blocker", 5,
-        "--collision.action", "none", "--no-step-log", "true", "--duration-log.disable", "true", "--xml-validation", "never",
+        "sumo",
+        "--net-file",
+        network,
+        "--route-files",
+        routes,
+        "--begin",
+        0,
+        "--end",
+        f"{end:.3f}",
+        "--step-length",
+        recipe.dt,
+        "--seed",
+        recipe.seed,
+        "--precision",
+        6,
+        "--fcd-output",
+        out,
+        "--device.fcd.begin",
+        recipe.warmup,
+        "--fcd-output.attributes",
+        "x,y,z,angle,slope,speed",
+        "--lanechange.duration",
+        3,
+        "--time-to-teleport",
+        -1,
+        "--ignore-junction-blocker",
+        5,
+        "--collision.action",
+        "none",
+        "--no-step-log",
+        "true",
+        "--duration-log.disable",
+        "true",
+        "--xml-validation",
+        "never",
     )
 
 
@@ -115,8 +156,8 @@ def _walk(streets: Streets, length: dict[str, float], distance: float, rng: np.r
 def _vehicle(recipe: Recipe, number: int, route: list[str], top_speed: float) -> list[str]:
     name, place = f"{recipe.name}-{number:02d}", "random_free" if recipe.platoon < 10 else "last"
     return [
-        f'<vType id="{name}" length="{VEHICLE_LENGTH}" maxSpeed="{top_speed:.3f}" sigma="{recipe.dawdle}" sigmaStep="1" '
-        'speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="0.8" minGap="2"/>',
+        f'<vType id="{name}" length="{VEHICLE_LENGTH}" maxSpeed="{top_speed:.3f}" sigma="{recipe.dawdle}" '
+        'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="0.8" minGap="2"/>',
         f'<vehicle id="{name}" type="{name}" depart="0" departPos="{place}" departLane="random">'
         f'<route edges="{" ".join(route)}"/></vehicle>',
     ]

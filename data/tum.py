@@ -42,13 +42,18 @@ def read_tum(path: Path, *, dt: float | None = None) -> Fleet:
     vehicle = [file.stem for file, pose in zip(files, poses, strict=True) for _ in pose]
     table = np.concatenate(poses)
     return assemble(
-        vehicle, table[:, 0], table[:, 1:4], dt=dt, file=path.name, name=path.stem,
+        vehicle,
+        table[:, 0],
+        table[:, 1:4],
+        dt=dt,
+        file=path.name,
+        name=path.stem,
         source=f"TUM {path.name}, velocity by backward difference",
     )
 
 
 def write_tum(fleet: Fleet, folder: Path) -> None:
-    """Write <id>.tum for every vehicle; velocity is not stored, and orientation, which a Fleet lacks, is the identity."""
+    """Write <id>.tum for every vehicle: no velocity, and the identity as orientation, which a Fleet lacks."""
     folder.mkdir(parents=True, exist_ok=True)
     for column, name in enumerate(fleet.ids):
         present = fleet.present[:, column]
@@ -67,7 +72,9 @@ def _read(file: Path) -> Floats:
             row = []
         if len(row) != 8 or not np.isfinite(row).all():
             raise InputError(
-                f"{file.name}: line {number}", " ".join(words), "must be eight finite numbers t x y z qx qy qz qw",
+                f"{file.name}: line {number}",
+                " ".join(words),
+                "must be eight finite numbers t x y z qx qy qz qw",
                 "Mend or remove the line.",
             )
         rows.append(row)

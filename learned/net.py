@@ -71,10 +71,10 @@ class GainNet(nn.Module):
                 self.gain.weight.mul_(0.1)
                 self.gain.bias.copy_(start_gain * torch.eye(SIZE).flatten())
 
-    def start(self, x0: Tensor, gnss0: Tensor) -> Memory:
-        """Memory at the first step: estimate x0 (B, 3) and fix gnss0 (B, 3), both m; GRU priors I, 0, I."""
+    def start(self, x0: Tensor) -> Memory:
+        """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""
         unit = torch.eye(SIZE, dtype=x0.dtype).flatten().expand(len(x0), CELLS)
-        return Memory(unit, torch.zeros_like(unit), unit, x0, x0, x0, gnss0)
+        return Memory(unit, torch.zeros_like(unit), unit, x0, x0, x0, x0)
 
     def step(self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float) -> tuple[Memory, Tensor]:
         """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3).
@@ -98,9 +98,9 @@ class GainNet(nn.Module):
         x = x_prior + (matrix @ (gnss - x_prior).unsqueeze(-1)).squeeze(-1)
         return Memory(process, posterior, innovation, x, memory.x, x_prior, gnss), matrix
 
-    def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, gnss0: Tensor, dt: float) -> Tensor:
+    def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float) -> Tensor:
         """Estimates (B, T, 3) m of T steps after the start, from fixes and velocities (B, T, 3)."""
-        memory, estimates = self.start(x0, gnss0), []
+        memory, estimates = self.start(x0), []
         for fix, speed in zip(gnss.unbind(1), velocity.unbind(1), strict=True):
             memory, _ = self.step(memory, fix, speed, dt)
             estimates.append(memory.x)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from .clients import Batch
 from .net import CELLS, SIZE, GainNet
-
-_STATES = ("process", "prior", "innovation")
 
 
 def flatten(models: Sequence[GainNet]) -> Tensor:
@@ -78,21 +78,25 @@ class Tape:
             out[f"{layer}.bias{kind}"].copy_(delta.sum(1))
 
 
-def rollout(
-    tape: Tape, gnss: Tensor, velocity: Tensor, x0: Tensor, gnss0: Tensor, dt: float
-) -> tuple[Tensor, list[tuple[Tensor, ...]]]:
-    """Estimates of T steps after the start: the same arithmetic as `GainNet.step`, for S models x B pieces.
+class Step(NamedTuple):
+    """One step of S models x B lanes: estimate x (S, B, 3) m, GRU states (S, B, 9) and gain (S, B, 9)."""
+
+    x: Tensor
+    process: Tensor
+    prior: Tensor
+    innovation: Tensor
+    gain: Tensor
+
+
+def steps(tape: Tape, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float) -> Iterator[Step]:
+    """The T steps after the start: the same arithmetic as `GainNet.step`, for S models x B lanes.
 
     Args:
-        tape: the models. gnss, velocity: (T, S, B, 3) m, m/s. x0, gnss0: (S, B, 3) m. dt: s.
-
-    Returns:
-        Estimates (T, S, B, 3) m.
+        tape: the models. gnss, velocity: (T, S, B, 3) m, m/s. x0: (S, B, 3) m. dt: s.
     """
     unit = torch.eye(SIZE, dtype=x0.dtype).flatten().expand(*x0.shape[:2], CELLS)
-    process, prior, innovation = unit, torch.zeros_like(unit), unit
-    x = x_before = prior_before = x0
-    gnss_before, estimates = gnss0, []
+    process, memory, innovation = unit, torch.zeros_like(unit), unit
+    x = x_before = prior_before = gnss_before = x0
     for fix, speed in zip(gnss.unbind(), velocity.unbind(), strict=True):
         x_prior = torch.add(x, speed, alpha=dt)
         surprise = fix - x_prior
@@ -100,23 +104,28 @@ def rollout(
         observed, evolved, updated = normalize(features, dim=-1).flatten(2).split([2 * SIZE, SIZE, SIZE], dim=2)
 
         process = tape.gru("process", process, tape.linear("update", updated).relu())
-        prior = tape.gru("prior", prior, process, tape.linear("evolution", evolved).relu())
+        prior = tape.gru("prior", memory, process, tape.linear("evolution", evolved).relu())
         expected = tape.linear("prior_to_innovation", prior).relu()
         innovation = tape.gru("innovation", innovation, expected, tape.linear("observation", observed).relu())
         gain = tape.linear("gain", tape.linear("gain_hidden", prior, innovation).relu())
         back = tape.linear("posterior_hidden", innovation, gain).relu()
-        prior = tape.linear("posterior", prior, back).relu()
+        memory = tape.linear("posterior", prior, back).relu()
 
         x_before, prior_before, gnss_before = x, x_prior, fix
         x = x_prior + (gain.unflatten(2, (SIZE, SIZE)) * surprise.unsqueeze(2)).sum(-1)
-        estimates.append(x)
-    return torch.stack(estimates)
+        yield Step(x, process, prior, innovation, gain)
 
 
-def loss_and_gradient(theta, like, gnss, velocity, x0, gnss0, truth, dt):
-    tape = Tape(views(theta, like))
-    error = rollout(tape, gnss, velocity, x0, gnss0, dt) - truth
-    losses = error.square().sum(-1).mean(dim=(0, 2))
-    gradient = torch.zeros_like(theta)
-    tape.gradient(losses.sum(), views(gradient, like))
+def loss(tape: Tape, batch: Batch) -> Tensor:
+    """(S, B) squared error of each piece, mean over time, sum over components, m^2 (equation 7 without its norm)."""
+    estimates = torch.stack([s.x for s in steps(tape, batch.gnss, batch.velocity, batch.x0, batch.dt)])
+    return (estimates - batch.truth).square().sum(-1).mean(0)
+
+
+def loss_and_gradient(theta: Tensor, like: GainNet, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Loss (S,) m^2, mean over the batch, and its gradient (S, P) for S models with weights theta (S, P)."""
+    tape, gradient = Tape(views(theta, like)), torch.empty_like(theta)
+    with torch.enable_grad():
+        losses = loss(tape, batch).mean(1)
+        tape.gradient(losses.sum(), views(gradient, like))
     return losses.detach(), gradient

@@ -16,7 +16,7 @@ from .knowledge import Knowledge
 FORGOTTEN = 1e6
 """m^2, prior variance of a vehicle that has just joined: nothing is known of it."""
 ACCELERATION_STD = 1.0
-"""m/s^2, how fast a velocity that was not received may have changed since the last one that was."""
+"""m/s^2, how fast a velocity may have changed since the message that carried it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,35 +45,59 @@ class StarStep:
 
 
 def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge) -> Iterator[StarStep]:
-    """The ego's star at every step. A fix sent `age` steps ago is brought forward with the velocity that came with it.
+    """The ego's star at every step, with what the newest message of each member says.
 
-    A late velocity adds (dt age ACCELERATION_STD)^2 to the variance of the velocity, per step that it is used for.
+    A fix sent `age` steps ago is brought forward with the velocity that came with it. A velocity that is used for the
+    n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this step
+    adds (2n - 1) times the variance of one. Nothing is assumed of who is seen but not heard.
     """
     variance = knowledge.process_variance(recording)
-    runs = np.arange(recording.runs)[:, None]
-    before = np.array([], dtype=np.int64)
+    before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)
+    uses = np.ones((recording.runs, 0), dtype=np.int64)
     for t in range(len(recording.t)):
         span = slice(box.start[t], box.start[t + 1])
         links = box.link[span]
         members = np.concatenate([[ego], recording.links.neighbour[links]])
-        sent = np.concatenate([np.full((recording.runs, 1), t), box.newest[:, span]], axis=1)
-        held = sent >= 0
-        at = np.where(held, sent, t)
-        late = bool((at != t).any()) or not held.all()
-        if late:
-            moved, process = _late_motion(recording, variance, runs, at, members, held, t)
-        else:
-            moved, process = recording.dt * recording.velocity[:, t, members], _at(variance, t, members)
-        heard = np.concatenate([np.ones((recording.runs, 1), dtype=bool), box.fresh[:, span]], axis=1)
-        age = (t - at)[..., None]
-        fix = recording.gnss[runs, at, members] + age * moved if late else recording.gnss[:, t, members]
+        kept = np.array([_place(before, m) for m in members])
+        own = np.full((recording.runs, 1), t)
+        sent = np.concatenate([own, box.newest[:, span]], axis=1)
+        again = (kept >= 0) & (np.append(before_sent, own * 0 - 2, axis=1)[:, kept] == sent)
+        uses = np.where(again, np.append(uses, own, axis=1)[:, kept] + 1, 1)
+        motion = _prompt if (sent == t).all() else _late
+        moved, process, fix, fix_variance = motion(recording, variance, members, sent, uses, t)
+        relative = recording.relative[:, links]
+        heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1)
         yield StarStep(
-            t, np.array([_place(before, m) for m in members]), links, recording.relative[:, links],
-            to_vector(recording.relative[:, links]), moved, process, fix,
-            knowledge.gnss_variance + age**2 * process if late else np.broadcast_to(
-                knowledge.gnss_variance, (1, len(members), 3)), heard,
+            t, kept, links, relative, to_vector(relative), moved, process, fix, knowledge.gnss_variance + fix_variance,
+            heard,
         )  # fmt: skip
-        before = members
+        before, before_sent = members, sent
+
+
+def _prompt(
+    recording: Recording, variance: Floats, members: Ints, sent: Ints, uses: Ints, t: int
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Motion, its variance, fix and the variance added to it, when every message was sent at this step."""
+    row = variance[:, t if variance.shape[1] > 1 else 0]
+    process = row[:, members] if row.shape[1] > 1 else np.repeat(row, len(members), axis=1)
+    moved = recording.dt * recording.velocity[:, t, members]
+    return moved, process, recording.gnss[:, t, members], np.zeros((1, len(members), 1))
+
+
+def _late(
+    recording: Recording, variance: Floats, members: Ints, sent: Ints, uses: Ints, t: int
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """The same four from the newest message of each run and member, as old as it may be."""
+    held = (sent >= 0)[..., None]
+    at, age = np.where(sent >= 0, sent, t), (t - sent)[..., None]
+    runs = np.arange(recording.runs)[:, None]
+    velocity = recording.velocity[runs, at, members]
+    one_step = np.broadcast_to(variance, recording.velocity.shape)[runs, at, members]
+    one_step = one_step + (recording.dt**2 * age * ACCELERATION_STD) ** 2
+    moved = np.where(held, recording.dt * velocity, 0.0)
+    process = np.where(held, (2 * uses[..., None] - 1) * one_step, FORGOTTEN)
+    fix = recording.gnss[runs, at, members] + np.where(held, age * moved, 0.0)
+    return moved, process, fix, np.where(held, age**2 * one_step, 0.0)
 
 
 def rows(members: Ints) -> Ints:
@@ -88,20 +112,3 @@ def rows(members: Ints) -> Ints:
 def _place(members: Ints, member: int) -> int:
     where = np.flatnonzero(members == member)
     return int(where[0]) if len(where) else -1
-
-
-def _at(variance: Floats, t: int, members: Ints) -> Floats:
-    """(R or 1, n, 3) of an array broadcastable to (R, T, N, 3)."""
-    row = variance[:, t if variance.shape[1] > 1 else 0]
-    return row[:, members] if row.shape[1] > 1 else np.repeat(row, len(members), axis=1)
-
-
-def _late_motion(
-    recording: Recording, variance: Floats, runs: Ints, at: Ints, members: Ints, held: Bools, t: int
-) -> tuple[Floats, Floats]:
-    """Motion of the members from the newest velocity held; a member never heard may stand still or drive at 10 m/s."""
-    velocity = np.where(held[..., None], recording.velocity[runs, at, members], 0.0)
-    full = np.broadcast_to(variance, recording.velocity.shape)
-    drift = (recording.dt**2 * (t - at) * ACCELERATION_STD) ** 2
-    process = full[runs, at, members] + np.where(held, drift, (10.0 * recording.dt) ** 2)[..., None]
-    return recording.dt * velocity, process

@@ -19,7 +19,7 @@ _LIBRARIES = (
 
 
 def environment() -> dict[str, str]:
-    """Versions of Python, coopoc and the libraries that compute, the processor, and the git revision if there is one."""
+    """Versions of Python, coopoc and the libraries that compute, the processor, and the git revision if any."""
     found = {"coopoc": metadata.version("coopoc"), "git revision": git_revision(), "python": platform.python_version(),
              "system": f"{platform.system()} {platform.machine()}", "processor": _processor()}  # fmt: skip
     for library in _LIBRARIES:

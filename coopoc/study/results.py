@@ -17,11 +17,14 @@ from ..errors import InputError
 from ..evaluate.statistics import Interval, mean_interval
 from ..plugins import unknown
 from . import store
+from .parse import assignments, parse
 
 if TYPE_CHECKING:
     from .tables import Table
 
 SEED = "train_seed"
+"""Column of the training seed: means are taken over it, and intervals are not."""
+NOTHING = Interval(float("nan"), float("nan"), float("nan"), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +85,7 @@ class Results:
             for value in values:
                 if not _is(self.frame[name], value).any():
                     known = ", ".join(map(str, self.frame[name].unique()[:12])) or "(no cell has finished)"
-                    raise InputError(name, repr(value), f"must be among {known}", "See failed cells, or widen the grid.")
+                    raise InputError(name, repr(value), f"must be among {known}", "Widen the grid, or see failures.")
             frame = frame[np.logical_or.reduce([_is(frame[name], v) for v in values])]
         return frame
 
@@ -90,13 +93,18 @@ class Results:
         """(E, R) of one metric, sorted by ego and run: what paired comparisons take. Averaged over training seeds."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
-        return _grid(frame, value)[0]
+        found = _grid(frame, value)[0]
+        if found.size == 0:
+            raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
+        return found
 
     def interval(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Interval:
         """Mean of one metric over egos and runs with its interval."""
         return mean_interval(self.values(value, where, **also))
 
-    def groups(self, by: Sequence[str], where: Mapping[str, Any] | None = None) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
+    def groups(
+        self, by: Sequence[str], where: Mapping[str, Any] | None = None
+    ) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
         """Rows of each combination of the columns `by`, in the order of the grid."""
         frame = self.select(where)
         for name in by:
@@ -107,6 +115,8 @@ class Results:
     def summary(self, by: Sequence[str], value: str, where: Mapping[str, Any] | None = None) -> pd.DataFrame:
         """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (egos left out).
 
+        A metric that a combination does not have at all is NaN with n = 0.
+
         Raises:
             InputError: rows that differ in an axis which neither `by` nor `where` names would be mixed.
         """
@@ -114,9 +124,19 @@ class Results:
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
             grid, missing = _grid(frame, value)
-            found = mean_interval(grid)
+            found = mean_interval(grid) if grid.size else NOTHING
             rows.append([*names, found.mean, found.low, found.high, found.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
+
+    def parsed(self, texts: Sequence[str]) -> dict[str, Any]:
+        """["method=okf,kalman"] as a selection: each value read as the type of its column."""
+        where: dict[str, Any] = {}
+        for name, text in assignments(texts).items():
+            if name not in self.frame:
+                raise unknown("column", name, self.frame.columns)
+            example = self.frame[name].dropna().iloc[:1].tolist()
+            where[name] = list(parse(name, text, tuple(example)))
+        return where
 
     def table(self, rows: str | Sequence[str], columns: str, value: str, **options: Any) -> Table:
         """Table of one metric, see `coopoc.study.tables.tabulated` for the options."""
@@ -155,6 +175,4 @@ def _grid(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
     frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame})
     table = frame.pivot_table(index="ego", columns="run", values=value, aggfunc="mean", sort=True, dropna=False)
     whole = table.dropna()
-    if whole.empty:
-        raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
-    return whole.to_numpy(dtype=float), len(table) - len(whole)
+    return whole.to_numpy(dtype=float), len(table) - len(whole) if len(whole) else 0

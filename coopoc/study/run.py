@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
@@ -121,11 +121,11 @@ def _check(rows: Sequence[Row], cell: Cell) -> None:
         raise InputError("rows", "none", "a cell must return at least one row", "Return one dict per run and ego.")
     taken = {name for row in rows for name in row} & {*cell.params, *store.OWN_COLUMNS}
     if taken:
-        raise InputError("rows", sorted(taken), "must not name a parameter of the cell", "The engine adds those columns.")
+        raise InputError("rows", sorted(taken), "must not repeat a parameter", "The engine adds those columns.")
     store.to_table(rows)
 
 
-def _compute(function: Callable[[Params], list[Row]], cells: Sequence[Cell], jobs: int) -> Iterator[Outcome]:
+def _compute(function: Callable[[Params], list[Row]], cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:
     if jobs == 1 or len(cells) < 2:
         yield from (attempt(function, cell) for cell in cells)
         return
@@ -149,10 +149,9 @@ def _keep(folder: Path, outcome: Outcome) -> bool:
 
 
 def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:
-    if isinstance(study, str):
-        study = plugins.find("coopoc.studies", study)
-    study = study.override(settings or {})
-    return study, study.cells(), Path(out) / study.name
+    found: Study = plugins.find("coopoc.studies", study) if isinstance(study, str) else study
+    found = found.override(settings or {})
+    return found, found.cells(), Path(out) / found.name
 
 
 def _manifest(study: Study, cells: Sequence[Cell]) -> dict[str, Any]:

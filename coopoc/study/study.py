@@ -104,7 +104,7 @@ class Study:
             elif name in self.axes:
                 grid = _narrow(grid, name, value)
             else:
-                raise unknown(f"--set {name}: setting", name, [*settings, *self.axes])
+                raise unknown("setting", name, [*settings, *self.axes])
         return replace(self, settings=settings, grid=grid)
 
 

@@ -6,8 +6,8 @@ import zlib
 from dataclasses import dataclass
 from typing import Any
 
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+BLACK, ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = (
+    "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"
 )  # fmt: skip
 """Okabe and Ito, Color Universal Design (2008): distinguishable under the common forms of colour blindness."""
 
@@ -21,22 +21,26 @@ class Look:
     marker: str
 
 
+NEUTRAL = "#9DB0C3"
+"""For what belongs to no method."""
+
 METHODS = {
     "gnss": Look("GNSS", "#7F7F7F", "x"),
     "kalman": Look("KF", ORANGE, "s"),
     "okf": Look("OKF", VERMILLION, "D"),
-    "msmv": Look("MSMV (reconstruction)", YELLOW, "p"),
-    "lkf_sa_paper": Look("LKF-SA (paper)", SKY, "^"),
-    "lkf_sa_edge": Look("LKF-SA (edge form)", BLUE, "v"),
+    "msmv-r": Look("MSMV (reconstruction)", "#C9B500", "p"),
+    "lkf-sa": Look("LKF-SA", SKY, "^"),
+    "lkf-sa-edge": Look("LKF-SA (edge form)", BLUE, "v"),
     "joint": Look("Joint filter", GREEN, "o"),
-    "cooperative_map": Look("Cooperative MAP", "#00543C", "P"),
+    "cooperative-map": Look("Cooperative MAP", "#00543C", "P"),
     "fedkalmannet": Look("FedKalmanNet", PURPLE, "*"),
     "centralised": Look("Centralised KalmanNet", "#8A2F63", "X"),
-    "individual": Look("Individual KalmanNet", "#B58FD0", "h"),
+    "individual": Look("Individual KalmanNet", "#9370C9", "h"),
+    "oracle": Look("Oracle KF", "#5B3A1E", "d"),
     "bound": Look("Cramér-Rao bound", BLACK, ""),
 }
 _SPARE = tuple((color, marker) for marker in "<>d8H" for color in (BLUE, VERMILLION, GREEN, PURPLE, ORANGE))
-_LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "fitted": "-", "trained": "-"}
+_LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1, 1, 1)), "fitted": "-", "trained": "-"}
 
 UNITS = {
     "rt_le_m": ("RT-LE", "m"), "max_error_m": ("Maximum error", "m"), "bytes_per_second": ("Received", "B/s"),
@@ -45,7 +49,10 @@ UNITS = {
 }  # fmt: skip
 """Column -> (words, unit)."""
 
-RC: dict[str, Any] = {
+SYMBOLS = {"max_neighbours": "K"}
+"""Column -> the short form that fits over a column of numbers."""
+
+RC: Any = {
     "figure.figsize": (5.6, 3.5), "figure.constrained_layout.use": True, "savefig.dpi": 200,
     "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.labelsize": 9, "legend.fontsize": 7.5,
     "xtick.labelsize": 8, "ytick.labelsize": 8, "axes.spines.top": False, "axes.spines.right": False,
@@ -61,14 +68,14 @@ def look(method: str) -> Look:
     >>> look("okf").label
     'OKF'
     """
-    if method in METHODS:
-        return METHODS[method]
+    if method.replace("_", "-") in METHODS:
+        return METHODS[method.replace("_", "-")]
     color, marker = _SPARE[zlib.crc32(method.encode()) % len(_SPARE)]
     return Look(method, color, marker)
 
 
 def line(knowledge: object) -> Any:
-    """Line style of a knowledge: dotted identity, dashed nominal, solid fitted or trained."""
+    """Line style of a knowledge: dotted identity, dashed nominal, dash-dotted oracle, solid fitted or trained."""
     return _LINES.get(str(knowledge), "-")
 
 
@@ -80,6 +87,17 @@ def words(name: str) -> str:
     """
     text, unit = UNITS.get(name, (name.replace("_", " ").capitalize(), ""))
     return f"{text} [{unit}]" if unit else text
+
+
+def title(column: str, value: object) -> str:
+    """Title over a column of numbers.
+
+    >>> title("max_neighbours", 4), title("method", "okf")
+    ('K = 4', 'OKF')
+    """
+    if column in ("method", "knowledge"):
+        return label(column, value)
+    return f"{SYMBOLS.get(column, words(column))} = {label(column, value)}"
 
 
 def label(column: str, value: object) -> str:

@@ -1,1 +1,1 @@
-"""."""
+"""One file per solver; each has build(problem, **options) -> Run."""

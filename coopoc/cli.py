@@ -1,0 +1,199 @@
+"""The command line: `coopoc run | table | report | list`, and the commands that installed distributions add."""
+
+from __future__ import annotations
+
+import json
+import sys
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import EntryPoint, version
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
+
+from . import plugins
+from .errors import InputError, MissingLibraryError
+
+Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
+
+_ABOUT = """usage: coopoc COMMAND [options]
+
+Cooperative localization: studies of what other vehicles, and learned gains, are worth.
+
+commands:
+{commands}
+
+Each command explains itself: coopoc COMMAND --help. Example: coopoc run neighbours --jobs 2
+Tables and JSON go to stdout, progress and messages to stderr.
+Exit status: 0 done, 1 some cells failed, 2 usage, 130 interrupted and resumable."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Entry point of the console script; exits with the status that the help text names."""
+    warnings.formatwarning = lambda message, *_args, **_options: f"coopoc: warning: {message}\n"
+    sys.exit(_status(list(sys.argv[1:] if argv is None else argv)))
+
+
+def run(
+    name: Annotated[Positional[str], arg(metavar="NAME")],
+    /,
+    data: Annotated[str | None, arg(metavar="NAME_OR_PATH")] = None,
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs"),
+    jobs: Annotated[int, arg(metavar="N")] = 1,
+    set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEY=VALUE ...")] = (),
+    dry_run: bool = False,
+) -> int:
+    """Run a study, or resume it: finished cells are kept, failed ones are tried again.
+
+    Example: coopoc run neighbours --jobs 2 --set runs=100 max_neighbours=0,4
+
+    Args:
+        name: of the study; coopoc list shows them.
+        data: a data set instead of the study's own.
+        out: of all studies; this one goes to FOLDER/NAME.
+        jobs: worker processes. Results do not depend on it.
+        set: settings or axes of the study. Lists are split at commas.
+        dry_run: count the cells and stop.
+    """
+    from .study.parse import assignments
+    from .study.run import plan
+    from .study.run import run as run_study
+
+    changes = dict(assignments([text for group in set for text in group]))
+    if data is not None:
+        changes["data"] = data
+    if dry_run:
+        print(json.dumps(plan(name, out, changes), indent=1, default=str))
+        return 0
+    results = run_study(name, out, jobs, changes)
+    folder = out / results.study
+    for path in sorted((folder / "tables").glob("*.md")):
+        print(path.read_text(), end="\n\n")
+    for _, row in results.failures.head(5).iterrows():
+        print(f"coopoc: failed: {row['reason']}", file=sys.stderr)
+    failed = f"; cells failed: {results.failed}, repeat the command to try them again" if results.failed else ""
+    print(f"coopoc: results are in {folder}{failed}. Report: coopoc report {folder}", file=sys.stderr)
+    return int(results.failed > 0)
+
+
+def table(
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")],
+    /,
+    format: Literal["markdown", "csv", "latex", "html"] = "markdown",
+    name: Annotated[str | None, arg(metavar="NAME")] = None,
+    rows: Annotated[str | None, arg(metavar="AXIS")] = None,
+    columns: Annotated[str, arg(metavar="AXIS")] = "method",
+    value: Annotated[str, arg(metavar="METRIC")] = "rt_le_m",
+    where: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
+) -> None:
+    """Print the tables of a study, or (with --rows) another table of its results.
+
+    Example: coopoc table runs/neighbours --format latex
+
+    Args:
+        folder: of the study.
+        format: of the table.
+        name: only this one of the study's tables.
+        rows: what labels the rows of another table.
+        columns: what labels its columns.
+        value: its numbers.
+        where: rows of the results that it stands on.
+    """
+    from .study.publish import tables
+    from .study.results import Results
+
+    if rows is None:
+        print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
+        return
+    results = Results.load(folder)
+    print(results.table(rows=rows, columns=columns, value=value, where=results.parsed(where)).render(format))
+
+
+def report(
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")],
+    /,
+    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+    title: Annotated[str, arg(metavar="TEXT")] = "",
+) -> None:
+    """Write one self-contained HTML page on one or several studies.
+
+    Example: coopoc report runs/neighbours runs/error_cdf --out report.html
+
+    Args:
+        folders: of the studies, in the order of the page.
+        out: the file; default report.html in the folder of the first study.
+        title: of the page.
+    """
+    from .study.report import report as write_report
+
+    if not folders:
+        raise InputError("folders", "none", "must be at least one", "Example: coopoc report runs/neighbours.")
+    print(write_report(folders, out or folders[0] / "report.html", title))
+
+
+def list_names() -> None:
+    """List methods, studies, data sets and backends that are installed.
+
+    Example: coopoc list
+    """
+    for group in plugins.GROUPS:
+        if group != "coopoc.commands":
+            print(f"{group.removeprefix('coopoc.')}: {', '.join(plugins.names(group)) or '(none)'}")
+
+
+OWN: Mapping[str, Command] = {"run": run, "table": table, "report": report, "list": list_names}
+
+
+def _status(argv: list[str]) -> int:
+    try:
+        if argv[:1] in (["--version"], ["-V"]):
+            print(version("coopoc"))
+            return 0
+        return _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
+    except (InputError, MissingLibraryError) as error:
+        print(f"coopoc: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("coopoc: interrupted. Finished cells are kept: repeat the command to resume.", file=sys.stderr)
+        return 130
+    except OSError as error:
+        print(f"coopoc: {error}", file=sys.stderr)
+        return 1
+
+
+def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> int:
+    """Call the command that argv names; only that one is loaded and parsed, which keeps the start quick."""
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_help(commands, prog))
+        return 0 if argv else 2
+    name, rest = argv[0], argv[1:]
+    if name not in commands:
+        raise plugins.unknown("command", name, commands)
+    command = commands[name]
+    loaded = command.load() if isinstance(command, EntryPoint) else command
+    if isinstance(loaded, Mapping):
+        return _dispatch(loaded, rest, f"{prog} {name}")
+    return int(tyro.cli(loaded, prog=f"{prog} {name}", args=rest, config=(FlagCreatePairsOff,)) or 0)
+
+
+def _help(commands: Mapping[str, Command], prog: str) -> str:
+    order = [*(name for name in OWN if name in commands), *(name for name in commands if name not in OWN)]
+    lines = "\n".join(f"  {name:<10} {_summary(commands[name])}" for name in order)
+    return _ABOUT.format(commands=lines) if prog == "coopoc" else f"usage: {prog} COMMAND [options]\n\n{lines}"
+
+
+def _summary(command: Command) -> str:
+    """First line of the docstring; a command that cannot be loaded says why instead of hiding the others."""
+    try:
+        loaded = command.load() if isinstance(command, EntryPoint) else command
+    except Exception as error:
+        return f"(cannot be loaded: {error})"
+    if isinstance(loaded, Mapping):
+        return " | ".join(loaded)
+    return (loaded.__doc__ or "").strip().partition("\n")[0]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,167 @@
+"""Arrowhead elimination: groups of points that only meet at a hub are solved by its Schur complement, B problems at once.
+
+A snapshot is a hub of one (the ego) with groups of one (its neighbours); a window is a hub of the ego's points with one
+group per neighbour's chain. One Schur complement serves both, batched in LAPACK.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from .normal import Pattern, pattern
+from .problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Arrow:
+    """A hub of h points and G groups of up to s points that only meet at the hub: J^T J is an arrowhead.
+
+    Args:
+        hub: (h,) points. group: (G, s) points, -1 where a group is smaller.
+        corner, arm, head: (source block, destination, transposed) triples of the three parts.
+    """
+
+    hub: Ints
+    group: Ints
+    corner: tuple[Ints, Ints, Ints]
+    arm: tuple[Ints, Ints, Ints]
+    head: tuple[Ints, Ints, Ints]
+
+
+def structure(problem: Problem) -> tuple[Pattern, Arrow]:
+    """Pattern and arrowhead of a problem, kept for the next problems of the same structure: a drive has few."""
+    nodes = tuple((f.nodes.shape[1], f.nodes.tobytes()) for f in problem.factors)
+    return _structure(len(problem.names), problem.hub, nodes)
+
+
+@lru_cache(maxsize=512)
+def _structure(n: int, hub: tuple[int, ...], nodes: tuple[tuple[int, bytes], ...]) -> tuple[Pattern, Arrow]:
+    scheme = pattern(n, [np.frombuffer(raw, np.int64).reshape(-1, arity) for arity, raw in nodes])
+    return scheme, _arrow(np.array(hub or range(n), dtype=np.int64), scheme)
+
+
+def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
+    """Groups are what is left connected when the hub is taken out (no hub: all is hub)."""
+    n = scheme.points
+    label = _groups(n, hub, scheme.pairs)
+    count = int(label.max(initial=-1)) + 1
+    members = [np.flatnonzero(label == g) for g in range(count)]
+    size = max((len(m) for m in members), default=0)
+    group = np.full((count, size), -1, dtype=np.int64)
+    place = np.empty(n, dtype=np.int64)
+    place[hub] = np.arange(len(hub))
+    for g, m in enumerate(members):
+        group[g, : len(m)] = m
+        place[m] = np.arange(len(m))
+    i, j = scheme.pairs.T
+    both = np.concatenate([scheme.pairs, scheme.pairs[i != j][:, ::-1]])
+    source = np.concatenate([np.arange(len(i)), np.flatnonzero(i != j)])
+    turned = np.concatenate([np.zeros(len(i), np.int64), np.ones(int((i != j).sum()), np.int64)])
+    row, col = both.T
+    in_hub_row, in_hub_col = label[row] < 0, label[col] < 0
+
+    def part(chosen: Ints, at: Ints) -> tuple[Ints, Ints, Ints]:
+        return source[chosen], at[chosen], turned[chosen]
+
+    corner = part(np.flatnonzero(in_hub_row & in_hub_col), place[row] * len(hub) + place[col])
+    arm = part(np.flatnonzero(~in_hub_row & in_hub_col), (label[row] * size + place[row]) * len(hub) + place[col])
+    head = part(np.flatnonzero(~in_hub_row & ~in_hub_col), (label[row] * size + place[row]) * size + place[col])
+    return Arrow(hub, group, corner, arm, head)
+
+
+def _groups(n: int, hub: Ints, pairs: Ints) -> Ints:
+    """(n,) group of each point, -1 for the hub."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    rest = np.ones(n, dtype=bool)
+    rest[hub] = False
+    edges = pairs[rest[pairs].all(axis=1)]
+    graph = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    label = connected_components(graph, directed=False)[1]
+    out = np.full(n, -1, dtype=np.int64)
+    out[rest] = np.unique(label[rest], return_inverse=True)[1]
+    return out
+
+
+def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Floats, Floats]:
+    """Corner (B, 3h, 3h), arms (B, G, 3s, 3h) and heads (B, G, 3s, 3s), damping added to the diagonal."""
+    batch, h, (count, size) = len(blocks), len(frame.hub), frame.group.shape
+
+    def fill(triple: tuple[Ints, Ints, Ints], shape: tuple[int, ...]) -> Floats:
+        source, at, turned = triple
+        out = np.zeros((batch, int(np.prod(shape)), 3, 3))
+        chosen = blocks[:, source]
+        flip = np.flatnonzero(turned)
+        chosen[:, flip] = np.swapaxes(chosen[:, flip], -1, -2)
+        out[:, at] = chosen
+        out = np.swapaxes(out.reshape(batch, *shape, 3, 3), -3, -2)
+        return out.reshape(batch, *shape[:-2], 3 * shape[-2], 3 * shape[-1])
+
+    corner = fill(frame.corner, (h, h))
+    at = np.arange(3 * h)
+    corner[:, at, at] += damping[:, frame.hub].reshape(batch, -1)
+    arm, head = fill(frame.arm, (count, size, h)), fill(frame.head, (count, size, size))
+    extra = np.where((frame.group >= 0)[None, :, :, None], damping[:, frame.group], 1.0)
+    at = np.arange(3 * size)
+    head[:, :, at, at] += extra.reshape(batch, count, 3 * size)
+    return corner, arm, head
+
+
+def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -> Floats:
+    """dx (B, n, 3) of (J^T J + diag(damping)) dx = -gradient by the Schur complement on the hub.
+
+    Raises:
+        numpy.linalg.LinAlgError: a singular block.
+    """
+    corner, arm, head = _parts(frame, blocks, damping)
+    batch = len(blocks)
+    pull = gradient[:, frame.hub].reshape(batch, -1, 1)
+    dx = np.empty_like(gradient)
+    if not frame.group.size:
+        dx[:, frame.hub] = -np.linalg.solve(corner, pull).reshape(batch, -1, 3)
+        return dx
+    there = frame.group >= 0
+    side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
+    reduced = np.linalg.solve(head, np.concatenate([arm, side], axis=-1))
+    taken = np.swapaxes(arm, -1, -2) @ reduced
+    schur = corner - taken[..., :-1].sum(axis=1)
+    hub = np.linalg.solve(schur, taken[..., -1:].sum(axis=1) - pull)
+    rest = -(reduced[..., -1:] + reduced[..., :-1] @ hub[:, None])
+    dx[:, frame.hub] = hub.reshape(batch, -1, 3)
+    dx[:, frame.group[there]] = rest.reshape(batch, *frame.group.shape, 3)[:, there]
+    return dx
+
+
+def marginals(frame: Arrow, blocks: Floats) -> Floats:
+    """(B, n, 3, 3) diagonal blocks of (J^T J)^-1.
+
+    Raises:
+        numpy.linalg.LinAlgError: a singular block.
+    """
+    batch, n = len(blocks), len(frame.hub) + int((frame.group >= 0).sum())
+    corner, arm, head = _parts(frame, blocks, np.zeros((batch, n, 3)))
+    cov = np.empty((batch, n, 3, 3))
+    if not frame.group.size:
+        cov[:, frame.hub] = _own(np.linalg.inv(corner))
+        return cov
+    inverse = np.linalg.inv(head)
+    reduced = inverse @ arm
+    hub = np.linalg.inv(corner - (np.swapaxes(arm, -1, -2) @ reduced).sum(axis=1))
+    cov[:, frame.hub] = _own(hub)
+    there = frame.group >= 0
+    rest = _own(inverse + reduced @ hub[:, None] @ np.swapaxes(reduced, -1, -2))
+    cov[:, frame.group[there]] = rest[:, there]
+    return cov
+
+
+def _own(matrix: Floats) -> Floats:
+    """(..., m, 3, 3) diagonal blocks of (..., 3m, 3m)."""
+    m = matrix.shape[-1] // 3
+    split = matrix.reshape(*matrix.shape[:-2], m, 3, m, 3)
+    at = np.arange(m)
+    return np.moveaxis(split[..., at, :, at, :], 0, -3)

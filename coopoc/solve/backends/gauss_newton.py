@@ -1,0 +1,56 @@
+"""gauss-newton: the reference. Levenberg-Marquardt with arrowhead elimination for stars and windows, sparse otherwise."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from ...arrays import Floats
+from ..arrowhead import eliminate, structure
+from ..descend import Step, descend
+from ..normal import normal_equations
+from ..problem import Linear, Problem, jacobian
+from .run import Ended, Run
+
+DENSE_POINTS = 60
+"""Up to this many points a problem without a hub is solved densely."""
+
+
+def build(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) -> Run:
+    """Solver of one problem.
+
+    Args:
+        max_iterations: of Gauss-Newton steps. tolerance: m, largest move of a point in the last step.
+    """
+    step = linear_step(problem)
+
+    def run(x: Floats) -> Ended:
+        end = descend(problem, step, x[None], max_iterations, tolerance)
+        return Ended(end.x[0], int(end.iterations[0]), bool(end.converged[0]))
+
+    return run
+
+
+def linear_step(problem: Problem) -> Step:
+    """The linear solver that suits the structure; batched unless the problem is large and has no hub."""
+    if not problem.hub and len(problem.names) > DENSE_POINTS:
+        return partial(_sparse_step, problem)
+    scheme, frame = structure(problem)
+    return lambda linear, damping: eliminate(frame, *normal_equations(scheme, linear), damping)
+
+
+def _sparse_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
+    out = np.empty_like(linear.x)
+    for b, residual in enumerate(zip(*linear.residual, strict=True)):
+        J = jacobian(problem, linear, b)
+        hessian = (J.T @ J + diags_array(damping[b].ravel())).tocsc()
+        try:
+            factored = splu(hessian, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        except RuntimeError as singular:
+            raise np.linalg.LinAlgError(str(singular)) from singular
+        out[b] = -factored.solve(J.T @ np.concatenate([r.ravel() for r in residual])).reshape(-1, 3)
+    return out

@@ -1,0 +1,57 @@
+"""solve_batch: B noise realisations of one problem at once, by gauss-newton."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from .arrowhead import marginals, structure
+from .backends.gauss_newton import linear_step
+from .descend import descend
+from .initial import initial_guess
+from .normal import normal_equations
+from .problem import Problem
+
+CHUNK = 40_000
+"""Blocks of 3x3 numbers that one chunk may hold, so that a batch stays in the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Solutions of B realisations: x (B, n, 3) m, covariance (B, n, 3, 3) m^2, cost (B,), iterations (B,), converged (B,)."""
+
+    x: Floats
+    covariance: Floats
+    cost: Floats
+    iterations: Ints
+    converged: Bools
+
+
+def solve_batch(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) -> Batch:
+    """Minima of all realisations, each as `solve` finds it.
+
+    Args:
+        problem: with a batch axis B (a single problem is a batch of one).
+        max_iterations: of Gauss-Newton steps. tolerance: m, largest move of a point in the last step.
+
+    Raises:
+        numpy.linalg.LinAlgError: a realisation is not observable: solve it alone to see what is free.
+
+    >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
+    >>> solve_batch(problem).x.shape
+    (2, 1, 3)
+    """
+    step = linear_step(problem)
+    scheme, frame = structure(problem)
+    count = problem.batch or 1
+    per = max(1, CHUNK // (len(scheme.order) + frame.group.size * max(len(frame.hub), 1)))
+    parts = []
+    for first in range(0, count, per):
+        part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
+        end = descend(part, step, initial_guess(part), max_iterations, tolerance)
+        linear = part.linearise(end.x)
+        cov = marginals(frame, normal_equations(scheme, linear)[0])
+        parts.append((end.x, cov, linear.cost, end.iterations, end.converged))
+    return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))

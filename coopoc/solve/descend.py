@@ -1,0 +1,90 @@
+"""Levenberg-Marquardt: the outer loop that every backend with a linear step shares, for B problems at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from .problem import Linear, Problem
+
+Step = Callable[[Linear, Floats], Floats]
+"""(linearisation, damping (B, n, 3)) -> dx (B, n, 3) of (J^T J + diag(damping)) dx = -J^T r; LinAlgError if singular."""
+
+GIVE_UP = 1e12
+"""Damping beyond which no step can help."""
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where the loop ended.
+
+    Args:
+        x: (B, n, 3) m. iterations: (B,) linear steps taken. converged: (B,) the last step was below the tolerance.
+    """
+
+    x: Floats
+    iterations: Ints
+    converged: Bools
+
+
+def descend(problem: Problem, step: Step, x: Floats, max_iterations: int = 100, tolerance: float = 1e-8) -> Descent:
+    """Gauss-Newton steps; where the cost would rise the step is refused and the damping grows (Marquardt's scaling).
+
+    (J^T J + mu diag(J^T J)) dx = -J^T r, mu = 0 at first, 1e-4 after a refusal and ten times more after each, a tenth
+    after each success. A realisation leaves the batch when no point of it moves by more than `tolerance`.
+
+    Args:
+        problem: one or B realisations. step: the backend's linear solver. x: (B, n, 3) m start.
+        max_iterations: of linear steps. tolerance: m.
+    """
+    best, count = x.copy(), np.zeros(len(x), dtype=np.int64)
+    done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
+    active, now = np.arange(len(x)), problem
+    linear = problem.linearise(best)
+    for _ in range(max_iterations):
+        dx, solved = _try(step, problem, linear, mu[active])
+        count[active] += 1
+        with np.errstate(all="ignore"):
+            trial = now.linearise(linear.x + dx)
+            small = solved & (np.abs(dx).max(axis=(1, 2)) <= tolerance)
+            better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
+        best[active[better]] = trial.x[better]
+        mu[active] = np.where(better, np.where(mu[active] > 1e-8, mu[active] / 10, 0.0), np.maximum(10 * mu[active], 1e-4))
+        done[active[better & small]] = True
+        going = ~(better & small) & (mu[active] < GIVE_UP)
+        if not going.any():
+            break
+        if not better[going].all():
+            linear = now.linearise(best[active]).pick(going)
+        else:
+            linear = trial if going.all() else trial.pick(going)
+        if not going.all():
+            active = active[going]
+            now = problem.pick(active) if problem.batch else problem
+    return Descent(best, count, done)
+
+
+def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Bools]:
+    """The step, and for which realisations it is finite; a singular system counts as none."""
+    damping = np.zeros_like(linear.x)
+    if mu.any():
+        damping = mu[:, None, None] * np.maximum(_scale(problem, linear), 1e-9)
+    try:
+        with np.errstate(all="ignore"):
+            dx = step(linear, damping)
+    except np.linalg.LinAlgError:
+        return np.zeros_like(linear.x), np.zeros(len(linear.x), dtype=bool)
+    finite: Bools = np.isfinite(dx).all(axis=(1, 2))
+    return np.where(finite[:, None, None], dx, 0.0), finite
+
+
+def _scale(problem: Problem, linear: Linear) -> Floats:
+    """(B, n, 3) diagonal of J^T J."""
+    total = np.zeros_like(linear.x)
+    for factor, slope in zip(problem.factors, linear.slope, strict=True):
+        for column in factor.nodes.T:
+            np.add.at(total, (slice(None), column), np.square(slope).sum(axis=-2))
+    return total

@@ -1,0 +1,57 @@
+"""Where to start: the linear least-squares solution of the converted measurements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..arrays import Floats
+from ..world.spherical import to_vector
+from .arrowhead import eliminate, structure
+from .factor import Factor
+from .normal import normal_equations
+from .problem import Problem
+
+LEAST_RANGE = 1.0
+"""m; a noisy range near zero would make the converted angles seem exact (performance.md G1 of the design notes)."""
+LEAST_SINE = 0.05
+"""Of the inclination: near the vertical the azimuth says nothing."""
+RIDGE = 1e-9
+"""1/m^2 on every point, so that one without information has a place to start from."""
+
+
+def converted(problem: Problem) -> Problem:
+    """The linear problem: spherical factors become vectors d u with the rotated covariance; other angles are left out.
+
+    d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
+    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot
+    (performance.md section 1.1 of the design notes).
+    """
+    factors = [_vector(f) if f.kind == "spherical" else f for f in problem.factors]
+    return replace(problem, factors=tuple(f for f in factors if f.measurement.linear), x0=None)
+
+
+def initial_guess(problem: Problem) -> Floats:
+    """(B, n, 3) m: x0 if the problem has one, else the solution of `converted`."""
+    batch = problem.batch or 1
+    if problem.x0 is not None:
+        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), 3)))
+    linear = converted(problem)
+    x = np.zeros((batch, len(problem.names), 3))
+    if not linear.factors:
+        return x
+    scheme, frame = structure(linear)
+    blocks, gradient = normal_equations(scheme, linear.linearise(x))
+    return eliminate(frame, blocks, gradient, np.full_like(x, RIDGE))
+
+
+def _vector(factor: Factor) -> Factor:
+    d, az, inc = np.moveaxis(factor.z, -1, 0)
+    d = np.maximum(d, LEAST_RANGE)
+    sa, ca, si, ci = np.sin(az), np.cos(az), np.sin(inc), np.cos(inc)
+    sine = np.where(si < 0, -1.0, 1.0) * np.maximum(np.abs(si), LEAST_SINE)
+    zero = np.zeros_like(d)
+    rows = [[si * ca, si * sa, ci], [-sa / (d * sine), ca / (d * sine), zero], [ci * ca / d, ci * sa / d, -si / d]]
+    inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    return Factor("displacement", factor.nodes, to_vector(factor.z), sqrt_information=factor.root @ inverse)

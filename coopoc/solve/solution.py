@@ -1,0 +1,74 @@
+"""Solution: the estimate, how sure it is, and what became of the solve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+
+
+class Status(Enum):
+    """How a solve ended; the value is a sentence.
+
+    >>> print(Status.SOLVED.value)
+    At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m.
+    """
+
+    SOLVED = "At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m."
+    MAX_ITERATIONS = "Stopped at the limit of iterations before a minimum: raise max_iterations or give a better x0."
+    RANK_DEFICIENT = "Some points can move without changing the cost: measure them, or add a position factor."
+    FAILED = "The backend stopped before a minimum: give a better x0, or try another backend."
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The answer of one backend, with all that can be checked recomputed by `solve`.
+
+    Args:
+        x: (n, 3) m. covariance: (n, 3, 3) m^2 marginals of (J^T J)^-1 at x, NaN if rank deficient.
+        cost: 1/2 sum of squared whitened residuals. gradient: |J^T r| at x.
+        status: how it ended. iterations: of the backend. build_seconds, solve_seconds: to prepare and to run it.
+        backend: its name. names: of the points. shown: the point that `print` shows.
+        free: names of the points that the measurements leave free. extras: the backend's own numbers.
+    """
+
+    x: Floats
+    covariance: Floats
+    cost: float
+    gradient: float
+    status: Status
+    iterations: int
+    build_seconds: float
+    solve_seconds: float
+    backend: str
+    names: tuple[str, ...]
+    shown: int = 0
+    free: tuple[str, ...] = ()
+    extras: dict[str, Any] = field(default_factory=dict)
+
+    def __getitem__(self, point: str) -> Floats:
+        """(3,) m estimate of a point by name."""
+        return self.x[self.names.index(point)]
+
+    def __str__(self) -> str:
+        at = ", ".join(f"{v:.2f}" for v in self.x[self.shown])
+        spread = ", ".join(f"{v:.2f}" for v in np.sqrt(np.diag(self.covariance[self.shown])))
+        return (
+            f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; cost {self.cost:.4g}, "
+            f"gradient {self.gradient:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"
+        )
+
+
+class SolveError(RuntimeError):
+    """A solve that did not reach a minimum; `solution` holds what there is."""
+
+    def __init__(self, solution: Solution) -> None:
+        self.solution = solution
+        super().__init__(f"{solution.backend}: {solution.status.value} ({solution})")
+
+    def __reduce__(self) -> tuple[type[SolveError], tuple[Solution]]:
+        return type(self), (self.solution,)

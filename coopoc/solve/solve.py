@@ -1,0 +1,152 @@
+"""solve: a Problem, the name of a backend, a Solution whose figures no backend has computed."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import time
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError, MissingLibraryError
+from .assess import assess
+from .initial import initial_guess
+from .problem import Problem
+from .solution import Solution, SolveError, Status
+
+POSITION_TOLERANCE = 1e-6
+"""m, what one more Gauss-Newton step may still move."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A solver by name: what it is for, the library that it needs (None: ours) and whether that is installed."""
+
+    name: str
+    module: str
+    purpose: str
+    library: str | None = None
+
+    @property
+    def installed(self) -> bool:
+        """True if it can run here."""
+        return self.library is None or find_spec(self.library) is not None
+
+
+_BACKENDS = {
+    b.name: b
+    for b in (
+        Backend("gauss-newton", "gauss_newton", "reference: Levenberg-Marquardt, batched over noise runs"),
+        Backend("gtsam", "gtsam_", "factor graph elimination by GTSAM", "gtsam"),
+        Backend("osqp", "osqp_", "sequential quadratic programming, persistent workspace", "osqp"),
+    )
+}
+
+
+def backends() -> dict[str, Backend]:
+    """The backends by name, with what each is for and whether its library is installed.
+
+    >>> backends()["gauss-newton"].installed
+    True
+    """
+    return dict(_BACKENDS)
+
+
+def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, **options: Any) -> Solution:
+    """The most probable positions: a minimum of the problem's cost, by the named backend.
+
+    Cost, gradient, covariance, status and times are computed here from x alone, so that no backend can flatter itself.
+
+    Args:
+        problem: a single one; `solve_batch` takes B realisations. backend: a name of `backends()`.
+        throw: raise unless SOLVED; otherwise failure is data.
+        options: of the backend, such as max_iterations and tolerance (m).
+
+    Raises:
+        InputError: unknown backend or option, B realisations, points that coincide, or (if `throw`) free points.
+        MissingLibraryError: the backend's library is not installed.
+        SolveError: (if `throw`) no minimum was reached; it carries the Solution.
+
+    >>> problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    >>> solve(problem.add("range", ("ego", "b"), 10.0, std=1.0)).x.round(3)[:, 0]
+    array([-0.333,  9.333])
+    """
+    module = _module(backend, options)
+    if problem.batch is not None:
+        mend = "Pick one with problem.pick(0), or use solve_batch."
+        raise InputError("problem", repr(problem), "must be a single realisation", mend)
+    if not problem.factors:
+        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    began = time.perf_counter()
+    start = initial_guess(problem)[0]
+    _check_start(problem, start)
+    run = module.build(problem, **options)
+    built = time.perf_counter()
+    ended = run(start)
+    solved = time.perf_counter()
+    truth = assess(problem, ended.x)
+    solution = Solution(
+        x=ended.x, covariance=truth.covariance, cost=truth.cost, gradient=truth.gradient,
+        status=_status(truth.free, truth.remaining, ended.iterations, options.get("max_iterations", 100)),
+        iterations=ended.iterations, build_seconds=built - began, solve_seconds=solved - built, backend=backend,
+        names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, extras=ended.extras,
+    )  # fmt: skip
+    if throw and solution.status is not Status.SOLVED:
+        _raise(solution)
+    return solution
+
+
+def usable(backend: str) -> Backend:
+    """The backend of a name; InputError that lists the names, MissingLibraryError with the line that installs it."""
+    if backend not in _BACKENDS:
+        raise InputError("backend", repr(backend), f"must be one of {sorted(_BACKENDS)}", "See backends().")
+    known = _BACKENDS[backend]
+    if not known.installed:
+        raise MissingLibraryError(str(known.library), f"backend {backend!r}", str(known.library))
+    return known
+
+
+def _module(backend: str, options: dict[str, Any]) -> Any:
+    known = usable(backend)
+    module = importlib.import_module(f".backends.{known.module}", __package__)
+    allowed = list(inspect.signature(module.build).parameters)[1:]
+    for name in options:
+        if name not in allowed:
+            raise InputError(name, options[name], f"is no option of {backend}, which has {allowed}", "Leave it out.")
+    return module
+
+
+def _check_start(problem: Problem, start: Floats) -> None:
+    """InputError if a measurement has no derivative at the start."""
+    with np.errstate(all="ignore"):
+        linear = problem.linearise(start[None])
+    for factor, residual, slope in zip(problem.factors, linear.residual, linear.slope, strict=True):
+        bad = ~(np.isfinite(residual[0]).all(axis=-1) & np.isfinite(slope[0]).all(axis=(-2, -1)))
+        if bad.any():
+            pair = " and ".join(problem.names[n] for n in factor.nodes[np.flatnonzero(bad)[0]])
+            raise InputError(
+                "x0", f"{pair} coincide or stand above each other", f"leave {factor.kind} without a direction",
+                "Give an x0 that keeps them apart.",
+            )  # fmt: skip
+
+
+def _status(free: tuple[str, ...], remaining: float, iterations: int, limit: int) -> Status:
+    if free:
+        return Status.RANK_DEFICIENT
+    if remaining <= POSITION_TOLERANCE:
+        return Status.SOLVED
+    return Status.MAX_ITERATIONS if iterations >= limit else Status.FAILED
+
+
+def _raise(solution: Solution) -> None:
+    if solution.status is not Status.RANK_DEFICIENT:
+        raise SolveError(solution)
+    shown = ", ".join(solution.free[:6]) + (", ..." if len(solution.free) > 6 else "")
+    raise InputError(
+        "problem", f"{len(solution.free)} of {len(solution.names)} points can move freely ({shown})",
+        "must be observable", "Add a position factor (a fix) to one of them, or more measurements between them.",
+    )  # fmt: skip

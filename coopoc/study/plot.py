@@ -1,0 +1,123 @@
+"""Plot: a figure with its caption, saved as the same bytes for the same numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from . import store
+from .results import Results
+from .style import RC, line, look
+
+FIXED: Mapping[str, Mapping[str, Any]] = {
+    "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
+    "svg": {"Date": None, "Creator": None},
+    "png": {"Software": None},
+}
+"""Formats and the metadata that would otherwise carry a time or a version."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A matplotlib figure and the caption that goes under it."""
+
+    figure: Figure
+    caption: str
+
+    def save(self, path: str | Path) -> str:
+        """Write path.pdf, path.png and path.svg, and return the caption."""
+        for suffix, metadata in FIXED.items():
+            buffer = BytesIO()
+            with mpl.rc_context(RC):
+                self.figure.savefig(buffer, format=suffix, metadata=dict(metadata))
+            store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
+        return self.caption
+
+
+def line_names(results: Results) -> list[str]:
+    """Columns that tell the lines of a figure apart."""
+    return [name for name in ("method", "knowledge") if name in results.frame]
+
+
+def groups(frame: pd.DataFrame, by: Sequence[str]) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+    """Rows of each combination of the columns `by`, with its names, in order of first appearance."""
+    return [(dict(zip(by, k, strict=True)), g) for k, g in frame.groupby(list(by), sort=False, dropna=False)]
+
+
+@contextmanager
+def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 3.4, **grid: Any) -> Iterator[Any]:
+    """(figure, axes) in the house style; matplotlib's global state stays as it is.
+
+    Args:
+        rows, columns: of panels. width, height: inches. grid: options of `Figure.subplots`.
+    """
+    with mpl.rc_context(RC):
+        figure = Figure(figsize=(width, height))
+        yield figure, figure.subplots(rows, columns, **grid)
+
+
+def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
+    """Line options of a method (colour, marker) under a knowledge (line style); the bound is dashed."""
+    shown = look(str(names["method"]))
+    dashes = "--" if names["method"] == "bound" else line(names.get("knowledge"))
+    width = {"linewidth": 0.8} if thin else {}
+    return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8, **width}
+
+
+def legend(
+    axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None, inside: bool = False
+) -> None:
+    """Legend: one entry per method, and one per line style where knowledge differs.
+
+    Args:
+        lines: the names (method, knowledge) of what was drawn. words: method -> text after its label.
+        inside: in the panel; else at its right.
+    """
+    handles = []
+    for method in dict.fromkeys(str(names["method"]) for names in lines):
+        options = strokes({"method": method})
+        text = look(method).label + (words or {}).get(method, "")
+        handles.append(Line2D([], [], **options, label=text))
+    styles: dict[Any, list[str]] = {}
+    for known in dict.fromkeys(str(n["knowledge"]) for n in lines if "knowledge" in n and n["method"] != "bound"):
+        styles.setdefault(line(known), []).append(known)
+    if len(styles) > 1:
+        handles += [Line2D([], [], color="#555555", linestyle=k, label=" / ".join(v)) for k, v in styles.items()]
+    place: dict[str, Any] = {} if inside else {"bbox_to_anchor": (1.02, 1.0), "borderaxespad": 0}
+    axes.legend(handles=handles, loc="upper right" if inside else "upper left", handlelength=2.6, **place)
+
+
+def plain_log(axis: Axis) -> None:
+    """Logarithmic axis with plain numbers at 1, 2 and 5 of each decade."""
+    if axis is axis.axes.xaxis:
+        axis.axes.set_xscale("log")
+    else:
+        axis.axes.set_yscale("log")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def apart(heights: Mapping[str, float], gap: float) -> dict[str, float]:
+    """Heights of labels moved up just enough to stand `gap` apart, in their order.
+
+    >>> apart({"a": 1.0, "b": 1.1, "c": 3.0}, 0.5)
+    {'a': 1.0, 'b': 1.5, 'c': 3.0}
+    """
+    moved: dict[str, float] = {}
+    last = float("-inf")
+    for label, height in sorted(heights.items(), key=lambda item: item[1]):
+        moved[label] = last = max(height, last + gap)
+    return moved

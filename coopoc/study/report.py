@@ -1,0 +1,119 @@
+"""report: one self-contained HTML page from the folders of studies; it needs neither network nor the code that ran."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import markupsafe
+
+from ..errors import InputError
+from . import store
+from .publish import views
+from .results import Results
+from .style import label, words
+
+_MIME = {"csv": "text/csv", "tex": "text/x-tex", "md": "text/markdown", "pdf": "application/pdf", "png": "image/png",
+         "svg": "image/svg+xml"}  # fmt: skip
+_LARGEST_SVG = 1_000_000
+
+
+def report(
+    folders: Sequence[str | Path],
+    out: str | Path,
+    title: str = "",
+    lead: Sequence[str] = (),
+    cards: Mapping[str, Mapping[str, Any]] | None = None,
+) -> Path:
+    """Write one HTML page that shows several studies, and return its path.
+
+    Args:
+        folders: of finished studies, in the order of the page. out: the file.
+        title: of the page. lead: sentences under it, before the first study.
+        cards: name -> field -> value of the data that the studies stand on.
+
+    Raises:
+        InputError: no folder, a folder that holds no study, or two studies of one name.
+    """
+    sections = [_section(Path(folder)) for folder in folders]
+    names = [section["name"] for section in sections]
+    if not sections or len(set(names)) < len(names):
+        raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
+    page = _template().render(
+        title=title or f"coopoc: {', '.join(name.replace('_', ' ') for name in names)}", lead=lead, sections=sections,
+        cards=cards or {}, environment=_environment(sections), css=markupsafe.Markup(_own("report.css")),
+    )  # fmt: skip
+    store.write(Path(out), page)
+    return Path(out)
+
+
+def _section(folder: Path) -> dict[str, Any]:
+    results, shown = Results.load(folder), views(folder)
+    return {
+        **shown, "name": results.study, "title": words(results.study), "question": results.question,
+        "settings": results.settings, "environment": results.environment, "pending": results.pending,
+        "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
+        "tables": [_table(folder, view, results.study) for view in shown["tables"]],
+        "figures": [_figure(folder, view, results.study) for view in shown["figures"]],
+        "failures": _failures(results),
+    }  # fmt: skip
+
+
+def _table(folder: Path, view: Mapping[str, str], study: str) -> dict[str, Any]:
+    path = folder / "tables" / view["name"]
+    html = markupsafe.Markup(Path(f"{path}.html").read_text())
+    return {**view, "html": html, "files": [_file(path, form, study) for form in ("csv", "tex", "md")]}
+
+
+def _figure(folder: Path, view: Mapping[str, str], study: str) -> dict[str, Any]:
+    path = folder / "figures" / view["name"]
+    form = "svg" if Path(f"{path}.svg").stat().st_size <= _LARGEST_SVG else "png"
+    shown = _file(path, form, study)["uri"]
+    return {**view, "uri": shown, "files": [_file(path, form, study) for form in ("pdf", "png")]}
+
+
+def _file(path: Path, form: str, study: str) -> dict[str, str]:
+    content = base64.b64encode(Path(f"{path}.{form}").read_bytes()).decode()
+    return {"form": form.upper(), "name": f"{study}-{path.name}.{form}", "uri": f"data:{_MIME[form]};base64,{content}"}
+
+
+def _failures(results: Results) -> list[dict[str, str]]:
+    found = []
+    for _, row in results.failures.iterrows():
+        params = ", ".join(f"{axis} = {label(axis, row[axis])}" for axis in results.axes if axis in row)
+        found.append({"cell": params, "reason": str(row["reason"])})
+    return found
+
+
+def _environment(sections: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Each field once; where the studies differ, all values with their studies."""
+    merged: dict[str, dict[str, list[str]]] = {}
+    for section in sections:
+        for field, value in section["environment"].items():
+            merged.setdefault(field, {}).setdefault(value, []).append(section["name"])
+    return {
+        field: next(iter(found)) if len(found) == 1 else "; ".join(f"{v} ({', '.join(n)})" for v, n in found.items())
+        for field, found in merged.items()
+    }
+
+
+def _template() -> jinja2.Template:
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    jinja = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
+                               lstrip_blocks=True)  # fmt: skip
+    jinja.filters["words"] = words
+    jinja.filters["shown"] = _shown
+    return jinja.get_template("report.html.j2")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_shown, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _own(name: str) -> str:
+    return (Path(__file__).parent / name).read_text()

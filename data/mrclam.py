@@ -1,0 +1,212 @@
+"""Reader of UTIAS MR.CLAM: five real robots with wheel odometry, range and bearing, and Vicon truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coopoc.arrays import Floats, Ints
+from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
+
+from .rows import backward_difference, interpolate
+
+ROBOTS = 5
+MAX_GAP = 0.5
+"""s without truth that is interpolated; longer gaps are NaN."""
+PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8) 2011"
+
+
+@dataclass(frozen=True, eq=False)
+class MrclamLog:
+    """What five robots measured, and Vicon's truth.
+
+    Args:
+        fleet: Vicon truth on the steps, z = 0, NaN in gaps of Vicon.
+        heading: (T, N) rad, Vicon, unwrapped, NaN in gaps.
+        speed, turn_rate: (T, N) m/s and rad/s, wheel odometry averaged over the step that ends at t.
+        time: (M,) s on the fleet's clock, of every robot-to-robot measurement.
+        step: (M,) nearest step, -1 outside the fleet's interval. observer, subject: (M,) columns of the fleet.
+        range: (M,) m. bearing: (M,) rad in the observer's body frame.
+        true_range, true_bearing: (M,) m and rad, from Vicon at `time`; NaN in gaps.
+        observer_heading: (M,) rad, Vicon at `time`.
+        landmarks, unknown: number of measurements of landmarks and of barcodes in no list, which are not among the M.
+    """
+
+    fleet: Fleet
+    heading: Floats
+    speed: Floats
+    turn_rate: Floats
+    time: Floats
+    step: Ints
+    observer: Ints
+    subject: Ints
+    range: Floats
+    bearing: Floats
+    true_range: Floats
+    true_bearing: Floats
+    observer_heading: Floats
+    landmarks: int
+    unknown: int
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """Residuals of the real measurements against Vicon: range (M,) m, bearing (M,) rad."""
+
+    range: Floats
+    bearing: Floats
+
+    @property
+    def range_std(self) -> float:
+        """m, robust: 1.4826 times the median absolute deviation."""
+        return robust_std(self.range)
+
+    @property
+    def bearing_std(self) -> float:
+        """rad, robust."""
+        return robust_std(self.bearing)
+
+    def rows(self) -> list[dict[str, float | str]]:
+        """Table: quantity, measurements, median, robust std, the value stated for the set, share beyond 5 std."""
+        stated = (("range", "m", self.range, 0.095), ("bearing", "rad", self.bearing, 0.007))
+        return [
+            {
+                "quantity": name,
+                "unit": unit,
+                "measurements": len(r),
+                "median": float(np.median(r)),
+                "robust_std": robust_std(r),
+                "stated_std": value,
+                "beyond_5_std": float(np.mean(np.abs(r - np.median(r)) > 5 * robust_std(r))),
+            }
+            for name, unit, r, value in stated
+        ]
+
+
+def robust_std(residual: Floats) -> float:
+    """1.4826 median(|r - median(r)|), the standard deviation of a Gaussian without its outliers.
+
+    >>> round(robust_std(np.array([-1.0, 0, 1, 100])), 4)
+    1.4826
+    """
+    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+
+
+def innovations(log: MrclamLog) -> Innovations:
+    """Measured minus true range and bearing, where Vicon saw both robots."""
+    seen = np.isfinite(log.true_range)
+    return Innovations((log.range - log.true_range)[seen], _wrap(log.bearing - log.true_bearing)[seen])
+
+
+def read_mrclam(folder: str | Path, *, dt: float = 0.1) -> MrclamLog:
+    """Read RobotN_Groundtruth, _Odometry, _Measurement (N = 1..5) and Barcodes.dat.
+
+    The fleet covers the interval in which every robot has truth and odometry. The second column of a measurement
+    file is a barcode although its header says subject: Barcodes.dat translates.
+
+    Args:
+        folder: with the .dat files. dt: s, step of the fleet.
+
+    Raises:
+        InputError: a missing file, a line that is not numbers, dt <= 0.
+
+    Source: Leung, Halpern, Barfoot, Liu, IJRR 30(8) 2011.
+    """
+    if not dt > 0:
+        raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
+    folder = Path(folder)
+    truths = [_read(folder / f"Robot{n}_Groundtruth.dat", 4) for n in range(1, ROBOTS + 1)]
+    wheels = [_read(folder / f"Robot{n}_Odometry.dat", 3) for n in range(1, ROBOTS + 1)]
+    for truth in truths:
+        truth[:, 3] = np.unwrap(truth[:, 3])
+    start, end = max(a[0, 0] for a in truths + wheels), min(a[-1, 0] for a in truths + wheels)
+    t = dt * np.arange(int((end - start) / dt) + 1)
+    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, MAX_GAP) for a in truths], axis=1)
+    odometry = np.stack([_step_means(a[:, 0] - start, a[:, 1:], t) for a in wheels], axis=1)
+    seen, landmarks, unknown = _robot_measurements(folder, start)
+    step = np.rint(seen[:, 0] / dt).astype(np.int64)
+    true_range, true_bearing, heading = _true(seen, truths, start)
+    return MrclamLog(
+        fleet=_fleet(folder, t, poses[..., :2]),
+        heading=poses[..., 2],
+        speed=odometry[..., 0],
+        turn_rate=odometry[..., 1],
+        time=seen[:, 0],
+        step=np.where((step >= 0) & (step < len(t)), step, -1),
+        observer=seen[:, 1].astype(np.int64),
+        subject=seen[:, 2].astype(np.int64),
+        range=seen[:, 3],
+        bearing=seen[:, 4],
+        true_range=true_range,
+        true_bearing=true_bearing,
+        observer_heading=heading,
+        landmarks=landmarks,
+        unknown=unknown,
+    )
+
+
+def _fleet(folder: Path, t: Floats, xy: Floats) -> Fleet:
+    ids = tuple(f"robot{n}" for n in range(1, ROBOTS + 1))
+    position = np.concatenate([xy, np.where(np.isnan(xy[..., :1]), np.nan, 0.0)], axis=2)
+    return Fleet(
+        ids,
+        t,
+        position,
+        backward_difference(t, position, ids),
+        name=folder.name.lower(),
+        source=f"UTIAS MR.CLAM, Vicon truth, z = 0 ({PAPER})",
+        licence="none stated: read, not redistributed",
+    )
+
+
+def _read(file: Path, columns: int) -> Floats:
+    import pandas as pd
+
+    if not file.is_file():
+        raise InputError(
+            "folder", file.parent, f"has no {file.name}", "Point at a folder MRCLAM_DatasetN with all its .dat files."
+        )
+    try:
+        table = pd.read_csv(file, sep=r"\s+", comment="#", header=None, dtype=float).to_numpy()
+    except ValueError as error:
+        raise InputError(file.name, error, f"must hold {columns} numbers a line", "Unpack the set again.") from None
+    if table.shape[1] != columns or not np.isfinite(table).all():
+        raise InputError(file.name, table.shape, f"must hold {columns} numbers a line", "Unpack the set again.")
+    return np.array(table)
+
+
+def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
+    """(T, C) mean over the step that ends at each instant: difference of the trapezoidal integral."""
+    integral = np.vstack([0 * values[:1], np.cumsum(np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2, axis=0)])
+    at = np.column_stack([np.interp(grid, t, column) for column in integral.T])
+    mean = np.diff(at, axis=0) / np.diff(grid)[:, None]
+    return np.vstack([mean[:1], mean])
+
+
+def _robot_measurements(folder: Path, start: float) -> tuple[Floats, int, int]:
+    """(M, 5) time s, observer, subject, range m, bearing rad between robots by time; numbers of the other ones."""
+    subject_of = {int(barcode): int(subject) for subject, barcode in _read(folder / "Barcodes.dat", 2)}
+    rows = [_read(folder / f"Robot{n}_Measurement.dat", 4) for n in range(1, ROBOTS + 1)]
+    table = np.vstack([np.insert(a, 1, n, axis=1) for n, a in enumerate(rows)])
+    table[:, 0] -= start
+    subject = np.array([subject_of.get(int(barcode), 0) for barcode in table[:, 2]])
+    table[:, 2] = subject - 1
+    robots = table[(subject > 0) & (subject <= ROBOTS)]
+    robots = robots[np.argsort(robots[:, 0], kind="stable")]
+    return robots, int((subject > ROBOTS).sum()), int((subject == 0).sum())
+
+
+def _true(seen: Floats, truths: list[Floats], start: float) -> tuple[Floats, Floats, Floats]:
+    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], seen[:, 0], MAX_GAP) for a in truths])
+    rows = np.arange(len(seen))
+    here, there = poses[seen[:, 1].astype(int), rows], poses[seen[:, 2].astype(int), rows]
+    dx, dy = (there - here)[:, :2].T
+    return np.hypot(dx, dy), _wrap(np.arctan2(dy, dx) - here[:, 2]), here[:, 2]
+
+
+def _wrap(angle: Floats) -> Floats:
+    wrapped: Floats = (angle + np.pi) % (2 * np.pi) - np.pi
+    return wrapped

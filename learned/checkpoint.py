@@ -1,0 +1,131 @@
+"""Checkpoints: weights in safetensors with a card, written atomically, refused when they do not fit."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from coopoc.errors import InputError
+
+from .net import GainNet
+from .okf import OptimisedKF
+from .rollout import flatten
+from .train import unflatten
+
+_HISTORY = "history"
+_NOISE = ("process_std", "velocity_ratio", "gnss_std")
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """A trained model, its card (recipe, seed, data, noise, metrics, versions), and its weights along the way.
+
+    `history` is (k, P), the weights at the k rows of `card["history"]`, or None.
+    """
+
+    model: GainNet | OptimisedKF
+    card: Mapping[str, Any]
+    history: Tensor | None = None
+
+    def after(self, row: int) -> GainNet:
+        """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""
+        if not isinstance(self.model, GainNet) or self.history is None or not 0 <= row < len(self.history):
+            held = 0 if self.history is None else len(self.history)
+            raise InputError("row", row, f"must be in 0..{held - 1}", "This checkpoint holds no more weights.")
+        return unflatten(self.history[row][None], self.model)[0]
+
+
+def save(path: Path | str, checkpoint: Checkpoint) -> Path:
+    """Write weights, history and card to one safetensors file; a reader sees the old file or the new one whole."""
+    path, model = Path(path), checkpoint.model
+    card = dict(checkpoint.card) | {"environment": environment()}
+    if isinstance(model, GainNet):
+        card |= {"kind": "gain_net", "in_mult": model.in_mult, "out_mult": model.out_mult,
+                 "parameters": sum(p.numel() for p in model.parameters())}  # fmt: skip
+        tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
+    else:
+        card |= {"kind": "okf", "parameters": 9}
+        tensors = {name: torch.tensor(getattr(model, name), dtype=torch.float64) for name in _NOISE}
+    if checkpoint.history is not None:
+        tensors[_HISTORY] = checkpoint.history
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    save_file(tensors, partial, metadata={"card": json.dumps(card, sort_keys=True)})
+    os.replace(partial, path)
+    return path
+
+
+def load(path: Path | str) -> Checkpoint:
+    """Read a checkpoint and check every tensor's shape against what its card promises.
+
+    Raises:
+        InputError: no such file, no card, or tensors of another shape than the model of the card has.
+    """
+    tensors, card = _read(Path(path))
+    history = tensors.pop(_HISTORY, None)
+    if card["kind"] == "okf":
+        _match(path, {name: (3,) for name in _NOISE}, tensors)
+        return Checkpoint(OptimisedKF(*(tuple(tensors[name].tolist()) for name in _NOISE)), card, history)
+    model = GainNet(card["in_mult"], card["out_mult"])
+    load_into(model, tensors, path)
+    return Checkpoint(model, card, history)
+
+
+def load_into(model: GainNet, tensors: Mapping[str, Tensor], path: Path | str = "checkpoint") -> None:
+    """Put named tensors into a net; InputError naming the expected and the found shape if they do not fit."""
+    _match(path, {name: tuple(p.shape) for name, p in model.named_parameters()}, tensors)
+    model.load_state_dict(dict(tensors))
+
+
+def read_card(path: Path | str) -> Mapping[str, Any]:
+    """The card alone, without its weights."""
+    with _opened(Path(path)) as file:
+        return _card(file, path)
+
+
+def environment() -> dict[str, str]:
+    """Versions that a checkpoint was made with."""
+    return {"python": platform.python_version()} | {name: version(name) for name in ("coopoc", "torch", "numpy")}
+
+
+def _opened(path: Path) -> Any:
+    if not path.is_file():
+        raise InputError("checkpoint", path, "must be an existing file", "Train it with train_all or coopoc train.")
+    try:
+        return safetensors.safe_open(path, framework="pt")
+    except safetensors.SafetensorError as error:
+        raise InputError("checkpoint", path, f"is no safetensors file ({error})", "Train it again.") from error
+
+
+def _card(file: Any, path: Path | str) -> dict[str, Any]:
+    text = (file.metadata() or {}).get("card")
+    if text is None:
+        raise InputError("checkpoint", path, "must carry a card in its metadata", "Write it with checkpoint.save.")
+    card: dict[str, Any] = json.loads(text)
+    return card
+
+
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    with _opened(path) as file:
+        return {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
+
+
+def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], found: Mapping[str, Tensor]) -> None:
+    shapes = {name: tuple(tensor.shape) for name, tensor in found.items()}
+    for name in sorted(expected.keys() | shapes.keys()):
+        if expected.get(name) != shapes.get(name):
+            raise InputError(
+                f"checkpoint {path}", f"{name} of shape {shapes.get(name, 'missing')}",
+                f"expected {expected.get(name, 'no such tensor')}", "Load it with the in_mult and out_mult of its card.",
+            )  # fmt: skip

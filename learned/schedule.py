@@ -1,0 +1,94 @@
+"""Schedule: how a net is optimised; plans of batches; the optimiser of many models at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from coopoc.arrays import Floats, Ints
+from coopoc.errors import InputError
+
+Epoch = Literal["step", "pass"]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Optimiser settings, the same for every recipe so that only the data and its distribution differ."""
+
+    epochs: int = 1500
+    """The paper's 1500 (centralised) and 500 (individual)."""
+    epoch: Epoch = "step"
+    """"step": one optimiser step on one random batch, as KalmanNet's published loop counts. "pass": through all data."""
+    batch: int = 4
+    """Pieces per step. The paper's 1 is noisier for the same number of steps; see docs/learned.md."""
+    learning_rate: float = 1e-3
+    """Of AdamW, falling to zero as a half cosine. The paper's 0.3 does not train (docs/learned.md)."""
+    weight_decay: float = 0.3
+    """Decoupled from the gradient (AdamW), the paper's number."""
+    l2: float = 0.0
+    """gamma of the paper's gamma ||theta||^2 in the loss; weaker than the decoupled decay under static noise."""
+    clip: float = 1.0
+    """Largest norm of a model's gradient."""
+    check: int = 25
+    """Optimiser steps between validations; the best weights seen are kept."""
+
+    def __post_init__(self) -> None:
+        for field in ("epochs", "batch", "learning_rate", "clip", "check"):
+            if not getattr(self, field) > 0:
+                raise InputError(field, getattr(self, field), "must be > 0", f"Give Schedule({field}=...).")
+        if self.weight_decay < 0 or self.l2 < 0:
+            raise InputError("weight_decay, l2", (self.weight_decay, self.l2), "must be >= 0", "Use 0 for none.")
+        if self.epoch not in ("step", "pass"):
+            raise InputError("epoch", repr(self.epoch), 'must be "step" or "pass"', "Pick one.")
+
+    def plan(self, pieces: int, draw: np.random.Generator) -> Ints:
+        """(steps, batch) indices of the pieces that each optimiser step sees, without repetition within a pass."""
+        steps = self.epochs if self.epoch == "step" else -(-self.epochs * pieces // self.batch)
+        if self.epoch == "step" and self.batch <= pieces:
+            return np.stack([draw.permutation(pieces)[: self.batch] for _ in range(steps)])
+        passes = -(-steps * self.batch // pieces)
+        order = np.concatenate([draw.permutation(pieces) for _ in range(passes)])
+        return order[: steps * self.batch].reshape(steps, self.batch)
+
+
+def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
+    """(steps,) factors (1 + cos(pi s)) / 2 of the learning rate, s running from start to stop of the training.
+
+    >>> cosine(2).round(3).tolist()
+    [1.0, 0.5]
+    """
+    where = start + (stop - start) * np.arange(steps) / max(steps, 1)
+    factors: Floats = 0.5 * (1.0 + np.cos(np.pi * where))
+    return factors
+
+
+def clip(gradient: Tensor, limit: float) -> Tensor:
+    """Gradients (S, P), each scaled to a norm of at most `limit`."""
+    return gradient * (limit / (gradient.norm(dim=1, keepdim=True) + 1e-6)).clamp(max=1.0)
+
+
+def adamw(
+    theta: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Tensor, decay: float
+) -> None:
+    """One AdamW step in place for S models: theta, gradient and moments (S, P), step >= 1, rate (S, 1).
+
+    Row by row the same as `torch.optim.AdamW` (beta 0.9, 0.999); stacked, because rows may end at different steps.
+
+    Source: Loshchilov and Hutter, ICLR 2019, algorithm 2.
+    """
+    theta.mul_(1.0 - rate * decay)
+    first.lerp_(gradient, 0.1)
+    second.lerp_(gradient.square(), 0.001)
+    size = (second / (1.0 - 0.999**step)).sqrt_().add_(1e-8)
+    theta.addcdiv_(first * (-rate / (1.0 - 0.9**step)), size)
+
+
+def generator(draw: np.random.Generator) -> torch.Generator:
+    """A torch generator seeded by a keyed NumPy stream."""
+    made = torch.Generator()
+    made.manual_seed(int(draw.integers(2**62)))
+    return made

@@ -1,0 +1,204 @@
+"""fit: train nets on pieces, one or many at once, and keep the weights that validate best."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from coopoc.arrays import Ints
+from coopoc.errors import InputError
+from coopoc.world.noise import stream
+
+from .clients import Pieces
+from .net import GainNet
+from .rollout import Tape, flatten, loss, loss_and_gradient, views
+from .schedule import Schedule, adamw, clip, cosine, generator
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """One net to train: its start, its pieces, the seed of its batches, and a name for messages."""
+
+    model: GainNet
+    training: Pieces
+    validation: Pieces
+    seed: int = 0
+    name: str = "net"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A row of a history: optimiser steps so far, mean training loss since the last row and validation loss, m^2."""
+
+    step: int
+    training_loss: float
+    validation_loss: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A trained net: the weights that validated best, how it went, why it stopped early (None: it did not), seconds."""
+
+    model: GainNet
+    history: tuple[Progress, ...]
+    stopped: str | None
+    seconds: float
+
+    @property
+    def best(self) -> Progress:
+        """The row whose weights are kept."""
+        return min(self.history, key=lambda row: row.validation_loss)
+
+
+def fit(
+    model: GainNet,
+    training: Pieces,
+    validation: Pieces,
+    schedule: Schedule | None = None,
+    seed: int = 0,
+    progress: str | None = None,
+) -> Fit:
+    """Minimise 1/T sum_t ||xhat_t - x_t||^2 + gamma ||theta||^2 over batches of pieces.
+
+    Args:
+        model: the start; it is not changed. training, validation: pieces. schedule: default `Schedule()`.
+        seed: of the order of the batches. progress: name of the stage for a progress bar on stderr, None for no bar.
+
+    Raises:
+        InputError: no pieces, or a start that is not finite on the validation pieces.
+
+    Source: arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
+
+    >>> from coopoc.world.fleet import Fleet
+    >>> from coopoc.learned.clients import clients
+    >>> line = Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3)))
+    >>> (only,) = clients(line, piece=10)
+    >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
+    2
+    """
+    return fit_many([Task(model, training, validation, seed)], schedule, progress)[0]
+
+
+def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: str | None = None) -> list[Fit]:
+    """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding."""
+    schedule, began = schedule or Schedule(), time.perf_counter()
+    like, theta = tasks[0].model, flatten([t.model for t in tasks])
+    pool, members = pooled([t.training for t in tasks])
+    streams = [stream(t.seed, "batches", 0, "") for t in tasks]
+    plans = [rows[schedule.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
+    judge = Judge([t.validation for t in tasks], like)
+    best, lowest = theta.clone(), judge(theta)
+    if not lowest.isfinite().all():
+        raise InputError("model", "untrained net", "has no finite validation loss", "Use GainNet(start_gain=0.1).")
+    history = [[Progress(0, math.nan, float(low))] for low in lowest]
+    stopped: dict[int, str] = {}
+    seen: list[Tensor] = []
+    rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
+    draws = [generator(draw) for draw in streams]
+    for step, losses in bar(descend(theta, like, pool, plans, rates, schedule, draws, stopped), plans, progress):
+        seen.append(losses)
+        if step % schedule.check == 0 or step == max(map(len, plans)):
+            found, mean = judge(theta), torch.stack(seen).nanmean(0)
+            better = found < lowest
+            best[better], lowest[better] = theta[better], found[better]
+            for row in range(len(tasks)):
+                if row not in stopped:
+                    history[row].append(Progress(step, float(mean[row]), float(found[row])))
+            seen.clear()
+    seconds = (time.perf_counter() - began) / len(tasks)
+    models = unflatten(best, like)
+    return [Fit(m, tuple(h), stopped.get(i), seconds) for i, (m, h) in enumerate(zip(models, history, strict=True))]
+
+
+def descend(
+    theta: Tensor,
+    like: GainNet,
+    pool: Pieces,
+    plans: Sequence[Ints],
+    rates: Sequence[np.ndarray],
+    schedule: Schedule,
+    draws: Sequence[torch.Generator],
+    stopped: dict[int, str],
+) -> Iterator[tuple[int, Tensor]]:
+    """Change theta (S, P) in place, one optimiser step per iteration, and yield (steps so far, losses (S,) m^2).
+
+    A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
+    models with shorter plans wait for the longest. Their loss is NaN.
+    """
+    keep_freed_memory()
+    first, second = torch.zeros_like(theta), torch.zeros_like(theta)
+    for step in range(max(map(len, plans))):
+        rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
+        losses = torch.full((len(plans),), math.nan)
+        if rows:
+            batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), [draws[r] for r in rows])
+            mine, m, v = theta[rows], first[rows], second[rows]
+            losses[rows], gradient = loss_and_gradient(mine, like, batch)
+            finite = losses[rows].isfinite() & gradient.isfinite().all(1)
+            stopped |= {r: f"loss or gradient not finite at step {step + 1}"
+                        for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
+            rate = torch.tensor([[rates[r][step]] for r in rows], dtype=theta.dtype)
+            adamw(mine, clip(gradient + 2 * schedule.l2 * mine, schedule.clip), m, v, step + 1, rate,
+                  schedule.weight_decay)  # fmt: skip
+            good = torch.tensor(rows)[finite]
+            theta[good], first[good], second[good] = mine[finite], m[finite], v[finite]
+        yield step + 1, losses
+
+
+class Judge:
+    """Validation loss (S,) m^2 of S models, each on its own pieces; fresh pieces are drawn once."""
+
+    def __init__(self, validation: Sequence[Pieces], like: GainNet) -> None:
+        self.like = like
+        pool, members = pooled(validation)
+        most = max(map(len, members))
+        index = torch.from_numpy(np.stack([np.resize(m, most) for m in members]))
+        self.real = torch.from_numpy(np.stack([np.arange(most) < len(m) for m in members]))
+        self.batch = pool.batch(index, [generator(stream(0, "validation", 0, "")) for _ in members])
+
+    def __call__(self, theta: Tensor) -> Tensor:
+        with torch.no_grad():
+            losses = loss(Tape(views(theta, self.like)), self.batch)
+        return torch.where(self.real, losses, 0.0).sum(1) / self.real.sum(1)
+
+
+def pooled(parts: Sequence[Pieces]) -> tuple[Pieces, list[Ints]]:
+    """All pieces in one, and the indices of each part in it."""
+    ends = np.cumsum([len(p) for p in parts])
+    return Pieces.join(parts), [np.arange(end - len(p), end) for p, end in zip(parts, ends, strict=True)]
+
+
+def unflatten(theta: Tensor, like: GainNet) -> list[GainNet]:
+    """New models shaped as `like` with the weights theta (S, P)."""
+    models = []
+    for row in theta:
+        model = GainNet(like.in_mult, like.out_mult)
+        torch.nn.utils.vector_to_parameters(row.clone(), model.parameters())
+        models.append(model)
+    return models
+
+
+def bar(steps: Iterator[tuple[int, Tensor]], plans: Sequence[Ints], name: str | None) -> Iterator[tuple[int, Tensor]]:
+    """The same steps with a progress bar of that name on stderr, or without one."""
+    return iter(tqdm(steps, total=max(map(len, plans)), desc=name, unit="step", disable=name is None))
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep what a rollout frees for the next one instead of returning it to the system.
+
+    Each optimiser step allocates some hundred MB in small tensors; handing the pages back and faulting them in again
+    was 45 % of the training time. Other allocators are left alone.
+    """
+    trim_threshold, mmap_threshold, most = -1, -3, 2**31 - 1
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(mmap_threshold, 32 * 2**20)
+        mallopt(trim_threshold, most)

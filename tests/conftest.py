@@ -1,0 +1,54 @@
+"""Fleets that tests share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopoc import Fleet
+
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    if not SHARED.is_dir():
+        pytest.skip("the shared data folder is not beside the project")
+    return SHARED
+
+
+def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) -> Fleet:
+    """Rigid formation within 30 m on a gently sinuous path at 10 m/s (methods.md section 10): ten on a ring."""
+    t = np.arange(steps) * 0.1
+    course = 0.3 * np.sin(2 * np.pi * t / 60)
+    path = np.cumsum(np.stack([np.cos(course), np.sin(course), 0 * t], axis=1), axis=0)
+    around = np.linspace(0, 2 * np.pi, vehicles - 1, endpoint=False)
+    gap = np.linspace(ring, ring + 0.1, vehicles - 1)
+    offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0 * gap], axis=1)])
+    position = path[:, None] + offset
+    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
+    return Fleet(tuple(f"v{i}" for i in range(vehicles)), t, position, velocity)
+
+
+def crossing_fleet(vehicles: int = 8, steps: int = 60, seed: int = 3) -> Fleet:
+    """Vehicles that cross a square of 60 m at their own heights and speeds: neighbours come and go, z matters."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(steps) * 0.1
+    start = rng.uniform(-30, 30, (vehicles, 3)) * [1, 1, 0.1]
+    speed = rng.normal(0, 6, (vehicles, 3)) * [1, 1, 0.05]
+    wobble = np.sin(t[:, None, None] + np.arange(vehicles)[:, None])
+    position = start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1]
+    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
+    return Fleet(tuple(f"c{i}" for i in range(vehicles)), t, position, velocity)
+
+
+@pytest.fixture(scope="session")
+def formation() -> Fleet:
+    return formation_fleet()
+
+
+@pytest.fixture(scope="session")
+def crossing() -> Fleet:
+    return crossing_fleet()

@@ -1,0 +1,99 @@
+"""Published and independently simulated figures (methods.md section 10), within 5 %."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coopoc import V2X, Fleet, Gnss, Kalman, Knowledge, LaplacianKalman, Links, Sensors, observe
+from coopoc.evaluate.metrics import max_error, rt_le
+from coopoc.world.recording import Recording
+
+SENSORS = Sensors(gnss_std=(3.5, 3.5, 3.5))
+
+
+def fixture(fleet: Fleet, neighbours: int, ratio: float = 1.0, sensors: Sensors = SENSORS) -> Recording:
+    """Constant process noise, diag(.0707, .0707, .001) m per step, and a start from the fixes alone."""
+    recording = observe(fleet, sensors, V2X(max_neighbours=neighbours), runs=40, observers=[0])
+    links, late = recording.links, recording.links.step > 0
+    recording = replace(
+        recording,
+        links=Links(links.step[late], links.observer[late], links.neighbour[late]),
+        relative=recording.relative[:, late],
+        sent=recording.sent[late],
+        arrival=recording.arrival[:, late],
+    )
+    noise = np.random.default_rng(7).standard_normal(recording.velocity.shape) * np.array([0.707, 0.707, 0.01])
+    return replace(recording, velocity=fleet.velocity + noise * [ratio, ratio, 1.0])
+
+
+def score(method, recording: Recording, fleet: Fleet) -> float:
+    """Mean RT-LE over runs from step 1 on: the anchors start at a fix that is not scored."""
+    track = method(recording, [0])
+    late = replace(track, t=track.t[1:], x=track.x[:, 1:], covariance=None)
+    return float(rt_le(late, fleet.between(1, len(fleet.t))).mean())
+
+
+def tuned(ratio: float = 1.0, gnss: float = 3.5) -> Knowledge:
+    return Knowledge("fitted", SENSORS, process_std=(0.0707 * ratio, 0.0707 * ratio, 0.001), gnss_std=(gnss,) * 3)
+
+
+@pytest.mark.parametrize(
+    ("method", "ratio", "expected"),
+    [
+        (Gnss(), 1.0, 6.06),
+        (Kalman("identity"), 1.0, 4.06),
+        (Kalman(tuned()), 1.0, 0.80),
+        (Kalman(tuned(1.5)), 1.5, 0.93),
+    ],
+    ids=["gnss", "identity", "tuned 10 %", "tuned 15 %"],
+)
+def test_solo_anchors(method, ratio: float, expected: float, formation: Fleet) -> None:
+    assert score(method, fixture(formation, 0, ratio), formation) == pytest.approx(expected, rel=0.05)
+
+
+def test_identity_filter_closed_form(formation: Fleet) -> None:
+    """3.5 sqrt(3) sqrt(k / (2 - k)) = 4.05 with the golden-ratio gain k."""
+    k = (np.sqrt(5) - 1) / 2
+    closed = 3.5 * np.sqrt(3) * np.sqrt(k / (2 - k))
+    assert score(Kalman("identity"), fixture(formation, 0), formation) == pytest.approx(closed, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "identity", "ones", "weighted"),
+    [
+        (1, 3.00, 3.64, 0.70),
+        (2, 2.48, 3.27, 0.62),
+        (4, 1.98, 2.73, 0.51),
+        (6, 1.66, 2.34, 0.46),
+        (10, 1.35, 1.90, 0.37),
+    ],
+)
+def test_laplacian_filter_anchors(
+    neighbours: int, identity: float, ones: float, weighted: float, formation: Fleet
+) -> None:
+    recording = fixture(formation, neighbours)
+    pragmatic = Knowledge("fitted", SENSORS, process_std=(0.07, 0.07, 0.07), gnss_std=(3.5,) * 3)
+    assert score(LaplacianKalman("identity"), recording, formation) == pytest.approx(identity, rel=0.05)
+    assert score(LaplacianKalman("identity", transition="ones"), recording, formation) == pytest.approx(ones, rel=0.05)
+    assert score(LaplacianKalman(pragmatic), recording, formation) == pytest.approx(weighted, rel=0.05)
+
+
+def test_scenario1_anchors(formation: Fleet) -> None:
+    """Bias drawn at every sample, 15 %: GNSS 3.38, identity 2.46, tuned 1.42, maxima 8.0 / 5.7 / 3.6 m.
+
+    The last maximum is a 40-run mean of a start-up that varies by 1 m from run to run, so both it and ours have a
+    standard error of 0.15 m; the others repeat within 0.1 m.
+    """
+    sensors = replace(Sensors.paper_scenario1(), gnss_bias_mode="sample")
+    recording = fixture(formation, 0, 1.5, sensors)
+    for method, mean, largest, spread in (
+        (Gnss(), 3.38, 8.0, 0.0),
+        (Kalman("identity"), 2.46, 5.7, 0.0),
+        (Kalman(tuned(1.5, gnss=1.8)), 1.42, 3.6, 0.15),
+    ):
+        assert score(method, recording, formation) == pytest.approx(mean, rel=0.05)
+        measured = max_error(method(recording, [0]), formation).mean()
+        assert measured == pytest.approx(largest, abs=0.05 * largest + 1.5 * spread)

@@ -1,0 +1,131 @@
+"""The bundled fleets: exact storage, cards that tell the truth, the properties that the studies build on."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from coopoc.data import store
+from coopoc.data.registry import DATASETS, FLEETS, convert, detect, list_datasets, load
+from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
+
+NAMES = ("town10", "town10-clients", "town10-validation", "town04")
+
+
+def test_the_four_fleets_are_bundled_in_less_than_4_mb() -> None:
+    assert set(DATASETS) == set(NAMES)
+    assert sum(file.stat().st_size for file in FLEETS.iterdir()) < 4e6
+    assert [row["name"] for row in list_datasets()] == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
+    fleet, card = load(name), DATASETS[name].card()
+    assert fleet.digest == card.sha256
+    assert (fleet.name, fleet.licence) == (name, card.map_licence)
+    assert card.map in fleet.source
+    assert str(card.recipe["seed"]) in fleet.source
+    assert card.sha256 in card.render()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_velocity_is_exactly_the_step_over_dt(name: str) -> None:
+    fleet = load(name)
+    error = fleet.position[1:] - fleet.position[:-1] - fleet.dt * fleet.velocity[1:]
+    assert np.nanmax(np.abs(error)) < 1e-12
+    assert np.array_equal(fleet.velocity[0], fleet.velocity[1])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nobody_jumps(name: str) -> None:
+    fleet = load(name)
+    change = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2)
+    assert np.nanmax(change) / fleet.dt < 8.0, "m/s^2: less than the grip of a dry road"
+
+
+@pytest.mark.parametrize("name", ["town10", "town10-validation", "town04"])
+def test_card_counts_the_neighbours_that_a_kd_tree_finds(name: str) -> None:
+    """Independent check: SciPy's cKDTree."""
+    fleet, card = load(name), DATASETS[name].card()
+    counts = np.array([[len(n) - 1 for n in cKDTree(x).query_ball_point(x, 30.0)] for x in fleet.position[::25]])
+    assert np.mean(np.minimum(counts, 10)) == pytest.approx(card.neighbours["mean"], rel=0.05)
+
+
+def test_town10_is_dense_and_urban() -> None:
+    fleet, card = load("town10"), DATASETS["town10"].card()
+    assert fleet.position.shape == (900, 60, 3)
+    assert fleet.present.all()
+    assert 5 <= card.neighbours["mean"] <= 7
+    assert card.speed["max"] < 11.1
+    assert card.speed["standing"] < 0.3
+    path = np.linalg.norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0)
+    assert path.min() > 90, "every vehicle drives, m in 90 s"
+
+
+def test_clients_have_the_papers_lengths_and_speeds() -> None:
+    """Published values: section IV.A, 8.9-10.8, 9.2-10.9, 0.7-10.7 and 3.6-10.7 m/s; lengths from its figure."""
+    fleet = load("town10-clients")
+    assert fleet.present.sum(axis=0).tolist() == [1550, 4600, 1450, 1420]
+    assert (np.diff(fleet.present.astype(int), axis=0) <= 0).all(), "present from the start, absent after the end"
+    speed = np.linalg.norm(fleet.velocity, axis=2)
+    ranges = np.column_stack([np.nanmin(speed, axis=0), np.nanmax(speed, axis=0)])
+    np.testing.assert_allclose(ranges, [[8.9, 10.8], [9.2, 10.9], [0.7, 10.7], [3.6, 10.7]], atol=0.6)
+
+
+def test_town04_is_hilly() -> None:
+    fleet = load("town04")
+    assert np.ptp(fleet.position[..., 2]) > 10
+    gap = fleet.position[:, None] - fleet.position[:, :, None]
+    distance = np.linalg.norm(gap, axis=-1)
+    near = (distance < 30) & (distance > 0)
+    slope = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
+    assert np.mean(slope > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
+
+
+def test_fleets_are_disjoint() -> None:
+    for one, other in combinations(map(load, NAMES), 2):
+        assert not set(one.ids) & set(other.ids)
+        steps = min(len(one.t), len(other.t), 900)
+        for x in np.moveaxis(one.position[:steps], 1, 0):
+            same = np.abs(other.position[:steps] - x[:, None]).max(axis=2) < 0.5
+            assert same.mean(axis=0).max() < 0.5, "nobody drives where one of another fleet drives"
+
+
+def test_storage_is_exact_deterministic_and_refuses_what_it_would_change(tmp_path: Path) -> None:
+    t = np.arange(50) / 10
+    x = np.cumsum(np.random.default_rng(0).normal(0.5, 0.1, (50, 3, 3)), axis=0)
+    x[20:, 1] = np.nan
+    fleet = store.quantise(Fleet(("a", "b", "c"), t, x, x, name="w"))
+    np.testing.assert_allclose(fleet.position, x, atol=0.5e-4)
+    for copy in ("1.npz", "2.npz"):
+        store.save(fleet, tmp_path / copy)
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+    assert store.load(tmp_path / "1.npz", "w").digest == fleet.digest
+    with pytest.raises(InputError, match="quantise"):
+        store.save(Fleet(("a", "b", "c"), t, x, x), tmp_path / "3.npz")
+    jump = np.where(np.arange(50)[:, None, None] < 10, 0.0, 9.0) * np.ones((1, 1, 3))
+    with pytest.raises(InputError, match="jump"):
+        store.save(store.quantise(Fleet(("a",), t, jump, jump)), tmp_path / "4.npz")
+
+
+def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="town10-validation"):
+        load("town11")
+    with pytest.raises(InputError, match="must be one of table, tum, fcd, carla, mrclam"):
+        load(tmp_path, format="bag")
+    with pytest.raises(InputError, match=r"must end in \.csv"):
+        detect(tmp_path / "drive.bag")
+    convert("town10-clients", tmp_path / "a.csv")
+    with pytest.raises(InputError, match="vehicle_lenght"):
+        load(tmp_path / "a.csv", vehicle_lenght=4)
+
+
+def test_a_bundled_fleet_can_be_resampled() -> None:
+    fleet, coarse = load("town10"), load("town10", dt=0.3)
+    assert coarse.dt == 0.3
+    np.testing.assert_allclose(coarse.position, fleet.position[::3], atol=1e-9)

@@ -1,0 +1,132 @@
+"""The generator: the same seed gives the same bytes, and wrong recipes are refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.spatial import cKDTree
+
+from coopoc.data import traffic
+from coopoc.data.generate import make
+from coopoc.data.recipes import RECIPES, Recipe
+from coopoc.data.registry import DATASETS
+from coopoc.data.smooth import smooth
+from coopoc.data.store import load
+from coopoc.errors import InputError, MissingLibraryError
+
+MAPS = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "carla_maps"
+TINY = Recipe("tiny", "Town10HD.xodr", vehicles=6, steps=(60, 60, 60, 60, 60, 40), seed=1, warmup=10, platoon=2)
+with_sumo = pytest.mark.skipif(
+    importlib.util.find_spec("sumo") is None or not MAPS.is_dir(),
+    reason="needs eclipse-sumo and CARLA's maps at ../shared/data/carla_maps",
+)
+
+
+@with_sumo
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
+    one, two = (make(TINY, MAPS, tmp_path / name) for name in ("one", "two"))
+    other = make(TINY, MAPS, tmp_path / "other", seed=2)
+    for suffix in ("npz", "json"):
+        assert (tmp_path / "one" / f"tiny.{suffix}").read_bytes() == (tmp_path / "two" / f"tiny.{suffix}").read_bytes()
+    assert one == two
+    assert other.sha256 != one.sha256
+    fleet = load(tmp_path / "one" / "tiny.npz")
+    assert fleet.digest == one.sha256
+    assert fleet.present.sum(axis=0).tolist() == [60, 60, 60, 60, 60, 40]
+    assert one.speed["max"] > 2
+
+
+@with_sumo
+def test_a_bundled_fleet_is_made_again_bit_by_bit(tmp_path: Path) -> None:
+    """The smallest one here; all four were made again by hand with the SUMO that their cards name."""
+    card = DATASETS["town10-clients"].card()
+    if version("eclipse-sumo") != card.sumo:
+        pytest.skip(f"the bundled fleets were made with eclipse-sumo {card.sumo}")
+    assert make("town10-clients", MAPS, tmp_path).sha256 == card.sha256
+
+
+@pytest.mark.skipif(not MAPS.is_dir(), reason="needs CARLA's maps at ../shared/data/carla_maps")
+def test_elevation_is_that_of_the_map() -> None:
+    """Independent check: elevation polynomials of the OpenDRIVE file at its reference lines, without netconvert."""
+    points = []
+    for road in ElementTree.parse(MAPS / "Town04.xodr").getroot().iter("road"):
+        profile = [[float(e.attrib[k]) for k in "sabcd"] for e in road.iter("elevation")]
+        for g in road.iter("geometry"):
+            start, a, b, c, d = next(row for row in reversed(profile) if row[0] <= float(g.attrib["s"]) + 1e-9)
+            along = float(g.attrib["s"]) - start
+            points.append([float(g.attrib["x"]), float(g.attrib["y"]), a + along * (b + along * (c + along * d))])
+    lines, x = np.array(points), DATASETS["town04"].load().position[::10].reshape(-1, 3)
+    near = cKDTree(lines[:, :2]).query_ball_point(x[:, :2], 12.0)
+    error = [np.abs(lines[index, 2] - z).min() for index, z in zip(near, x[:, 2], strict=True) if index]
+    assert len(error) > 1000, "positions beside the start of a piece of a reference line"
+    assert np.percentile(error, 95) < 0.6
+    assert np.ptp([z for index, z in zip(near, x[:, 2], strict=True) if index]) > 10
+
+
+def test_the_cards_hold_the_recipes() -> None:
+    for name, recipe in RECIPES.items():
+        stored = DATASETS[name].card().recipe
+        assert Recipe(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}) == recipe
+
+
+def test_smoothing_halves_the_cutoff_and_keeps_slow_motion() -> None:
+    """Closed form of the gain, 1/(1 + (f/fc)^6), and the frequency response of sin by its amplitude."""
+    t = np.arange(2000) * 0.1
+    for f, gain in ((0.05, 1.0), (0.5, 0.5), (1.0, 1 / (1 + 2.0**6))):
+        out = smooth(np.sin(2 * np.pi * f * t), 0.1, 0.5)[500:1500]
+        window = signal.windows.hann(1000)
+        amplitude = 2 * abs(np.sum(window * out * np.exp(-2j * np.pi * f * t[500:1500]))) / window.sum()
+        assert amplitude == pytest.approx(gain, abs=0.03)
+
+
+def test_smoothing_solves_the_penalised_least_squares() -> None:
+    """Independent check: numpy.linalg.lstsq on the stacked problem."""
+    x = np.random.default_rng(0).normal(size=(40, 3))
+    weight = (2 * np.pi * 0.5 * 0.1) ** -3
+    stacked = np.vstack([np.eye(40), weight * np.diff(np.eye(40), n=3, axis=0)])
+    expected = np.linalg.lstsq(stacked, np.vstack([x, np.zeros((37, 3))]), rcond=None)[0]
+    np.testing.assert_allclose(smooth(x, 0.1, 0.5), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("change", "thing"),
+    [
+        ({"vehicles": 0}, "vehicles = 0"), ({"dt": 0.0}, "dt = 0"), ({"cutoff": -1.0}, "cutoff"),
+        ({"top_speed": (9.0, 8.0)}, "top_speed"), ({"steps": (10, 20)}, "steps"), ({"steps": 1}, "steps"),
+    ],
+)  # fmt: skip
+def test_a_recipe_that_nobody_can_drive_is_refused(change: dict[str, object], thing: str) -> None:
+    with pytest.raises(InputError, match=thing):
+        replace(TINY, **change)  # type: ignore[arg-type]
+
+
+def test_an_unknown_recipe_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="town10-clients"):
+        make("town11", tmp_path, tmp_path)
+
+
+@with_sumo
+def test_a_missing_map_or_edge_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"Town10HD\.xodr"):
+        make(TINY, tmp_path, tmp_path)
+    with pytest.raises(InputError, match="tours"):
+        make(replace(TINY, tours=("1 2 nowhere",)), MAPS, tmp_path)
+
+
+@with_sumo
+def test_vehicles_that_cannot_all_depart_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="smaller platoons"):
+        make(Recipe("crowd", "Town10HD.xodr", vehicles=60, steps=20, seed=1, warmup=5, platoon=60), MAPS, tmp_path)
+
+
+def test_without_sumo_the_pip_line_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(MissingLibraryError, match=r"pip install 'coopoc\[sumo\]'"):
+        traffic.program("sumo")

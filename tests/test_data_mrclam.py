@@ -1,0 +1,129 @@
+"""MR.CLAM: real measurements against Vicon, and the Recording made of them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopoc.data.mrclam import MrclamLog, innovations, read_mrclam
+from coopoc.data.mrclam_recording import recording
+from coopoc.data.registry import load
+from coopoc.errors import InputError
+from coopoc.world.v2x import V2X
+
+FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
+present = pytest.mark.skipif(not FOLDER.is_dir(), reason="UTIAS MR.CLAM set 6 is not at ../shared/data/mrclam")
+
+
+@pytest.fixture(scope="module")
+def log() -> MrclamLog:
+    return read_mrclam(FOLDER)
+
+
+@present
+def test_real_measurements_have_the_stated_noise(log: MrclamLog) -> None:
+    """Published value for this set, found independently of this reader: 0.095 m and 0.007 rad, robust."""
+    residual = innovations(log)
+    assert residual.range_std == pytest.approx(0.095, abs=0.0015)
+    assert residual.bearing_std == pytest.approx(0.007, abs=0.0006)
+    rows = residual.rows()
+    assert [row["stated_std"] for row in rows] == [0.095, 0.007]
+    assert all(0.001 < float(row["beyond_5_std"]) < 0.05 for row in rows), "rare outliers"
+
+
+@present
+def test_measurements_are_counted_like_the_description(log: MrclamLog) -> None:
+    """Stated for this set: 15383 of landmarks, 6 unknown barcodes, 3906 between robots that have truth."""
+    assert (log.landmarks, log.unknown) == (15383, 6)
+    assert abs(int(np.isfinite(log.true_range).sum()) - 3906) <= 4, "4 more fall into the gap of robot 4's truth"
+    assert set(np.unique(log.subject)) == set(range(5))
+    assert not (log.subject == log.observer).any()
+
+
+@present
+def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log: MrclamLog) -> None:
+    fleet = load(FOLDER)
+    assert fleet.digest == log.fleet.digest
+    assert fleet.dt == 0.1
+    assert 750 < fleet.t[-1] < 772
+    absent = (~fleet.present).sum(axis=0)
+    assert absent[[0, 1, 2, 4]].tolist() == [0, 0, 0, 0]
+    assert 15 <= absent[3] <= 30, "a gap of 2 s (and one of 0.55 s)"
+    assert np.nanmax(np.abs(fleet.position[..., 2])) == 0
+    assert 0.03 < np.nanmean(np.linalg.norm(fleet.velocity, axis=2)) < 0.08
+
+
+@present
+def test_odometry_with_vicons_heading_dead_reckons(log: MrclamLog) -> None:
+    """Independent check: integrated wheel speed stays near Vicon for 12 minutes, which a wrong sign would not."""
+    rec = recording(log, V2X(max_neighbours=4))
+    for robot in (0, 1, 2, 4):
+        path = np.cumsum(rec.velocity[0, 1:, robot] * rec.dt, axis=0)
+        truth = log.fleet.position[1:, robot] - log.fleet.position[0, robot]
+        assert np.linalg.norm(path - truth, axis=1).max() < 1.5
+        assert np.linalg.norm(truth, axis=1).max() > 2.0
+
+
+@present
+def test_runs_differ_only_in_the_simulated_gnss(log: MrclamLog) -> None:
+    rec, more = (recording(log, V2X(max_neighbours=4), runs=runs, seed=3) for runs in (2, 3))
+    np.testing.assert_array_equal(rec.gnss, more.gnss[:2])
+    np.testing.assert_array_equal(rec.relative[0], rec.relative[1])
+    np.testing.assert_array_equal(rec.velocity[0], rec.velocity[1])
+    error = (rec.gnss - log.fleet.position)[:, log.fleet.present[:, 3]]
+    np.testing.assert_allclose(error.std(axis=(0, 1, 2)), [0.3, 0.3, 0], rtol=0.02)
+    assert np.isnan(rec.gnss[0, ~log.fleet.present[:, 3], 3]).all()
+    text = " ".join(rec.notes)
+    for word in ("GNSS is simulated", "real", "Vicon's heading", "inclination was not measured"):
+        assert word in text
+
+
+@present
+def test_links_are_the_real_measurements(log: MrclamLog) -> None:
+    rec = recording(log, V2X(max_neighbours=4))
+    links, x = rec.links, log.fleet.position
+    gap = x[links.step, links.neighbour] - x[links.step, links.observer]
+    assert np.median(np.abs(rec.relative[0, :, 0] - np.linalg.norm(gap, axis=1))) < 0.1
+    turn = rec.relative[0, :, 1] - np.arctan2(gap[:, 1], gap[:, 0])
+    assert np.median(np.abs((turn + np.pi) % (2 * np.pi) - np.pi)) < 0.01
+    assert (rec.relative[..., 2] == np.pi / 2).all()
+    order = np.lexsort((rec.relative[0, :, 0], links.observer, links.step))
+    np.testing.assert_array_equal(order, np.arange(len(links)))
+    sees = np.array([len(np.unique(links.step[links.of(k)])) for k in range(5)]) / len(rec.t)
+    assert (sees > 0.04).all()
+    assert (sees < 0.135).all()
+
+
+@present
+def test_fewer_neighbours_are_the_nearest_ones_and_zero_is_none(log: MrclamLog) -> None:
+    four, one, none = (recording(log, V2X(max_neighbours=k)) for k in (4, 1, 0))
+    assert len(none.links) == 0
+    pairs = np.column_stack([one.links.step, one.links.observer])
+    assert len(np.unique(pairs, axis=0)) == len(pairs) < len(four.links)
+    nearest: dict[tuple[int, int], float] = {}
+    for step, observer, metres in zip(four.links.step, four.links.observer, four.relative[0, :, 0], strict=True):
+        key = (int(step), int(observer))
+        nearest[key] = min(float(metres), nearest.get(key, np.inf))
+    kept = zip(one.links.step.tolist(), one.links.observer.tolist(), one.relative[0, :, 0].tolist(), strict=True)
+    assert {(step, observer): metres for step, observer, metres in kept} == nearest
+
+
+@present
+def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
+    for file in FOLDER.glob("*.dat"):
+        shutil.copy(file, tmp_path / file.name)
+    (tmp_path / "Robot3_Odometry.dat").chmod(0o644)
+    (tmp_path / "Robot3_Odometry.dat").write_text("# Time v w\n1.0 2.0 fast\n")
+    with pytest.raises(InputError, match=r"Robot3_Odometry\.dat"):
+        read_mrclam(tmp_path)
+    (tmp_path / "Robot3_Odometry.dat").unlink()
+    with pytest.raises(InputError, match=r"has no Robot3_Odometry\.dat"):
+        read_mrclam(tmp_path)
+
+
+def test_dt_must_be_positive() -> None:
+    with pytest.raises(InputError, match="must be > 0"):
+        read_mrclam(FOLDER, dt=-1)

@@ -1,0 +1,210 @@
+"""Laws that every method obeys, and independent filters that it equals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from coopoc import V2X, Fleet, Gnss, InputError, JointFilter, Kalman, Knowledge, LaplacianKalman, Msmv, Sensors, observe
+from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
+from coopoc.methods.star import FORGOTTEN
+from coopoc.world.spherical import to_vector
+
+S2 = Sensors.paper_scenario2()
+SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
+COOPERATIVE = [
+    LaplacianKalman("identity"),
+    LaplacianKalman("identity", membership="reset"),
+    LaplacianKalman("nominal"),
+    JointFilter("identity"),
+    JointFilter("nominal"),
+    JointFilter("nominal", exact=False),
+    Msmv("identity"),
+    Msmv("nominal"),
+]
+METHODS = [Gnss(), Kalman("identity"), Kalman("nominal"), *COOPERATIVE]
+
+
+def label(method: object) -> str:
+    knowledge = getattr(method, "knowledge", "")
+    extra = [str(getattr(method, f)) for f in ("membership", "exact") if hasattr(method, f)]
+    return "-".join([method.name, str(knowledge), *extra])  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_zero_noise_gives_zero_error(method, crossing: Fleet) -> None:
+    recording = observe(crossing, SILENT, V2X(max_neighbours=4), assumed=S2)
+    assert errors(method(recording, [0, 3]), crossing).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_translating_the_world_translates_the_estimate(method, crossing: Fleet) -> None:
+    shift = np.array([1000.0, -500.0, 30.0])
+    moved = replace(crossing, position=crossing.position + shift)
+    here = method(observe(crossing, S2, V2X(max_neighbours=4), runs=2), [0]).x
+    there = method(observe(moved, S2, V2X(max_neighbours=4), runs=2), [0]).x
+    assert there - shift == pytest.approx(here, abs=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_order_of_vehicles_changes_nothing(method, crossing: Fleet) -> None:
+    names = list(crossing.ids)
+    shuffled = crossing.select([names[0], *reversed(names[1:])])
+    here = method(observe(crossing, S2, V2X(max_neighbours=4), runs=2), ["c0"]).x
+    there = method(observe(shuffled, S2, V2X(max_neighbours=4), runs=2), ["c0"]).x
+    assert there == pytest.approx(here, abs=1e-7)
+
+
+@pytest.mark.parametrize("method", COOPERATIVE, ids=label)
+def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=3)
+    solo = Kalman(method.knowledge)(recording, [0, 1])
+    assert method(recording, [0, 1]).x == pytest.approx(solo.x, abs=2e-4)  # the flat prior weighs 1e-6 of a fix
+    assert (method(recording, [0]).received_bytes == 0).all()
+
+
+@pytest.mark.parametrize("method", COOPERATIVE, ids=label)
+def test_no_message_ever_is_at_best_the_solo_filter(method, crossing: Fleet) -> None:
+    """All messages lost: on-board sightings of vehicles that say nothing must not move the ego much."""
+    recording = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=3)
+    track, solo = method(recording, [0]), Kalman(method.knowledge)(recording, [0])
+    assert (track.received_bytes == 0).all()
+    if "reset" not in label(method):
+        assert rt_le(track, crossing).mean() < 1.2 * rt_le(solo, crossing).mean()
+
+
+def test_solo_filter_equals_filterpy(crossing: Fleet) -> None:
+    """Independent check: filterpy's KalmanFilter on the same numbers."""
+    recording = observe(crossing, S2, runs=1)
+    known = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = Kalman(known)(recording, [2])
+    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    peer.B, peer.H = 0.1 * np.eye(3), np.eye(3)
+    peer.Q, peer.R = np.diag(np.square(known.process_std)), np.diag(known.gnss_variance)
+    peer.x, peer.P = recording.gnss[0, 0, 2], peer.R.copy()
+    for t in range(1, 60):
+        peer.predict(u=recording.velocity[0, t, 2])
+        peer.update(recording.gnss[0, t, 2])
+        assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-9)
+        assert track.covariance is not None
+        assert track.covariance[0, t, 0] == pytest.approx(peer.P, abs=1e-9)
+
+
+def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
+    """Independent check: filterpy's KalmanFilter over the stacked star of a formation that never changes."""
+    fleet = formation.select(range(4)).between(0, 40)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
+    known = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = JointFilter(known, exact=False)(recording, [0])
+    n, order = 4, [0, *recording.links.neighbour[:3]]
+    sight = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
+    peer = KalmanFilter(dim_x=3 * n, dim_z=3 * n + 9, dim_u=3 * n)
+    peer.B, peer.H = 0.1 * np.eye(3 * n), np.vstack([np.eye(3 * n), sight])
+    peer.Q = np.kron(np.eye(n), np.diag(np.square(known.process_std)))
+    vectors = known.relative_cov(recording.relative[0])
+    where = to_vector(recording.relative[0])
+    peer.x = recording.gnss[0, 0, 0].repeat(n).reshape(3, n).T.ravel()
+    peer.x = np.concatenate([recording.gnss[0, 0, 0], (recording.gnss[0, 0, 0] + where[:3]).ravel()])
+    peer.P = FORGOTTEN * np.eye(3 * n)
+    for t in range(40):
+        if t:
+            peer.predict(u=recording.velocity[0, t, order].ravel())
+        noise = np.zeros((3 * n + 9, 3 * n + 9))
+        noise[: 3 * n, : 3 * n] = np.kron(np.eye(n), np.diag(known.gnss_variance))
+        for k in range(3):
+            at = slice(3 * n + 3 * k, 3 * n + 3 * k + 3)
+            noise[at, at] = vectors[3 * t + k]
+        peer.update(np.concatenate([recording.gnss[0, t, order].ravel(), where[3 * t : 3 * t + 3].ravel()]), R=noise)
+        assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-6)
+
+
+def test_laplacian_form_equals_the_batch_least_squares(formation: Fleet) -> None:
+    """Independent check: numpy.linalg.lstsq on [L; I] at the first step, where the filter has no past."""
+    recording = observe(formation.between(0, 2), S2, V2X(max_neighbours=4), runs=1, observers=[0])
+    track = LaplacianKalman("identity")(recording, [0])
+    order = [0, *recording.links.neighbour[:4]]
+    laplacian = np.diag([4.0, 1, 1, 1, 1])
+    laplacian[0, 1:] = laplacian[1:, 0] = -1
+    vector = to_vector(recording.relative[0, :4])
+    delta = np.vstack([-vector.sum(axis=0), vector])
+    z = np.vstack([delta, recording.gnss[0, 0, order]])
+    expected = np.linalg.lstsq(np.vstack([laplacian, np.eye(5)]), z, rcond=None)[0]
+    assert track.x[0, 0, 0] == pytest.approx(expected[0], abs=1e-4)
+    assert track.neighbours is not None
+    assert track.neighbours[0, :4] == pytest.approx(expected[1:], abs=1e-4)
+
+
+def test_neighbours_are_better_located_than_by_their_fix(formation: Fleet) -> None:
+    fleet = formation.between(0, 200)
+    recording = observe(fleet, S2, V2X(max_neighbours=6), runs=4, observers=[0])
+    for method in (JointFilter("nominal"), LaplacianKalman("identity"), Msmv("nominal")):
+        assert (neighbour_rt_le(method(recording, [0]), recording, fleet) < 3.5 * np.sqrt(3)).all()
+
+
+def test_loss_and_delay_cost_accuracy_and_never_break(formation: Fleet) -> None:
+    fleet = formation.between(0, 300)
+    score = {}
+    for name, v2x in {
+        "ideal": V2X(max_neighbours=6),
+        "late": V2X(max_neighbours=6, latency=0.3),
+        "poor": V2X(max_neighbours=6, rate=1.0, latency=0.3, loss=0.5, burst=4.0),
+        "none": V2X(max_neighbours=0),
+    }.items():
+        recording = observe(fleet, S2, v2x, runs=20, observers=[0])
+        score[name] = rt_le(JointFilter("nominal")(recording, [0]), fleet).mean()
+    assert score["ideal"] < score["late"] < score["poor"] < score["none"]
+
+
+def test_stale_velocities_do_not_make_the_filter_sure_of_itself(formation: Fleet) -> None:
+    """A velocity held for ten steps makes the same error ten times: NEES stays near 3 at one message a second."""
+    fleet = formation.between(0, 300)
+    recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0, loss=0.3), runs=30, observers=[0])
+    assert nees(JointFilter("nominal")(recording, [0]), fleet).mean() < 4.0
+
+
+def test_identity_gain_is_the_golden_ratio(formation: Fleet) -> None:
+    """Closed form: with unit covariances gain and posterior variance tend to (sqrt 5 - 1)/2."""
+    track = Kalman("identity")(observe(formation, S2, observers=[0]), [0])
+    assert track.covariance is not None
+    assert track.covariance[0, -1, 0] == pytest.approx((np.sqrt(5) - 1) / 2 * np.eye(3))
+
+
+@pytest.mark.parametrize(
+    "method", [Kalman("nominal"), JointFilter("nominal"), JointFilter("nominal", exact=False)], ids=label
+)
+def test_filters_that_claim_a_covariance_are_consistent(method, formation: Fleet) -> None:
+    """NEES gate: 95 % of the steps have their run-averaged NEES in the 99 % chi-square band; noise without bias."""
+    fleet = formation.between(0, 300)
+    recording = observe(fleet, S2, V2X(max_neighbours=6), runs=40, seed=1, observers=[0])
+    assert nees_inside(method(recording, [0]), fleet).min() >= 0.95
+
+
+def test_fitted_knowledge_finds_the_acting_noise(formation: Fleet) -> None:
+    training = observe(formation, Sensors(gnss_std=(1.0, 2.0, 3.0), velocity_reading="speed"), runs=2)
+    fitted = Knowledge.fitted(training, formation)
+    assert fitted.gnss_std == pytest.approx((1.0, 2.0, 3.0), rel=0.02)
+    assert fitted.process_std == pytest.approx((0.1, 0.1, 0.1), rel=0.02)
+
+
+def test_bad_knowledge_is_named(crossing: Fleet) -> None:
+    recording = observe(crossing, S2)
+    with pytest.raises(InputError, match="knowledge = 'guess'"):
+        Kalman("guess")(recording)
+    with pytest.raises(InputError, match="process_std"):
+        Knowledge("mine", S2, process_std=(0.1, 0.1, 0.0))
+    with pytest.raises(InputError, match="start"):
+        Kalman("nominal", start=np.zeros((2, 3)))(recording, [0])
+
+
+def test_absent_neighbour_is_left_out_and_absent_ego_refused(crossing: Fleet) -> None:
+    position, velocity = crossing.position.copy(), crossing.velocity.copy()
+    position[20:40, 1] = velocity[20:40, 1] = np.nan
+    gappy = replace(crossing, position=position, velocity=velocity)
+    recording = observe(gappy, S2, V2X(max_neighbours=7), runs=2)
+    for method in METHODS:
+        assert np.isfinite(method(recording, [0]).x).all()
+    with pytest.raises(InputError, match="absent"):
+        Kalman()(recording, [1])

@@ -1,0 +1,202 @@
+"""The world: fleets that cannot be used, noise keys, links, messages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from coopoc import V2X, Fleet, InputError, Sensors, observe
+from coopoc.world.inbox import inbox
+from coopoc.world.spherical import spherical, to_vector, vector_cov
+from coopoc.world.v2x import FIX_AND_VELOCITY, lost
+
+S2 = Sensors.paper_scenario2()
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"t": [0.0, 0.1, 0.1]}, "dt"),
+        ({"t": [0.0, 0.1, 0.3]}, "t"),
+        ({"ids": ("a", "a")}, "ids"),
+        ({"position": np.zeros((3, 1, 3))}, "position"),
+        ({"position": np.full((3, 2, 3), np.nan)}, "position/velocity"),
+        ({"position": np.full((3, 2, 3), np.inf)}, "position/velocity"),
+    ],
+)
+def test_unusable_fleet_names_the_field(change: dict, field: str) -> None:
+    good = {"ids": ("a", "b"), "t": [0.0, 0.1, 0.2], "position": np.zeros((3, 2, 3)), "velocity": np.zeros((3, 2, 3))}
+    with pytest.raises(InputError) as error:
+        Fleet(**{**good, **change})
+    assert error.value.field == field
+    assert error.value.mend
+
+
+def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
+    with pytest.raises(InputError, match="c0, c1"):
+        crossing.select(["nobody"])
+    with pytest.raises(InputError, match=r"0\.\.7"):
+        crossing.index(8)
+
+
+@pytest.mark.parametrize(
+    ("build", "words"),
+    [
+        (lambda: V2X(max_neighbours=-1), "max_neighbours = -1"),
+        (lambda: V2X(loss=1.5), "loss"),
+        (lambda: V2X(rate=0), "rate"),
+        (lambda: V2X(burst=0.5), "burst"),
+        (lambda: Sensors(gnss_std=(1, -1, 1)), "gnss_std"),
+        (lambda: Sensors(azimuth_std=4.0), "radians"),
+        (lambda: Sensors(gnss_bias_mode="daily"), "gnss_bias_mode"),
+        (lambda: Sensors(velocity_std_ratio=float("nan")), "velocity_std_ratio"),
+    ],
+)
+def test_bad_configuration_is_named(build, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        build()
+
+
+def test_zero_noise_may_act_but_not_be_assumed(crossing: Fleet) -> None:
+    silent = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
+    with pytest.raises(InputError, match=r"gnss_std.*assumed=Sensors"):
+        observe(crossing, silent)
+    recording = observe(crossing, silent, assumed=S2)
+    assert np.array_equal(recording.gnss[0], crossing.position)
+
+
+def test_draws_belong_to_their_key(crossing: Fleet) -> None:
+    """30 runs are a prefix of 100, K = 2 a part of K = 6, a smaller fleet keeps its draws."""
+    few = observe(crossing, S2, V2X(max_neighbours=2), runs=3, seed=5)
+    many = observe(crossing, S2, V2X(max_neighbours=6), runs=5, seed=5)
+    assert np.array_equal(few.gnss, many.gnss[:3])
+    key = {
+        (s, o, n): k
+        for k, (s, o, n) in enumerate(zip(many.links.step, many.links.observer, many.links.neighbour, strict=True))
+    }
+    same = [key[row] for row in zip(few.links.step, few.links.observer, few.links.neighbour, strict=True)]
+    assert np.array_equal(few.relative, many.relative[:3, same])
+    part = observe(crossing.select(["c3", "c1"]), S2, runs=3, seed=5)
+    assert np.array_equal(part.gnss[:, :, 0], few.gnss[:, :, 3])
+    assert not np.array_equal(observe(crossing, S2, runs=3, seed=6).gnss, few.gnss)
+
+
+def test_noise_has_the_stated_moments() -> None:
+    """Independent check: SciPy's Kolmogorov-Smirnov test against the normal and uniform distributions."""
+    apart = np.broadcast_to(np.array([[0.0, 0, 0], [20, 0, 0]]), (400, 2, 3))
+    fleet = Fleet(("a", "b"), np.arange(400) * 0.1, apart, np.full((400, 2, 3), 8.0))
+    sensors = replace(Sensors.paper_scenario1(), gnss_bias=(0.0, 0.0))
+    recording = observe(fleet, sensors, V2X(max_neighbours=1), runs=20)
+    for draws, std in (
+        (recording.gnss - fleet.position, 1.8),
+        (recording.velocity - fleet.velocity, 1.2),
+        (recording.relative[..., 0] - 20.0, 1.0),
+        (recording.relative[:, recording.links.observer == 0, 1], np.deg2rad(4)),
+    ):
+        assert stats.kstest(draws.ravel() / std, "norm").pvalue > 0.01
+    biased = observe(fleet, Sensors.paper_scenario1(), runs=200).gnss - observe(fleet, sensors, runs=200).gnss
+    assert np.ptp(biased, axis=1).max() < 1e-9
+    assert stats.kstest(biased[:, 0].ravel(), "uniform", args=(0.5, 0.5)).pvalue > 0.01
+    sampled = observe(fleet, replace(Sensors.paper_scenario1(), gnss_bias_mode="sample"), runs=2)
+    assert np.ptp(sampled.gnss - observe(fleet, sensors, runs=2).gnss, axis=1).min() > 0.4
+
+
+def test_velocity_readings() -> None:
+    velocity = np.array([3.0, 4.0, 0.0])
+    assert Sensors(velocity_reading="axis").velocity_std(velocity) == pytest.approx([0.3, 0.4, 0.0])
+    assert Sensors(velocity_reading="speed").velocity_std(velocity) == pytest.approx([0.5, 0.5, 0.5])
+    assert Sensors().assumed_velocity_std(velocity)[2] == 0.05
+
+
+def test_links_are_the_nearest_within_the_radius(crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=3, radius=25.0))
+    for step in (0, 30, 59):
+        for observer in range(8):
+            gap = np.linalg.norm(crossing.position[step] - crossing.position[step, observer], axis=1)
+            expected = [j for j in np.argsort(gap) if j != observer and S2.min_range <= gap[j] <= 25.0][:3]
+            mine = (recording.links.step == step) & (recording.links.observer == observer)
+            assert recording.links.neighbour[mine].tolist() == expected
+
+
+def test_spherical_there_and_back() -> None:
+    vector = np.random.default_rng(0).normal(0, 10, (50, 3))
+    assert to_vector(np.stack(spherical(*vector.T), axis=-1)) == pytest.approx(vector)
+
+
+def test_vector_cov_against_sampling() -> None:
+    """Independent check: the sample covariance of converted draws (small angles, so that first order holds)."""
+    relative, std = np.array([25.0, 0.7, 1.3]), np.array([0.3, 0.01, 0.02])
+    draws = to_vector(relative + np.random.default_rng(1).standard_normal((200_000, 3)) * std)
+    assert vector_cov(relative, std) == pytest.approx(np.cov(draws.T), abs=2e-3)
+
+
+def test_gilbert_elliott_share_and_burst() -> None:
+    """Closed form: stationary loss and mean run length of the two-state chain."""
+    bad = lost(np.random.default_rng(0).uniform(size=(40, 20_000)), loss=0.1, burst=5.0)
+    starts = (bad[:, 1:] & ~bad[:, :-1]).sum()
+    assert bad.mean() == pytest.approx(0.1, rel=0.03)
+    assert bad.sum() / starts == pytest.approx(5.0, rel=0.03)
+
+
+def test_loss_delay_rate_and_cap_act_on_messages(formation: Fleet) -> None:
+    fleet = formation.between(0, 200)
+    ideal = observe(fleet, S2, V2X(max_neighbours=4), runs=6, observers=[0])
+    box = inbox(ideal, 0, FIX_AND_VELOCITY)
+    assert box.fresh.all()
+    assert (box.received_bytes == 200 * 4 * 32).all()
+    assert box.sent_bytes == 200 * 32
+    lossy = inbox(observe(fleet, S2, V2X(max_neighbours=4, loss=0.3), runs=6, observers=[0]), 0, FIX_AND_VELOCITY)
+    assert lossy.received_bytes.mean() == pytest.approx(0.7 * 200 * 4 * 32, rel=0.05)
+    assert np.ptp(lossy.received_bytes) > 0
+    late = inbox(observe(fleet, S2, V2X(max_neighbours=4, latency=0.25), runs=1, observers=[0]), 0, FIX_AND_VELOCITY)
+    at = ideal.links.step[late.link]
+    assert (late.newest[0, at >= 3] == at[at >= 3] - 3).all()
+    assert (late.newest[0, at < 3] == -1).all()
+    slow = inbox(observe(fleet, S2, V2X(max_neighbours=4, rate=2.0), runs=1, observers=[0]), 0, FIX_AND_VELOCITY)
+    assert slow.received_bytes[0] == pytest.approx(200 * 4 * 32 / 5, rel=0.05)
+    assert slow.fresh.mean() == pytest.approx(0.2, abs=0.02)
+    cap = observe(fleet, S2, V2X(max_neighbours=4, bytes_per_second=640), runs=1, observers=[0])
+    capped = inbox(cap, 0, FIX_AND_VELOCITY)
+    assert 0.9 * 640 * 20 <= capped.received_bytes[0] <= 640 * 20
+    heard = [capped.fresh[0, cap.links.neighbour[capped.link] == j].mean() for j in np.unique(cap.links.neighbour)]
+    assert max(heard) > 0.9  # the nearest is heard, the farthest pays
+    assert min(heard) < 0.1
+
+
+def test_a_fix_is_fresh_once(crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=4, rate=3.0, latency=0.1, loss=0.2), runs=4, observers=[0])
+    box = inbox(recording, 0, FIX_AND_VELOCITY)
+    for run in range(4):
+        used = [
+            (recording.links.neighbour[k], s)
+            for k, s, f in zip(box.link, box.newest[run], box.fresh[run], strict=True)
+            if f
+        ]
+        assert len(used) == len(set(used))
+
+
+def test_rate_above_the_step_is_refused(crossing: Fleet) -> None:
+    with pytest.raises(InputError, match="rate = 20"):
+        observe(crossing, S2, V2X(rate=20.0))
+
+
+def test_recording_holds_no_truth(crossing: Fleet) -> None:
+    """No array of the recording holds a true position or velocity, and no field leads to the fleet."""
+    recording = observe(crossing, S2, V2X(max_neighbours=3), runs=2)
+    for name in recording.__dataclass_fields__:
+        value = getattr(recording, name)
+        assert not isinstance(value, Fleet)
+        if isinstance(value, np.ndarray) and value.ndim == 4:
+            assert not np.isclose(value, crossing.position, atol=1e-6).all(axis=(2, 3)).any()
+
+
+def test_unknown_and_unrecorded_egos(crossing: Fleet) -> None:
+    recording = observe(crossing, S2, observers=[1, 2])
+    with pytest.raises(InputError, match="observers"):
+        recording.columns([0])
+    with pytest.raises(InputError, match="egos"):
+        recording.columns(["ghost"])
+    assert recording.columns(["c2", 1]) == [2, 1]
