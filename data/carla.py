@@ -62,7 +62,11 @@ def read_carla(
     names = _columns(table, dict(columns or {}), path.name)
     rows = {key: numeric(table, name, path.name) for key, name in names.items() if key != "id"}
     ids = [str(v) for v in table[names["id"]]] if "id" in names and vehicles is None else None
-    if "t" in rows and ids is not None:
+    if "t" in rows:
+        if ids is None:
+            raise InputError(
+                f"{path.name}: column t", "given", "needs a column id", "Name it in columns=, drop vehicles=."
+            )
         fleet = assemble(ids, rows["t"], _xyz(rows, "{}"), _xyz(rows, "v{}"), dt=dt, file=path.name)
         notes = [f"stamps given, |dx/dt - v| is {disagreement(fleet.position, fleet.velocity, fleet.dt):.1%} of |v|"]
     else:

@@ -86,7 +86,7 @@ def frame(yaw: Floats | None, velocity: Floats, fleet: Fleet) -> tuple[str, str]
     """("left" or "right", why): handedness of the frame of positions and velocities.
 
     CARLA's yaw turns clockwise seen from above. If yaw = -atan2(vy, vx), the positions have been flipped to a
-    right-handed frame and the yaw has not. If yaw = atan2(vy, vx), both are in one frame: the side of the traffic tells which.
+    right-handed frame and the yaw has not. If yaw = atan2(vy, vx), both are in one frame: traffic tells which.
 
     Args:
         yaw: (L,) in degrees or radians, or None. velocity: (L, 3) m/s of the same rows. fleet: the rows in their frame.

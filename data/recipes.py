@@ -23,6 +23,7 @@ class Recipe:
         top_speed: (low, high) m/s, each vehicle's own top speed is uniform between them.
         warmup: seconds that are driven before the first kept step.
         platoon: vehicles that share one random route and start on the same edge.
+        start: SUMO's departPos: "random_free" spreads a platoon over its first edge, "last" queues it.
         lights: True: netconvert guesses junctions with traffic lights, actuated; False: nobody has the right of way.
         turn_acceleration: m/s^2 of lateral acceleration that limits the speed in turns of junctions.
         tours: routes that are repeated instead of random ones, for the first vehicles: edge ids with spaces between.
@@ -45,6 +46,7 @@ class Recipe:
     top_speed: tuple[float, float] = (8.0, 11.0)
     warmup: float = 60.0
     platoon: int = 1
+    start: str = "random_free"
     lights: bool = True
     turn_acceleration: float = 3.0
     tours: tuple[str, ...] = ()
@@ -89,6 +91,8 @@ RECIPES: dict[str, Recipe] = {
             dawdle=0.6,
             tours=(_CLOCKWISE, _ANTICLOCKWISE),
         ),
-        Recipe("town04", "Town04.xodr", vehicles=60, steps=900, seed=5, top_speed=(11.0, 13.5), platoon=10),
+        Recipe(
+            "town04", "Town04.xodr", vehicles=60, steps=900, seed=5, top_speed=(11.0, 13.5), platoon=10, start="last"
+        ),
     )
 }

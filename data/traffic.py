@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from .recipes import Recipe
 Streets = dict[str, tuple[str, ...]]
 VEHICLE_LENGTH = 4.6
 """Metres from bumper to bumper of every generated vehicle."""
+DRIVER = 'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="0.8" minGap="2"'
+"""Krauss' model: m/s^2, s and m as in dense city traffic; dawdling changes once a second, not at every 0.1 s."""
 
 
 def program(name: str) -> Path:
@@ -37,27 +40,19 @@ def build_network(map_file: Path, recipe: Recipe, out: Path) -> None:
         raise InputError(
             "map", map_file, "must be an OpenDRIVE file", "Point --maps at the folder of CARLA's .xodr files."
         )
-    _run(
-        "netconvert",
-        "--opendrive",
-        map_file,
-        "--output-file",
-        out,
-        "--tls.discard-loaded",
-        "--offset.disable-normalization",
-        "--opendrive.curve-resolution",
-        0.5,
-        "--junctions.internal-link-detail",
-        20,
-        "--junctions.limit-turn-speed",
-        recipe.turn_acceleration,
-        "--precision",
-        6,
-        "--tls.guess",
-        str(recipe.lights).lower(),
-        "--tls.default-type",
-        "actuated",
-    )
+    options = {
+        "opendrive": map_file,
+        "output-file": out,
+        "offset.disable-normalization": "true",
+        "opendrive.curve-resolution": 0.5,
+        "junctions.internal-link-detail": 20,
+        "junctions.limit-turn-speed": recipe.turn_acceleration,
+        "tls.discard-loaded": "true",
+        "tls.guess": str(recipe.lights).lower(),
+        "tls.default-type": "actuated",
+        "precision": 6,
+    }
+    _run("netconvert", options)
 
 
 def read_streets(network: Path) -> tuple[Streets, dict[str, float]]:
@@ -95,44 +90,24 @@ def drive(recipe: Recipe, network: Path, routes: Path, out: Path) -> None:
 
     Teleporting is switched off: a vehicle that is stuck stays stuck. Collisions are left to the car-following model.
     """
-    end = recipe.warmup + max(recipe.lengths) * recipe.dt
-    _run(
-        "sumo",
-        "--net-file",
-        network,
-        "--route-files",
-        routes,
-        "--begin",
-        0,
-        "--end",
-        f"{end:.3f}",
-        "--step-length",
-        recipe.dt,
-        "--seed",
-        recipe.seed,
-        "--precision",
-        6,
-        "--fcd-output",
-        out,
-        "--device.fcd.begin",
-        recipe.warmup,
-        "--fcd-output.attributes",
-        "x,y,z,angle,slope,speed",
-        "--lanechange.duration",
-        3,
-        "--time-to-teleport",
-        -1,
-        "--ignore-junction-blocker",
-        5,
-        "--collision.action",
-        "none",
-        "--no-step-log",
-        "true",
-        "--duration-log.disable",
-        "true",
-        "--xml-validation",
-        "never",
-    )
+    options = {
+        "net-file": network,
+        "route-files": routes,
+        "end": f"{recipe.warmup + max(recipe.lengths) * recipe.dt:.3f}",
+        "step-length": recipe.dt,
+        "seed": recipe.seed,
+        "precision": 6,
+        "fcd-output": out,
+        "fcd-output.attributes": "x,y,z,angle,slope,speed",
+        "device.fcd.begin": recipe.warmup,
+        "lanechange.duration": 3,
+        "time-to-teleport": -1,
+        "ignore-junction-blocker": 5,
+        "collision.action": "none",
+        "no-step-log": "true",
+        "xml-validation": "never",
+    }
+    _run("sumo", options)
 
 
 def _tour(tour: str, length: dict[str, float], distance: float) -> list[str]:
@@ -154,16 +129,16 @@ def _walk(streets: Streets, length: dict[str, float], distance: float, rng: np.r
 
 
 def _vehicle(recipe: Recipe, number: int, route: list[str], top_speed: float) -> list[str]:
-    name, place = f"{recipe.name}-{number:02d}", "random_free" if recipe.platoon < 10 else "last"
+    name = f"{recipe.name}-{number:02d}"
     return [
-        f'<vType id="{name}" length="{VEHICLE_LENGTH}" maxSpeed="{top_speed:.3f}" sigma="{recipe.dawdle}" '
-        'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="0.8" minGap="2"/>',
-        f'<vehicle id="{name}" type="{name}" depart="0" departPos="{place}" departLane="random">'
+        f'<vType id="{name}" length="{VEHICLE_LENGTH}" maxSpeed="{top_speed:.3f}" sigma="{recipe.dawdle}" {DRIVER}/>',
+        f'<vehicle id="{name}" type="{name}" depart="0" departPos="{recipe.start}" departLane="random">'
         f'<route edges="{" ".join(route)}"/></vehicle>',
     ]
 
 
-def _run(name: str, *options: object) -> None:
-    done = subprocess.run([program(name), *map(str, options)], capture_output=True, text=True, check=False)
+def _run(name: str, options: Mapping[str, object]) -> None:
+    words = [f"--{key}={value}" for key, value in options.items()]
+    done = subprocess.run([program(name), *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise InputError(name, done.stderr.strip()[-400:], "must run without an error", "Check the map and the recipe.")

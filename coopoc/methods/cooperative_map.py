@@ -24,7 +24,7 @@ from .knowledge import Knowledge, resolve
 from .star import StarStep, star_steps
 from .track import Track
 
-TOLERANCE = 1e-6
+TOLERANCE = 1e-5
 """m, the last Gauss-Newton step of a problem."""
 STACKED = 64
 """Windows of one structure that are solved together, times R."""
@@ -149,7 +149,7 @@ def stack(windows: Sequence[Window], known: Knowledge) -> Problem:
             met.update(seen.members.tolist())
             sights.append(_sight(seen, first, opening=seen is window[0]))
     merged = [_merge(sights) for sights in columns]
-    return chain(merged, None if known.sensors is None else known.sensors.relative_std)
+    return chain(merged, known.sensors)
 
 
 def _sight(seen: Seen, first: Bools, opening: bool) -> Sight:

@@ -11,7 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from .normal import Pattern, pattern
 from .problem import Problem
 
@@ -22,14 +22,14 @@ class Arrow:
 
     Args:
         hub: (h,) points. group: (G, s) points, -1 where a group is smaller.
-        corner, arm, head: (source block, destination, transposed) triples of the three parts.
+        corner, arm, head: source block and destination (group, row, column) of the three parts; blocks are symmetric.
     """
 
     hub: Ints
     group: Ints
-    corner: tuple[Ints, Ints, Ints]
-    arm: tuple[Ints, Ints, Ints]
-    head: tuple[Ints, Ints, Ints]
+    corner: tuple[Ints, ...]
+    arm: tuple[Ints, ...]
+    head: tuple[Ints, ...]
 
 
 def structure(problem: Problem) -> tuple[Pattern, Arrow]:
@@ -58,19 +58,16 @@ def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
         group[g, : len(m)] = m
         place[m] = np.arange(len(m))
     i, j = scheme.pairs.T
-    both = np.concatenate([scheme.pairs, scheme.pairs[i != j][:, ::-1]])
+    row, col = np.concatenate([scheme.pairs, scheme.pairs[i != j][:, ::-1]]).T
     source = np.concatenate([np.arange(len(i)), np.flatnonzero(i != j)])
-    turned = np.concatenate([np.zeros(len(i), np.int64), np.ones(int((i != j).sum()), np.int64)])
-    row, col = both.T
-    in_hub_row, in_hub_col = label[row] < 0, label[col] < 0
+    in_hub = label < 0
 
-    def part(chosen: Ints, at: Ints) -> tuple[Ints, Ints, Ints]:
-        return source[chosen], at[chosen], turned[chosen]
+    def part(chosen: Bools) -> tuple[Ints, ...]:
+        return source[chosen], label[row[chosen]], place[row[chosen]], place[col[chosen]]
 
-    corner = part(np.flatnonzero(in_hub_row & in_hub_col), place[row] * len(hub) + place[col])
-    arm = part(np.flatnonzero(~in_hub_row & in_hub_col), (label[row] * size + place[row]) * len(hub) + place[col])
-    head = part(np.flatnonzero(~in_hub_row & ~in_hub_col), (label[row] * size + place[row]) * size + place[col])
-    return Arrow(hub, group, corner, arm, head)
+    corner = part(in_hub[row] & in_hub[col])
+    return Arrow(hub, group, (corner[0], 0 * corner[1], *corner[2:]),
+                 part(~in_hub[row] & in_hub[col]), part(~in_hub[row] & ~in_hub[col]))  # fmt: skip
 
 
 def _groups(n: int, hub: Ints, pairs: Ints) -> Ints:
@@ -92,20 +89,15 @@ def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Float
     """Corner (B, 3h, 3h), arms (B, G, 3s, 3h) and heads (B, G, 3s, 3s), damping added to the diagonal."""
     batch, h, (count, size) = len(blocks), len(frame.hub), frame.group.shape
 
-    def fill(triple: tuple[Ints, Ints, Ints], shape: tuple[int, ...]) -> Floats:
-        source, at, turned = triple
-        out = np.zeros((batch, int(np.prod(shape)), 3, 3))
-        chosen = blocks[:, source]
-        flip = np.flatnonzero(turned)
-        chosen[:, flip] = np.swapaxes(chosen[:, flip], -1, -2)
-        out[:, at] = chosen
-        out = np.swapaxes(out.reshape(batch, *shape, 3, 3), -3, -2)
-        return out.reshape(batch, *shape[:-2], 3 * shape[-2], 3 * shape[-1])
+    def fill(part: tuple[Ints, ...], groups: int, rows: int, cols: int) -> Floats:
+        out = np.zeros((batch, groups, rows, 3, cols, 3))
+        np.swapaxes(out, 3, 4)[:, part[1], part[2], part[3]] = blocks[:, part[0]]
+        return out.reshape(batch, groups, 3 * rows, 3 * cols)
 
-    corner = fill(frame.corner, (h, h))
+    corner = fill(frame.corner, 1, h, h)[:, 0]
     at = np.arange(3 * h)
     corner[:, at, at] += damping[:, frame.hub].reshape(batch, -1)
-    arm, head = fill(frame.arm, (count, size, h)), fill(frame.head, (count, size, size))
+    arm, head = fill(frame.arm, count, size, h), fill(frame.head, count, size, size)
     extra = np.where((frame.group >= 0)[None, :, :, None], damping[:, frame.group], 1.0)
     at = np.arange(3 * size)
     head[:, :, at, at] += extra.reshape(batch, count, 3 * size)

@@ -46,7 +46,7 @@ def solve_batch(problem: Problem, max_iterations: int = 100, tolerance: float = 
     step = linear_step(problem)
     scheme, frame = structure(problem)
     count = problem.batch or 1
-    per = max(1, CHUNK // (len(scheme.order) + frame.group.size * max(len(frame.hub), 1)))
+    per = max(1, CHUNK // (len(scheme.rows) + frame.group.size * max(len(frame.hub), 1)))
     parts = []
     for first in range(0, count, per):
         part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem

@@ -13,56 +13,67 @@ from .problem import Linear
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Which 3x3 blocks of J^T J exist and what adds up in them; the same for all realisations.
+    """Which 3x3 blocks of J^T J exist and which measurements add up in them; the same for all realisations.
+
+    A measurement with derivative S by its vector adds S^T S to the diagonal blocks of its points and, if it has two,
+    -S^T S to the block between them: every block is symmetric.
 
     Args:
-        points: n. pairs: (P, 2) blocks (i, j), i <= j. order, starts: gather contributions of each block.
-        grad_order, grad_starts, grad_points: the same for the gradient.
-        arity: per factor.
+        points: n. pairs: (P, 2) blocks (i, j), i <= j. rows, starts: measurements of each block, one after the other.
+        pull_rows, pull_signs, pull_starts, pull_points: the same for the gradient, by point.
     """
 
     points: int
     pairs: Ints
-    order: Ints
+    rows: Ints
     starts: Ints
-    grad_order: Ints
-    grad_starts: Ints
-    grad_points: Ints
-    arity: tuple[int, ...]
+    pull_rows: Ints
+    pull_signs: Floats
+    pull_starts: Ints
+    pull_points: Ints
 
 
 def pattern(n: int, nodes: Sequence[Ints]) -> Pattern:
     """Pattern of n points whose factors touch `nodes`, (M, arity) per factor."""
-    keys, points = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    keys, rows, points, signs, point_rows, top = [], [], [], [], [], 0
     for touched in nodes:
-        for p in touched.T:
-            keys.append(p * n + p)
-            points.append(p)
+        row = top + np.arange(len(touched))
+        top += len(touched)
+        ends = ((-1.0, touched[:, 0]), (1.0, touched[:, -1]))[2 - touched.shape[1] :]
+        for sign, point in ends:
+            keys.append(point * n + point)
+            points.append(point)
+            signs.append(np.full(len(touched), sign))
+            point_rows.append(row)
+            rows.append(row)
         if touched.shape[1] == 2:
             keys.append(touched.min(axis=1) * n + touched.max(axis=1))
+            rows.append(row)
     key, point = np.concatenate(keys), np.concatenate(points)
-    order, grad_order = np.argsort(key, kind="stable"), np.argsort(point, kind="stable")
-    unique, starts = np.unique(key[order], return_index=True)
-    grad_points, grad_starts = np.unique(point[grad_order], return_index=True)
-    return Pattern(n, np.stack([unique // n, unique % n], axis=1), order, starts, grad_order, grad_starts, grad_points,
-                   tuple(touched.shape[1] for touched in nodes))  # fmt: skip
+    order, pull_order = np.argsort(key, kind="stable"), np.argsort(point, kind="stable")
+    blocks, starts = np.unique(key[order], return_index=True)
+    pull_points, pull_starts = np.unique(point[pull_order], return_index=True)
+    return Pattern(
+        n, np.stack([blocks // n, blocks % n], axis=1), np.concatenate(rows)[order], starts,
+        np.concatenate(point_rows)[pull_order], np.concatenate(signs)[pull_order][:, None], pull_starts, pull_points,
+    )  # fmt: skip
 
 
 def normal_equations(scheme: Pattern, linear: Linear) -> tuple[Floats, Floats]:
     """Blocks (B, P, 3, 3) of J^T J in the pattern's order and the gradient J^T r (B, n, 3)."""
     batch = len(linear.x)
-    blocks, pulls = [], []
-    for arity, residual, slope in zip(scheme.arity, linear.residual, linear.slope, strict=True):
-        turned = np.swapaxes(slope, -1, -2)
-        count = residual.shape[1]
-        square = np.broadcast_to(turned @ slope, (batch, count, 3, 3)).reshape(batch, count, 9)
-        pull = np.broadcast_to((turned @ residual[..., None])[..., 0], (batch, count, 3))
-        blocks += [square] if arity == 1 else [square, square, -square]
-        pulls += [pull] if arity == 1 else [-pull, pull]
-    gathered = np.concatenate(blocks, axis=1)[:, scheme.order]
-    summed = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(batch, -1, 3, 3)
+    count = sum(r.shape[1] for r in linear.residual)
+    squares, pulls = np.empty((batch, count, 3, 3)), np.empty((batch, count, 3))
+    top = 0
+    for residual, slope in zip(linear.residual, linear.slope, strict=True):
+        turned, at = np.swapaxes(slope, -1, -2), slice(top, top + residual.shape[1])
+        squares[:, at] = turned @ slope
+        pulls[:, at] = (turned @ residual[..., None])[..., 0]
+        top = at.stop
+    gathered = squares.reshape(batch, count, 9)[:, scheme.rows]
+    blocks = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(batch, -1, 3, 3)
+    blocks[:, scheme.pairs[:, 0] != scheme.pairs[:, 1]] *= -1.0
     gradient = np.zeros((batch, scheme.points, 3))
-    gradient[:, scheme.grad_points] = np.add.reduceat(
-        np.concatenate(pulls, axis=1)[:, scheme.grad_order], scheme.grad_starts, axis=1
-    )
-    return summed, gradient
+    signed = pulls[:, scheme.pull_rows] * scheme.pull_signs
+    gradient[:, scheme.pull_points] = np.add.reduceat(signed, scheme.pull_starts, axis=1)
+    return blocks, gradient

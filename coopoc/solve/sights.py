@@ -51,14 +51,12 @@ class Sight:
     relative: Floats
 
 
-def chain(
-    sights: Sequence[Sight], relative_std: Floats | None, names: Sequence[str] | None = None
-) -> Problem:
+def chain(sights: Sequence[Sight], sensors: Sensors | None, names: Sequence[str] | None = None) -> Problem:
     """The problem of consecutive sights: a point per member and step, the ego's points being the hub.
 
     Args:
-        sights: oldest first. relative_std: (3,) m, rad, rad of exact spherical factors; None: the converted vector has
-            unit covariance, as the paper's identity baselines assume.
+        sights: oldest first. sensors: relative noise of exact spherical factors; None: the converted vector has unit
+            covariance, as the paper's identity baselines assume.
         names: of the points, step by step; default their numbers.
     """
     top = np.concatenate([[0], np.cumsum([len(s.kept) for s in sights])])
@@ -74,13 +72,26 @@ def chain(
                             for s, a in zip(sights, top[:-1], strict=True)])  # fmt: skip
     if len(edges):
         relative = np.concatenate([s.relative for s in sights], axis=-2)
-        exact = relative_std is not None
         factors.append(
-            Factor("spherical", edges, relative, relative_std) if exact
-            else Factor("displacement", edges, to_vector(relative), np.ones(3))
+            Factor("displacement", edges, to_vector(relative), np.ones(3)) if sensors is None
+            else Factor("spherical", edges, relative, relative_std(relative, sensors))
         )  # fmt: skip
     hub = tuple(int(a) for a in top[:-1])
     return Problem(tuple(names or map(str, range(top[-1]))), tuple(factors), hub=hub)
+
+
+def relative_std(relative: Floats, sensors: Sensors) -> Floats:
+    """Std (3,), or (..., M, 3) if a range is below `min_range`: its angles are widened by min_range / d.
+
+    Centres are never closer than `min_range`, so that such a range is noise, and without this the angles would place the
+    neighbour to the centimetre (performance.md G1 of the design notes; `vector_cov` does the same).
+    """
+    wide = np.maximum(sensors.min_range / relative[..., 0], 1.0)
+    if (wide == 1.0).all():
+        return sensors.relative_std
+    scale = np.stack([np.ones_like(wide), wide, wide], axis=-1)
+    limit = np.array([np.inf, np.pi, np.pi])
+    return np.minimum(scale * sensors.relative_std, limit)
 
 
 def _joined(sights: Sequence[Sight], *fields: str) -> list[Floats]:
@@ -102,8 +113,7 @@ def window_problem(
         sights.append(_sight(recording, s, members, kept, links, run, noise))
         names += [recording.ids[m] if length == 1 else f"{recording.ids[m]}@{s}" for m in members]
         before = members
-    sensors = recording.sensors if noise is None else noise.sensors
-    return chain(sights, None if sensors is None else sensors.relative_std, names)
+    return chain(sights, recording.sensors if noise is None else noise.sensors, names)
 
 
 def _sight(

@@ -24,6 +24,9 @@ from .publish import publish
 from .results import Results
 from .study import Cell, Params, Row, Study
 
+IDLE = 15.0
+"""s after which an idle worker leaves; it bounds the life of orphans when this process is killed."""
+
 
 def run(
     study: Study | str,
@@ -129,7 +132,7 @@ def _compute(function: Callable[[Params], list[Row]], cells: Sequence[Cell], job
     if jobs == 1 or len(cells) < 2:
         yield from (attempt(function, cell) for cell in cells)
         return
-    with parallel_config(backend="loky", inner_max_num_threads=1):
+    with parallel_config(backend="loky", inner_max_num_threads=1, idle_worker_timeout=IDLE):
         workers = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
         try:
             yield from workers(delayed(attempt)(function, cell) for cell in cells)

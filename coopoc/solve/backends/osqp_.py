@@ -21,6 +21,8 @@ from .run import Ended, Run
 
 SETTINGS = {"scaling": 0, "rho": 1e-4, "alpha": 1.0, "sigma": 1e-6, "eps_abs": 1e-12, "eps_rel": 1e-12, "max_iter": 200,
             "check_termination": 1, "polishing": False, "adaptive_rho": 0, "warm_starting": True, "verbose": False}  # fmt: skip
+NEGLIGIBLE = 1e-11
+"""m, an error of a coordinate that no tolerance asks to be smaller."""
 REPAIRS = 5
 """How often a quadratic programme is continued before its answer is refused."""
 
@@ -73,7 +75,7 @@ def _checked(solver: Any, upper: Any, q: Floats, tolerance: float, counts: dict[
         dx = np.asarray(answer.x, dtype=np.float64)
         force = upper @ dx + upper.T @ dx - weight * dx
         size = max(np.abs(q).max(), np.abs(weight * dx).max())
-        if np.abs(force + q).max() <= tolerance * size + 1e-300:
+        if np.all(np.abs(force + q) <= tolerance * size + NEGLIGIBLE * weight):
             return dx
         if attempt < REPAIRS:
             counts["repairs"] += 1

@@ -1,0 +1,39 @@
+# make paper   the environment, the training, the studies, the report in runs/paper/
+# make test    the environment, then style, types and tests
+# make clean   forget the environment (results in runs/ stay)
+#
+# TORCH_INDEX: where the package index serves torch's CUDA build (several GB; it works, too), name an index of CPU builds:
+#   make paper TORCH_INDEX=https://download.pytorch.org/whl/cpu
+PYTHON ?= python3
+TORCH_INDEX ?=
+JOBS ?= 2
+VENV := .venv
+READY := $(VENV)/.ready
+PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
+	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+
+.PHONY: paper test clean
+
+paper: $(READY)
+	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
+
+test: $(VENV)/.ready-dev
+	$(VENV)/bin/ruff check .
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
+
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "coopoc needs Python 3.11 or later: make PYTHON=python3.11")'
+	@test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV) || \
+		{ rm -rf $(VENV); echo "No venv module: apt-get install python3-venv, then repeat."; exit 1; }
+	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
+	$(PIP) setuptools wheel torch
+	$(PIP) --no-build-isolation --editable .
+	@touch $(READY)
+
+$(VENV)/.ready-dev: $(READY)
+	@echo "Installing the tools of the tests." >&2
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV)
