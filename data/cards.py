@@ -58,7 +58,7 @@ class Card:
         """The card as a text to read."""
         rows = {
             "map": f"{self.map}, {self.map_licence}",
-            "made by": f"{self.command} (SUMO {self.sumo}, seed {self.recipe['seed']})",
+            "made by": f"{self.command} (SUMO {self.sumo})",
             "sha256": self.sha256,
             "size": f"{self.vehicles} vehicles x {self.steps} steps of {self.dt:g} s",
             "speed": "{min:g}..{max:g} m/s, mean {mean:g}, 5..95 %: {p05:g}..{p95:g}, standing {standing:.0%}".format(
@@ -80,7 +80,7 @@ def card_of(fleet: Fleet, recipe: Recipe) -> Card:
         name=recipe.name,
         map=recipe.map,
         map_licence=MAP_LICENCE,
-        command=f"coopoc data make {recipe.name} --maps FOLDER",
+        command=f"coopoc data make {recipe.name} --maps FOLDER --seed {recipe.seed}",
         sumo=version("eclipse-sumo"),
         sha256=fleet.digest,
         recipe=asdict(recipe),
@@ -95,7 +95,12 @@ def card_of(fleet: Fleet, recipe: Recipe) -> Card:
 
 
 def speed_statistics(fleet: Fleet) -> dict[str, Any]:
-    """Distribution of the speed over all vehicles and steps, m/s; per vehicle too if there are fewer than ten."""
+    """Distribution of the speed over all vehicles and steps, m/s; per vehicle too if there are fewer than ten.
+
+    >>> u = np.array([[[3.0, 4, 0]], [[0, 0, 0]]])
+    >>> speed_statistics(Fleet(("a",), [0, 0.1], 0 * u, u))["standing"]
+    0.5
+    """
     speed = np.linalg.norm(fleet.velocity, axis=2)
     values = [np.nanmin(speed), *np.nanpercentile(speed, [5, 95]), np.nanmean(speed), np.nanmax(speed)]
     out: dict[str, Any] = dict(zip(("min", "p05", "p95", "mean", "max"), _rounded(values), strict=True))
@@ -106,7 +111,12 @@ def speed_statistics(fleet: Fleet) -> dict[str, Any]:
 
 
 def neighbour_statistics(fleet: Fleet, radius: float = RADIUS, cap: int = CAP) -> dict[str, float]:
-    """Number of neighbours within `radius` metres, at most `cap`, over all present vehicles and steps."""
+    """Number of neighbours within `radius` metres, at most `cap`, over all present vehicles and steps.
+
+    >>> x = np.array([[[0.0, 0, 0], [9, 0, 0], [99, 0, 0]]] * 2)
+    >>> neighbour_statistics(Fleet(("a", "b", "c"), [0, 0.1], x, 0 * x))["mean"]
+    0.667
+    """
     counts = np.array([_neighbours(x, radius, cap) for x in fleet.position])
     per_vehicle = np.nanmean(counts, axis=0)
     values = [np.nanmean(counts), np.nanmean(counts[fleet.present] > 0), per_vehicle.min(), per_vehicle.max()]

@@ -28,7 +28,11 @@ def row_order(ids: list[str]) -> str | None:
 
 
 def disagreement(position: Floats, velocity: Floats, dt: float) -> float:
-    """rms |dx/dt - v| / rms |v| over (T, N, 3) arrays, v being the mean over the step; inf if nothing moves."""
+    """rms |dx/dt - v| / rms |v| over (T, N, 3) arrays, v being the mean over the step; inf if nothing moves.
+
+    >>> disagreement(np.arange(3.0).reshape(3, 1, 1), np.full((3, 1, 1), 10.0), 0.1)
+    0.0
+    """
     slope = np.diff(position, axis=0) / dt
     middle = (velocity[1:] + velocity[:-1]) / 2
     size = np.sqrt(np.nanmean(middle**2))
@@ -39,6 +43,9 @@ def interval(position: Floats, velocity: Floats, dt: float | None = None) -> tup
     """(dt s, disagreement) of the candidate that agrees best, or of the dt that is given.
 
     The candidates differ by factors of 1.5 and more, so a disagreement below 0.3 leaves no second one.
+
+    >>> interval(np.arange(3.0).reshape(3, 1, 1), np.full((3, 1, 1), 10.0))
+    (0.1, 0.0)
     """
     size, best = min((disagreement(position, velocity, d), d) for d in (INTERVALS if dt is None else (dt,)))
     return best, size
@@ -49,6 +56,10 @@ def yaw_reading(yaw: Floats, velocity: Floats) -> tuple[str, int] | None:
 
     Args:
         yaw: (...,) in an unknown unit. velocity: (..., 3) m/s.
+
+    >>> course = np.linspace(-3.0, 3.0, 9)
+    >>> yaw_reading(np.degrees(course), 5 * np.column_stack([np.cos(course), np.sin(course), 0 * course]))
+    ('degrees', 1)
     """
     moving = np.hypot(velocity[..., 0], velocity[..., 1]) > 1.0
     if not moving.any():
@@ -67,6 +78,9 @@ def oncoming_on_left(position: Floats, velocity: Floats) -> tuple[int, int]:
     """(left, all) instants at which an oncoming vehicle passes within 12 m; left as in a right-handed frame.
 
     CARLA's towns drive on the right: oncoming traffic is on the left, unless the frame is mirrored.
+
+    >>> oncoming_on_left(np.array([[[0.0, 0, 0], [0, 4, 0]]]), np.array([[[9.0, 0, 0], [-9, 0, 0]]]))
+    (2, 2)
     """
     left = total = 0
     for x, u in zip(position[..., :2], velocity[..., :2], strict=True):

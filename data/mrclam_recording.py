@@ -6,7 +6,7 @@ import numpy as np
 
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.world.recording import Links, Recording
-from coopoc.world.sensing import _messages, observe
+from coopoc.world.sensing import observe, schedule
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
@@ -42,7 +42,7 @@ def recording(
     azimuth = log.bearing[index] + log.observer_heading[index]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
     relative = np.column_stack([log.range[index], azimuth, np.full(len(index), np.pi / 2)])
-    sent, arrival = _messages(log.fleet, links, v2x, runs, seed)
+    sent, arrival = schedule(log.fleet, links, v2x, runs, seed)
     return Recording(
         ids=log.fleet.ids,
         t=log.fleet.t,

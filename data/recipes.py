@@ -24,7 +24,7 @@ class Recipe:
         warmup: seconds that are driven before the first kept step.
         platoon: vehicles that share one random route and start on the same edge.
         start: SUMO's departPos: "random_free" spreads a platoon over its first edge, "last" queues it.
-        lights: True: netconvert guesses junctions with traffic lights, actuated; False: nobody has the right of way.
+        lights: True: netconvert guesses junctions with traffic lights, actuated; False: junctions of equal rank.
         turn_acceleration: m/s^2 of lateral acceleration that limits the speed in turns of junctions.
         tours: routes that are repeated instead of random ones, for the first vehicles: edge ids with spaces between.
         dawdle: Krauss' sigma in 0..1, how irregularly a driver keeps the speed.

@@ -17,7 +17,12 @@ UNIT = 1e-4
 
 
 def quantise(fleet: Fleet) -> Fleet:
-    """The fleet on the grid of 0.1 mm, with u_t = (x_t - x_{t-1})/dt and u_0 := u_1: what `save` keeps exactly."""
+    """The fleet on the grid of 0.1 mm, with u_t = (x_t - x_{t-1})/dt and u_0 := u_1: what `save` keeps exactly.
+
+    >>> x = np.array([[[0.0, 0, 0]], [[0.123456, 0, 0]]])
+    >>> quantise(Fleet(("a",), [0, 0.1], x, x)).position[1, 0, 0]
+    np.float64(0.1235)
+    """
     return _fleet(fleet.ids, _units(fleet.position), ~np.isnan(fleet.position[..., 0]), fleet.dt, fleet.name)
 
 

@@ -48,6 +48,16 @@ class Federation:
     sizes: tuple[int, ...]
     seconds: float
 
+    @property
+    def best(self) -> Round:
+        """The round whose weights are kept: the least validation loss, clients weighted by their sizes."""
+        return min(self.history, key=self.validation_loss)
+
+    def validation_loss(self, row: Round) -> float:
+        """Validation loss of a round over all clients, m^2; infinite if it is not finite."""
+        total = sum(n * loss for n, loss in zip(self.sizes, row.validation_loss, strict=True)) / sum(self.sizes)
+        return total if math.isfinite(total) else math.inf
+
     def after(self, number: int) -> GainNet:
         """The global net after round `number`, 0 being the start."""
         if not 0 <= number < len(self.history):
@@ -173,9 +183,6 @@ def _rows(
 
 
 def _chosen(history: Sequence[Round], sizes: Tensor, like: GainNet, seconds: float) -> Federation:
-    """The federation with the weights of the round whose size-weighted validation loss is least."""
-    share = sizes / sizes.sum()
-    scores = [float((torch.tensor(row.validation_loss) * share).sum()) for row in history]
-    best = min(range(len(scores)), key=lambda i: scores[i] if math.isfinite(scores[i]) else math.inf)
-    model = unflatten(history[best].weights[None], like)[0]
-    return Federation(model, tuple(history), tuple(sizes.tolist()), seconds)
+    """The federation with the weights of its best round."""
+    federation = Federation(like, tuple(history), tuple(sizes.tolist()), seconds)
+    return replace(federation, model=federation.after(federation.best.number))

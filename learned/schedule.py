@@ -33,11 +33,11 @@ class Schedule:
     """gamma of the paper's gamma ||theta||^2 in the loss; weaker than the decoupled decay under static noise."""
     clip: float = 1.0
     """Largest norm of a model's gradient."""
-    check: int = 25
-    """Optimiser steps between validations; the best weights seen are kept."""
+    checks: int = 20
+    """Validations spread over the training, as many as the paper has rounds; the best weights seen are kept."""
 
     def __post_init__(self) -> None:
-        for field in ("epochs", "batch", "learning_rate", "clip", "check"):
+        for field in ("epochs", "batch", "learning_rate", "clip", "checks"):
             if not getattr(self, field) > 0:
                 raise InputError(field, getattr(self, field), "must be > 0", f"Give Schedule({field}=...).")
         if self.weight_decay < 0 or self.l2 < 0:

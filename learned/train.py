@@ -34,11 +34,13 @@ class Task:
     name: str = "net"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Progress:
-    """A row of a history: optimiser steps so far, mean training loss since the last row and validation loss, m^2."""
+    """A row of a history: optimiser steps so far, weights (P,), mean training loss since the last row and validation
+    loss, m^2."""
 
     step: int
+    weights: Tensor
     training_loss: float
     validation_loss: float
 
@@ -98,20 +100,21 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     best, lowest = theta.clone(), judge(theta)
     if not lowest.isfinite().all():
         raise InputError("model", "untrained net", "has no finite validation loss", "Use GainNet(start_gain=0.1).")
-    history = [[Progress(0, math.nan, float(low))] for low in lowest]
+    history = [[Progress(0, w.clone(), math.nan, float(low))] for w, low in zip(theta, lowest, strict=True)]
     stopped: dict[int, str] = {}
     seen: list[Tensor] = []
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
+    due = set(np.linspace(0, max(map(len, plans)), schedule.checks + 1).round().astype(int).tolist())
     draws = [generator(draw) for draw in streams]
     for step, losses in bar(descend(theta, like, pool, plans, rates, schedule, draws, stopped), plans, progress):
         seen.append(losses)
-        if step % schedule.check == 0 or step == max(map(len, plans)):
+        if step in due:
             found, mean = judge(theta), torch.stack(seen).nanmean(0)
             better = found < lowest
             best[better], lowest[better] = theta[better], found[better]
             for row in range(len(tasks)):
                 if row not in stopped:
-                    history[row].append(Progress(step, float(mean[row]), float(found[row])))
+                    history[row].append(Progress(step, theta[row].clone(), float(mean[row]), float(found[row])))
             seen.clear()
     seconds = (time.perf_counter() - began) / len(tasks)
     models = unflatten(best, like)

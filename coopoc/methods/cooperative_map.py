@@ -13,6 +13,7 @@ from tqdm import tqdm
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..solve.batch import solve_batch
+from ..solve.initial import converted
 from ..solve.problem import Problem
 from ..solve.sights import Sight, chain
 from ..solve.solution import Status
@@ -26,6 +27,8 @@ from .track import Track
 
 TOLERANCE = 1e-5
 """m, the last Gauss-Newton step of a problem."""
+LEAST_GROUND = 0.25
+"""m, two vehicles whose centres are closer on the ground than this stand in one place."""
 STACKED = 64
 """Windows of one structure that are solved together, times R."""
 
@@ -34,10 +37,12 @@ STACKED = 64
 class CooperativeMAP:
     """argmin of 1/2 sum |W (h(x) - z)|^2 over the ego and its neighbours at the last `window` steps (methods.md 6.0).
 
-    Window 1 is the snapshot maximum likelihood; a longer one adds odometry, dt u with the assumed process noise, between
-    the steps: a smoother whose newest point is the estimate, without a prior from before the window. Relative measurements
-    are exact factors in range and angles, or with identity knowledge unit-weight vectors. Neighbours are used as far as
-    their messages have arrived: a late one is brought forward with its last velocity, one never heard is left out.
+    Window 1 is the snapshot maximum likelihood; a longer one adds odometry, dt u with the assumed process noise, from
+    step to step: a smoother whose newest point is the estimate, without a prior from before the window. Relative
+    measurements are exact factors in range and angles, or with identity knowledge unit-weight vectors. Neighbours are
+    used as far as their messages have arrived: a late one is brought forward with its last velocity, one never heard
+    is left out. Where the minimum puts two vehicles in one place, which a short noisy range can do and where angles
+    have no derivative, the converted (linear) problem answers instead, and the notes count it.
 
     Args:
         backend: of `coopoc.solve.backends()`. Only gauss-newton batches over the runs; the others loop, and their
@@ -66,42 +71,56 @@ class CooperativeMAP:
         x, cov = np.empty(shape), np.empty((*shape, 3))
         neighbours = np.full_like(recording.relative, np.nan)
         received, sent = np.zeros((2, recording.runs, len(columns)))
-        stopped = 0
+        replaced = 0
         with tqdm(total=len(columns) * len(recording.t), desc=self.name, unit="step", delay=2.0) as bar:
             for e, ego in enumerate(columns):
                 box = inbox(recording, ego, self.message)
                 received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
                 for windows in alike(_windows(recording, ego, box, known, self.window)):
-                    points, spread, failed = self._solve(windows, known)
+                    points, spread, met = self._solve(windows, known)
                     for k, window in enumerate(windows):
                         newest = window[-1]
                         t = newest.star.step
                         x[:, t, e], cov[:, t, e] = points[k, :, 0], spread[k]
                         neighbours[:, newest.star.links] = np.where(newest.held[:, 1:, None], points[k, :, 1:], np.nan)
-                    stopped += failed
+                    replaced += met
                     bar.update(len(windows))
         return Track(
             recording.t, tuple(columns), x, cov, received, sent, time.perf_counter() - began, neighbours,
-            self._notes(stopped),
+            self._notes(replaced),
         )  # fmt: skip
 
     def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, int]:
-        """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many missed a minimum."""
+        """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were replaced."""
         problem = stack(windows, known)
         ego, last = problem.hub[-1], len(windows[0][-1].members)
         if self.backend == "gauss-newton":
             answer = solve_batch(problem, tolerance=TOLERANCE)
-            x, spread, failed = answer.x, answer.covariance[:, ego], int((~answer.converged).sum())
+            x, spread, sound = answer.x, answer.covariance[:, ego], answer.converged
         else:
             each = [solve(problem.pick(b), self.backend, throw=False) for b in range(problem.batch or 1)]
             x, spread = np.stack([s.x for s in each]), np.stack([s.covariance[ego] for s in each])
-            failed = sum(s.status is not Status.SOLVED for s in each)
+            sound = np.array([s.status is Status.SOLVED for s in each])
+        met = np.flatnonzero(~sound | _meeting(problem, x))
+        if len(met):
+            linear = solve_batch(converted(problem.pick(met)), tolerance=TOLERANCE)
+            x[met], spread[met] = linear.x, linear.covariance[:, ego]
         shape = (len(windows), len(x) // len(windows))
-        return x[:, -last:].reshape(*shape, last, 3), spread.reshape(*shape, 3, 3), failed
+        return x[:, -last:].reshape(*shape, last, 3), spread.reshape(*shape, 3, 3), len(met)
 
-    def _notes(self, stopped: int) -> tuple[str, ...]:
+    def _notes(self, replaced: int) -> tuple[str, ...]:
         loop = () if self.backend == "gauss-newton" else (f"{self.backend} loops over the runs",)
-        return (*loop, f"{stopped} problems stopped before a minimum") if stopped else loop
+        return (*loop, f"{replaced} problems where vehicles met were solved converted") if replaced else loop
+
+
+def _meeting(problem: Problem, x: Floats) -> Bools:
+    """(B,) True where a solution (B, n, 3) puts an observer and the vehicle that it sees in one place on the ground."""
+    met = np.zeros(len(x), dtype=bool)
+    for factor in problem.factors:
+        if factor.kind == "spherical":
+            gap = x[:, factor.nodes[:, 1], :2] - x[:, factor.nodes[:, 0], :2]
+            met |= (np.linalg.norm(gap, axis=-1) < LEAST_GROUND).any(axis=1)
+    return met
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +147,7 @@ def _windows(recording: Recording, ego: int, box: Inbox, known: Knowledge, lengt
 
 
 def alike(windows: Iterator[Window]) -> Iterator[list[Window]]:
-    """Windows of the same structure together, so that one batch solves them: a drive of snapshots has K + 1 structures."""
+    """Windows of the same structure together, for one batch to solve: a drive of snapshots has K + 1 structures."""
     waiting: dict[tuple[bytes, ...], list[Window]] = defaultdict(list)
     for window in windows:
         first, *later = window

@@ -1,4 +1,4 @@
-"""Arrowhead elimination: groups of points that only meet at a hub are solved by its Schur complement, B problems at once.
+"""Arrowhead elimination: groups of points that only meet at a hub, by its Schur complement, B problems at once.
 
 A snapshot is a hub of one (the ego) with groups of one (its neighbours); a window is a hub of the ego's points with one
 group per neighbour's chain. One Schur complement serves both, batched in LAPACK.

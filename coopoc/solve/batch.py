@@ -20,7 +20,7 @@ CHUNK = 40_000
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Solutions of B realisations: x (B, n, 3) m, covariance (B, n, 3, 3) m^2, cost (B,), iterations (B,), converged (B,)."""
+    """Solutions of B realisations: x (B, n, 3) m, covariance (B, n, 3, 3) m^2, the others (B,)."""
 
     x: Floats
     covariance: Floats

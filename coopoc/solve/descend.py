@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats, Ints
 from .problem import Linear, Problem
 
 Step = Callable[[Linear, Floats], Floats]
-"""(linearisation, damping (B, n, 3)) -> dx (B, n, 3) of (J^T J + diag(damping)) dx = -J^T r; LinAlgError if singular."""
+"""(linearisation, damping (B, n, 3)) -> dx (B, n, 3) of (J^T J + diag(damping)) dx = -J^T r; LinAlgError: singular."""
 
 GIVE_UP = 1e12
 """Damping beyond which no step can help."""
@@ -52,7 +52,8 @@ def descend(problem: Problem, step: Step, x: Floats, max_iterations: int = 100, 
             small = solved & (np.abs(dx).max(axis=(1, 2)) <= tolerance)
             better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
         best[active[better]] = trial.x[better]
-        mu[active] = np.where(better, np.where(mu[active] > 1e-8, mu[active] / 10, 0.0), np.maximum(10 * mu[active], 1e-4))
+        lower = np.where(mu[active] > 1e-8, mu[active] / 10, 0.0)
+        mu[active] = np.where(better, lower, np.maximum(10 * mu[active], 1e-4))
         done[active[better & small]] = True
         going = ~(better & small) & (mu[active] < GIVE_UP)
         if not going.any():
@@ -77,7 +78,7 @@ def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floa
             dx = step(linear, damping)
     except np.linalg.LinAlgError:
         return np.zeros_like(linear.x), np.zeros(len(linear.x), dtype=bool)
-    finite: Bools = np.isfinite(dx).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(dx).all(axis=(1, 2)))
     return np.where(finite[:, None, None], dx, 0.0), finite
 
 
@@ -86,5 +87,5 @@ def _scale(problem: Problem, linear: Linear) -> Floats:
     total = np.zeros_like(linear.x)
     for factor, slope in zip(problem.factors, linear.slope, strict=True):
         for column in factor.nodes.T:
-            np.add.at(total, (slice(None), column), np.square(slope).sum(axis=-2))
+            np.add.at(total.swapaxes(0, 1), column, np.square(slope).sum(axis=-2).swapaxes(0, 1))
     return total

@@ -48,7 +48,8 @@ class Factor:
         if self.std is not None:
             object.__setattr__(self, "std", _std(known, self.std, self.z.shape))
         else:
-            object.__setattr__(self, "sqrt_information", _root(known, self.sqrt_information, self.z.shape))
+            root = np.asarray(self.sqrt_information, dtype=np.float64)
+            object.__setattr__(self, "sqrt_information", _root(known, root, self.z.shape))
 
     @property
     def measurement(self) -> Measurement:
@@ -67,7 +68,7 @@ class Factor:
     @property
     def informative(self) -> Bools:
         """(M,) or (B, M) True where the measurement says anything at all."""
-        weight = 1.0 / self.std if self.std is not None else np.abs(self.sqrt_information).sum(axis=-1)
+        weight = np.abs(self.root).sum(axis=-1)
         says: Bools = np.broadcast_to((weight > 0).any(axis=-1), (*weight.shape[:-2], len(self.nodes)))
         return says
 
@@ -86,6 +87,7 @@ class Factor:
         if self.std is not None:
             weight = 1.0 / self.std
             return weight * residual, None if slope is None else weight[..., None] * slope
+        assert self.sqrt_information is not None
         root = self.sqrt_information
         return (root @ residual[..., None])[..., 0], None if slope is None else root @ slope
 
@@ -158,7 +160,7 @@ def _std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) -> Floa
     return frozen(wide)
 
 
-def _root(known: Measurement, root: npt.ArrayLike | None, shape: tuple[int, ...]) -> Floats:
+def _root(known: Measurement, root: Floats, shape: tuple[int, ...]) -> Floats:
     array = frozen(root)
     array = array[None] if array.ndim == 2 else array
     size = known.size

@@ -51,13 +51,14 @@ class Problem:
         names: (n,) unique names of the points.
         factors: the measurements.
         x0: (n, 3) or (B, n, 3) m where the solver starts; None: the converted measurements' linear solution.
-        hub: points that the others hang on, such as the ego at each step. What remains without them must fall into small
-            groups (the neighbours); they are eliminated last and the last of them is the one that a Solution shows.
+        hub: points that the others hang on, such as the ego at each step. What remains without them must fall into
+            small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
 
     Raises:
         InputError: repeated names, factors on unknown points, shapes that do not agree.
 
-    >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0).add("displacement", "ab", [5, 0, 0], std=1)
+    >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
+    >>> problem = problem.add("displacement", ("a", "b"), [5, 0, 0], std=1.0)
     >>> problem.cost(np.array([[0, 0, 0], [6.0, 0, 0]]))
     0.5
     """
@@ -177,8 +178,9 @@ class Problem:
 
     @classmethod
     def from_window(
-        cls, recording: Recording, step: int, ego: int | str, length: int, run: int | None = 0, noise: Noise | None = None
-    ) -> Problem:
+        cls, recording: Recording, step: int, ego: int | str, length: int, run: int | None = 0,
+        noise: Noise | None = None,
+    ) -> Problem:  # fmt: skip
         """The stars of the last `length` steps, one point per vehicle and step, joined by odometry dt u.
 
         Arguments and errors as `from_snapshot`; the first step of the window must exist.
@@ -239,7 +241,7 @@ def _rows(problem: Problem, kind: str, nodes: Any, z: npt.ArrayLike) -> tuple[In
     flat = [p for row in flat for p in (row if isinstance(row, list | tuple | np.ndarray) else [row])]
     if len(flat) % known.arity or not flat:
         raise InputError("nodes", nodes, f"must name {known.arity} points per {kind}", "Give points by name or index.")
-    index = np.array([problem.index(p) for p in flat]).reshape(-1, known.arity)
+    index = np.array([problem.index(p if isinstance(p, str) else int(p)) for p in flat]).reshape(-1, known.arity)
     values = np.asarray(z, dtype=np.float64)
     return index, values.reshape(len(index), -1) if values.ndim < 2 else values
 

@@ -83,15 +83,16 @@ def chain(sights: Sequence[Sight], sensors: Sensors | None, names: Sequence[str]
 def relative_std(relative: Floats, sensors: Sensors) -> Floats:
     """Std (3,), or (..., M, 3) if a range is below `min_range`: its angles are widened by min_range / d.
 
-    Centres are never closer than `min_range`, so that such a range is noise, and without this the angles would place the
-    neighbour to the centimetre (performance.md G1 of the design notes; `vector_cov` does the same).
+    Centres are never closer than `min_range`, so that such a range is noise, and without this the angles would place
+    the neighbour to the centimetre (performance.md G1 of the design notes; `vector_cov` does the same).
     """
     wide = np.maximum(sensors.min_range / relative[..., 0], 1.0)
     if (wide == 1.0).all():
         return sensors.relative_std
     scale = np.stack([np.ones_like(wide), wide, wide], axis=-1)
     limit = np.array([np.inf, np.pi, np.pi])
-    return np.minimum(scale * sensors.relative_std, limit)
+    widened: Floats = np.minimum(scale * sensors.relative_std, limit)
+    return widened
 
 
 def _joined(sights: Sequence[Sight], *fields: str) -> list[Floats]:

@@ -52,14 +52,15 @@ class Solution:
 
     def __getitem__(self, point: str) -> Floats:
         """(3,) m estimate of a point by name."""
-        return self.x[self.names.index(point)]
+        where: Floats = self.x[self.names.index(point)]
+        return where
 
     def __str__(self) -> str:
         at = ", ".join(f"{v:.2f}" for v in self.x[self.shown])
         spread = ", ".join(f"{v:.2f}" for v in np.sqrt(np.diag(self.covariance[self.shown])))
         return (
-            f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; cost {self.cost:.4g}, "
-            f"gradient {self.gradient:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"
+            f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; "
+            f"cost {self.cost:.4g}, gradient {self.gradient:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"
         )
 
 

@@ -50,7 +50,7 @@ def observe(
     v2x = v2x or V2X.ideal()
     columns = list(range(len(fleet.ids))) if observers is None else sorted({fleet.index(o) for o in observers})
     links = find_links(fleet, columns, v2x.max_neighbours, v2x.radius, sensors.min_range)
-    sent, arrival = _messages(fleet, links, v2x, runs, seed)
+    sent, arrival = schedule(fleet, links, v2x, runs, seed)
     return Recording(
         ids=fleet.ids, t=fleet.t,
         gnss=_gnss(fleet, sensors, runs, seed), velocity=_velocity(fleet, sensors, runs, seed),
@@ -121,7 +121,7 @@ def _relative(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int
     return relative
 
 
-def _messages(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
+def schedule(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
     """Sending schedule (L,) and arrival step (R, L) of the neighbour's broadcast over each link."""
     per_step = v2x.rate * fleet.dt
     if per_step > 1 + 1e-9:

@@ -1,4 +1,4 @@
-"""gauss-newton: the reference. Levenberg-Marquardt with arrowhead elimination for stars and windows, sparse otherwise."""
+"""gauss-newton: the reference. Levenberg-Marquardt, arrowhead elimination for stars and windows, sparse otherwise."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def build(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) 
 
     def run(x: Floats) -> Ended:
         end = descend(problem, step, x[None], max_iterations, tolerance)
-        return Ended(end.x[0], int(end.iterations[0]), bool(end.converged[0]))
+        return Ended(end.x[0], int(end.iterations[0]))
 
     return run
 

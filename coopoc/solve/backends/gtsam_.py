@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ...errors import InputError
 from ..descend import descend
 from ..factor import Factor
 from ..problem import Linear, Problem
@@ -50,7 +49,7 @@ def build(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) 
 
     def run(x: Floats) -> Ended:
         end = descend(problem, step, x[None], max_iterations, tolerance)
-        return Ended(end.x[0], int(end.iterations[0]), bool(end.converged[0]))
+        return Ended(end.x[0], int(end.iterations[0]))
 
     return run
 
@@ -104,10 +103,3 @@ def _zeros(points: int) -> Any:
     for i in range(points):
         values.insert(i, np.zeros(3))
     return values
-
-
-def check(problem: Problem) -> None:
-    """InputError for a kind that this backend cannot take."""
-    for factor in problem.factors:
-        if factor.measurement.arity == 1 and not factor.measurement.linear:
-            raise InputError("backend", "gtsam", f"cannot take {factor.kind}", "Use gauss-newton.")

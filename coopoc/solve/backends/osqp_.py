@@ -1,9 +1,9 @@
 """osqp: sequential quadratic programming with one workspace per structure, whose values are updated at every step.
 
 Settings matter (performance.md G4 of the design notes): OSQP says "solved" and can be a metre off when odometry weighs
-5e5 times as much as GNSS. Scaling is off, over-relaxation is off (alpha = 1: without active constraints an iteration is a
-proximal step with the weight sigma, and 1.6 would make 40 of them out of one), the tolerance is tight, and every answer
-is held against its own KKT residual and repaired by further iterations where it fails.
+5e5 times as much as GNSS. Scaling is off, over-relaxation is off (alpha = 1: without active constraints an iteration
+is a proximal step with the weight sigma, and 1.6 would make 40 of them out of one), the tolerance is tight, and every
+answer is held against its own KKT residual and repaired by further iterations where it fails.
 """
 
 from __future__ import annotations
@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..descend import descend
 from ..arrowhead import structure
+from ..descend import descend
 from ..normal import Pattern, normal_equations
 from ..problem import Linear, Problem
 from .run import Ended, Run
 
-SETTINGS = {"scaling": 0, "rho": 1e-4, "alpha": 1.0, "sigma": 1e-6, "eps_abs": 1e-12, "eps_rel": 1e-12, "max_iter": 200,
-            "check_termination": 1, "polishing": False, "adaptive_rho": 0, "warm_starting": True, "verbose": False}  # fmt: skip
+SETTINGS = {
+    "scaling": 0, "rho": 1e-4, "alpha": 1.0, "sigma": 1e-6, "eps_abs": 1e-12, "eps_rel": 1e-12, "max_iter": 200,
+    "check_termination": 1, "polishing": False, "adaptive_rho": 0, "warm_starting": True, "verbose": False,
+}  # fmt: skip
 NEGLIGIBLE = 1e-11
 """m, an error of a coordinate that no tolerance asks to be smaller."""
 REPAIRS = 5
@@ -61,7 +63,7 @@ def build(
 
     def run(x: Floats) -> Ended:
         end = descend(problem, step, x[None], max_iterations, tolerance)
-        return Ended(end.x[0], int(end.iterations[0]), bool(end.converged[0]), dict(counts))
+        return Ended(end.x[0], int(end.iterations[0]), dict(counts))
 
     return run
 

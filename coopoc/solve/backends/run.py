@@ -11,11 +11,10 @@ from ...arrays import Floats
 
 @dataclass(frozen=True, eq=False)
 class Ended:
-    """A backend's claim, which `solve` checks: x (n, 3) m, iterations, whether it thinks that it converged, and extras."""
+    """A backend's claim, which `solve` checks: x (n, 3) m, iterations, and extras of its own."""
 
     x: Floats
     iterations: int
-    converged: bool
     extras: dict[str, Any] = field(default_factory=dict)
 
 

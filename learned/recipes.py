@@ -1,0 +1,232 @@
+"""Recipes: what is trained, from which data and how; train_all makes every checkpoint that a study needs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
+from coopoc.world.sensors import Sensors, VelocityReading
+
+from .checkpoint import Checkpoint, load, read_card, save
+from .clients import Client, Noise, Pieces, Start, clients
+from .federated import federate_many
+from .method import LearnedGain
+from .net import GainNet
+from .okf import OptimisedKF, fit_okf_many
+from .schedule import Schedule
+from .train import Fit, Task, fit_many
+
+REVISION = 1
+"""Raised whenever the training code changes what it makes of the same recipe."""
+WEIGHTS = Path(__file__).parent / "weights"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One way to train, with the paper's schedule (section IV.A): 20 rounds; 1500 or 500 steps; pieces of 100, 80/20.
+
+    Args:
+        kind: "federated", "centralised", "individual" (one net per client) or "okf".
+        schedule: optimiser, the same for all nets. rounds, local_epochs, aggregate: of a federation.
+    """
+
+    kind: str
+    schedule: Schedule = field(default_factory=Schedule)
+    rounds: int = 20
+    local_epochs: int = 5
+    aggregate: str = "mean"
+    noise: Noise = "static"
+    piece: int = 100
+    split: float = 0.8
+    in_mult: int = 40
+    out_mult: int = 5
+    start_gain: float = 0.1
+
+
+RECIPES: dict[str, Recipe] = {
+    "fedkalmannet": Recipe("federated"),
+    "centralised": Recipe("centralised", Schedule(epochs=1500)),
+    "individual": Recipe("individual", Schedule(epochs=500)),
+    "okf": Recipe("okf", Schedule(epochs=300)),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the paper leaves open and a study varies: the seed of noise, split, start and batches; the start of the
+    filter; the reading of "10 % of the velocity"."""
+
+    seed: int = 0
+    start: Start = "gnss"
+    reading: VelocityReading = "axis"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One checkpoint to make: recipe by name, setting, and the client of an individual net (1-based, as the paper)."""
+
+    name: str
+    recipe: Recipe
+    setting: Setting
+    client: int | None = None
+
+    @property
+    def label(self) -> str:
+        """Name of the checkpoint, such as fedkalmannet-gnss-axis-0 or individual2-gnss-axis-0."""
+        return f"{self.name}{self.client or ''}-{self.setting.start}-{self.setting.reading}-{self.setting.seed}"
+
+    def key(self, fleet: Fleet) -> str:
+        """Hash of everything that changes the weights."""
+        facts = {"recipe": asdict(self.recipe), "setting": asdict(self.setting), "client": self.client,
+                 "sensors": asdict(sensors(self.setting)), "fleet": fleet.digest, "revision": REVISION,
+                 "torch": torch.__version__}  # fmt: skip
+        return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def sensors(setting: Setting) -> Sensors:
+    """The paper's training noise in the setting's reading."""
+    return replace(Sensors.paper_training(), velocity_reading=setting.reading)
+
+
+def train_all(
+    fleet: Fleet,
+    out: Path | str,
+    *,
+    seeds: Sequence[int] = range(5),
+    starts: Sequence[Start] = ("gnss",),
+    readings: Sequence[VelocityReading] = ("axis",),
+    recipes: Sequence[str] | None = None,
+    progress: bool = True,
+) -> dict[str, Checkpoint]:
+    """Train every recipe in every setting, or read it from `out` where the same was trained before.
+
+    All settings of a recipe are trained together. A checkpoint is reused if its card's key, the hash of all that
+    changes the weights, is the same; each is written whole or not at all.
+
+    Args:
+        fleet: the clients' drives, such as the bundled "town10-clients". out: folder of the checkpoints.
+        seeds, starts, readings: the settings, every combination. recipes: names, default all of `RECIPES`.
+        progress: bars on stderr that name the stage.
+
+    Returns:
+        Checkpoints by label, such as "fedkalmannet-gnss-axis-0".
+
+    Raises:
+        InputError: an unknown recipe.
+    """
+    settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
+    found: dict[str, Checkpoint] = {}
+    for name in RECIPES if recipes is None else recipes:
+        if name not in RECIPES:
+            raise InputError("recipe", repr(name), f"must be one of {sorted(RECIPES)}", "Pick one.")
+        jobs = [job for setting in settings for job in _jobs(name, setting, len(fleet.ids))]
+        paths = {job.label: Path(out) / f"{job.label}.safetensors" for job in jobs}
+        missing = [job for job in jobs if not _made(paths[job.label], job.key(fleet))]
+        if missing:
+            data = {job.setting: _data(fleet, job) for job in missing}
+            trained = TRAINERS[missing[0].recipe.kind](missing, data, f"train {name}" if progress else None)
+            for job, made in zip(missing, trained, strict=True):
+                card = _card(job, fleet, data[job.setting]) | made.card
+                save(paths[job.label], Checkpoint(made.model, card, made.history))
+        found |= {job.label: load(paths[job.label]) for job in jobs}
+    return found
+
+
+def load_method(name_or_path: Path | str) -> LearnedGain | OptimisedKF:
+    """The method of a checkpoint file, or of weights that come with the package by their name.
+
+    Raises:
+        InputError: neither a file nor a shipped name.
+    """
+    shipped = {path.stem: path for path in sorted(WEIGHTS.glob("*.safetensors"))}
+    path = shipped.get(str(name_or_path), Path(name_or_path))
+    if not path.is_file():
+        allowed = f"must be a checkpoint file or one of {sorted(shipped)}"
+        raise InputError("learned method", str(name_or_path), allowed, "Train one: coopoc train fedkalmannet.")
+    checkpoint = load(path)
+    if isinstance(checkpoint.model, OptimisedKF):
+        return checkpoint.model
+    return LearnedGain(checkpoint.model, name=str(checkpoint.card.get("recipe", path.stem)))
+
+
+Data = dict[Setting, tuple[Client, ...]]
+Trainer = Callable[[Sequence[Job], Data, str | None], list[Checkpoint]]
+
+
+def _jobs(name: str, setting: Setting, vehicles: int) -> list[Job]:
+    recipe = RECIPES[name]
+    return [Job(name, recipe, setting, c + 1 if recipe.kind == "individual" else None)
+            for c in range(vehicles if recipe.kind == "individual" else 1)]  # fmt: skip
+
+
+def _made(path: Path, key: str) -> bool:
+    return path.is_file() and read_card(path).get("key") == key
+
+
+def _data(fleet: Fleet, job: Job) -> tuple[Client, ...]:
+    recipe, setting = job.recipe, job.setting
+    return clients(fleet, sensors(setting), seed=setting.seed, noise=recipe.noise, start=setting.start,
+                   piece=recipe.piece, split=recipe.split)  # fmt: skip
+
+
+def _card(job: Job, fleet: Fleet, data: Sequence[Client]) -> dict[str, Any]:
+    used = [c for i, c in enumerate(data) if job.client in (None, i + 1)]
+    return {"key": job.key(fleet), "recipe": job.name, "settings": asdict(job.recipe) | asdict(job.setting),
+            "noise": asdict(sensors(job.setting)), "client": job.client, "fleet": fleet.name, "digest": fleet.digest,
+            "clients": [c.name for c in used], "training_pieces": [len(c.training) for c in used],
+            "validation_pieces": [len(c.validation) for c in used]}  # fmt: skip
+
+
+def _net(job: Job) -> GainNet:
+    return GainNet(job.recipe.in_mult, job.recipe.out_mult, job.recipe.start_gain, seed=job.setting.seed)
+
+
+def _joined(data: Sequence[Client], client: int | None) -> tuple[Pieces, Pieces]:
+    used = [c for i, c in enumerate(data) if client in (None, i + 1)]
+    return Pieces.join([c.training for c in used]), Pieces.join([c.validation for c in used])
+
+
+def _federated(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    recipe, nets = jobs[0].recipe, [_net(job) for job in jobs]
+    done = federate_many(
+        nets, [data[j.setting] for j in jobs], [j.setting.seed for j in jobs], recipe.rounds, recipe.aggregate,
+        recipe.local_epochs, recipe.schedule, stage,
+    )  # fmt: skip
+    found = []
+    for federation in done:
+        rows = [{"round": r.number, "training_loss": r.training_loss, "validation_loss": r.validation_loss,
+                 "sent_bytes": r.sent_bytes, "received_bytes": r.received_bytes, "rejected": r.rejected}
+                for r in federation.history]  # fmt: skip
+        weights = torch.stack([r.weights for r in federation.history])
+        card = {"history": rows, "best": federation.best.number, "seconds": federation.seconds}
+        found.append(Checkpoint(federation.model, card, weights))
+    return found
+
+
+def _fitted(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    tasks = [Task(_net(j), *_joined(data[j.setting], j.client), j.setting.seed, j.label) for j in jobs]
+    return [_of_fit(fit) for fit in fit_many(tasks, jobs[0].recipe.schedule, stage)]
+
+
+def _of_fit(fit: Fit) -> Checkpoint:
+    rows = [{"step": r.step, "training_loss": r.training_loss, "validation_loss": r.validation_loss}
+            for r in fit.history]  # fmt: skip
+    card = {"history": rows, "best": fit.best.step, "stopped": fit.stopped, "seconds": fit.seconds}
+    return Checkpoint(fit.model, card, torch.stack([r.weights for r in fit.history]))
+
+
+def _okf(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    tasks = [_joined(data[job.setting], None) for job in jobs]
+    fits = fit_okf_many(tasks, jobs[0].recipe.schedule.epochs, progress=stage)
+    return [Checkpoint(f.method, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
+
+
+TRAINERS: dict[str, Trainer] = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}
