@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .evaluate.metrics import max_error as max_error
     from .evaluate.metrics import nees as nees
     from .evaluate.metrics import rt_le as rt_le
+    from .fleets import load as load
     from .methods.gnss import Gnss as Gnss
     from .methods.joint_filter import JointFilter as JointFilter
     from .methods.kalman import Kalman as Kalman
@@ -41,7 +42,7 @@ _HOME = {
     "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
     "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
     "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds",
-    "Method": "methods.track", "Track": "methods.track",
+    "load": "fleets", "Method": "methods.track", "Track": "methods.track",
 }  # fmt: skip
 
 __version__ = "0.1.0"

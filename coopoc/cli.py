@@ -108,7 +108,8 @@ def table(
         print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
         return
     results = Results.load(folder)
-    print(results.table(rows=rows, columns=columns, value=value, where=results.parsed(where)).render(format))
+    shown = results.table(rows=rows, columns=columns, value=value, where=results.parsed(where))
+    print(shown.render(format).rstrip("\n"))
 
 
 def report(

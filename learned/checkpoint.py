@@ -20,8 +20,7 @@ from coopoc.errors import InputError
 
 from .net import GainNet
 from .okf import OptimisedKF
-from .rollout import flatten
-from .train import unflatten
+from .rollout import unflatten
 
 _HISTORY = "history"
 _NOISE = ("process_std", "velocity_ratio", "gnss_std")
@@ -75,8 +74,9 @@ def load(path: Path | str) -> Checkpoint:
     tensors, card = _read(Path(path))
     history = tensors.pop(_HISTORY, None)
     if card["kind"] == "okf":
-        _match(path, {name: (3,) for name in _NOISE}, tensors)
-        return Checkpoint(OptimisedKF(*(tuple(tensors[name].tolist()) for name in _NOISE)), card, history)
+        _match(path, dict.fromkeys(_NOISE, (3,)), tensors)
+        process, ratio, gnss = (tuple(tensors[name].tolist()) for name in _NOISE)
+        return Checkpoint(OptimisedKF(process, ratio, gnss), card, history)
     model = GainNet(card["in_mult"], card["out_mult"])
     load_into(model, tensors, path)
     return Checkpoint(model, card, history)
@@ -127,5 +127,5 @@ def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], found: Map
         if expected.get(name) != shapes.get(name):
             raise InputError(
                 f"checkpoint {path}", f"{name} of shape {shapes.get(name, 'missing')}",
-                f"expected {expected.get(name, 'no such tensor')}", "Load it with the in_mult and out_mult of its card.",
+                f"expected {expected.get(name, 'no such tensor')}", "Use a net of its card's in_mult and out_mult.",
             )  # fmt: skip

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -20,6 +20,8 @@ from coopoc.world.v2x import V2X
 
 Noise = Literal["static", "fresh"]
 Start = Literal["gnss", "true"]
+LONG = 9
+"""Training pieces that a long piece is as long as: 900 steps, the paper's test drive."""
 
 
 class Batch(NamedTuple):
@@ -65,12 +67,12 @@ class Pieces:
             gnss = truth + self.gnss_std[index] * normals[0]
             velocity = self.true_velocity[index] + self.velocity_std[index] * normals[1]
         x0 = torch.where(self.true_start[index][..., None], truth[..., 0, :], gnss[..., 0, :])
-        steps = [array[..., 1:, :].permute(2, 0, 1, 3).contiguous() for array in (gnss, velocity, truth)]
-        return Batch(*steps, x0, self.dt)
+        gnss, velocity, truth = (a[..., 1:, :].permute(2, 0, 1, 3).contiguous() for a in (gnss, velocity, truth))
+        return Batch(gnss, velocity, truth, x0, self.dt)
 
     def take(self, index: Sequence[int]) -> Pieces:
         """The pieces `index`."""
-        return replace(self, **{name: getattr(self, name)[list(index)] for name in _ARRAYS})
+        return self._each(lambda name: getattr(self, name)[list(index)])
 
     @classmethod
     def join(cls, parts: Sequence[Pieces]) -> Pieces:
@@ -78,19 +80,40 @@ class Pieces:
         if len({(p.truth.shape[1], p.dt, p.fresh) for p in parts}) != 1:
             found = [(p.truth.shape[1], p.dt, p.fresh) for p in parts]
             raise InputError("pieces", found, "must agree in length, dt and noise", "Cut all clients alike.")
-        return replace(parts[0], **{name: torch.cat([getattr(p, name) for p in parts]) for name in _ARRAYS})
+        return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
+
+    def _each(self, made: Callable[[str], Tensor]) -> Pieces:
+        """The same pieces with every tensor field replaced by what `made` gives for its name."""
+        tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
+        return Pieces(**tensors, dt=self.dt, fresh=self.fresh)
 
 
-_ARRAYS = ("gnss", "velocity", "truth", "true_velocity", "gnss_std", "velocity_std", "true_start")
+def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
+    """Each piece (S, B) mirrored at random: the sign of every axis, and x exchanged with y, from S generators.
+
+    Neither the motion nor the noise of the training drives prefers east to west or east to north, but a net trained on
+    a few streets does: its features are directions in the world frame.
+    """
+    dice = torch.stack([torch.rand((batch.x0.shape[1], 4), generator=draw) for draw in draws])
+    signs, swap = torch.where(dice[..., :3] < 0.5, -1.0, 1.0), dice[..., 3:] < 0.5
+
+    def turn(vectors: Tensor) -> Tensor:
+        return torch.where(swap, vectors[..., [1, 0, 2]], vectors) * signs
+
+    return Batch(turn(batch.gnss), turn(batch.velocity), turn(batch.truth), turn(batch.x0), batch.dt)
 
 
 @dataclass(frozen=True, eq=False)
 class Client:
-    """One vehicle with its private pieces, disjoint for training and validation."""
+    """One vehicle with its private pieces, disjoint for training and validation, and its drive in long pieces.
+
+    Nothing is trained on `long`: it shows whether a net that learned from short pieces holds over a whole drive.
+    """
 
     name: str
     training: Pieces
     validation: Pieces
+    long: Pieces
 
 
 def clients(
@@ -130,20 +153,22 @@ def clients(
     sensors = sensors or Sensors.paper_training()
     if noise == "fresh" and sensors.gnss_bias[1] > 0:
         raise InputError("gnss_bias", sensors.gnss_bias, "must be (0, 0) with fresh noise", "Train without a bias.")
-    seen = observe(fleet, sensors, V2X(max_neighbours=0), seed=seed)
-    found = []
+    seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
+    found, longest = [], min(LONG * piece, int(fleet.present.sum(0).min()) - 1)
     for column, name in enumerate(fleet.ids):
         there = np.flatnonzero(fleet.present[:, column])
         if len(there) and there[-1] - there[0] >= len(there):
             raise InputError("fleet", f"{name} leaves and comes back", "must be one drive", "Cut it with between(...).")
         arrays = (seen.gnss[0], seen.velocity[0], fleet.position, fleet.velocity)
-        pieces = _cut([a[there, column] for a in arrays], sensors, piece, fleet.dt, noise, start)
+        drive = [a[there, column] for a in arrays]
+        pieces = _cut(drive, sensors, piece, fleet.dt, noise, start)
         if len(pieces) < 2:
             mend = f"Give it at least {2 * (piece + 1)} steps or shorten the pieces."
             raise InputError("fleet", f"{name} with {len(pieces)} pieces of {piece}", "needs at least two", mend)
         order = stream(seed, "split", 0, name).permutation(len(pieces)).tolist()
         count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
-        found.append(Client(name, pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]))))
+        long = _cut(drive, sensors, longest, fleet.dt, noise, start)
+        found.append(Client(name, pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:])), long))
     return tuple(found)
 
 
@@ -152,9 +177,12 @@ def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise
     count = len(drive[0]) // (piece + 1)
     gnss, velocity, truth, true_velocity = (d[: count * (piece + 1)].reshape(count, piece + 1, 3) for d in drive)
     origin = truth[:, :1]
-    numbers = (
-        gnss - origin, velocity, truth - origin, true_velocity,
-        np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), sensors.velocity_std(true_velocity),
+    stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), sensors.velocity_std(true_velocity)
+
+    def tensor(numbers: Floats) -> Tensor:
+        return torch.tensor(numbers, dtype=torch.float32)
+
+    return Pieces(
+        tensor(gnss - origin), tensor(velocity), tensor(truth - origin), tensor(true_velocity), tensor(stds[0]),
+        tensor(stds[1]), torch.full((count,), start == "true"), dt, noise == "fresh",
     )  # fmt: skip
-    tensors = [torch.tensor(n, dtype=torch.float32) for n in numbers]
-    return Pieces(*tensors, torch.full((count,), start == "true"), dt, noise == "fresh")

@@ -18,9 +18,9 @@ from coopoc.world.noise import stream
 from .aggregate import Aggregate, rule
 from .clients import Client, Pieces
 from .net import GainNet
-from .rollout import flatten
+from .rollout import flatten, unflatten
 from .schedule import Schedule, cosine, generator
-from .train import Judge, descend, pooled, unflatten
+from .train import Judge, descend, pooled
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def federate_many(
     everyone = [client for group in groups for client in group]
     keys = [(seed, c.name) for seed, group in zip(seeds, groups, strict=True) for c in group]
     pool, members = pooled([c.training for c in everyone])
-    judge = Judge([c.validation for c in everyone], models[0])
+    judge = Judge([[c.validation for c in everyone], [c.long for c in everyone]], models[0])
     sizes = [torch.tensor([len(c.training) for c in group]) for group in groups]
     theta = flatten(models)
     copies = torch.tensor([len(group) for group in groups])

@@ -16,9 +16,9 @@ from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
+from .machine import one_core
 from .net import SIZE, GainNet
-from .rollout import Step, Tape, flatten, steps, views
-from .train import keep_freed_memory
+from .rollout import Step, flatten, layers, steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class LearnedGain:
         columns = recording.columns(egos)
 
         def picture(step: Step) -> Tensor:
-            return torch.stack([step.gain, step.process, step.prior, step.innovation], dim=2)
+            return torch.stack([step.gain, step.process.after, step.prior.after, step.innovation.after], dim=2)
 
         found = self._scan(recording, columns, picture)
         gain, process, prior, innovation = np.moveaxis(found.reshape(*found.shape[:-1], SIZE, SIZE), 3, 0)
@@ -96,7 +96,6 @@ class LearnedGain:
 
     def _scan(self, recording: Recording, columns: list[int], pick: Callable[[Step], Tensor]) -> AnyArray:
         """(R, T, E, ...) of what `pick` takes from each step, relative to the first fix; step 0 is NaN."""
-        keep_freed_memory()
         origin = recording.gnss[:, :1, columns]
 
         def lanes(array: Floats) -> Tensor:
@@ -105,10 +104,10 @@ class LearnedGain:
 
         gnss = lanes(recording.gnss[:, 1:, columns] - origin)
         velocity = lanes(recording.velocity[:, 1:, columns])
-        x0 = lanes((self._x0(recording, columns)[:, None] - origin))[0]
-        tape = Tape(views(flatten([self.model]), self.model))
-        with torch.inference_mode():
-            picked = [pick(s)[0].numpy() for s in steps(tape, gnss, velocity, x0, recording.dt)]
+        x0 = lanes(self._x0(recording, columns)[:, None] - origin)[0]
+        net = layers(flatten([self.model]), self.model)
+        with torch.inference_mode(), one_core():
+            picked = [pick(s)[0].numpy() for s in steps(net, gnss, velocity, x0, recording.dt)]
         rows = np.stack([np.full_like(picked[0], np.nan), *picked]).astype(np.float64)
         return np.moveaxis(rows.reshape(len(rows), recording.runs, len(columns), *rows.shape[2:]), 0, 1)
 
@@ -122,4 +121,5 @@ def _divergence(x: Floats, recording: Recording, columns: list[int]) -> list[str
     limit = DIVERGED * float(np.linalg.norm(recording.sensors.gnss_std))
     gap = np.linalg.norm(x - recording.gnss[:, :, columns], axis=-1)
     lost = int((gap > limit).any(axis=1).sum())
-    return [f"diverged in {lost} of {gap.shape[0] * gap.shape[2]} runs (over {limit:.0f} m from the fix)"] if lost else []
+    total = gap.shape[0] * gap.shape[2]
+    return [f"diverged in {lost} of {total} runs (over {limit:.0f} m from the fix)"] if lost else []

@@ -110,21 +110,24 @@ def fit_okf_many(
         fall.step()
     with torch.no_grad():
         numbers = torch.exp(best) * _calibration(best, *data)[:, None]
+    seconds = (time.perf_counter() - began) / len(tasks)
     return [
-        OkfFit(OptimisedKF(*(_three(v) for v in row)), tuple(h), (time.perf_counter() - began) / len(tasks))
+        OkfFit(OptimisedKF(_three(row[0]), _three(row[1]), _three(row[2])), tuple(h), seconds)
         for row, h in zip(numbers, zip(*history, strict=True), strict=True)
     ]
 
 
 def _stacked(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:
-    """All pieces of S settings in float64, and the weight (S, B) of each in its setting's mean (0 for padding)."""
+    """All pieces of S settings in float64; (2, S, B): weight in the mean, 0 for padding, and uncertain start."""
     pool, most = Pieces.join(parts), max(map(len, parts))
     ends = np.cumsum([len(p) for p in parts])
-    index = np.stack([np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)])
-    batch = pool.batch(torch.from_numpy(index), [torch.Generator().manual_seed(i) for i in range(len(parts))])
+    rows = [np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)]
+    index = torch.from_numpy(np.stack(rows))
+    batch = pool.batch(index, [torch.Generator().manual_seed(i) for i in range(len(parts))])
     weight = torch.tensor([[float(i < len(p)) / len(p) for i in range(most)] for p in parts], dtype=torch.float64)
     gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
-    return Batch(gnss, velocity, truth, x0, pool.dt), torch.stack([weight, 1.0 - pool.true_start[torch.from_numpy(index)].double()])
+    uncertain = 1.0 - pool.true_start[index].double()
+    return Batch(gnss, velocity, truth, x0, pool.dt), torch.stack([weight, uncertain])
 
 
 def _scan(logs: Tensor, batch: Batch, uncertain: Tensor) -> tuple[Tensor, Tensor]:

@@ -96,6 +96,20 @@ def sensors(setting: Setting) -> Sensors:
     return replace(Sensors.paper_training(), velocity_reading=setting.reading)
 
 
+def jobs(name: str, setting: Setting, fleet: Fleet) -> list[Job]:
+    """The checkpoints of a recipe in a setting: one, or one per vehicle of the fleet for individual nets.
+
+    Raises:
+        InputError: an unknown recipe.
+    """
+    if name not in RECIPES:
+        raise InputError("recipe", repr(name), f"must be one of {sorted(RECIPES)}", "Pick one.")
+    recipe = RECIPES[name]
+    if recipe.kind != "individual":
+        return [Job(name, recipe, setting)]
+    return [Job(name, recipe, setting, client) for client in range(1, len(fleet.ids) + 1)]
+
+
 def train_all(
     fleet: Fleet,
     out: Path | str,
@@ -125,18 +139,16 @@ def train_all(
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     found: dict[str, Checkpoint] = {}
     for name in RECIPES if recipes is None else recipes:
-        if name not in RECIPES:
-            raise InputError("recipe", repr(name), f"must be one of {sorted(RECIPES)}", "Pick one.")
-        jobs = [job for setting in settings for job in _jobs(name, setting, len(fleet.ids))]
-        paths = {job.label: Path(out) / f"{job.label}.safetensors" for job in jobs}
-        missing = [job for job in jobs if not _made(paths[job.label], job.key(fleet))]
+        wanted = [job for setting in settings for job in jobs(name, setting, fleet)]
+        paths = {job.label: Path(out) / f"{job.label}.safetensors" for job in wanted}
+        missing = [job for job in wanted if not _made(paths[job.label], job.key(fleet))]
         if missing:
             data = {job.setting: _data(fleet, job) for job in missing}
             trained = TRAINERS[missing[0].recipe.kind](missing, data, f"train {name}" if progress else None)
             for job, made in zip(missing, trained, strict=True):
-                card = _card(job, fleet, data[job.setting]) | made.card
+                card = _card(job, fleet, data[job.setting]) | dict(made.card)
                 save(paths[job.label], Checkpoint(made.model, card, made.history))
-        found |= {job.label: load(paths[job.label]) for job in jobs}
+        found |= {job.label: load(paths[job.label]) for job in wanted}
     return found
 
 
@@ -161,12 +173,6 @@ Data = dict[Setting, tuple[Client, ...]]
 Trainer = Callable[[Sequence[Job], Data, str | None], list[Checkpoint]]
 
 
-def _jobs(name: str, setting: Setting, vehicles: int) -> list[Job]:
-    recipe = RECIPES[name]
-    return [Job(name, recipe, setting, c + 1 if recipe.kind == "individual" else None)
-            for c in range(vehicles if recipe.kind == "individual" else 1)]  # fmt: skip
-
-
 def _made(path: Path, key: str) -> bool:
     return path.is_file() and read_card(path).get("key") == key
 
@@ -189,15 +195,19 @@ def _net(job: Job) -> GainNet:
     return GainNet(job.recipe.in_mult, job.recipe.out_mult, job.recipe.start_gain, seed=job.setting.seed)
 
 
-def _joined(data: Sequence[Client], client: int | None) -> tuple[Pieces, Pieces]:
-    used = [c for i, c in enumerate(data) if client in (None, i + 1)]
-    return Pieces.join([c.training for c in used]), Pieces.join([c.validation for c in used])
+def _joined(data: Sequence[Client], client: int | None, part: str) -> Pieces:
+    return Pieces.join([getattr(c, part) for i, c in enumerate(data) if client in (None, i + 1)])
 
 
-def _federated(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    recipe, nets = jobs[0].recipe, [_net(job) for job in jobs]
+def _task(job: Job, data: Sequence[Client]) -> Task:
+    training, validation, long = (_joined(data, job.client, part) for part in ("training", "validation", "long"))
+    return Task(_net(job), training, validation, job.setting.seed, str(job.client or ""), long)
+
+
+def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    recipe, nets = todo[0].recipe, [_net(job) for job in todo]
     done = federate_many(
-        nets, [data[j.setting] for j in jobs], [j.setting.seed for j in jobs], recipe.rounds, recipe.aggregate,
+        nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], recipe.rounds, recipe.aggregate,
         recipe.local_epochs, recipe.schedule, stage,
     )  # fmt: skip
     found = []
@@ -211,9 +221,9 @@ def _federated(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Check
     return found
 
 
-def _fitted(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    tasks = [Task(_net(j), *_joined(data[j.setting], j.client), j.setting.seed, j.label) for j in jobs]
-    return [_of_fit(fit) for fit in fit_many(tasks, jobs[0].recipe.schedule, stage)]
+def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    fits = fit_many([_task(job, data[job.setting]) for job in todo], todo[0].recipe.schedule, stage)
+    return [_of_fit(fit) for fit in fits]
 
 
 def _of_fit(fit: Fit) -> Checkpoint:
@@ -223,9 +233,9 @@ def _of_fit(fit: Fit) -> Checkpoint:
     return Checkpoint(fit.model, card, torch.stack([r.weights for r in fit.history]))
 
 
-def _okf(jobs: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    tasks = [_joined(data[job.setting], None) for job in jobs]
-    fits = fit_okf_many(tasks, jobs[0].recipe.schedule.epochs, progress=stage)
+def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    tasks = [(_joined(data[j.setting], None, "training"), _joined(data[j.setting], None, "validation")) for j in todo]
+    fits = fit_okf_many(tasks, todo[0].recipe.schedule.epochs, progress=stage)
     return [Checkpoint(f.method, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
 
 

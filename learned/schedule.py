@@ -22,7 +22,7 @@ class Schedule:
     epochs: int = 1500
     """The paper's 1500 (centralised) and 500 (individual)."""
     epoch: Epoch = "step"
-    """"step": one optimiser step on one random batch, as KalmanNet's published loop counts. "pass": through all data."""
+    """"step": one optimiser step on one random batch, as KalmanNet's published loop counts. "pass": all the data."""
     batch: int = 4
     """Pieces per step. The paper's 1 is noisier for the same number of steps; see docs/learned.md."""
     learning_rate: float = 1e-3
@@ -33,6 +33,8 @@ class Schedule:
     """gamma of the paper's gamma ||theta||^2 in the loss; weaker than the decoupled decay under static noise."""
     clip: float = 1.0
     """Largest norm of a model's gradient."""
+    mirror: bool = True
+    """Mirror each piece at random at each use (`clients.mirrored`). Not in the paper; docs/learned.md has the gain."""
     checks: int = 20
     """Validations spread over the training, as many as the paper has rounds; the best weights seen are kept."""
 
@@ -68,7 +70,8 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
 
 def clip(gradient: Tensor, limit: float) -> Tensor:
     """Gradients (S, P), each scaled to a norm of at most `limit`."""
-    return gradient * (limit / (gradient.norm(dim=1, keepdim=True) + 1e-6)).clamp(max=1.0)
+    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
+    return gradient * torch.clamp(limit / (norm + 1e-6), max=1.0)
 
 
 def adamw(

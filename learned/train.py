@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -13,25 +12,28 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from coopoc.arrays import Ints
+from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
-from .clients import Pieces
+from .clients import Batch, Pieces, mirrored
+from .gradient import loss, loss_and_gradient
+from .machine import one_core
 from .net import GainNet
-from .rollout import Tape, flatten, loss, loss_and_gradient, views
+from .rollout import flatten, layers, unflatten
 from .schedule import Schedule, adamw, clip, cosine, generator
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One net to train: its start, its pieces, the seed of its batches, and a name for messages."""
+    """One net to train: its start, its pieces, and the key of its batches: a seed and the name of the data."""
 
     model: GainNet
     training: Pieces
     validation: Pieces
     seed: int = 0
-    name: str = "net"
+    name: str = ""
+    long: Pieces | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,15 +69,17 @@ def fit(
     schedule: Schedule | None = None,
     seed: int = 0,
     progress: str | None = None,
+    long: Pieces | None = None,
 ) -> Fit:
     """Minimise 1/T sum_t ||xhat_t - x_t||^2 + gamma ||theta||^2 over batches of pieces.
 
     Args:
         model: the start; it is not changed. training, validation: pieces. schedule: default `Schedule()`.
         seed: of the order of the batches. progress: name of the stage for a progress bar on stderr, None for no bar.
+        long: long pieces that weights must hold on to be kept.
 
     Raises:
-        InputError: no pieces, or a start that is not finite on the validation pieces.
+        InputError: a start that is not finite on the validation pieces.
 
     Source: arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
 
@@ -86,7 +90,7 @@ def fit(
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
     2
     """
-    return fit_many([Task(model, training, validation, seed)], schedule, progress)[0]
+    return fit_many([Task(model, training, validation, seed, long=long)], schedule, progress)[0]
 
 
 def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: str | None = None) -> list[Fit]:
@@ -94,9 +98,10 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     schedule, began = schedule or Schedule(), time.perf_counter()
     like, theta = tasks[0].model, flatten([t.model for t in tasks])
     pool, members = pooled([t.training for t in tasks])
-    streams = [stream(t.seed, "batches", 0, "") for t in tasks]
+    streams = [stream(t.seed, "batches", 0, t.name) for t in tasks]
     plans = [rows[schedule.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
-    judge = Judge([t.validation for t in tasks], like)
+    long = [t.long for t in tasks if t.long is not None]
+    judge = Judge([[t.validation for t in tasks], *([long] if len(long) == len(tasks) else [])], like)
     best, lowest = theta.clone(), judge(theta)
     if not lowest.isfinite().all():
         raise InputError("model", "untrained net", "has no finite validation loss", "Use GainNet(start_gain=0.1).")
@@ -126,7 +131,7 @@ def descend(
     like: GainNet,
     pool: Pieces,
     plans: Sequence[Ints],
-    rates: Sequence[np.ndarray],
+    rates: Sequence[Floats],
     schedule: Schedule,
     draws: Sequence[torch.Generator],
     stopped: dict[int, str],
@@ -136,15 +141,17 @@ def descend(
     A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
     models with shorter plans wait for the longest. Their loss is NaN.
     """
-    keep_freed_memory()
     first, second = torch.zeros_like(theta), torch.zeros_like(theta)
     for step in range(max(map(len, plans))):
         rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
         losses = torch.full((len(plans),), math.nan)
         if rows:
-            batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), [draws[r] for r in rows])
+            dice = [draws[r] for r in rows]
+            batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), dice)
+            batch = mirrored(batch, dice) if schedule.mirror else batch
             mine, m, v = theta[rows], first[rows], second[rows]
-            losses[rows], gradient = loss_and_gradient(mine, like, batch)
+            with one_core():
+                losses[rows], gradient = loss_and_gradient(mine, like, batch)
             finite = losses[rows].isfinite() & gradient.isfinite().all(1)
             stopped |= {r: f"loss or gradient not finite at step {step + 1}"
                         for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
@@ -157,20 +164,29 @@ def descend(
 
 
 class Judge:
-    """Validation loss (S,) m^2 of S models, each on its own pieces; fresh pieces are drawn once."""
+    """Score (S,) m^2 of S models: the larger of the mean losses on each kind of their pieces, infinite if not finite.
 
-    def __init__(self, validation: Sequence[Pieces], like: GainNet) -> None:
+    The kinds are the validation pieces and, where there are any, the long ones: over a long drive a stable filter is
+    the better for its start being over, so they decide only against weights that drift away. Fresh noise is drawn once.
+    """
+
+    def __init__(self, kinds: Sequence[Sequence[Pieces]], like: GainNet) -> None:
         self.like = like
-        pool, members = pooled(validation)
-        most = max(map(len, members))
-        index = torch.from_numpy(np.stack([np.resize(m, most) for m in members]))
-        self.real = torch.from_numpy(np.stack([np.arange(most) < len(m) for m in members]))
-        self.batch = pool.batch(index, [generator(stream(0, "validation", 0, "")) for _ in members])
+        self.batches = [_padded(parts) for parts in kinds]
 
     def __call__(self, theta: Tensor) -> Tensor:
-        with torch.no_grad():
-            losses = loss(Tape(views(theta, self.like)), self.batch)
-        return torch.where(self.real, losses, 0.0).sum(1) / self.real.sum(1)
+        with torch.no_grad(), one_core():
+            means = [(loss(layers(theta, self.like), batch) * share).sum(1) for batch, share in self.batches]
+        return torch.stack(means).nan_to_num(math.inf).amax(0)
+
+
+def _padded(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:
+    """All pieces of S models as one batch, and the share (S, B) of each in its model's mean, 0 for padding."""
+    pool, members = pooled(parts)
+    most = max(map(len, members))
+    index = torch.from_numpy(np.stack([np.resize(m, most) for m in members]))
+    share = torch.tensor([[(i < len(m)) / len(m) for i in range(most)] for m in members])
+    return pool.batch(index, [generator(stream(0, "validation", 0, "")) for _ in members]), share
 
 
 def pooled(parts: Sequence[Pieces]) -> tuple[Pieces, list[Ints]]:
@@ -179,29 +195,6 @@ def pooled(parts: Sequence[Pieces]) -> tuple[Pieces, list[Ints]]:
     return Pieces.join(parts), [np.arange(end - len(p), end) for p, end in zip(parts, ends, strict=True)]
 
 
-def unflatten(theta: Tensor, like: GainNet) -> list[GainNet]:
-    """New models shaped as `like` with the weights theta (S, P)."""
-    models = []
-    for row in theta:
-        model = GainNet(like.in_mult, like.out_mult)
-        torch.nn.utils.vector_to_parameters(row.clone(), model.parameters())
-        models.append(model)
-    return models
-
-
 def bar(steps: Iterator[tuple[int, Tensor]], plans: Sequence[Ints], name: str | None) -> Iterator[tuple[int, Tensor]]:
     """The same steps with a progress bar of that name on stderr, or without one."""
     return iter(tqdm(steps, total=max(map(len, plans)), desc=name, unit="step", disable=name is None))
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep what a rollout frees for the next one instead of returning it to the system.
-
-    Each optimiser step allocates some hundred MB in small tensors; handing the pages back and faulting them in again
-    was 45 % of the training time. Other allocators are left alone.
-    """
-    trim_threshold, mmap_threshold, most = -1, -3, 2**31 - 1
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is not None:
-        mallopt(mmap_threshold, 32 * 2**20)
-        mallopt(trim_threshold, most)

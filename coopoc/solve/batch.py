@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from .arrowhead import marginals, structure
 from .backends.gauss_newton import linear_step
-from .descend import descend
+from .descend import MAX_ITERATIONS, TOLERANCE, descend
 from .initial import initial_guess
 from .normal import normal_equations
 from .problem import Problem
@@ -29,7 +29,7 @@ class Batch:
     converged: Bools
 
 
-def solve_batch(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) -> Batch:
+def solve_batch(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Batch:
     """Minima of all realisations, each as `solve` finds it.
 
     Args:

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from .problem import Linear, Problem
+from .problem import Linear, Problem, half_squares, vector
 
 Step = Callable[[Linear, Floats], Floats]
 """(linearisation, damping (B, n, 3)) -> dx (B, n, 3) of (J^T J + diag(damping)) dx = -J^T r; LinAlgError: singular."""
 
+MAX_ITERATIONS = 500
+"""About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
+TOLERANCE = 1e-8
+"""m, largest move of a point in the last step."""
 GIVE_UP = 1e12
 """Damping beyond which no step can help."""
 
@@ -30,11 +34,15 @@ class Descent:
     converged: Bools
 
 
-def descend(problem: Problem, step: Step, x: Floats, max_iterations: int = 100, tolerance: float = 1e-8) -> Descent:
-    """Gauss-Newton steps; where the cost would rise the step is refused and the damping grows (Marquardt's scaling).
+def descend(
+    problem: Problem, step: Step, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE
+) -> Descent:
+    """Gauss-Newton steps, damped where the linear model does not hold (Levenberg-Marquardt with Marquardt's scaling).
 
-    (J^T J + mu diag(J^T J)) dx = -J^T r, mu = 0 at first, 1e-4 after a refusal and ten times more after each, a tenth
-    after each success. A realisation leaves the batch when no point of it moves by more than `tolerance`.
+    (J^T J + mu diag(J^T J)) dx = -J^T r, mu = 0 at first. A step that raises the cost is refused; mu then grows, and
+    also where the cost falls by less than a quarter of what the model promised: plain Gauss-Newton overshoots for ever
+    where the true curvature exceeds twice that of J^T J, as in range-only problems of flat geometry. A realisation
+    leaves the batch when no point of it moves by more than `tolerance`.
 
     Args:
         problem: one or B realisations. step: the backend's linear solver. x: (B, n, 3) m start.
@@ -51,9 +59,8 @@ def descend(problem: Problem, step: Step, x: Floats, max_iterations: int = 100, 
             trial = now.linearise(linear.x + dx)
             small = solved & (np.abs(dx).max(axis=(1, 2)) <= tolerance)
             better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
+        mu[active] = _damping(mu[active], better, linear.cost, trial.cost, _promised(problem, linear, dx))
         best[active[better]] = trial.x[better]
-        lower = np.where(mu[active] > 1e-8, mu[active] / 10, 0.0)
-        mu[active] = np.where(better, lower, np.maximum(10 * mu[active], 1e-4))
         done[active[better & small]] = True
         going = ~(better & small) & (mu[active] < GIVE_UP)
         if not going.any():
@@ -66,6 +73,25 @@ def descend(problem: Problem, step: Step, x: Floats, max_iterations: int = 100, 
             active = active[going]
             now = problem.pick(active) if problem.batch else problem
     return Descent(best, count, done)
+
+
+def _promised(problem: Problem, linear: Linear, dx: Floats) -> Floats:
+    """(B,) cost that the linear model expects after the step: 1/2 |r + J dx|^2."""
+    residuals = [
+        r + (s @ vector(dx, f.nodes)[..., None])[..., 0]
+        for f, r, s in zip(problem.factors, linear.residual, linear.slope, strict=True)
+    ]
+    return half_squares(residuals, len(dx))
+
+
+def _damping(mu: Floats, better: Bools, before: Floats, after: Floats, promised: Floats) -> Floats:
+    """The next mu (B,): by the share of the promised decrease that came true, where it stands out from rounding."""
+    decrease = before - promised
+    telling = decrease > 1e-9 * before
+    share = np.where(telling, (before - after) / np.where(telling, decrease, 1.0), 0.5)
+    lower = np.where(mu > 1e-5, mu / 5.0, 0.0)
+    kept = np.where(share > 0.75, lower, np.where(share < 0.25, np.maximum(4.0 * mu, 1e-2), mu))
+    return np.where(better, kept, np.maximum(10.0 * mu, 1e-3))
 
 
 def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Bools]:

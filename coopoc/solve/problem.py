@@ -133,7 +133,7 @@ class Problem:
         out = []
         for factor in self.factors:
             known = factor.measurement
-            gap = known.difference(known.predict(_vector(x, factor.nodes)), factor.z)
+            gap = known.difference(known.predict(vector(x, factor.nodes)), factor.z)
             out.append(factor.whiten(gap)[0])
         return tuple(out)
 
@@ -142,7 +142,7 @@ class Problem:
         residuals, slopes = [], []
         for factor in self.factors:
             known = factor.measurement
-            predicted, slope = known.differentiate(_vector(x, factor.nodes))
+            predicted, slope = known.differentiate(vector(x, factor.nodes))
             residual, slope = factor.whiten(known.difference(predicted, factor.z), slope)  # type: ignore[assignment]
             residuals.append(residual)
             slopes.append(slope if slope.ndim == 4 else slope[None])
@@ -222,7 +222,7 @@ def jacobian(problem: Problem, linear: Linear, which: int = 0) -> Any:
     return csr_array(entries, shape=(top, 3 * len(problem.names)))
 
 
-def _vector(x: Floats, nodes: Ints) -> Floats:
+def vector(x: Floats, nodes: Ints) -> Floats:
     """(B, M, 3) the vector that each row of nodes measures."""
     if nodes.shape[1] == 1:
         return x[:, nodes[:, 0]]
@@ -235,9 +235,7 @@ def _rows(problem: Problem, kind: str, nodes: Any, z: npt.ArrayLike) -> tuple[In
     from .measurements import lookup
 
     known = lookup(kind)
-    if isinstance(nodes, str) and (nodes in problem.names or known.arity == 1):
-        nodes = [nodes]
-    flat = [nodes] if isinstance(nodes, int | np.integer) else list(nodes)
+    flat = [nodes] if isinstance(nodes, str | int | np.integer) else list(nodes)
     flat = [p for row in flat for p in (row if isinstance(row, list | tuple | np.ndarray) else [row])]
     if len(flat) % known.arity or not flat:
         raise InputError("nodes", nodes, f"must name {known.arity} points per {kind}", "Give points by name or index.")

@@ -14,6 +14,7 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError, MissingLibraryError
 from .assess import assess
+from .descend import MAX_ITERATIONS
 from .initial import initial_guess
 from .problem import Problem
 from .solution import Solution, SolveError, Status
@@ -91,7 +92,7 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     truth = assess(problem, ended.x)
     solution = Solution(
         x=ended.x, covariance=truth.covariance, cost=truth.cost, gradient=truth.gradient,
-        status=_status(truth.free, truth.remaining, ended.iterations, options.get("max_iterations", 100)),
+        status=_status(truth.free, truth.remaining, ended.iterations, options.get("max_iterations", MAX_ITERATIONS)),
         iterations=ended.iterations, build_seconds=built - began, solve_seconds=solved - built, backend=backend,
         names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, extras=ended.extras,
     )  # fmt: skip

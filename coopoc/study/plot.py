@@ -38,12 +38,22 @@ class Plot:
 
     def save(self, path: str | Path) -> str:
         """Write path.pdf, path.png and path.svg, and return the caption."""
-        for suffix, metadata in FIXED.items():
-            buffer = BytesIO()
-            with mpl.rc_context(RC):
+        with mpl.rc_context(RC):
+            _settle(self.figure)
+            for suffix, metadata in FIXED.items():
+                buffer = BytesIO()
                 self.figure.savefig(buffer, format=suffix, metadata=dict(metadata))
-            store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
+                store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
         return self.caption
+
+
+def _settle(figure: Figure) -> None:
+    """Lay the panels out and round their places: the solver of constrained layout differs in its last digits."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axes in figure.axes:
+        x, y, width, height = (round(side, 5) for side in axes.get_position(original=True).bounds)
+        axes.set_position((x, y, width, height))
 
 
 def line_names(results: Results) -> list[str]:

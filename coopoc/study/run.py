@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import itertools
+import os
+import signal
+import threading
 import time
 import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +27,6 @@ from .environment import environment
 from .publish import publish
 from .results import Results
 from .study import Cell, Params, Row, Study
-
-IDLE = 15.0
-"""s after which an idle worker leaves; it bounds the life of orphans when this process is killed."""
-
 
 def run(
     study: Study | str,
@@ -132,15 +132,34 @@ def _compute(function: Callable[[Params], list[Row]], cells: Sequence[Cell], job
     if jobs == 1 or len(cells) < 2:
         yield from (attempt(function, cell) for cell in cells)
         return
-    with parallel_config(backend="loky", inner_max_num_threads=1, idle_worker_timeout=IDLE):
+    with parallel_config(backend="loky", inner_max_num_threads=1):
         workers = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
         try:
-            yield from workers(delayed(attempt)(function, cell) for cell in cells)
+            yield from workers(delayed(_in_worker)(function, cell, os.getpid()) for cell in cells)
         except BrokenProcessPool as error:
             raise WorkerDiedError(
                 "A worker process was killed, mostly for want of memory. Finished cells are kept: "
                 "repeat the command to resume, with fewer --jobs."
             ) from error
+
+
+def _in_worker(function: Callable[[Params], list[Row]], cell: Cell, parent: int) -> Outcome:
+    _leave_with(parent)
+    return attempt(function, cell)
+
+
+@lru_cache
+def _leave_with(parent: int) -> None:
+    """End this worker when the process that started it does: Ctrl-C is for that one, and a kill leaves no orphan."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    if os.getppid() == parent:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        threading.Thread(target=watch, daemon=True).start()
 
 
 def _keep(folder: Path, outcome: Outcome) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..arrowhead import eliminate, structure
-from ..descend import Step, descend
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, descend
 from ..normal import normal_equations
 from ..problem import Linear, Problem, jacobian
 from .run import Ended, Run
@@ -17,7 +17,7 @@ DENSE_POINTS = 60
 """Up to this many points a problem without a hub is solved densely."""
 
 
-def build(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) -> Run:
+def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Run:
     """Solver of one problem.
 
     Args:

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..descend import descend
+from ..descend import MAX_ITERATIONS, TOLERANCE, descend
 from ..factor import Factor
 from ..problem import Linear, Problem
 from .run import Ended, Run
 
 
-def build(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) -> Run:
+def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Run:
     """Solver of one problem.
 
     Args:
@@ -45,6 +45,9 @@ def build(problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8) 
             there: Floats = graph.optimize(ordering[0]).vector()
         except RuntimeError as singular:
             raise np.linalg.LinAlgError("gtsam: indeterminate linear system") from singular
+        if there.size < linear.x.size:
+            ordering.clear()
+            raise np.linalg.LinAlgError("gtsam: a point without measurements")
         return there.reshape(linear.x.shape) - linear.x
 
     def run(x: Floats) -> Ended:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..arrowhead import structure
-from ..descend import descend
+from ..descend import MAX_ITERATIONS, TOLERANCE, descend
 from ..normal import Pattern, normal_equations
 from ..problem import Linear, Problem
 from .run import Ended, Run
@@ -30,7 +30,7 @@ REPAIRS = 5
 
 
 def build(
-    problem: Problem, max_iterations: int = 100, tolerance: float = 1e-8, kkt_tolerance: float = 1e-9
+    problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, kkt_tolerance: float = 1e-9
 ) -> Run:
     """Solver of one problem.
 

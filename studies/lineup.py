@@ -1,0 +1,121 @@
+"""The methods of a cell by name and knowledge, and the rows that say how they did."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from coopoc.arrays import Floats
+from coopoc.errors import InputError
+from coopoc.evaluate.metrics import errors, max_error, nees, nees_inside, neighbour_rt_le, rt_le
+from coopoc.methods.cooperative_map import CooperativeMAP
+from coopoc.methods.gnss import Gnss
+from coopoc.methods.joint_filter import JointFilter
+from coopoc.methods.kalman import Kalman
+from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.lkf_sa import LaplacianKalman
+from coopoc.methods.msmv import Msmv
+from coopoc.methods.track import Method, Track
+from coopoc.study.study import Params, Row
+from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
+
+from . import scene, weights
+
+COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
+SOLO = ("gnss", "kalman")
+KNOWLEDGE = ("identity", "nominal", "fitted", "oracle", "trained")
+
+
+def knowledge(p: Params) -> Knowledge | str:
+    """What the cell's method assumes."""
+    if p["knowledge"] == "fitted":
+        return weights.fitted(p)
+    if p["knowledge"] == "oracle":
+        return Knowledge.oracle(scene.sensors(p), scene.fleet(p["data"]))
+    return str(p["knowledge"])
+
+
+def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
+    """The method of a cell, once per training seed if it is trained.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    name, start = p["method"], _start(p)
+    if name in weights.LEARNED:
+        return [(seed, _learned(name, p, seed, start)) for seed in weights.seeds(p)]
+    assumed = knowledge(p)
+    found: dict[str, Method] = {
+        "gnss": Gnss(),
+        "kalman": Kalman(assumed, start=start),
+        "lkf-sa": LaplacianKalman(assumed),
+        "lkf-sa-edge": JointFilter(assumed, exact=False),
+        "msmv-r": Msmv(assumed),
+        "joint": JointFilter(assumed),
+        "cooperative-map": CooperativeMAP(knowledge=assumed, backend=p.get("backend", "gauss-newton")),
+    }
+    if name not in found:
+        raise InputError("method", repr(name), f"must be one of {[*found, *weights.LEARNED]}", "See coopoc list.")
+    return [(None, found[name])]
+
+
+def _start(p: Params) -> Floats | None:
+    """True positions of the egos at the first step if the cell starts there, as KalmanNet's published loop does."""
+    if p.get("start", "gnss") == "gnss":
+        return None
+    drive = scene.fleet(p["data"])
+    return drive.position[0, [drive.index(i) for i in scene.egos(p["data"], str(p["egos"]))]]
+
+
+def _learned(name: str, p: Params, seed: int, start: Floats | None) -> Method:
+    from coopoc.learned.method import LearnedGain
+    from coopoc.learned.net import GainNet
+
+    model = weights.checkpoint(name, p, seed).model
+    if isinstance(model, GainNet):
+        return LearnedGain(model, name=name, start=start)
+    return replace(model, start=start)
+
+
+def rows(p: Params, *, quantiles: int = 0) -> list[Row]:
+    """Rows of a cell, one per training seed, ego and run: errors, consistency, bytes, neighbours' errors."""
+    drive, recording = scene.fleet(p["data"]), scene.recording(p)
+    who = scene.egos(p["data"], str(p["egos"]))
+    found: list[Row] = []
+    for seed, method in methods(p, recording):
+        track = method(recording, who)
+        found += _rows(track, drive, recording, who, quantiles, {} if seed is None else {"train_seed": seed})
+    return found
+
+
+def _rows(
+    track: Track, drive: Fleet, recording: Recording, who: tuple[str, ...], quantiles: int, extra: dict[str, Any]
+) -> list[Row]:
+    duration = len(track.t) * recording.dt
+    columns: dict[str, Floats] = {
+        "rt_le_m": rt_le(track, drive),
+        "max_error_m": max_error(track, drive),
+        "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
+        "received_bytes_per_second": track.received_bytes / duration,
+        "sent_bytes_per_second": track.sent_bytes / duration,
+    }
+    fixes = np.sqrt(((recording.gnss - drive.position) ** 2).sum(axis=-1).mean(axis=1))[:, list(track.egos)]
+    columns["worse_than_gnss"] = (columns["rt_le_m"] > fixes).astype(float)
+    if track.covariance is not None:
+        columns["nees"] = nees(track, drive).mean(axis=1)
+        columns["nees_inside"] = np.broadcast_to(nees_inside(track, drive), columns["nees"].shape)
+    links = [len(recording.links.of(column)) / len(track.t) for column in track.egos]
+    distance = errors(track, drive) if quantiles else None
+    found = []
+    for e, ego in enumerate(who):
+        for r in range(len(track.x)):
+            row: Row = {"run": r, "ego": ego, **extra, "neighbours_mean": links[e]}
+            row |= {name: float(values[r, e]) for name, values in columns.items()}
+            row["seconds"] = track.seconds / len(track.x) / len(who)
+            if distance is not None:
+                row["error_quantiles_m"] = np.quantile(distance[r, :, e], np.linspace(0, 1, quantiles)).tolist()
+            found.append(row)
+    return found

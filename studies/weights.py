@@ -1,0 +1,89 @@
+"""The weights that a study needs: trained once for a setting, found again by everything that changes them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from coopoc.methods.knowledge import Knowledge
+from coopoc.study.study import Params
+from coopoc.world.sensing import observe
+from coopoc.world.v2x import V2X
+
+from .scene import fleet
+
+if TYPE_CHECKING:
+    from coopoc.learned.checkpoint import Checkpoint
+
+LEARNED = ("fedkalmannet", "centralised", "individual1", "individual2", "individual3", "individual4", "okf")
+"""Methods that are trained, the individual nets one per client."""
+
+
+def seeds(p: Params) -> range:
+    """Training seeds of a study."""
+    return range(int(p["train_seeds"]))
+
+
+def label(name: str, p: Params, seed: int) -> str:
+    """Name of a checkpoint, such as fedkalmannet-gnss-axis-0."""
+    return f"{name}-{p['start']}-{p['velocity_reading']}-{seed}"
+
+
+def key(name: str, p: Params) -> str:
+    """Hash of everything that changes the weights of a method, known before any training."""
+    keys = _keys(p["clients"], p["start"], p["velocity_reading"], int(p["train_seeds"]))
+    return hashlib.sha256("".join(keys[label(name, p, seed)] for seed in seeds(p)).encode()).hexdigest()
+
+
+@lru_cache
+def _keys(clients: str, start: str, reading: str, count: int) -> Mapping[str, str]:
+    from coopoc.learned.recipes import RECIPES, Setting, jobs
+
+    drives = fleet(clients)
+    settings = [Setting(seed, start, reading) for seed in range(count)]  # type: ignore[arg-type]
+    return {
+        job.label: job.key(drives) for setting in settings for name in RECIPES for job in jobs(name, setting, drives)
+    }
+
+
+def prepare(cells: Iterable[Params]) -> None:
+    """Train what the cells need and is not there yet: in this process, one setting after another, with progress."""
+    from coopoc.learned.recipes import train_all
+
+    wanted: dict[tuple[str, str, int], tuple[set[str], set[str]]] = {}
+    for p in cells:
+        if p.get("method") in LEARNED:
+            starts, readings = wanted.setdefault((p["clients"], p["weights"], int(p["train_seeds"])), (set(), set()))
+            starts.add(p["start"])
+            readings.add(p["velocity_reading"])
+    for (clients, folder, count), (starts, readings) in wanted.items():
+        train_all(fleet(clients), folder, seeds=range(count), starts=sorted(starts), readings=sorted(readings))  # type: ignore[arg-type]
+
+
+@lru_cache(maxsize=64)
+def _checkpoint(path: Path) -> Checkpoint:
+    from coopoc.learned.checkpoint import load
+
+    return load(path)
+
+
+def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
+    """The trained checkpoint of a method for one training seed."""
+    return _checkpoint(Path(p["weights"]) / f"{label(name, p, seed)}.safetensors")
+
+
+@lru_cache
+def _fitted(clients: str, reading: str) -> Knowledge:
+    from coopoc.learned.recipes import Setting, sensors
+
+    drives = fleet(clients)
+    acting = sensors(Setting(reading=reading))  # type: ignore[arg-type]
+    return Knowledge.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
+
+
+def fitted(p: Params) -> Knowledge:
+    """Noise fitted on the recording that the nets of training seed 0 saw."""
+    return _fitted(p["clients"], p["velocity_reading"])

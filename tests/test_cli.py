@@ -1,0 +1,136 @@
+"""The command line as a stranger meets it: in a subprocess, from another folder."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+DISTRIBUTION = Path(__file__).parent / "distribution"
+COMMAND = [sys.executable, "-m", "coopoc.cli"]
+ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION), "COLUMNS": "100"}
+
+
+def coopoc(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run([*COMMAND, *words], cwd=cwd, env=ENV, capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the small study has run."""
+    out = tmp_path_factory.mktemp("cli")
+    done = coopoc("run", "small", "--set", "runs=3", "--set", "max_neighbours=0,2", cwd=out)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("| Neighbours K")
+    assert "results are in runs/small" in done.stderr
+    assert "small:" in done.stderr  # the bar names the stage
+    return out
+
+
+def test_help_loads_nothing_heavy_and_lists_what_others_add(tmp_path: Path) -> None:
+    code = ("import sys, coopoc.cli as c\ntry: c.main(['--help'])\nexcept SystemExit as e: "
+            "print(e.code, sorted({'torch', 'pandas', 'pyarrow', 'matplotlib', 'joblib', 'scipy'} & set(sys.modules)))")  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[-1].startswith("0 []"), done.stdout
+    own = coopoc("--help", cwd=tmp_path)
+    assert re.search(r"greet +Greet somebody\.", own.stdout)
+    assert re.search(r"run +Run a study", own.stdout)
+
+
+@pytest.mark.parametrize("name", ["run", "table", "report", "list", "greet"])
+def test_each_command_explains_itself_with_an_example(tmp_path: Path, name: str) -> None:
+    done = coopoc(name, "--help", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert f"Example: coopoc {name}" in done.stdout
+
+
+def test_tables_on_stdout(folder: Path) -> None:
+    assert coopoc("table", "runs/small", "--format", "latex", cwd=folder).stdout.startswith(r"\begin{table}")
+    done = coopoc("table", "runs/small", "--rows", "max_neighbours", "--value", "max_error_m", "--where",
+                  "method=kalman,joint", "--format", "csv", cwd=folder)  # fmt: skip
+    assert done.stdout.splitlines()[0] == "Neighbours K,KF,KF low,KF high,Joint filter,Joint filter low,Joint filter high"
+    assert len(done.stdout.splitlines()) == 3
+    assert done.stderr == ""
+
+
+def test_a_dry_run_counts(folder: Path) -> None:
+    plan = json.loads(coopoc("run", "small", "--set", "runs=3", "--dry-run", cwd=folder).stdout)
+    assert (plan["cells"], plan["finished"], plan["to_compute"]) == (9, 6, 3)
+
+
+def test_a_report(folder: Path) -> None:
+    done = coopoc("report", "runs/small", "--out", "r.html", cwd=folder)
+    assert done.stdout == "r.html\n"
+    assert (folder / "r.html").read_text().startswith("<!DOCTYPE html>")
+
+
+def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
+    done = coopoc("list", cwd=tmp_path)
+    assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["datasets", "methods", "studies", "backends"]
+
+
+def test_commands_of_others(tmp_path: Path) -> None:
+    assert coopoc("greet", "--name", "x", cwd=tmp_path).stdout == "hello x\n"
+    assert coopoc("kin", "greet", cwd=tmp_path).stdout == "hello you\n"
+    assert "greet" in coopoc("kin", "--help", cwd=tmp_path).stdout
+    assert coopoc("kin", "gret", cwd=tmp_path).returncode == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run", "smal"], "study = 'smal': must be one of"),
+        (["rn"], "command = 'rn': must be one of"),
+        (["run", "small", "--set", "max_neighbours=-1"], "max_neighbours = -1: must be >= 0. Use 0 for no neighbours."),
+        (["run", "small", "--set", "runs"], "--set = 'runs': must be key=value"),
+        (["run", "small", "--set", "rums=3"], "Did you mean runs?"),
+        (["run", "small", "--jobs", "0"], "jobs = 0: must be >= 1"),
+        (["table", "nowhere"], "folder = nowhere: holds no views yet"),
+        (["report"], "folders = none"),
+    ],
+)
+def test_bad_usage_is_one_readable_line(tmp_path: Path, words: list[str], message: str) -> None:
+    done = coopoc(*words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("coopoc: ")
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert done.stdout == ""
+
+
+def test_an_unknown_option_is_usage(tmp_path: Path) -> None:
+    assert coopoc("run", "small", "--job", "2", cwd=tmp_path).returncode == 2
+
+
+def test_failed_cells_set_the_status(tmp_path: Path) -> None:
+    (tmp_path / "trouble").write_text("raise")
+    done = coopoc("run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
+    assert done.returncode == 1
+    assert "coopoc: failed: FloatingPointError: the filter diverged at step 3" in done.stderr
+    assert "cells failed: 1" in done.stderr
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> None:
+    words = ["run", "small", "--jobs", jobs, "--set", "runs=2", "pause=0.4"]
+    process = subprocess.Popen([*COMMAND, *words], cwd=tmp_path, env=ENV, stdout=subprocess.PIPE,
+                               stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
+    cells = tmp_path / "runs/small/cells"
+    for _ in range(1000):
+        if cells.is_dir() and len(list(cells.glob("*.parquet"))) >= 3:  # both workers are at work
+            break
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    _, stderr = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "coopoc: interrupted. Finished cells are kept: repeat the command to resume." in stderr
+    assert "Traceback" not in stderr
+    plan = json.loads(coopoc(*words, "--dry-run", cwd=tmp_path).stdout)
+    assert 3 <= plan["finished"] < 9

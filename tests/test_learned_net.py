@@ -1,0 +1,188 @@
+"""GainNet and its stacked rollout, against an independent wiring of the published architecture."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from coopoc import Fleet, InputError, Sensors, observe
+from coopoc.learned import GainNet, LearnedGain
+from coopoc.learned.clients import Batch
+from coopoc.learned.gradient import loss_and_gradient
+from coopoc.learned.method import DIVERGED
+from coopoc.learned.rollout import flatten, layers, steps
+
+
+def drive(steps: int = 60, vehicles: int = 1) -> Fleet:
+    """A sinuous drive with x_t = x_{t-1} + dt u_t."""
+    t = np.arange(steps) / 10
+    wave = t[:, None] / 3 + np.arange(vehicles)
+    velocity = np.stack([8 * np.cos(wave), 8 * np.sin(wave), 0.2 * np.cos(wave)], axis=-1)
+    return Fleet(tuple("abcdef"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
+
+
+def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float64) -> Batch:
+    torch.manual_seed(1)
+    velocity = 5 * torch.randn(1, models, lanes, 3, dtype=dtype).expand(steps, -1, -1, -1)
+    truth = torch.cumsum(0.1 * velocity, 0)
+    noise = torch.randn(2, steps, models, lanes, 3, dtype=dtype)
+    return Batch(truth + noise[0], velocity + noise[1], truth, 0.5 * noise[0, 0], 0.1)
+
+
+@pytest.mark.parametrize(("in_mult", "out_mult", "count"), [(40, 5, 19_938), (5, 40, 23_928), (5, 32, 19_896)])
+def test_parameter_count(in_mult: int, out_mult: int, count: int) -> None:
+    """Published: "almost 20K" (the paper), 23,928 at KalmanNet_TSP's defaults; closed form 390 i + 504 o + 1818."""
+    assert sum(p.numel() for p in GainNet(in_mult, out_mult).parameters()) == count
+    assert count == 390 * in_mult + 504 * out_mult + 1818
+
+
+class Published(nn.Module):
+    """KalmanNet architecture 2 as described in its paper, with nn.GRU over sequences of one step; same weights."""
+
+    def __init__(self, net: GainNet) -> None:
+        super().__init__()
+        self.net = net
+        self.grus = {}
+        for name in ("process", "prior", "innovation"):
+            cell = getattr(net, name)
+            gru = nn.GRU(cell.input_size, 9).to(next(net.parameters()).dtype)
+            gru.load_state_dict({f"{key}_l0": value for key, value in cell.state_dict().items()})
+            self.grus[name] = gru
+
+    def run(self, name: str, x: torch.Tensor, h: torch.Tensor) -> torch.Tensor:
+        return self.grus[name](x[None], h[None])[1][0]
+
+    def forward(self, gnss: torch.Tensor, velocity: torch.Tensor, x0: torch.Tensor, dt: float) -> torch.Tensor:
+        def unit(v: torch.Tensor) -> torch.Tensor:
+            return v / torch.clamp(torch.sqrt((v * v).sum(1, keepdim=True)), min=1e-12)
+
+        n, eye = self.net, torch.eye(3, dtype=gnss.dtype).reshape(1, 9).repeat(len(gnss), 1)
+        h_q, h_sigma, h_s = eye, 0 * eye, eye
+        y_old, m, m_old, m_prior_old, out = x0, x0, x0, x0, []
+        for t in range(gnss.shape[1]):
+            m_prior = m + dt * velocity[:, t]
+            y = gnss[:, t]
+            f1, f2, f3, f4 = unit(y - y_old), unit(y - m_prior), unit(m - m_old), unit(m - m_prior_old)
+            fc5, fc6 = torch.relu(n.update(f4)), torch.relu(n.evolution(f3))
+            fc7 = torch.relu(n.observation(torch.cat((f1, f2), 1)))
+            h_q = self.run("process", fc5, h_q)
+            sigma = self.run("prior", torch.cat((h_q, fc6), 1), h_sigma)
+            fc1 = torch.relu(n.prior_to_innovation(sigma))
+            h_s = self.run("innovation", torch.cat((fc1, fc7), 1), h_s)
+            k = n.gain(torch.relu(n.gain_hidden(torch.cat((sigma, h_s), 1))))
+            fc3 = torch.relu(n.posterior_hidden(torch.cat((h_s, k), 1)))
+            h_sigma = torch.relu(n.posterior(torch.cat((sigma, fc3), 1)))
+            correction = torch.einsum("bij,bj->bi", k.reshape(-1, 3, 3), y - m_prior)
+            m_old, m_prior_old, y_old, m = m, m_prior, y, m_prior + correction
+            out.append(m)
+        return torch.stack(out, 1)
+
+
+def test_wiring_and_features_as_published() -> None:
+    net, data = GainNet(start_gain=None, seed=3).double(), batch(1, 4, 12)
+    gnss, velocity = data.gnss[:, 0].transpose(0, 1), data.velocity[:, 0].transpose(0, 1)
+    expected = Published(net)(gnss, velocity, data.x0[0], 0.1)
+    torch.testing.assert_close(net(gnss, velocity, data.x0[0], 0.1), expected, rtol=1e-10, atol=1e-10)
+
+
+def test_stacked_rollout_is_the_reference_step() -> None:
+    nets, data = [GainNet(seed=s) for s in range(3)], batch(3, 5, 100, torch.float32)
+    stack = layers(flatten(nets), nets[0])
+    with torch.no_grad():
+        fast = torch.stack([s.x for s in steps(stack, data.gnss, data.velocity, data.x0, 0.1)])
+        for s, net in enumerate(nets):
+            slow = net(data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], 0.1)
+            torch.testing.assert_close(fast[:, s].transpose(0, 1), slow, rtol=1e-5, atol=1e-5 * slow.abs().max().item())
+
+
+def test_gradient_is_autograd_of_the_reference() -> None:
+    nets, data = [GainNet(seed=s).double() for s in range(2)], batch(2, 3, 15)
+    losses, gradient = loss_and_gradient(flatten(nets), nets[0], data)
+    for s, net in enumerate(nets):
+        x = net(data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], 0.1)
+        loss = ((x - data.truth[:, s].transpose(0, 1)) ** 2).sum(-1).mean()
+        loss.backward()
+        expected = torch.cat([p.grad.flatten() for p in net.parameters()])
+        torch.testing.assert_close(losses[s], loss.detach(), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(gradient[s], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_gradient_is_the_finite_difference() -> None:
+    net, data = GainNet(in_mult=2, out_mult=1).double(), batch(1, 2, 6)
+    theta = flatten([net])
+    _, gradient = loss_and_gradient(theta, net, data)
+    torch.manual_seed(0)
+    for _ in range(5):
+        direction = torch.randn_like(theta)
+        up, _ = loss_and_gradient(theta + 1e-6 * direction, net, data)
+        down, _ = loss_and_gradient(theta - 1e-6 * direction, net, data)
+        slope = float((up - down) / 2e-6)
+        assert slope == pytest.approx(float((gradient * direction).sum()), rel=1e-5, abs=1e-7)
+
+
+def constant(gain: np.ndarray) -> GainNet:
+    """A net whose gain is constant: the last layer's weights are zero and its bias is the gain."""
+    net = GainNet()
+    with torch.no_grad():
+        net.gain.weight.zero_()
+        net.gain.bias.copy_(torch.from_numpy(gain.flatten()))
+    return net
+
+
+def test_constant_gain_equals_the_constant_gain_filter_by_hand() -> None:
+    gain = np.array([[0.1, 0.02, 0.0], [-0.03, 0.2, 0.0], [0.0, 0.0, 0.5]])
+    rec = observe(drive(vehicles=2), Sensors(), runs=3)
+    track = LearnedGain(constant(gain))(rec, [0, 1])
+    x = rec.gnss[:, 0]
+    for t in range(1, len(rec.t)):
+        prior = x + 0.1 * rec.velocity[:, t]
+        x = prior + (rec.gnss[:, t] - prior) @ gain.T
+        np.testing.assert_allclose(track.x[:, t], x, atol=2e-4)
+
+
+def test_nothing_is_sent_online_and_no_covariance_is_claimed() -> None:
+    method = LearnedGain(GainNet())
+    track = method(observe(drive(), Sensors(), runs=2))
+    assert not method.cooperative
+    assert track.received_bytes.sum() == track.sent_bytes.sum() == method.message.payload == 0
+    assert track.covariance is None
+
+
+def test_translating_the_world_translates_the_estimate() -> None:
+    here = drive()
+    there = Fleet(here.ids, here.t, here.position + np.array([4e5, -5e6, 100.0]), here.velocity)
+    tracks = [LearnedGain(GainNet())(observe(f, Sensors(), runs=2)).x for f in (here, there)]
+    np.testing.assert_allclose(tracks[1] - tracks[0], np.broadcast_to([4e5, -5e6, 100.0], tracks[0].shape), atol=1e-4)
+
+
+def test_a_given_start_is_used_and_its_shape_checked() -> None:
+    fleet = drive()
+    rec = observe(fleet, Sensors(), runs=2)
+    track = LearnedGain(GainNet(), start=fleet.position[0])(rec)
+    np.testing.assert_array_equal(track.x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3)))
+    with pytest.raises(InputError, match="start"):
+        LearnedGain(GainNet(), start=np.zeros((5, 3)))(rec)
+
+
+def test_divergence_is_reported_and_nan_is_refused() -> None:
+    rec = observe(drive(200), Sensors(), runs=2)
+    assert LearnedGain(constant(0.1 * np.eye(3)))(rec).notes == ()
+    (note,) = LearnedGain(constant(2.05 * np.eye(3)))(rec).notes
+    assert "diverged in 2 of 2 runs" in note
+    assert DIVERGED == 10.0
+    with pytest.raises(InputError, match="not finite in run 0"):
+        LearnedGain(constant(1e30 * np.eye(3)))(rec)
+
+
+def test_diagnostics_are_the_gain_and_the_gru_states() -> None:
+    rec = observe(drive(), Sensors(), runs=2)
+    method = LearnedGain(GainNet())
+    found, track = method.diagnostics(rec), method(rec)
+    assert found.gain.shape == found.process.shape == found.prior.shape == found.innovation.shape == (2, 60, 1, 3, 3)
+    assert np.nanmax(np.abs(found.process[:, 1:])) <= 1.0
+    np.testing.assert_allclose(found.posterior[:, 1:], 1.5**2 * found.gain[:, 1:])
+    prior = track.x[:, :-1] + 0.1 * rec.velocity[:, 1:]
+    moved = np.einsum("rteij,rtej->rtei", found.gain[:, 1:], rec.gnss[:, 1:] - prior)
+    np.testing.assert_allclose(track.x[:, 1:], prior + moved, atol=1e-4)

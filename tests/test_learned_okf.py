@@ -1,0 +1,100 @@
+"""OptimisedKF: recovers known noise, equals filterpy's filter, and its covariance is calibrated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from coopoc import Fleet, InputError, Sensors, observe
+from coopoc.evaluate.metrics import nees
+from coopoc.learned import OptimisedKF, Pieces, clients, fit_okf
+from coopoc.learned.okf import fit_okf_many
+
+
+def walk(steps: int, seed: int = 0) -> Fleet:
+    """Standing velocity readings of a vehicle that moves by N(0, 0.2^2) m per step and axis: velocity noise is the
+    process noise, known exactly."""
+    rng = np.random.default_rng(seed)
+    position = np.cumsum(rng.normal(0, 0.2, (steps, 1, 3)), axis=0)
+    return Fleet(("w",), np.arange(steps) / 10, position, np.zeros((steps, 1, 3)))
+
+
+@pytest.mark.parametrize("start", ["gnss", "true"])
+def test_recovers_the_noise_of_a_linear_problem(start: str) -> None:
+    """Known: 0.2 m per step and 1.5 m; the loss fixes the ratio, the innovations fix the scale."""
+    (client,) = clients(walk(8100), Sensors(), piece=100, start=start)  # type: ignore[arg-type]
+    found = fit_okf(client.training, client.validation, steps=120, velocity_part=False)
+    np.testing.assert_allclose(found.method.process_std, 0.2, rtol=0.12)
+    np.testing.assert_allclose(found.method.gnss_std, 1.5, rtol=0.05)
+    assert found.validation_loss[-1] < found.validation_loss[0]
+
+
+def test_recovers_the_share_of_the_velocity() -> None:
+    """Known: 10 % of each velocity component (the "axis" reading of the paper's training noise)."""
+    t = np.arange(8100) / 10
+    velocity = np.stack([9 * np.cos(t / 9), 9 * np.sin(t / 9), 4 * np.cos(t / 5)], axis=-1)[:, None]
+    fleet = Fleet(("a",), t, np.cumsum(0.1 * velocity, axis=0), velocity)
+    (client,) = clients(fleet, Sensors.paper_training())
+    found = fit_okf(client.training, client.validation, steps=150).method
+    np.testing.assert_allclose(found.velocity_ratio, 0.1, rtol=0.2)
+    np.testing.assert_allclose(found.gnss_std, 1.5, rtol=0.05)
+
+
+def test_equals_filterpy() -> None:
+    method = OptimisedKF((0.1, 0.2, 0.05), (0.1, 0.05, 0.0), (1.5, 2.0, 0.7))
+    velocity = np.random.default_rng(0).normal(0, 8, (50, 1, 3))
+    fleet = Fleet(("a",), np.arange(50) / 10, np.cumsum(0.1 * velocity, axis=0), velocity)
+    rec = observe(fleet, Sensors(), runs=1)
+    track = method(rec)
+    theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    theirs.x, theirs.P = rec.gnss[0, 0, 0].copy(), np.diag(np.square(method.gnss_std))
+    theirs.H, theirs.R, theirs.B = np.eye(3), np.diag(np.square(method.gnss_std)), 0.1 * np.eye(3)
+    for step in range(1, 50):
+        u = rec.velocity[0, step, 0]
+        moved = 0.1 * np.array(method.velocity_ratio) * u
+        theirs.predict(u=u, Q=np.diag(np.square(method.process_std) + moved**2))
+        theirs.update(rec.gnss[0, step, 0])
+        np.testing.assert_allclose(track.x[0, step, 0], theirs.x, atol=1e-10)
+        assert track.covariance is not None
+        np.testing.assert_allclose(track.covariance[0, step, 0], theirs.P, atol=1e-10)
+
+
+def test_trained_covariance_is_calibrated() -> None:
+    """Mean NEES of a three-state filter with the right covariance is 3."""
+    (client,) = clients(walk(8100), Sensors())
+    method = fit_okf(client.training, client.validation, steps=120, velocity_part=False).method
+    fleet = walk(400, seed=9)
+    claimed = nees(method(observe(fleet, Sensors(), runs=30)), fleet)
+    assert claimed[:, 50:].mean() == pytest.approx(3.0, rel=0.15)
+
+
+def test_stacked_training_is_training_one_by_one() -> None:
+    tasks = []
+    for seed in range(2):
+        (client,) = clients(walk(700 + 300 * seed, seed), Sensors(), piece=20, seed=seed)
+        tasks.append((client.training, client.validation))
+    together = fit_okf_many(tasks, steps=20)
+    for task, found in zip(tasks, together, strict=True):
+        alone = fit_okf(*task, steps=20)
+        np.testing.assert_allclose(alone.method.process_std, found.method.process_std, rtol=1e-8)
+        np.testing.assert_allclose(alone.method.gnss_std, found.method.gnss_std, rtol=1e-8)
+
+
+def test_padding_does_not_weigh() -> None:
+    """A short set of pieces keeps its own mean when it is stacked with a long one."""
+    (client,) = clients(walk(900), Sensors(), piece=20)
+    few, many = client.training.take(range(3)), client.training
+    alone = fit_okf(few, few, steps=5).validation_loss
+    stacked = fit_okf_many([(few, few), (many, Pieces.join([few, few]))], steps=5)
+    np.testing.assert_allclose(stacked[0].validation_loss, alone, rtol=1e-10)
+    np.testing.assert_allclose(stacked[1].validation_loss[0], alone[0], rtol=1e-10)
+
+
+def test_noise_that_cannot_be_is_refused() -> None:
+    with pytest.raises(InputError, match="gnss_std"):
+        OptimisedKF((0.1, 0.1, 0.1), (0, 0, 0), (1.5, 0.0, 1.5))
+    with pytest.raises(InputError, match="process_std"):
+        replace(OptimisedKF((0.1, 0.1, 0.1), (0, 0, 0), (1.5, 1.5, 1.5)), process_std=(0.1, -1, 0.1))

@@ -1,0 +1,130 @@
+"""Checkpoints, recipes and train_all: round trips, refusals, resuming."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import coopoc.learned.recipes as recipes
+from coopoc import Fleet, InputError, Sensors, observe
+from coopoc.learned import Checkpoint, GainNet, LearnedGain, OptimisedKF, Schedule, load, load_method, save, train_all
+from coopoc.learned.checkpoint import read_card
+from coopoc.learned.rollout import flatten
+
+
+def drives() -> Fleet:
+    t = np.arange(80) / 10
+    wave = t[:, None] / 4 + np.arange(2)
+    velocity = np.stack([9 * np.cos(wave), 9 * np.sin(wave), 0 * wave], axis=-1)
+    return Fleet(("a", "b"), t, np.cumsum(0.1 * velocity, axis=0), velocity, name="pair")
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The recipes with a few steps on short pieces."""
+    for name, recipe in recipes.RECIPES.items():
+        schedule = Schedule(epochs=3, batch=2, checks=2)
+        quicker = replace(recipe, schedule=schedule, rounds=2, local_epochs=1, piece=10)
+        monkeypatch.setitem(recipes.RECIPES, name, quicker)
+
+
+def test_checkpoint_round_trip(tmp_path: Path) -> None:
+    net, history = GainNet(seed=4), flatten([GainNet(seed=1), GainNet(seed=2)])
+    path = save(tmp_path / "net.safetensors", Checkpoint(net, {"recipe": "mine", "best": 3}, history))
+    again = load(path)
+    assert isinstance(again.model, GainNet)
+    assert torch.equal(flatten([again.model]), flatten([net]))
+    assert torch.equal(flatten([again.after(1)]), history[1:])
+    assert (again.card["recipe"], again.card["best"], again.card["parameters"]) == ("mine", 3, 19_938)
+    assert again.card["environment"]["torch"] == torch.__version__
+    assert [p.name for p in tmp_path.iterdir()] == ["net.safetensors"]
+    with pytest.raises(InputError, match="row"):
+        again.after(2)
+
+
+def test_okf_round_trip(tmp_path: Path) -> None:
+    method = OptimisedKF((0.1, 0.2, 0.3), (0.1, 0.1, 0.0), (1.5, 1.6, 1.7))
+    save(tmp_path / "okf.safetensors", Checkpoint(method, {}))
+    again = load_method(tmp_path / "okf.safetensors")
+    assert isinstance(again, OptimisedKF)
+    assert (again.process_std, again.velocity_ratio, again.gnss_std) == (
+        method.process_std, method.velocity_ratio, method.gnss_std,
+    )  # fmt: skip
+
+
+def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
+    path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(5, 40), {}))
+    tensors, card = load_file(path), read_card(path)
+    tensors["gain.weight"] = torch.zeros(9, 90)
+    save_file(tensors, path, metadata={"card": '{"kind": "gain_net", "in_mult": 5, "out_mult": 40}'})
+    assert card["parameters"] == 23_928
+    with pytest.raises(InputError, match=r"gain.weight of shape \(9, 90\): expected \(9, 720\)"):
+        load(path)
+
+
+def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "text.safetensors").write_text("not weights")
+    save_file({"x": torch.zeros(1)}, tmp_path / "bare.safetensors")
+    for name, message in (("none", "existing file"), ("text", "no safetensors"), ("bare", "card")):
+        with pytest.raises(InputError, match=message):
+            load(tmp_path / f"{name}.safetensors")
+    with pytest.raises(InputError, match="learned method"):
+        load_method("kalmannet9")
+
+
+@pytest.mark.usefixtures("quick")
+def test_train_all_makes_every_recipe_and_resumes(tmp_path: Path) -> None:
+    fleet = drives()
+    made = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"), progress=False)
+    names = {"fedkalmannet", "centralised", "individual1", "individual2", "okf"}
+    assert set(made) == {f"{n}-{start}-axis-{seed}" for n in names for start in ("gnss", "true") for seed in (0, 1)}
+    card = made["fedkalmannet-true-axis-1"].card
+    assert card["digest"] == fleet.digest
+    assert (card["settings"]["seed"], card["settings"]["start"], card["recipe"]) == (1, "true", "fedkalmannet")
+    assert [row["round"] for row in card["history"]] == [0, 1, 2]
+
+    stamps = {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()}
+    again = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"), progress=False)
+    assert {p: p.stat().st_mtime_ns for p in tmp_path.iterdir()} == stamps
+    first, second = (flatten([d["centralised-gnss-axis-0"].model]) for d in (made, again))  # type: ignore[list-item]
+    assert torch.equal(first, second)
+
+
+@pytest.mark.usefixtures("quick")
+def test_what_changes_the_weights_changes_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet = drives()
+    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
+    (path,) = tmp_path.iterdir()
+    before = read_card(path)["key"]
+    faster = replace(recipes.RECIPES["centralised"], schedule=Schedule(epochs=3, batch=2, checks=2, learning_rate=2e-3))
+    monkeypatch.setitem(recipes.RECIPES, "centralised", faster)
+    train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
+    assert read_card(path)["key"] != before
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_trained_net_is_a_method(tmp_path: Path) -> None:
+    train_all(drives(), tmp_path, seeds=[0], recipes=["individual"], progress=False)
+    method = load_method(tmp_path / "individual2-gnss-axis-0.safetensors")
+    assert isinstance(method, LearnedGain)
+    assert method.name == "individual"
+    assert method(observe(drives(), Sensors(), runs=2), [1]).x.shape == (2, 80, 1, 3)
+
+
+def test_unknown_recipe_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="recipe = 'magic'"):
+        train_all(drives(), tmp_path, recipes=["magic"])
+
+
+def test_recipes_follow_the_paper() -> None:
+    """Section IV.A: 20 rounds; 1500 and 500 epochs; pieces of 100; 80/20; all nets with one optimiser setting."""
+    fed, centralised, individual = (recipes.RECIPES[n] for n in ("fedkalmannet", "centralised", "individual"))
+    assert (fed.rounds, fed.aggregate, fed.local_epochs) == (20, "mean", 5)
+    assert (centralised.schedule.epochs, individual.schedule.epochs) == (1500, 500)
+    assert {(r.piece, r.split, r.noise) for r in recipes.RECIPES.values()} == {(100, 0.8, "static")}
+    assert len({replace(r.schedule, epochs=1) for r in (fed, centralised, individual)}) == 1

@@ -1,0 +1,209 @@
+"""Clients, fit and federate: pieces, laws, determinism and guards; AdamW against torch's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import coopoc.learned.train as train
+from coopoc import Fleet, InputError, Sensors
+from coopoc.learned import GainNet, Pieces, Schedule, clients, federate, fit
+from coopoc.learned.aggregate import mean, uniform
+from coopoc.learned.clients import mirrored
+from coopoc.learned.rollout import flatten
+from coopoc.learned.schedule import adamw, clip, cosine
+from coopoc.learned.train import Task, fit_many
+
+QUICK = Schedule(epochs=6, batch=2, checks=3)
+
+
+def drives(lengths: tuple[int, ...] = (130, 260), seed: int = 0) -> Fleet:
+    """Drives of these lengths with different speeds, absent afterwards."""
+    steps, rng = max(lengths), np.random.default_rng(seed)
+    t = np.arange(steps) / 10
+    wave = t[:, None] / 4 + rng.uniform(0, 6, len(lengths))
+    velocity = np.stack([9 * np.cos(wave), 9 * np.sin(wave), 0.1 + 0 * wave], axis=-1)
+    position = np.cumsum(0.1 * velocity, axis=0)
+    for column, length in enumerate(lengths):
+        velocity[length:, column] = position[length:, column] = np.nan
+    return Fleet(tuple(f"c{i}" for i in range(len(lengths))), t, position, velocity)
+
+
+def test_pieces_as_in_the_paper() -> None:
+    """T = 1550, 4600, 1450, 1420 give 15, 45, 14, 14 pieces of 100 steps after a start; 80 % of them train."""
+    found = clients(drives((1550, 4600, 1450, 1420)))
+    assert [(len(c.training), len(c.validation)) for c in found] == [(12, 3), (36, 9), (11, 3), (11, 3)]
+    assert found[0].training.truth.shape == (12, 101, 3)
+
+
+def test_training_and_validation_pieces_are_disjoint() -> None:
+    for client in clients(drives(), piece=10):
+        used = {row.numpy().tobytes() for row in client.training.gnss}
+        kept = {row.numpy().tobytes() for row in client.validation.gnss}
+        assert len(used) == len(client.training)
+        assert not used & kept
+
+
+def test_pieces_are_the_noisy_drive() -> None:
+    fleet, sensors = drives((2100,)), Sensors.paper_training()
+    (client,) = clients(fleet, sensors, piece=20)
+    pieces = Pieces.join([client.training, client.validation])
+    assert float((pieces.gnss - pieces.truth).std()) == pytest.approx(1.5, rel=0.03)
+    relative = (pieces.velocity - pieces.true_velocity) / pieces.true_velocity
+    assert float(relative.std()) == pytest.approx(0.1, rel=0.03)
+    assert float(pieces.truth[:, 0].abs().max()) == 0.0
+    moved = pieces.truth.diff(dim=1) - 0.1 * pieces.true_velocity[:, 1:]
+    assert float(moved.abs().max()) < 1e-4
+
+
+def test_start_and_fresh_noise() -> None:
+    index, draws = torch.arange(4)[None], [torch.Generator().manual_seed(0)]
+    first = {start: clients(drives(), piece=10, start=start)[0].training for start in ("gnss", "true")}
+    torch.testing.assert_close(first["gnss"].batch(index).x0[0], first["gnss"].gnss[:4, 0])
+    assert float(first["true"].batch(index).x0.abs().max()) == 0.0
+    static = first["gnss"].batch(index)
+    torch.testing.assert_close(static.gnss, first["gnss"].batch(index).gnss, rtol=0, atol=0)
+    fresh = clients(drives(), piece=10, noise="fresh")[0].training
+    one, two = fresh.batch(index, draws), fresh.batch(index, draws)
+    assert float((one.gnss - two.gnss).abs().max()) > 0.5
+    torch.testing.assert_close(one.truth, static.truth)
+
+
+def test_mirroring_keeps_motion_and_noise() -> None:
+    pieces = clients(drives(), piece=10)[0].training
+    given = pieces.batch(torch.arange(8)[None])
+    seen = mirrored(given, [torch.Generator().manual_seed(2)])
+    for a, b in ((given.gnss, seen.gnss), (given.truth, seen.truth)):
+        torch.testing.assert_close(a.norm(dim=-1), b.norm(dim=-1))
+    exact = replace(pieces, velocity=pieces.true_velocity).batch(torch.arange(8)[None])
+    moved = 0.1 * mirrored(exact, [torch.Generator().manual_seed(2)]).velocity[1:]
+    torch.testing.assert_close(seen.truth.diff(dim=0), moved, atol=1e-4, rtol=0)
+    assert not torch.equal(given.truth, seen.truth)
+
+
+@pytest.mark.parametrize(
+    ("field", "options"),
+    [("noise", {"noise": "none"}), ("start", {"start": "zero"}), ("piece", {"piece": 1}), ("fleet", {"piece": 100})],
+)
+def test_clients_refuse_what_cannot_be(field: str, options: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=field):
+        clients(drives((130,)), **options)  # type: ignore[arg-type]
+
+
+def test_one_federated_client_is_local_training() -> None:
+    """Law: federating one client for one round is `fit` on its pieces, bit for bit, and so is a uniform average."""
+    (client,) = clients(drives((300,)), piece=10)
+    schedule = replace(QUICK, epochs=2, epoch="pass", batch=4)
+    local = train.fit_many([Task(GainNet(), client.training, client.validation, 5, client.name)], schedule)[0]
+    for rule in ("mean", "uniform"):
+        fed = federate(GainNet(), [client], 1, rule, local_epochs=2, seed=5, schedule=schedule)
+        assert torch.equal(fed.history[1].weights, local.history[-1].weights)
+
+
+def test_federation_counts_its_bytes_and_keeps_every_round() -> None:
+    group = clients(drives(), piece=10)
+    fed = federate(GainNet(), group, rounds=3, local_epochs=1, schedule=QUICK)
+    assert [r.number for r in fed.history] == [0, 1, 2, 3]
+    assert fed.history[2].received_bytes == 2 * 4 * 19_938
+    assert fed.history[2].sent_bytes == 2 * (4 * 19_938 + 4)
+    assert torch.equal(flatten([fed.model])[0], fed.best.weights)
+    assert torch.equal(flatten([fed.after(1)])[0], fed.history[1].weights)
+    with pytest.raises(InputError, match="round = 4"):
+        fed.after(4)
+
+
+def test_aggregation_rules() -> None:
+    weights, sizes = torch.tensor([[1.0, 0.0], [4.0, 8.0]]), torch.tensor([3, 1])
+    assert mean(weights, sizes).tolist() == [1.75, 2.0]
+    assert uniform(weights, sizes).tolist() == [2.5, 4.0]
+    with pytest.raises(InputError, match="aggregate"):
+        federate(GainNet(), clients(drives(), piece=10), aggregate="vote")
+
+
+def test_same_seed_same_weights_and_another_seed_another_net() -> None:
+    (client,) = clients(drives((300,)), piece=10)
+    nets = [fit(GainNet(seed=s), client.training, client.validation, QUICK, seed=s).model for s in (1, 1, 2)]
+    first, again, other = flatten(nets)
+    assert torch.equal(first, again)
+    assert not torch.allclose(first, other)
+
+
+def test_stacking_changes_no_net() -> None:
+    group = clients(drives(), piece=10)
+    tasks = [Task(GainNet(seed=s), c.training, c.validation, s) for s, c in enumerate(group)]
+    together = fit_many(tasks, QUICK)
+    for task, fitted in zip(tasks, together, strict=True):
+        alone = fit_many([task], QUICK)[0]
+        torch.testing.assert_close(flatten([alone.model]), flatten([fitted.model]), rtol=1e-5, atol=1e-6)
+
+
+def test_training_lowers_the_loss_and_keeps_the_best_weights() -> None:
+    group = clients(drives((600, 600)), piece=20)
+    training, validation = (Pieces.join([getattr(c, part) for c in group]) for part in ("training", "validation"))
+    found = fit(GainNet(start_gain=0.3), training, validation, Schedule(epochs=60, learning_rate=3e-3))
+    assert found.best.validation_loss < 0.85 * found.history[0].validation_loss
+    assert torch.equal(flatten([found.model])[0], found.best.weights)
+
+
+def test_a_pass_sees_every_piece_and_a_step_one_batch() -> None:
+    draw = np.random.default_rng(0)
+    plan = Schedule(epochs=3, epoch="pass", batch=5).plan(10, draw)
+    assert plan.shape == (6, 5)
+    assert np.bincount(plan.ravel()).tolist() == [3] * 10
+    assert Schedule(epochs=7, batch=4).plan(10, draw).shape == (7, 4)
+    assert all(len(set(row)) == 4 for row in Schedule(epochs=50, batch=4).plan(10, draw).tolist())
+
+
+def test_a_net_that_breaks_stops_with_a_reason_and_the_others_go_on() -> None:
+    (client,) = clients(drives((300,)), piece=10)
+    broken = replace(client.training, gnss=client.training.gnss.clone().fill_(float("nan")))
+    tasks = [Task(GainNet(), t, client.validation) for t in (client.training, broken)]
+    good, bad = fit_many(tasks, QUICK)
+    assert good.stopped is None
+    assert bad.stopped == "loss or gradient not finite at step 1"
+    assert torch.equal(flatten([bad.model]), flatten([GainNet()]))
+    assert not torch.equal(flatten([good.model]), flatten([GainNet()]))
+
+
+def test_a_client_that_breaks_is_left_out_of_the_round() -> None:
+    one, two = clients(drives(), piece=10)
+    broken = replace(two, training=replace(two.training, gnss=two.training.gnss.clone().fill_(float("nan"))))
+    fed = federate(GainNet(), [one, broken], rounds=1, local_epochs=1, schedule=QUICK)
+    alone = federate(GainNet(), [one], rounds=1, local_epochs=1, schedule=QUICK)
+    assert fed.history[1].rejected == {"c1": "loss or gradient not finite at step 1"}
+    torch.testing.assert_close(fed.history[1].weights, alone.history[1].weights, rtol=1e-5, atol=1e-7)
+
+
+def test_adamw_is_that_of_torch() -> None:
+    torch.manual_seed(0)
+    theta = torch.randn(3, 7, dtype=torch.float64)
+    other = theta.clone().requires_grad_()
+    optimiser = torch.optim.AdamW([other], lr=1e-2, weight_decay=0.3)
+    first, second, rate = torch.zeros_like(theta), torch.zeros_like(theta), torch.full((3, 1), 1e-2, dtype=theta.dtype)
+    for step in range(1, 8):
+        gradient = torch.randn_like(theta)
+        other.grad = gradient.clone()
+        optimiser.step()
+        adamw(theta, gradient, first, second, step, rate, 0.3)
+        torch.testing.assert_close(theta, other.detach(), rtol=1e-10, atol=1e-12)
+
+
+def test_clip_and_cosine() -> None:
+    """Against torch's own clipping and cosine schedule."""
+    gradient = torch.tensor([[3.0, 4.0], [0.3, 0.4]])
+    torch.testing.assert_close(clip(gradient, 1.0), torch.tensor([[0.6, 0.8], [0.3, 0.4]]), rtol=1e-5, atol=0)
+    optimiser = torch.optim.SGD([torch.zeros(1)], lr=1.0)
+    scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 8)
+    for factor in cosine(8):
+        assert factor == pytest.approx(scheduler.get_last_lr()[0], abs=1e-12)
+        optimiser.step()
+        scheduler.step()
+
+
+@pytest.mark.parametrize("field", ["epochs", "batch", "learning_rate", "clip", "checks"])
+def test_schedule_refuses_zero(field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        Schedule(**{field: 0})  # type: ignore[arg-type]

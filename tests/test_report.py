@@ -1,0 +1,101 @@
+"""The report: one file, nothing outside it, everything that must be said."""
+
+import importlib
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from coopoc.errors import InputError
+from coopoc.study.report import report
+from coopoc.study.run import run
+
+VOID = {"meta", "link", "img"}
+
+
+class Page(HTMLParser):
+    """Collects tags, attributes that refer to something, ids and text, and checks that tags close in order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.references: list[str] = []
+        self.ids: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        if tag not in VOID:
+            self.open.append(tag)
+        assert tag != "script"
+        for name, value in attrs:
+            if name in ("href", "src", "srcset", "action", "data"):
+                self.references.append(value or "")
+            if name == "id":
+                self.ids.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
+    out = tmp_path_factory.mktemp("report")
+    (out / "trouble").write_text("raise")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
+        study = importlib.import_module("small_study").STUDY
+        run(study, out, settings={"trouble": str(out / "trouble")}, progress=False)
+    cards = {"circle": {"vehicles": 5, "licence": "<none> & free"}}
+    path = report([out / "small"], out / "page" / "report.html", "Circles & <more>", ["A lead."], cards)
+    page = Page()
+    page.feed(path.read_text())
+    return path, page
+
+
+def test_nothing_outside_the_file_is_needed(made: tuple[Path, Page]) -> None:
+    path, page = made
+    assert page.open == []
+    outside = [r for r in page.references if not r.startswith(("data:", "#"))]
+    assert outside == []
+    assert {r[1:] for r in page.references if r.startswith("#")} <= set(page.ids)
+    css = re.search(r"<style>(.*?)</style>", path.read_text(), re.S)
+    assert css is not None
+    assert "url(" not in css[1]
+    assert "@import" not in css[1]
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["What is a neighbour worth on a circle?", "Key findings", "KF: ", "Settings and seeds", "Recipe", "nothing here learns",
+     "Limitations", "Nobody drives in circles.", "Environment", "numpy", "Failed cells: 1",
+     "FloatingPointError: the filter diverged at step 3", "method = KF", "RT-LE [m] at a GNSS noise of 3.5 m.",
+     "A lead.", "<none> & free", "Circles & <more>"],
+)  # fmt: skip
+def test_it_says(made: tuple[Path, Page], words: str) -> None:
+    assert words in made[1].text
+
+
+def test_files_can_be_taken_out_of_it(made: tuple[Path, Page]) -> None:
+    text = made[0].read_text()
+    for name in ("small-rt_le.csv", "small-rt_le.tex", "small-rt_le.md", "small-rt_le.pdf", "small-rt_le.png"):
+        assert f'download="{name}"' in text
+    assert 'src="data:image/svg+xml;base64,' in text
+
+
+def test_the_same_folders_give_the_same_page(made: tuple[Path, Page], tmp_path: Path) -> None:
+    path, _ = made
+    folder = path.parents[1] / "small"
+    first, second = (report([folder], tmp_path / name) for name in ("a.html", "b.html"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_folders_that_cannot_be_shown_are_named(made: tuple[Path, Page], tmp_path: Path) -> None:
+    folder = made[0].parents[1] / "small"
+    with pytest.raises(InputError, match="different studies"):
+        report([folder, folder], tmp_path / "r.html")
+    with pytest.raises(InputError, match=r"holds no manifest\.json"):
+        report([tmp_path], tmp_path / "r.html")

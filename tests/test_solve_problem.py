@@ -1,0 +1,235 @@
+"""Problems: built by hand, from a snapshot, from a window; residuals, Jacobian, and what a wrong input says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from coopoc import V2X, Fleet, InputError, Knowledge, Sensors, observe
+from coopoc.solve import MEASUREMENTS, Factor, Problem, SolveError, Status, solve
+from coopoc.solve.initial import converted, initial_guess
+from coopoc.solve.sights import relative_std
+from coopoc.world.recording import Recording
+from coopoc.world.spherical import to_vector, vector_cov
+
+S2 = Sensors.paper_scenario2()
+PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+
+
+@pytest.fixture(scope="module")
+def recording(crossing: Fleet) -> Recording:
+    return observe(crossing, S2, V2X(max_neighbours=4, radius=60), runs=3)
+
+
+def mixed(seed: int = 0) -> Problem:
+    """One factor of every kind, with std per component, per row and a full root."""
+    rng = np.random.default_rng(seed)
+    p = Problem("abcd", x0=rng.normal(size=(4, 3)) * 10)
+    p = p.add("position", list("abcd"), rng.normal(size=(4, 3)) * 10, std=rng.uniform(1, 3, (4, 3)))
+    p = p.add("displacement", ("a", "b"), [5, 1, 0], sqrt_information=np.tril(rng.uniform(0.5, 1, (3, 3))))
+    p = p.add("spherical", [("a", "c"), ("d", "b")], [[9, 1, 1.5], [12, -3, 1.2]], std=[1, 0.07, 0.07])
+    p = p.add("range", ("c", "d"), 7.0, std=0.5).add("azimuth", ("b", "d"), 2.0, std=0.1)
+    return p.add("inclination", ("a", "d"), 1.4, std=0.1)
+
+
+def test_jacobian_equals_casadis() -> None:
+    problem = mixed()
+    x = ca.SX.sym("x", 3, 4)
+    rows = []
+    for factor in problem.factors:
+        for k, nodes in enumerate(factor.nodes.tolist()):
+            vector = x[:, nodes[-1]] - (x[:, nodes[0]] if len(nodes) == 2 else 0)
+            gap = ca.vertcat(*MEASUREMENTS[factor.kind].formula(vector[0], vector[1], vector[2], ca)) - factor.z[k]
+            gap = [ca.atan2(ca.sin(gap[c]), ca.cos(gap[c])) if angle else gap[c]
+                   for c, angle in enumerate(factor.measurement.angles)]  # fmt: skip
+            rows.append(ca.DM(factor.root[k]) @ ca.vertcat(*gap))
+    residual = ca.vertcat(*rows)
+    reference = ca.Function("r", [x], [residual, ca.jacobian(residual, ca.vec(x))])
+    r, J = problem.whiten(problem.x0)
+    expected, slope = (np.asarray(a) for a in reference(problem.x0.T))
+    assert r == pytest.approx(expected[:, 0], abs=1e-12)
+    assert J.toarray() == pytest.approx(slope, abs=1e-12)
+    assert problem.cost(problem.x0) == pytest.approx(0.5 * r @ r)
+
+
+def test_snapshot_holds_the_star_of_its_step(recording: Recording) -> None:
+    problem = Problem.from_snapshot(recording, step=10, ego="c0")
+    links = recording.links.of(0)
+    links = links[recording.links.step[links] == 10]
+    fixes, relative = problem.factors
+    assert problem.names == ("c0", *(recording.ids[n] for n in recording.links.neighbour[links]))
+    assert np.array_equal(fixes.z[1:], recording.gnss[0, 10, recording.links.neighbour[links]])
+    assert np.array_equal(relative.z, recording.relative[0, links])
+    assert np.array_equal(relative.nodes, [[0, k + 1] for k in range(len(links))])
+    assert (fixes.std == 3.5).all()
+    assert relative.std[0] == pytest.approx(S2.relative_std)
+
+
+def test_window_chains_who_stays(recording: Recording) -> None:
+    problem = Problem.from_window(recording, step=20, ego=0, length=4)
+    moved = next(f for f in problem.factors if f.kind == "displacement")
+    for (i, j), z in zip(moved.nodes, moved.z, strict=True):
+        (before, s), (after, t) = problem.names[i].split("@"), problem.names[j].split("@")
+        assert before == after
+        assert int(t) == int(s) + 1
+        column = recording.ids.index(after)
+        assert z == pytest.approx(recording.dt * recording.velocity[0, int(t), column])
+    stays = sum(name.split("@")[0] + f"@{int(name.split('@')[1]) - 1}" in problem.names for name in problem.names)
+    assert len(moved.nodes) == stays
+    assert [problem.names[h] for h in problem.hub] == [f"c0@{s}" for s in range(17, 21)]
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_all_runs_at_once_hold_each_run(recording: Recording, length: int) -> None:
+    batch = Problem.from_window(recording, 20, 0, length, run=None)
+    assert batch.batch == 3
+    for run in range(3):
+        single, picked = Problem.from_window(recording, 20, 0, length, run=run), batch.pick(run)
+        assert picked.batch is None
+        x = np.random.default_rng(run).normal(size=(len(single.names), 3)) * 30
+        assert picked.cost(x) == single.cost(x)
+
+
+def test_knowledge_sets_the_weights(recording: Recording) -> None:
+    nominal = Problem.from_window(recording, 20, 0, 3)
+    stated = Problem.from_window(recording, 20, 0, 3, noise=Knowledge.nominal(S2))
+    x = np.random.default_rng(0).normal(size=(len(nominal.names), 3)) * 30
+    assert stated.cost(x) == pytest.approx(nominal.cost(x), rel=1e-12)
+    identity = Problem.from_window(recording, 20, 0, 3, noise=Knowledge.identity())
+    assert {f.kind for f in identity.factors} == {"position", "displacement"}
+    assert all((f.std == 1).all() for f in identity.factors)
+
+
+def test_a_range_below_the_gate_widens_its_angles(recording: Recording) -> None:
+    """The tangential std in metres is that at min_range, as in the converted covariance (vector_cov)."""
+    near = np.array([[0.5, 0.3, 1.5]])
+    std = relative_std(near, S2)[0]
+    floor = np.linalg.eigvalsh(vector_cov(near[0], S2.relative_std, S2.min_range))
+    assert 0.5 * std[2] == pytest.approx(np.sqrt(floor[1]), rel=1e-9)
+    assert relative_std(near * [10, 1, 1], S2).shape == (3,)
+
+
+def test_infinite_std_is_no_measurement() -> None:
+    with_blank = PAIR.add("spherical", ("a", "b"), [9.5, 0.1, 1.5], std=np.inf).add("range", ("a", "b"), 10, std=1.0)
+    without = PAIR.add("range", ("a", "b"), 10, std=1.0)
+    for backend in ("gauss-newton", "gtsam", "osqp"):
+        assert solve(with_blank, backend).x == pytest.approx(solve(without).x, abs=1e-9)
+
+
+BAD = {
+    "nan": (lambda: PAIR.add("position", "a", [0, np.nan, 0], std=1.0), "finite"),
+    "infinite": (lambda: PAIR.add("range", ("a", "b"), np.inf, std=1.0), "finite"),
+    "zero std": (lambda: PAIR.add("range", ("a", "b"), 5.0, std=0.0), "must be > 0"),
+    "negative std": (lambda: PAIR.add("range", ("a", "b"), 5.0, std=-1.0), "must be > 0"),
+    "nan std": (lambda: PAIR.add("range", ("a", "b"), 5.0, std=np.nan), "must be > 0"),
+    "degrees": (lambda: PAIR.add("azimuth", ("a", "b"), 270.0, std=0.1), "deg2rad"),
+    "degrees std": (lambda: PAIR.add("azimuth", ("a", "b"), 1.0, std=4.0), "radians"),
+    "zero range": (lambda: PAIR.add("range", ("a", "b"), 0.0, std=1.0), "Coincident"),
+    "unknown node": (lambda: PAIR.add("range", ("a", "c"), 5.0, std=1.0), "one of a, b"),
+    "unknown index": (lambda: Problem(("a",), (Factor("position", [[3]], [[0, 0, 0]], std=1.0),)), "index < 1"),
+    "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "two different points"),
+    "unknown kind": (lambda: PAIR.add("doppler", ("a", "b"), 5.0, std=1.0), "spherical"),
+    "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "one of the two"),
+    "both std": (lambda: PAIR.add("range", ("a", "b"), 5.0, 1.0, [[1.0]]), "one of the two"),
+    "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1], std=1.0), "must have shape"),
+    "shape of std": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
+    "shape of root": (lambda: PAIR.add("range", ("a", "b"), 5.0, sqrt_information=np.eye(3)), "must have shape"),
+    "nan root": (lambda: PAIR.add("range", ("a", "b"), 5.0, sqrt_information=[[np.nan]]), "finite"),
+    "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
+    "twice a name": (lambda: Problem(("a", "a")), "must be unique"),
+    "x0": (lambda: Problem(("a", "b"), x0=np.zeros((3, 3))), "shape"),
+    "no factors": (lambda: solve(Problem(("a",))), "no measurements"),
+    "coincident": (
+        lambda: solve(replace(PAIR.add("range", ("a", "b"), 5.0, std=1.0), x0=np.zeros((2, 3)))), "a and b coincide"
+    ),
+    "above each other": (
+        lambda: solve(replace(PAIR.add("azimuth", ("a", "b"), 1.0, std=1.0), x0=[[0, 0, 0], [0, 0, 5]])), "direction"
+    ),
+    "unobservable": (lambda: solve(Problem("ab").add("displacement", ("a", "b"), [5, 0, 0], std=1.0)), "move freely"),
+    "batch": (
+        lambda: solve(Problem("a").add("position", [["a"]], np.zeros((2, 1, 3)), std=1.0)), "solve_batch"
+    ),
+    "uneven batch": (
+        lambda: Problem("a").add("position", [["a"]], np.zeros((2, 1, 3)), std=1.0)
+        .add("position", [["a"]], np.zeros((3, 1, 3)), std=1.0), "must agree"
+    ),
+    "batch of std": (lambda: Factor("position", [[0]], np.zeros((2, 1, 3)), std=np.ones((3, 1, 3))).batch, "agree"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD, ids=str)
+def test_wrong_input_says_what_to_do(case: str) -> None:
+    wrong, words = BAD[case]
+    with pytest.raises(InputError, match=words) as caught:
+        wrong()
+    assert caught.value.mend
+
+
+@pytest.mark.parametrize(
+    ("arguments", "field"),
+    [((60, 0, 1), "step"), ((-1, 0, 1), "step"), ((5, 0, 9), "length"), ((5, 0, 0), "length"), ((5, 99, 1), "egos")],
+)
+def test_a_window_that_does_not_exist(recording: Recording, arguments: tuple[int, int, int], field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        Problem.from_window(recording, *arguments)
+
+
+def test_a_run_that_does_not_exist(recording: Recording) -> None:
+    with pytest.raises(InputError, match="run"):
+        Problem.from_snapshot(recording, 5, 0, run=3)
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
+def test_no_fix_at_all_is_rank_deficient_and_names_what_is_free(recording: Recording, backend: str) -> None:
+    star = Problem.from_snapshot(recording, 10, 0)
+    floating = replace(star, factors=star.factors[1:])
+    solution = solve(floating, backend, throw=False)
+    assert solution.status is Status.RANK_DEFICIENT
+    assert solution.free == star.names
+    assert np.isnan(solution.covariance).all()
+    one_fixed = floating.add("position", star.names[0], [0, 0, 0], std=1.0)
+    hanging = Problem((*star.names, "stray"), one_fixed.factors)
+    assert solve(one_fixed, backend).status is Status.SOLVED
+    assert solve(hanging, backend, throw=False).free == ("stray",)
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
+def test_the_limit_of_iterations_is_an_error_with_the_solution(backend: str) -> None:
+    with pytest.raises(SolveError, match="limit of iterations") as caught:
+        solve(mixed(), backend, max_iterations=1)
+    assert caught.value.solution.status is Status.MAX_ITERATIONS
+    assert solve(mixed(), backend, throw=False, max_iterations=1).status is Status.MAX_ITERATIONS
+
+
+def test_converted_measurement_has_the_rotated_covariance(recording: Recording) -> None:
+    """Against vector_cov, J diag(std^2) J^T, wherever neither floor acts."""
+    problem = Problem.from_snapshot(recording, 20, 0)
+    _, edges = converted(problem).factors
+    cov = np.linalg.inv(np.swapaxes(edges.root, -1, -2) @ edges.root)
+    measured = problem.factors[1].z
+    assert (measured[:, 0] > 1).all()
+    assert cov == pytest.approx(vector_cov(measured, S2.relative_std), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
+def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
+    """One range leaves two of its three directions open, and the rounding of J^T J does not hide it."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        x0 = np.concatenate([[[0, 0, 0], [9, 0, 0]], rng.normal(0, 9, (1, 3))])
+        hanging = Problem(("a", "b", "c"), PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
+        solution = solve(hanging, backend, throw=False)
+        assert solution.status is Status.RANK_DEFICIENT
+        assert solution.free == ("c",)
+
+
+def test_converted_measurement_starts_at_the_truth_without_noise(crossing: Fleet) -> None:
+    silent = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
+    problem = Problem.from_snapshot(observe(crossing, silent, V2X(max_neighbours=5), assumed=S2), 10, 0)
+    truth = crossing.position[10, [crossing.index(n) for n in problem.names]]
+    assert initial_guess(problem)[0] == pytest.approx(truth, abs=1e-5)
+    gap = truth[1:] - truth[0]
+    assert to_vector(problem.factors[1].z) == pytest.approx(gap, abs=1e-12)

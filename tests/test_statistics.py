@@ -1,0 +1,94 @@
+"""Intervals against scipy.stats (bootstrap, t-test) and against their own promise: coverage."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from coopoc.errors import InputError
+from coopoc.evaluate.statistics import mean_interval, over_seeds, paired_difference, paired_ratio
+
+
+def test_one_ego_agrees_with_scipy_bootstrap() -> None:
+    values = np.random.default_rng(0).gamma(4.0, 0.3, 200)
+    ours = mean_interval(values, resamples=20000)
+    theirs = stats.bootstrap((values,), np.mean, n_resamples=20000, method="percentile", rng=1).confidence_interval
+    width = theirs.high - theirs.low
+    assert abs(ours.low - theirs.low) < 0.03 * width
+    assert abs(ours.high - theirs.high) < 0.03 * width
+    assert ours.mean == pytest.approx(values.mean())
+    assert ours.n == 200
+
+
+def test_ratio_agrees_with_scipy_bootstrap() -> None:
+    rng = np.random.default_rng(2)
+    b = rng.gamma(9.0, 0.2, 300)
+    a = 0.8 * b + rng.normal(0, 0.1, 300)
+    ours = paired_ratio(a, b, resamples=20000)
+    theirs = stats.bootstrap((a, b), lambda x, y, axis=-1: x.mean(axis) / y.mean(axis), paired=True, rng=1,
+                             n_resamples=20000, method="percentile").confidence_interval  # fmt: skip
+    width = theirs.high - theirs.low
+    assert abs(ours.low - theirs.low) < 0.05 * width
+    assert abs(ours.high - theirs.high) < 0.05 * width
+
+
+def test_pairing_cancels_what_both_share() -> None:
+    rng = np.random.default_rng(3)
+    shared = rng.normal(5, 2, (4, 50))
+    a, b = shared + 0.1 + rng.normal(0, 0.05, shared.shape), shared
+    difference = paired_difference(a, b)
+    assert 0.05 < difference.low < difference.mean < difference.high < 0.15
+    apart = mean_interval(a)
+    assert apart.high - apart.low > 10 * (difference.high - difference.low)
+
+
+@pytest.mark.parametrize(("egos", "runs", "between", "low", "high"), [(1, 40, 0.0, 0.90, 0.98), (8, 20, 1.0, 0.88, 0.98)])
+def test_intervals_hold_the_mean_as_often_as_they_promise(
+    egos: int, runs: int, between: float, low: float, high: float
+) -> None:
+    rng = np.random.default_rng(4)
+    hits = 0
+    for trial in range(300):
+        values = between * rng.normal(size=(egos, 1)) + rng.normal(size=(egos, runs))
+        found = mean_interval(values, resamples=400, seed=trial)
+        hits += found.low <= 0 <= found.high
+    assert low < hits / 300 < high
+
+
+def test_few_egos_that_differ_give_a_wider_interval_than_pooled_runs() -> None:
+    values = np.array([[1.0], [2.0], [3.0]]) + 0.01 * np.random.default_rng(5).normal(size=(3, 100))
+    nested, pooled = mean_interval(values), mean_interval(values.ravel())
+    assert nested.high - nested.low > 4 * (pooled.high - pooled.low)
+
+
+def test_the_same_seed_gives_the_same_interval() -> None:
+    values = np.random.default_rng(6).normal(size=(3, 20))
+    assert mean_interval(values, seed=1) == mean_interval(values, seed=1)
+    assert mean_interval(values, seed=1) != mean_interval(values, seed=2)
+    assert mean_interval(values).mean == pytest.approx(values.mean())
+
+
+def test_seeds_agree_with_scipy_t_interval() -> None:
+    values = np.random.default_rng(7).normal(1.1, 0.1, (5, 3, 40))
+    found = over_seeds(values)
+    means = values.mean(axis=(1, 2))
+    expected = stats.ttest_1samp(means, 0.0).confidence_interval(0.95)
+    np.testing.assert_allclose(found.means, means)
+    assert (found.interval.low, found.interval.high) == pytest.approx((expected.low, expected.high))
+
+
+def test_one_value_has_no_interval() -> None:
+    found = mean_interval(np.array([2.0]))
+    assert found.mean == 2.0
+    assert np.isnan(found.low)
+    assert np.isnan(found.high)
+
+
+def test_what_cannot_be_averaged_is_named() -> None:
+    with pytest.raises(InputError, match="values = not finite"):
+        mean_interval(np.array([1.0, np.nan]))
+    with pytest.raises(InputError, match="must have shape"):
+        mean_interval(np.empty((0, 3)))
+    with pytest.raises(InputError, match="must have the shape of a"):
+        paired_difference(np.ones((2, 3)), np.ones((3, 2)))
+    with pytest.raises(InputError, match="at least two seeds"):
+        over_seeds(np.ones((1, 3)))

@@ -1,0 +1,129 @@
+"""Figures: the same bytes twice, one look per method, and what is drawn is what was measured."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from coopoc.errors import InputError
+from coopoc.study import figures
+from coopoc.study.figures import Plot
+from coopoc.study.results import Results
+from coopoc.study.style import METHODS, look
+from coopoc.world.fleet import Fleet
+
+
+@pytest.fixture(scope="module")
+def results() -> Results:
+    rng = np.random.default_rng(0)
+    rows = []
+    for method, knowledge, level, bytes_each in [("gnss", "identity", 6.0, 0), ("kalman", "identity", 4.0, 0),
+                                                 ("kalman", "fitted", 0.9, 0), ("joint", "fitted", 0.7, 320),
+                                                 ("fedkalmannet", "trained", 1.1, 0), ("bound", "nominal", 0.5, 320)]:  # fmt: skip
+        for k in (0, 2, 10):
+            for run in range(5):
+                errors = np.abs(rng.normal(size=200)) * level
+                rows.append({"method": method, "knowledge": knowledge, "max_neighbours": k, "ego": "a", "run": run,
+                             "rt_le_m": level * rng.uniform(0.9, 1.1) / (1 + 0.02 * k * bool(bytes_each)),
+                             "bytes_per_second": float(k * bytes_each),
+                             "error_quantiles_m": np.quantile(errors, np.linspace(0, 1, 51)).tolist()})  # fmt: skip
+    axes = ("method", "knowledge", "max_neighbours")
+    return Results("demo", "?", axes, {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
+
+
+@pytest.fixture(scope="module")
+def rounds() -> Results:
+    rows = [{"method": m, "train_seed": s, "round": k, "ego": "a", "run": r, "rt_le_m": 1 + s / 10 + 3 * np.exp(-k / 3)}
+            for m in ("fedkalmannet", "centralised") for s in range(3) for k in range(6) for r in range(2)]  # fmt: skip
+    return Results("demo", "?", ("method", "train_seed", "round"), {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
+
+
+def fleet(vehicles: int = 4) -> Fleet:
+    t = 0.1 * np.arange(50)
+    velocity = np.ones((50, vehicles, 3)) * np.arange(1, vehicles + 1)[:, None] * [1.0, 0.5, 0.0]
+    return Fleet(tuple(map(str, range(vehicles))), t, velocity * t[:, None, None], velocity)
+
+
+def all_plots(results: Results, rounds: Results) -> dict[str, Callable[[], Plot]]:
+    noise = np.random.default_rng(1).normal(0, 0.1, 500)
+    return {
+        "sweep": lambda: figures.sweep(results, "max_neighbours", log=True),
+        "pareto": lambda: figures.pareto(results, training={"fedkalmannet": 3e6}),
+        "cdf": lambda: figures.cdf(results, where={"max_neighbours": 2}),
+        "convergence": lambda: figures.convergence(rounds, levels={"client 1": 1.4, "client 2": 1.41}),
+        "paths": lambda: figures.paths(fleet()),
+        "innovations": lambda: figures.innovations({"Range": (noise, 0.095, "m")}),
+    }
+
+
+@pytest.mark.parametrize("name", ["sweep", "pareto", "cdf", "convergence", "paths", "innovations"])
+def test_the_same_numbers_give_the_same_bytes(results: Results, rounds: Results, tmp_path: Path, name: str) -> None:
+    make = all_plots(results, rounds)[name]
+    assert make().save(tmp_path / "a") == make().save(tmp_path / "b") != ""
+    for suffix in ("pdf", "png", "svg"):
+        first, second = ((tmp_path / f"{n}.{suffix}").read_bytes() for n in "ab")
+        assert first == second
+    assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
+    assert b"/Type /Font" in (tmp_path / "a.pdf").read_bytes()  # text stays text
+    bitmaps = (tmp_path / "a.svg").read_bytes().count(b"<image")
+    assert bitmaps == (1 if name == "paths" else 0)  # vectors, but for the shades of a colour bar
+
+
+def test_no_two_methods_look_alike() -> None:
+    looks = [(m.color, m.marker) for m in METHODS.values()]
+    assert len(set(looks)) == len(looks)
+    assert len({m.label for m in METHODS.values()}) == len(METHODS)
+    assert look("msmv_r") == look("msmv-r")
+    assert look("my own") == look("my own") != look("another")
+
+
+def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
+    axes = figures.sweep(results, "max_neighbours", where={"knowledge": ["fitted", "nominal"]}).figure.axes[0]
+    drawn = {line.get_color(): line for line in axes.lines}
+    assert set(drawn) == {look(m).color for m in ("kalman", "joint", "bound")}
+    expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()
+    np.testing.assert_allclose(drawn[look("joint").color].get_ydata(), expected.to_numpy())
+    assert drawn[look("bound").color].get_linestyle() == "--"
+    assert len(axes.collections) == 3
+
+
+def test_knowledge_is_told_by_the_line_style(results: Results) -> None:
+    axes = figures.sweep(results, "max_neighbours", where={"method": "kalman"}).figure.axes[0]
+    assert len({line.get_linestyle() for line in axes.lines}) == 2
+    assert {line.get_color() for line in axes.lines} == {look("kalman").color}
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["KF", "identity", "fitted"]
+
+
+def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
+    axes = figures.cdf(results, where={"max_neighbours": 2, "method": "joint"}).figure.axes[0]
+    curve, mark = axes.lines
+    quantiles = results.select(max_neighbours=2, method="joint")["error_quantiles_m"]
+    assert float(mark.get_xdata()[0]) == pytest.approx(np.mean([q[-1] for q in quantiles]))
+    assert curve.get_xdata()[-1] == pytest.approx(max(q[-1] for q in quantiles))
+    share = curve.get_ydata()
+    assert share[0] > 0
+    assert share[-1] == 1.0
+    assert np.all(np.diff(share) > 0)
+
+
+def test_what_receives_nothing_stands_at_the_left(results: Results) -> None:
+    figure = figures.pareto(results, where={"max_neighbours": [0, 2, 10]}, training={"fedkalmannet": 3e6}).figure
+    left, right, bars = figure.axes
+    assert {float(x) for line in left.lines for x in np.atleast_1d(line.get_xdata())} == {0.0}
+    assert {float(x) for line in right.lines for x in np.atleast_1d(line.get_xdata())} == {640.0, 3200.0}
+    assert right.get_xscale() == "log"
+    assert [patch.get_height() for patch in bars.patches] == [3e6]
+
+
+def test_convergence_bands_reach_from_seed_to_seed(rounds: Results) -> None:
+    axes = figures.convergence(rounds).figure.axes[0]
+    band = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert band.max() == pytest.approx(4.2)
+    assert axes.lines[0].get_ydata()[0] == pytest.approx(4.1)
+
+
+def test_too_many_paths_are_refused() -> None:
+    with pytest.raises(InputError, match="7 vehicles: must be at most 6"):
+        figures.paths(fleet(7))

@@ -1,0 +1,100 @@
+"""Results: means against pandas' own, and what must not be mixed."""
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from coopoc.errors import InputError
+from coopoc.study.results import Results
+
+
+def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "knowledge", "k")) -> Results:
+    return Results("demo", "?", axes, {}, frame, pd.DataFrame(), 0, {})
+
+
+@pytest.fixture()
+def rows() -> list[dict[str, Any]]:
+    rng = np.random.default_rng(0)
+    return [{"method": m, "knowledge": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
+            for m, kn in (("gnss", "identity"), ("kalman", "identity"), ("kalman", "fitted"), ("bound", "nominal"))
+            for k in (0, 4) for ego in ("b", "a") for run in range(6)]  # fmt: skip
+
+
+def test_means_are_those_of_pandas(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows)
+    by = ["method", "knowledge", "k"]
+    summary = results(frame).summary(by, "rt_le_m").set_index(by)["mean"]
+    expected = frame.groupby(by)["rt_le_m"].mean()
+    for name, value in expected.items():
+        assert summary[name] == pytest.approx(value)
+    assert list(dict.fromkeys(summary.index.get_level_values("method"))) == ["gnss", "kalman", "bound"]
+
+
+def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows)
+    where = {"knowledge": "identity", "k": 0}
+    straight = results(frame).values("rt_le_m", where, method="gnss")
+    mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
+    assert straight.shape == (2, 6)
+    np.testing.assert_array_equal(straight, mixed)
+    first = frame.query("method == 'gnss' and k == 0 and ego == 'a'").sort_values("run")["rt_le_m"]
+    np.testing.assert_array_equal(straight[0], first)
+
+
+def test_training_seeds_are_averaged_before_the_interval(rows: list[dict[str, Any]]) -> None:
+    one = pd.DataFrame(rows).query("method == 'gnss'")
+    many = pd.concat([one.assign(train_seed=s, rt_le_m=one["rt_le_m"] + s) for s in (0, 1, 2)])
+    found = results(many, ("method", "knowledge", "k", "train_seed")).interval("rt_le_m", k=0)
+    assert found.mean == pytest.approx(one.query("k == 0")["rt_le_m"].mean() + 1)
+    assert found.n == 12
+
+
+def test_what_would_be_mixed_is_named(rows: list[dict[str, Any]]) -> None:
+    found = results(pd.DataFrame(rows))
+    with pytest.raises(InputError, match="knowledge = identity, fitted: would be averaged together"):
+        found.interval("rt_le_m", method="kalman", k=0)
+    with pytest.raises(InputError, match=r"k = 0, 4: would be averaged together\. Name k in where, rows or columns"):
+        found.summary(["method", "knowledge"], "rt_le_m")
+    with pytest.raises(InputError, match=r"column = 'metod'.*Did you mean method\?"):
+        found.summary(["metod"], "rt_le_m")
+    with pytest.raises(InputError, match=r"metric = 'rt_le'.*Did you mean rt_le_m\?"):
+        found.interval("rt_le", method="gnss", k=0)
+    with pytest.raises(InputError, match="k = 7: must be among 0, 4"):
+        found.select(k=7)
+
+
+def test_an_ego_without_all_its_runs_is_left_out_and_said_so(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows)
+    gone = frame.drop(frame.query("method == 'gnss' and k == 0 and ego == 'b' and run == 3").index)
+    summary = results(gone).summary(["method", "knowledge", "k"], "rt_le_m")
+    assert summary.query("method == 'gnss' and k == 0")[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
+    table = results(gone).table(["k"], "method", "rt_le_m", where={"knowledge": ["identity"]})
+    assert "1 egos are left out" in table.notes[0]
+
+
+def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows).query("knowledge == 'identity'").copy()
+    frame["nees"] = np.where(frame["method"] == "gnss", np.nan, 3.0)
+    table = results(frame).table("k", "method", "nees")
+    assert table.rows[0][1] is None
+    assert table.notes == ()
+    with pytest.raises(InputError, match="nees = no finite value"):
+        results(frame).interval("nees", method="gnss", k=0)
+
+
+def test_selection_from_text(rows: list[dict[str, Any]]) -> None:
+    found = results(pd.DataFrame(rows))
+    assert found.parsed(["k=0,4", "method=gnss"]) == {"k": [0, 4], "method": ["gnss"]}
+    with pytest.raises(InputError, match="k = 'x': must be a whole number"):
+        found.parsed(["k=x"])
+
+
+def test_csv_and_parquet_hold_every_digit(rows: list[dict[str, Any]], tmp_path: Any) -> None:
+    frame = pd.DataFrame(rows).assign(quantiles=[[0.1, 0.2]] * len(rows))
+    results(frame).to_csv(tmp_path / "r.csv")
+    results(frame).to_parquet(tmp_path / "r.parquet")
+    np.testing.assert_array_equal(pd.read_csv(tmp_path / "r.csv")["rt_le_m"], frame["rt_le_m"])
+    assert "quantiles" not in pd.read_csv(tmp_path / "r.csv")
+    assert pd.read_parquet(tmp_path / "r.parquet")["quantiles"].iloc[0].tolist() == [0.1, 0.2]

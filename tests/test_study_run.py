@@ -1,0 +1,211 @@
+"""The engine: resume, failures, processes. The study is a real one that is installed as a third party's."""
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from coopoc.errors import InputError
+from coopoc.study import store
+from coopoc.study.publish import views
+from coopoc.study.results import Results
+from coopoc.study.run import WorkerDiedError, plan, run, schedule
+from coopoc.study.study import Cell, Study
+
+DISTRIBUTION = Path(__file__).parent / "distribution"
+
+
+@pytest.fixture()
+def study(monkeypatch: pytest.MonkeyPatch) -> Study:
+    monkeypatch.syspath_prepend(str(DISTRIBUTION))
+    return importlib.import_module("small_study").STUDY
+
+
+def numbers(frame: pd.DataFrame) -> pd.DataFrame:
+    return frame[[c for c in frame if not c.endswith("seconds")]]
+
+
+def files(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / "cells").iterdir()}
+
+
+def command(out: Path, *settings: str, jobs: int = 1) -> list[str]:
+    return [sys.executable, "-m", "coopoc.cli", "run", "small", "--out", str(out), "--jobs", str(jobs), "--set",
+            "pause=0.12", *settings]  # fmt: skip
+
+
+def start(out: Path, jobs: int) -> "subprocess.Popen[bytes]":
+    env = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
+    return subprocess.Popen(command(out, jobs=jobs), env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                            cwd=out, start_new_session=True)  # fmt: skip
+
+
+def wait_for(folder: Path, count: int) -> None:
+    for _ in range(1000):
+        if folder.is_dir() and len(list(folder.glob("*.parquet"))) >= count:
+            return
+        time.sleep(0.02)
+    raise AssertionError("no cell was finished in 20 s")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_killed_run_resumes_to_the_last_digit(study: Study, tmp_path: Path, jobs: int) -> None:
+    whole = run(study, tmp_path / "whole", settings={"pause": 0.12}, progress=False)
+    process = start(tmp_path, jobs)
+    wait_for(tmp_path / "small" / "cells", 2)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    time.sleep(0.8)  # orphaned workers leave within half a second
+    before = files(tmp_path / "small")
+    finished = {name: content for name, content in before.items() if name.endswith(".parquet")}
+    assert 2 <= len(finished) < 9
+    resumed = run(study, tmp_path, settings={"pause": 0.12}, progress=False)
+    after = files(tmp_path / "small")
+    assert {name: after[name] for name in finished} == finished
+    pd.testing.assert_frame_equal(numbers(resumed.frame), numbers(whole.frame), check_exact=True)
+    for suffix in ("md", "csv", "tex", "html"):
+        path = Path("small") / "tables" / f"rt_le.{suffix}"
+        assert (tmp_path / path).read_bytes() == (tmp_path / "whole" / path).read_bytes()
+
+
+def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -> None:
+    one = run(study, tmp_path / "one", jobs=1, progress=False)
+    two = run(study, tmp_path / "two", jobs=2, progress=False)
+    pd.testing.assert_frame_equal(numbers(one.frame), numbers(two.frame), check_exact=True)
+    for name in ("tables/rt_le.csv", "tables/rt_le.tex", "figures/rt_le.pdf", "figures/rt_le.png", "figures/rt_le.svg"):
+        assert (tmp_path / "one/small" / name).read_bytes() == (tmp_path / "two/small" / name).read_bytes()
+
+
+def test_a_failed_cell_is_a_row_with_its_reason_and_is_tried_again(study: Study, tmp_path: Path) -> None:
+    trouble = tmp_path / "trouble"
+    trouble.write_text("raise")
+    first = run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
+    assert first.failed == 1
+    row = first.failures.iloc[0]
+    assert (row["method"], row["max_neighbours"], row["status"]) == ("kalman", 1, "failed")
+    assert row["reason"] == "FloatingPointError: the filter diverged at step 3"
+    assert "small_study.py" in row["traceback"]
+    assert set(first.frame["status"]) == {"ok"}
+    assert "–" in (tmp_path / "small/tables/rt_le.md").read_text()
+    assert plan(study, tmp_path, {"trouble": str(trouble)})["failed_before"] == 1
+    finished = files(tmp_path / "small")
+    trouble.unlink()
+    second = run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
+    assert second.failed == 0
+    assert len(second.frame) == 9 * 2 * 4
+    assert not list((tmp_path / "small/failed").iterdir())
+    assert {name: files(tmp_path / "small")[name] for name in finished} == finished
+
+
+def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, tmp_path: Path) -> None:
+    trouble = tmp_path / "trouble"
+    trouble.write_text("raise")
+    changes = {"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"}
+    results = run(study, tmp_path, settings=changes, progress=False)
+    assert results.frame.empty
+    assert set(views(tmp_path / "small")["missing"]) == {"rt_le", "findings"}
+
+
+def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study: Study, tmp_path: Path) -> None:
+    trouble = tmp_path / "trouble"
+    trouble.write_text("kill")
+    with pytest.raises(WorkerDiedError, match="repeat the command"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # loky's resource tracker reports the dead worker's semaphores
+        run(study, tmp_path, jobs=2, settings={"trouble": str(trouble)}, progress=False)
+    trouble.unlink()
+    assert run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False).failed == 0
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "of another cell"])
+def test_a_damaged_file_is_computed_again(study: Study, tmp_path: Path, damage: str) -> None:
+    whole = run(study, tmp_path, progress=False)
+    first, second = sorted((tmp_path / "small/cells").iterdir())[:2]
+    content = first.read_bytes()
+    bad = {"truncated": content[: len(content) // 2], "empty": b"", "of another cell": second.read_bytes()}[damage]
+    first.write_bytes(bad)
+    with pytest.warns(RuntimeWarning, match=f"{first.name} is damaged and will be computed again"):
+        again = run(study, tmp_path, progress=False)
+    pd.testing.assert_frame_equal(numbers(again.frame), numbers(whole.frame), check_exact=True)
+
+
+def test_plan_counts_and_writes_nothing(study: Study, tmp_path: Path) -> None:
+    found = plan(study, tmp_path / "new", {"max_neighbours": "0,2"})
+    assert (found["cells"], found["finished"], found["to_compute"]) == (6, 0, 6)
+    assert not (tmp_path / "new").exists()
+
+
+def test_changed_settings_compute_anew_and_keep_what_is_there(study: Study, tmp_path: Path) -> None:
+    run(study, tmp_path, settings={"max_neighbours": 0}, progress=False)
+    before = files(tmp_path / "small")
+    more = run(study, tmp_path, settings={"max_neighbours": 0, "runs": 5}, progress=False)
+    assert sorted(set(more.frame["run"])) == [0, 1, 2, 3, 4]
+    after = files(tmp_path / "small")
+    assert len(after) == 6
+    assert {name: after[name] for name in before} == before
+
+
+def test_bad_input_is_named_before_any_work(study: Study, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="max_neighbours = -1: must be >= 0"):
+        run(study, tmp_path, settings={"max_neighbours": -1})
+    with pytest.raises(InputError, match="jobs = 0: must be >= 1"):
+        run(study, tmp_path, jobs=0)
+    with pytest.raises(InputError, match=r"study = 'smal'.*Did you mean small\?"):
+        run("smal", tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        run(study, tmp_path / "file", progress=False)
+    assert not (tmp_path / "small").exists()
+
+
+def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path: Path) -> None:
+    study = Study("odd", "?", lambda p: {"none": [], "own": [{"x": 1}], "mixed": [{"y": 1}, {"y": "a"}]}[p["x"]],
+                  {"x": ("none", "own", "mixed")})  # fmt: skip
+    reasons = list(run(study, tmp_path, progress=False).failures["reason"])
+    assert "at least one row" in reasons[0]
+    assert "must not repeat a parameter" in reasons[1]
+    assert reasons[2].startswith("Arrow")
+
+
+def test_cells_of_one_recording_follow_each_other_in_a_lane() -> None:
+    cells = [Cell({}, {"k": k, "m": m}, f"{k}{m}") for m in "ab" for k in range(4)]
+    assert [c.name for c in schedule(cells, ("k",), 1)] == ["0a", "0b", "1a", "1b", "2a", "2b", "3a", "3b"]
+    two = [c.name for c in schedule(cells, ("k",), 2)]
+    assert two[0::2] == ["0a", "0b", "2a", "2b"]
+    assert two[1::2] == ["1a", "1b", "3a", "3b"]
+    assert sorted(c.name for c in schedule(cells[:5], ("k",), 3)) == sorted(c.name for c in cells[:5])
+
+
+def test_a_cell_runs_on_one_thread(tmp_path: Path) -> None:
+    def cell(p: object) -> list[dict[str, object]]:
+        from threadpoolctl import threadpool_info
+
+        return [{"threads": max(library["num_threads"] for library in threadpool_info())}]
+
+    results = run(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1, progress=False)
+    assert set(results.frame["threads"]) == {1}
+
+
+def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "kept"
+    store.write(path, "old")
+
+    def broken(file: object) -> None:
+        file.write(b"half")  # type: ignore[attr-defined]
+        raise OSError("no space left on device")
+
+    with pytest.raises(OSError, match="no space"):
+        store.write(path, broken)
+    assert [p.name for p in tmp_path.iterdir()] == ["kept"]
+    assert path.read_text() == "old"
+
+
+def test_results_of_a_folder_that_holds_none(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds no manifest\.json"):
+        Results.load(tmp_path)
