@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .evaluate.metrics import nees as nees
     from .evaluate.metrics import rt_le as rt_le
     from .fleets import load as load
+    from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
     from .methods.gnss import Gnss as Gnss
     from .methods.joint_filter import JointFilter as JointFilter
     from .methods.kalman import Kalman as Kalman
@@ -26,6 +27,11 @@ if TYPE_CHECKING:
     from .methods.msmv import Msmv as Msmv
     from .methods.track import Method as Method
     from .methods.track import Track as Track
+    from .optimize.factor import Factor as Factor
+    from .optimize.problem import Problem as Problem
+    from .optimize.solution import Solution as Solution
+    from .optimize.solve import backends as backends
+    from .optimize.solve import solve as solve
     from .world.fleet import Fleet as Fleet
     from .world.recording import Links as Links
     from .world.recording import Recording as Recording
@@ -42,6 +48,8 @@ _HOME = {
     "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
     "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
     "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds",
+    "CooperativeMAP": "methods.cooperative_map", "Factor": "optimize.factor", "Problem": "optimize.problem",
+    "Solution": "optimize.solution", "backends": "optimize.solve", "solve": "optimize.solve",
     "load": "fleets", "Method": "methods.track", "Track": "methods.track",
 }  # fmt: skip
 

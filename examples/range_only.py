@@ -21,7 +21,7 @@ import cvxpy as cp
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.solve import Problem, solve
+from coopoc.optimize import Problem, solve
 
 GNSS_STD, RANGE_STD = 3.5, 1.0
 

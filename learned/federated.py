@@ -19,7 +19,7 @@ from .aggregate import Aggregate, rule
 from .clients import Client, Pieces
 from .net import GainNet
 from .rollout import flatten, unflatten
-from .schedule import Schedule, cosine, generator
+from .schedule import Epoch, Schedule, cosine, generator
 from .train import Judge, descend, pooled
 
 
@@ -74,6 +74,7 @@ def federate(
     seed: int = 0,
     schedule: Schedule | None = None,
     progress: str | None = None,
+    epoch: Epoch = "pass",
 ) -> Federation:
     """FedKalmanNet: each round every client adapts the global net on its own pieces, and the server combines them.
 
@@ -83,8 +84,9 @@ def federate(
 
     Args:
         model: the start, not changed. clients: their data. rounds: M. aggregate: rule by name or function.
-        local_epochs: passes per round. seed: of the order of the batches. schedule: batch, rate, decay, clip.
+        local_epochs: E per round. seed: of the order of the batches. schedule: batch, rate, decay, clip.
         progress: name of the stage for a progress bar on stderr, None for no bar.
+        epoch: "pass" through the client's pieces, or "step", one optimiser step as KalmanNet's loop counts.
 
     Source: arXiv 2411.05847, algorithm 1; McMahan et al., AISTATS 2017, for E.
 
@@ -95,7 +97,7 @@ def federate(
     >>> federate(GainNet(), clients(line, piece=10), rounds=1, local_epochs=1).history[1].sent_bytes
     79756
     """
-    return federate_many([model], [clients], [seed], rounds, aggregate, local_epochs, schedule, progress)[0]
+    return federate_many([model], [clients], [seed], rounds, aggregate, local_epochs, schedule, progress, epoch)[0]
 
 
 def federate_many(
@@ -107,13 +109,14 @@ def federate_many(
     local_epochs: int = 5,
     schedule: Schedule | None = None,
     progress: str | None = None,
+    epoch: Epoch = "pass",
 ) -> list[Federation]:
     """`federate` for many independent federations in one rollout."""
     for name, value in (("rounds", rounds), ("local_epochs", local_epochs)):
         if value < 1:
             raise InputError(name, value, "must be >= 1", "The paper has 20 rounds.")
     began, combine = time.perf_counter(), rule(aggregate)
-    local = replace(schedule or Schedule(), epochs=local_epochs, epoch="pass")
+    local = replace(schedule or Schedule(), epochs=local_epochs, epoch=epoch)
     everyone = [client for group in groups for client in group]
     keys = [(seed, c.name) for seed, group in zip(seeds, groups, strict=True) for c in group]
     pool, members = pooled([c.training for c in everyone])

@@ -21,7 +21,7 @@ from .federated import federate_many
 from .method import LearnedGain
 from .net import GainNet
 from .okf import OptimisedKF, fit_okf_many
-from .schedule import Schedule
+from .schedule import Epoch, Schedule
 from .train import Fit, Task, fit_many
 
 REVISION = 1
@@ -35,13 +35,14 @@ class Recipe:
 
     Args:
         kind: "federated", "centralised", "individual" (one net per client) or "okf".
-        schedule: optimiser, the same for all nets. rounds, local_epochs, aggregate: of a federation.
+        schedule: optimiser, the same for all nets. rounds, local_epochs, local_epoch, aggregate: of a federation.
     """
 
     kind: str
     schedule: Schedule = field(default_factory=Schedule)
     rounds: int = 20
     local_epochs: int = 5
+    local_epoch: Epoch = "pass"
     aggregate: str = "mean"
     noise: Noise = "static"
     piece: int = 100
@@ -208,7 +209,7 @@ def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Check
     recipe, nets = todo[0].recipe, [_net(job) for job in todo]
     done = federate_many(
         nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], recipe.rounds, recipe.aggregate,
-        recipe.local_epochs, recipe.schedule, stage,
+        recipe.local_epochs, recipe.schedule, stage, recipe.local_epoch,
     )  # fmt: skip
     found = []
     for federation in done:

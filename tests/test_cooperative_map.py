@@ -11,7 +11,7 @@ from coopoc import V2X, Fleet, InputError, Knowledge, Method, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.star import ACCELERATION_STD
-from coopoc.solve import Problem, solve
+from coopoc.optimize import Problem, solve
 from coopoc.world.inbox import inbox
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import to_vector

@@ -1,4 +1,4 @@
-"""Imports run one way: world -> solve -> methods -> evaluate -> study -> cli, and the core names no plug-in package."""
+"""Imports run one way: world -> optimize -> methods -> evaluate -> study -> cli, and the core names no plug-in package."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FLOORS = ["world", "solve", "methods", "evaluate", "study", "cli"]
+FLOORS = ["world", "optimize", "methods", "evaluate", "study", "cli"]
 
 
 def imports(path: Path) -> set[str]:

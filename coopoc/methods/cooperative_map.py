@@ -12,12 +12,12 @@ from tqdm import tqdm
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from ..solve.batch import solve_batch
-from ..solve.initial import converted
-from ..solve.problem import Problem
-from ..solve.sights import Sight, chain
-from ..solve.solution import Status
-from ..solve.solve import solve, usable
+from ..optimize.batch import solve_batch
+from ..optimize.initial import converted
+from ..optimize.problem import Problem
+from ..optimize.sights import Sight, chain
+from ..optimize.solution import Status
+from ..optimize.solve import solve, usable
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -45,7 +45,7 @@ class CooperativeMAP:
     have no derivative, the converted (linear) problem answers instead, and the notes count it.
 
     Args:
-        backend: of `coopoc.solve.backends()`. Only gauss-newton batches over the runs; the others loop, and their
+        backend: of `coopoc.optimize.backends()`. Only gauss-newton batches over the runs; the others loop, and their
             tracks say so.
         window: steps. knowledge: "identity", "nominal" or a Knowledge.
     """

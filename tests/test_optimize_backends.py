@@ -12,9 +12,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from coopoc import V2X, Fleet, InputError, MissingLibraryError, Sensors, observe
-from coopoc.solve import Factor, Problem, Status, backends, solve, solve_batch
-from coopoc.solve.backends.gauss_newton import linear_step
-from coopoc.solve.initial import initial_guess
+from coopoc.optimize import Factor, Problem, Status, backends, solve, solve_batch
+from coopoc.optimize.backends.gauss_newton import linear_step
+from coopoc.optimize.initial import initial_guess
 from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
@@ -262,8 +262,8 @@ def test_solution_says_what_happened(dense: Recording, backend: str) -> None:
 
 def test_no_backend_can_flatter_itself(monkeypatch: pytest.MonkeyPatch, dense: Recording) -> None:
     """A backend that returns its start and claims one iteration is found out."""
-    from coopoc.solve.backends import osqp_
-    from coopoc.solve.backends.run import Ended
+    from coopoc.optimize.backends import osqp_
+    from coopoc.optimize.backends.run import Ended
 
     monkeypatch.setattr(osqp_, "build", lambda problem: lambda x: Ended(x + 0.1, 1))
     solution = solve(Problem.from_snapshot(dense, 10, 0), "osqp", throw=False)
@@ -273,7 +273,7 @@ def test_no_backend_can_flatter_itself(monkeypatch: pytest.MonkeyPatch, dense: R
 
 def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
     problem = Problem.from_window(dense, 20, 0, 5)
-    from coopoc.solve.backends import osqp_
+    from coopoc.optimize.backends import osqp_
 
     loose = {**osqp_.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
     with pytest.MonkeyPatch.context() as patch:
@@ -298,7 +298,7 @@ def test_unknown_names_list_the_known(dense: Recording, call, words: str) -> Non
 def test_a_missing_library_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, dense: Recording, backend: str
 ) -> None:
-    monkeypatch.setattr(sys.modules["coopoc.solve.solve"], "find_spec", lambda name: None)
+    monkeypatch.setattr(sys.modules["coopoc.optimize.solve"], "find_spec", lambda name: None)
     assert not backends()[backend].installed
     assert backends()["gauss-newton"].installed
     with pytest.raises(MissingLibraryError, match=f"pip install {backend}"):

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from coopoc import InputError
-from coopoc.solve import MEASUREMENTS, Problem, backends, measurement, solve
-from coopoc.solve import dual as dual_numbers
-from coopoc.solve.dual import seeds
+from coopoc.optimize import MEASUREMENTS, Problem, backends, measurement, solve
+from coopoc.optimize import dual as dual_numbers
+from coopoc.optimize.dual import seeds
 
 VECTORS = np.random.default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from coopoc import V2X, Fleet, InputError, Knowledge, Sensors, observe
-from coopoc.solve import MEASUREMENTS, Factor, Problem, SolveError, Status, solve
-from coopoc.solve.initial import converted, initial_guess
-from coopoc.solve.sights import relative_std
+from coopoc.optimize import MEASUREMENTS, Factor, Problem, SolveError, Status, solve
+from coopoc.optimize.initial import converted, initial_guess
+from coopoc.optimize.sights import relative_std
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import to_vector, vector_cov
 
