@@ -31,11 +31,7 @@ def names(group: str) -> tuple[str, ...]:
     >>> isinstance(names("coopoc.methods"), tuple)
     True
     """
-    found: list[str] = []
-    for name, point in points(group).items():
-        loaded = point.load()
-        found += loaded if isinstance(loaded, Mapping) else [name]
-    return tuple(sorted(found))
+    return tuple(sorted(n for name, point in points(group).items() for n in _members(point) or [name]))
 
 
 def find(group: str, name: str) -> Any:
@@ -58,10 +54,20 @@ def find(group: str, name: str) -> Any:
     if loaded is not None and not isinstance(loaded, Mapping):
         return loaded
     for point in registered.values():
-        table = point.load()
-        if isinstance(table, Mapping) and name in table:
-            return table[name]
+        members = _members(point)
+        if name in members:
+            return members[name]
     raise unknown(GROUPS.get(group, group), name, names(group))
+
+
+def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:
+    """What an entry point that holds a mapping stands for. One that cannot be loaded keeps its own name, and says why
+    when somebody asks for it."""
+    try:
+        loaded = point.load()
+    except Exception:
+        return {}
+    return loaded if isinstance(loaded, Mapping) else {}
 
 
 def unknown(noun: str, name: str, known: Iterable[str]) -> InputError:

@@ -54,9 +54,9 @@ class Card:
         """One line for Fleet.source."""
         return f"simulated with SUMO {self.sumo} on CARLA's {self.map}, seed {self.recipe['seed']}, smoothed"
 
-    def render(self) -> str:
-        """The card as a text to read."""
-        rows = {
+    def fields(self) -> dict[str, str]:
+        """What a reader wants to know, field by field."""
+        return {
             "map": f"{self.map}, {self.map_licence}",
             "made by": f"{self.command} (SUMO {self.sumo})",
             "sha256": self.sha256,
@@ -70,7 +70,10 @@ class Card:
             "height": f"{self.height[0]:g}..{self.height[1]:g} m",
             "acceleration": f"at most {self.acceleration:g} m/s^2",
         }
-        return "\n".join([self.name, *(f"  {key:<13}{value}" for key, value in rows.items())])
+
+    def render(self) -> str:
+        """The card as a text to read."""
+        return "\n".join([self.name, *(f"  {key:<13}{value}" for key, value in self.fields().items())])
 
 
 def card_of(fleet: Fleet, recipe: Recipe) -> Card:

@@ -17,6 +17,7 @@ from coopoc.world.noise import stream
 
 from .aggregate import Aggregate, rule
 from .clients import Client, Pieces
+from .machine import one_core
 from .net import GainNet
 from .rollout import flatten, unflatten
 from .schedule import Epoch, Schedule, cosine, generator
@@ -100,6 +101,7 @@ def federate(
     return federate_many([model], [clients], [seed], rounds, aggregate, local_epochs, schedule, progress, epoch)[0]
 
 
+@one_core()
 def federate_many(
     models: Sequence[GainNet],
     groups: Sequence[Sequence[Client]],

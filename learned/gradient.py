@@ -27,6 +27,10 @@ def loss_and_gradient(theta: Tensor, like: GainNet, batch: Batch) -> tuple[Tenso
 
     Each layer's input and output gradient are kept, and its weight gradient is one product over all T steps at the end:
     adding T outer products one by one, as autograd does, would be most of the cost of training.
+
+    >>> still = torch.zeros(2, 1, 4, 3)
+    >>> loss_and_gradient(torch.zeros(1, 19938), GainNet(), Batch(still, still, still, still[0], 0.1))[0].item()
+    0.0
     """
     net = layers(theta, like)
     tape = list(steps(net, batch.gnss, batch.velocity, batch.x0, batch.dt))

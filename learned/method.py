@@ -94,6 +94,7 @@ class LearnedGain:
             raise InputError("start", f"shape {np.shape(self.start)}", allowed, "Give one position per ego.")
         return np.broadcast_to(self.start, fixes.shape)
 
+    @one_core()
     def _scan(self, recording: Recording, columns: list[int], pick: Callable[[Step], Tensor]) -> AnyArray:
         """(R, T, E, ...) of what `pick` takes from each step, relative to the first fix; step 0 is NaN."""
         origin = recording.gnss[:, :1, columns]
@@ -106,7 +107,7 @@ class LearnedGain:
         velocity = lanes(recording.velocity[:, 1:, columns])
         x0 = lanes(self._x0(recording, columns)[:, None] - origin)[0]
         net = layers(flatten([self.model]), self.model)
-        with torch.inference_mode(), one_core():
+        with torch.inference_mode():
             picked = [pick(s)[0].numpy() for s in steps(net, gnss, velocity, x0, recording.dt)]
         rows = np.stack([np.full_like(picked[0], np.nan), *picked]).astype(np.float64)
         return np.moveaxis(rows.reshape(len(rows), recording.runs, len(columns), *rows.shape[2:]), 0, 1)

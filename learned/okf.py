@@ -19,6 +19,7 @@ from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .clients import Batch, Pieces
+from .machine import one_core
 
 Three = tuple[float, float, float]
 
@@ -82,10 +83,17 @@ def fit_okf(training: Pieces, validation: Pieces, steps: int = 300, velocity_par
 
     Args:
         training, validation: pieces. steps: of Adam on all training pieces. velocity_part: train b too, else b = 0.
+
+    >>> from coopoc.learned.clients import clients
+    >>> from coopoc.world.fleet import Fleet
+    >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
+    >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
+    (0.0, 0.0, 0.0)
     """
     return fit_okf_many([(training, validation)], steps, velocity_part)[0]
 
 
+@one_core()
 def fit_okf_many(
     tasks: Sequence[tuple[Pieces, Pieces]], steps: int = 300, velocity_part: bool = True, progress: str | None = None
 ) -> list[OkfFit]:
@@ -110,6 +118,8 @@ def fit_okf_many(
         fall.step()
     with torch.no_grad():
         numbers = torch.exp(best) * _calibration(best, *data)[:, None]
+    if not velocity_part:
+        numbers[:, 1] = 0.0
     seconds = (time.perf_counter() - began) / len(tasks)
     return [
         OkfFit(OptimisedKF(_three(row[0]), _three(row[1]), _three(row[2])), tuple(h), seconds)

@@ -15,7 +15,11 @@ EPS = 1e-12
 
 
 def flatten(models: Sequence[GainNet]) -> Tensor:
-    """(S, P) weights of S models of one shape, in the order of `parameters()`."""
+    """(S, P) weights of S models of one shape, in the order of `parameters()`.
+
+    >>> flatten([GainNet(seed=0), GainNet(seed=1)]).shape
+    torch.Size([2, 19938])
+    """
     return torch.stack([torch.nn.utils.parameters_to_vector(m.parameters()).detach() for m in models])
 
 
@@ -45,7 +49,12 @@ Layers = dict[str, Layer]
 
 
 def layers(theta: Tensor, like: GainNet) -> Layers:
-    """Views into flat weights, or gradients, (S, P) of models shaped as `like`: "update", ..., "process_ih", ..."""
+    """Views into flat weights, or gradients, (S, P) of models shaped as `like`: "update", ..., "process_ih", ...
+
+    >>> net = GainNet()
+    >>> layers(flatten([net]), net)["process_ih"].weight.shape
+    torch.Size([1, 27, 120])
+    """
     named, at = {}, 0
     for name, parameter in like.named_parameters():
         named[name] = theta[:, at : at + parameter.numel()].view(len(theta), *parameter.shape)

@@ -93,6 +93,7 @@ def fit(
     return fit_many([Task(model, training, validation, seed, long=long)], schedule, progress)[0]
 
 
+@one_core()
 def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: str | None = None) -> list[Fit]:
     """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding."""
     schedule, began = schedule or Schedule(), time.perf_counter()
@@ -150,8 +151,7 @@ def descend(
             batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), dice)
             batch = mirrored(batch, dice) if schedule.mirror else batch
             mine, m, v = theta[rows], first[rows], second[rows]
-            with one_core():
-                losses[rows], gradient = loss_and_gradient(mine, like, batch)
+            losses[rows], gradient = loss_and_gradient(mine, like, batch)
             finite = losses[rows].isfinite() & gradient.isfinite().all(1)
             stopped |= {r: f"loss or gradient not finite at step {step + 1}"
                         for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
@@ -175,7 +175,7 @@ class Judge:
         self.batches = [_padded(parts) for parts in kinds]
 
     def __call__(self, theta: Tensor) -> Tensor:
-        with torch.no_grad(), one_core():
+        with torch.no_grad():
             means = [(loss(layers(theta, self.like), batch) * share).sum(1) for batch, share in self.batches]
         return torch.stack(means).nan_to_num(math.inf).amax(0)
 

@@ -99,7 +99,7 @@ def _rows(
         "rt_le_m": rt_le(track, drive),
         "max_error_m": max_error(track, drive),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        "received_bytes_per_second": track.received_bytes / duration,
+        "bytes_per_second": track.received_bytes / duration,
         "sent_bytes_per_second": track.sent_bytes / duration,
     }
     fixes = np.sqrt(((recording.gnss - drive.position) ** 2).sum(axis=-1).mean(axis=1))[:, list(track.egos)]

@@ -28,6 +28,13 @@ def is_real(data: str) -> bool:
 
 
 @lru_cache(maxsize=4)
+def labels(data: str) -> tuple[str, ...]:
+    """What must be said of real data: what is simulated in it, and what uses truth."""
+    real = recorder(data)
+    return () if real is None else real(V2X(max_neighbours=0), runs=1, seed=0).notes
+
+
+@lru_cache(maxsize=4)
 def egos(data: str, wanted: str) -> tuple[str, ...]:
     """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+".
 
@@ -57,13 +64,13 @@ def sensors(p: Params) -> Sensors:
 
 
 def channel(p: Params) -> V2X:
-    """Neighbourhood and budget of the cell; what it does not name is ideal."""
-    cap = p.get("cap_bytes_per_second")
+    """Neighbourhood and budget of the cell; what it does not name is ideal; a cap of 0 is none."""
+    cap = float(p.get("cap_bytes_per_second", 0.0))
     return V2X(
         max_neighbours=int(p.get("max_neighbours", 0)),
         radius=float(p.get("radius_m", 30.0)),
         rate=float(p.get("rate_hz", 10.0)),
-        bytes_per_second=float("inf") if cap is None else float(cap),
+        bytes_per_second=cap or float("inf"),
     )
 
 

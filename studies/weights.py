@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -17,6 +18,7 @@ from .scene import fleet
 
 if TYPE_CHECKING:
     from coopoc.learned.checkpoint import Checkpoint
+    from coopoc.study.results import Results
 
 LEARNED = ("fedkalmannet", "centralised", "individual1", "individual2", "individual3", "individual4", "okf")
 """Methods that are trained, the individual nets one per client."""
@@ -82,6 +84,41 @@ def _fitted(clients: str, reading: str) -> Knowledge:
     drives = fleet(clients)
     acting = sensors(Setting(reading=reading))  # type: ignore[arg-type]
     return Knowledge.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
+
+
+def training_bytes(p: Params) -> dict[str, float]:
+    """Bytes that one vehicle sends and receives in training, on average over the clients.
+
+    A federation moves the weights both ways in every round. A centralised net needs the raw drives, six float32 per step
+    (noisy fixes and velocities; the reference drive comes on top), and sends the net back once.
+    """
+    card = checkpoint("fedkalmannet", p, 0).card
+    drives = fleet(p["clients"])
+    upload = 4 * 6 * float(drives.present.sum(axis=0).mean())
+    rounds = card["history"][1:]
+    moved = sum(row["sent_bytes"] + row["received_bytes"] for row in rounds) / len(card["clients"])
+    return {
+        "fedkalmannet": float(moved),
+        "centralised": upload + 4 * card["parameters"],
+        "okf": upload + 4 * checkpoint("okf", p, 0).card["parameters"],
+    }
+
+
+def described(results: Results) -> Mapping[str, str]:
+    """What the report says about the training, from the cards of the first seed."""
+    told = {}
+    for name in LEARNED:
+        card = checkpoint(name, results.settings, 0).card
+        plan, schedule = card["settings"], card["settings"]["schedule"]
+        steps = f"{plan['rounds']} rounds of {plan['local_epochs']} local epochs" if name == "fedkalmannet" else (
+            f"{schedule['epochs']} epochs"
+        )  # fmt: skip
+        told[name] = (
+            f"{card['parameters']} parameters; clients {', '.join(card['clients'])}; {steps}, {json.dumps(schedule)}; "
+            f"{plan['noise']} noise, pieces of {plan['piece']}, {card['seconds']:.0f} s of training per net; "
+            f"seeds 0-{int(results.settings['train_seeds']) - 1}; key {card['key'][:12]}"
+        )
+    return told
 
 
 def fitted(p: Params) -> Knowledge:

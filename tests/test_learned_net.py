@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 import torch
@@ -11,8 +13,16 @@ from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.learned.clients import Batch
 from coopoc.learned.gradient import loss_and_gradient
+from coopoc.learned.machine import one_core
 from coopoc.learned.method import DIVERGED
 from coopoc.learned.rollout import flatten, layers, steps
+from coopoc.methods.track import Method
+
+
+@pytest.fixture(autouse=True)
+def _one_core() -> Iterator[None]:
+    with one_core():
+        yield
 
 
 def drive(steps: int = 60, vehicles: int = 1) -> Fleet:
@@ -144,6 +154,7 @@ def test_constant_gain_equals_the_constant_gain_filter_by_hand() -> None:
 
 def test_nothing_is_sent_online_and_no_covariance_is_claimed() -> None:
     method = LearnedGain(GainNet())
+    assert isinstance(method, Method)
     track = method(observe(drive(), Sensors(), runs=2))
     assert not method.cooperative
     assert track.received_bytes.sum() == track.sent_bytes.sum() == method.message.payload == 0

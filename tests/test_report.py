@@ -70,8 +70,8 @@ def test_nothing_outside_the_file_is_needed(made: tuple[Path, Page]) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["What is a neighbour worth on a circle?", "Key findings", "KF: ", "Settings and seeds", "Recipe", "nothing here learns",
-     "Limitations", "Nobody drives in circles.", "Environment", "numpy", "Failed cells: 1",
+    ["What is a neighbour worth on a circle?", "Key findings", "KF: ", "Settings and seeds", "Recipe",
+     "nothing here learns", "Limitations", "Nobody drives in circles.", "Environment", "numpy", "Failed cells: 1",
      "FloatingPointError: the filter diverged at step 3", "method = KF", "RT-LE [m] at a GNSS noise of 3.5 m.",
      "A lead.", "<none> & free", "Circles & <more>"],
 )  # fmt: skip

@@ -41,17 +41,15 @@ def test_pairing_cancels_what_both_share() -> None:
     assert apart.high - apart.low > 10 * (difference.high - difference.low)
 
 
-@pytest.mark.parametrize(("egos", "runs", "between", "low", "high"), [(1, 40, 0.0, 0.90, 0.98), (8, 20, 1.0, 0.88, 0.98)])
-def test_intervals_hold_the_mean_as_often_as_they_promise(
-    egos: int, runs: int, between: float, low: float, high: float
-) -> None:
+@pytest.mark.parametrize(("egos", "runs", "between", "low"), [(1, 40, 0.0, 0.90), (8, 20, 1.0, 0.88)])
+def test_intervals_hold_the_mean_as_often_as_they_promise(egos: int, runs: int, between: float, low: float) -> None:
     rng = np.random.default_rng(4)
     hits = 0
     for trial in range(300):
         values = between * rng.normal(size=(egos, 1)) + rng.normal(size=(egos, runs))
         found = mean_interval(values, resamples=400, seed=trial)
         hits += found.low <= 0 <= found.high
-    assert low < hits / 300 < high
+    assert low < hits / 300 < 0.98
 
 
 def test_few_egos_that_differ_give_a_wider_interval_than_pooled_runs() -> None:

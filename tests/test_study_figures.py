@@ -19,9 +19,10 @@ from coopoc.world.fleet import Fleet
 def results() -> Results:
     rng = np.random.default_rng(0)
     rows = []
-    for method, knowledge, level, bytes_each in [("gnss", "identity", 6.0, 0), ("kalman", "identity", 4.0, 0),
-                                                 ("kalman", "fitted", 0.9, 0), ("joint", "fitted", 0.7, 320),
-                                                 ("fedkalmannet", "trained", 1.1, 0), ("bound", "nominal", 0.5, 320)]:  # fmt: skip
+    lines = [("gnss", "identity", 6.0, 0), ("kalman", "identity", 4.0, 0), ("kalman", "fitted", 0.9, 0),
+             ("joint", "fitted", 0.7, 320),
+             ("fedkalmannet", "trained", 1.1, 0), ("bound", "nominal", 0.5, 320)]  # fmt: skip
+    for method, knowledge, level, bytes_each in lines:
         for k in (0, 2, 10):
             for run in range(5):
                 errors = np.abs(rng.normal(size=200)) * level

@@ -14,7 +14,7 @@ def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "knowledge",
     return Results("demo", "?", axes, {}, frame, pd.DataFrame(), 0, {})
 
 
-@pytest.fixture()
+@pytest.fixture
 def rows() -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
     return [{"method": m, "knowledge": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
@@ -98,3 +98,11 @@ def test_csv_and_parquet_hold_every_digit(rows: list[dict[str, Any]], tmp_path: 
     np.testing.assert_array_equal(pd.read_csv(tmp_path / "r.csv")["rt_le_m"], frame["rt_le_m"])
     assert "quantiles" not in pd.read_csv(tmp_path / "r.csv")
     assert pd.read_parquet(tmp_path / "r.parquet")["quantiles"].iloc[0].tolist() == [0.1, 0.2]
+
+
+def test_tables_over_several_columns(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows).query("method == 'kalman'")
+    table = results(frame).table("k", ["method", "knowledge"], "rt_le_m", along="column")
+    assert table.header == ("K", "KF, identity", "KF, fitted")
+    assert table.along == "column"
+    assert table.rows[1][2].mean == pytest.approx(frame.query("k == 4 and knowledge == 'fitted'")["rt_le_m"].mean())

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -22,7 +22,7 @@ from coopoc.study.study import Cell, Study
 DISTRIBUTION = Path(__file__).parent / "distribution"
 
 
-@pytest.fixture()
+@pytest.fixture
 def study(monkeypatch: pytest.MonkeyPatch) -> Study:
     monkeypatch.syspath_prepend(str(DISTRIBUTION))
     return importlib.import_module("small_study").STUDY
@@ -116,8 +116,7 @@ def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, 
 def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study: Study, tmp_path: Path) -> None:
     trouble = tmp_path / "trouble"
     trouble.write_text("kill")
-    with pytest.raises(WorkerDiedError, match="repeat the command"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # loky's resource tracker reports the dead worker's semaphores
+    with pytest.raises(WorkerDiedError, match="repeat the command"):
         run(study, tmp_path, jobs=2, settings={"trouble": str(trouble)}, progress=False)
     trouble.unlink()
     assert run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False).failed == 0
@@ -133,6 +132,15 @@ def test_a_damaged_file_is_computed_again(study: Study, tmp_path: Path, damage: 
     with pytest.warns(RuntimeWarning, match=f"{first.name} is damaged and will be computed again"):
         again = run(study, tmp_path, progress=False)
     pd.testing.assert_frame_equal(numbers(again.frame), numbers(whole.frame), check_exact=True)
+
+
+def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study: Study, tmp_path: Path) -> None:
+    asked: list[list[int]] = []
+    study = replace(study, prepare=lambda cells: asked.append(sorted({p["max_neighbours"] for p in cells})))
+    run(study, tmp_path, settings={"max_neighbours": "0"}, progress=False)
+    run(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
+    run(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
+    assert asked == [[0], [2]]
 
 
 def test_plan_counts_and_writes_nothing(study: Study, tmp_path: Path) -> None:

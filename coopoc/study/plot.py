@@ -102,6 +102,8 @@ def legend(
         handles.append(Line2D([], [], **options, label=text))
     styles: dict[Any, list[str]] = {}
     for known in dict.fromkeys(str(n["knowledge"]) for n in lines if "knowledge" in n and n["method"] != "bound"):
+        if known == "none":
+            continue
         styles.setdefault(line(known), []).append(known)
     if len(styles) > 1:
         handles += [Line2D([], [], color="#555555", linestyle=k, label=" / ".join(v)) for k, v in styles.items()]

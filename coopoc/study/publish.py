@@ -59,7 +59,7 @@ def _made(view: Callable[[Results], Any], results: Results, missing: dict[str, s
 def _save_table(table: Table, path: Path) -> str:
     for form, suffix in FORMATS.items():
         store.write(Path(f"{path}.{suffix}"), table.render(form))
-    return table.caption
+    return " ".join(table.below)
 
 
 def _save_figure(plot: Any, path: Path) -> str:

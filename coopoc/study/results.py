@@ -138,7 +138,7 @@ class Results:
             where[name] = list(parse(name, text, tuple(example)))
         return where
 
-    def table(self, rows: str | Sequence[str], columns: str, value: str, **options: Any) -> Table:
+    def table(self, rows: str | Sequence[str], columns: str | Sequence[str], value: str, **options: Any) -> Table:
         """Table of one metric, see `coopoc.study.tables.tabulated` for the options."""
         from .tables import tabulated
 

@@ -28,6 +28,7 @@ from .publish import publish
 from .results import Results
 from .study import Cell, Params, Row, Study
 
+
 def run(
     study: Study | str,
     out: str | Path = "runs",
@@ -55,6 +56,8 @@ def run(
         raise InputError("jobs", jobs, "must be >= 1", "Give the number of worker processes.")
     store.prepare(folder, _manifest(study, cells))
     todo = [cell for cell in cells if store.load(folder, cell.name) is None]
+    if todo:
+        study.prepare([cell.given for cell in todo])
     bar = tqdm(total=len(cells), initial=len(cells) - len(todo), desc=study.name, unit="cell", disable=not progress)
     with bar, closing(_compute(study.cell, schedule(todo, study.shares, jobs), jobs)) as outcomes:
         failed = 0
@@ -91,7 +94,7 @@ def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Ce
     return [cell for step in itertools.zip_longest(*lanes) for cell in step if cell is not None]
 
 
-class WorkerDiedError(RuntimeError):
+class WorkerDiedError(ChildProcessError):
     """A worker process was killed from outside; finished cells are kept and the next run resumes."""
 
 

@@ -80,7 +80,7 @@ class Table:
         body = [[_mark(self.text(e), (i, j) in bold, "**{}**").replace("|", "\\|") for j, e in enumerate(row)]
                 for i, row in enumerate(self.rows)]  # fmt: skip
         grid = tabulate(body, self.header, "pipe", disable_numparse=True, colalign=self._sides("left", "right"))
-        return "\n\n".join([grid, *self._below()])
+        return "\n\n".join([grid, *self.below])
 
     def to_csv(self) -> str:
         """Full precision; an interval takes three columns: mean, low, high."""
@@ -96,7 +96,7 @@ class Table:
     def to_latex(self) -> str:
         r"""A booktabs table that compiles with \usepackage{booktabs}; best in bold, text escaped."""
         bold = self._bold()
-        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(' '.join(self._below()))}}}",
+        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(' '.join(self.below))}}}",
                  rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}", r"\toprule",
                  " & ".join(map(_tex, self.header)) + r" \\", r"\midrule"]  # fmt: skip
         for i, row in enumerate(self.rows):
@@ -112,7 +112,7 @@ class Table:
         for i, row in enumerate(self.rows):
             cells = [self._html(e, (i, j) in bold) for j, e in enumerate(row)]
             body.append("<tr>" + "".join(cells) + "</tr>")
-        caption = f"<caption>{escape(' '.join(self._below()))}</caption>"
+        caption = f"<caption>{escape(' '.join(self.below))}</caption>"
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
     def text(self, entry: Entry) -> str:
@@ -142,7 +142,9 @@ class Table:
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.header)
         return tuple(words if any(isinstance(e, str) for e in column) else numbers for column in columns)
 
-    def _below(self) -> list[str]:
+    @property
+    def below(self) -> list[str]:
+        """Caption and notes."""
         return [text for text in (self.caption, *self.notes) if text]
 
     def _bold(self) -> set[tuple[int, int]]:
@@ -162,37 +164,39 @@ class Table:
 def tabulated(
     results: Results,
     rows: str | Sequence[str],
-    columns: str,
+    columns: str | Sequence[str],
     value: str,
     where: Mapping[str, Any] | None = None,
     caption: str = "",
     best: Best = "min",
+    along: Literal["row", "column"] | None = None,
     decimals: int = 2,
     intervals: bool = True,
 ) -> Table:
     """Table of one metric over a study's results: mean over egos and runs, with its 95 % interval.
 
     Args:
-        rows: column(s) of the frame that label the rows. columns: the column whose values become columns.
-        value: the metric. where: column -> value or values. best: "min", "max" or None, sought among the methods.
+        rows: column(s) of the frame that label the rows. columns: column(s) whose values become columns.
+        value: the metric. where: column -> value or values. best: "min", "max" or None.
+        along: where the best is sought; default among the methods.
 
     Raises:
         InputError: as `Results.summary`.
     """
-    by = [rows] if isinstance(rows, str) else list(rows)
-    summary = results.summary([*by, columns], value, where)
-    across = list(dict.fromkeys(summary[columns]))
-    body, incomplete = [], 0
-    for names, group in summary.groupby(by, sort=False, dropna=False):
-        found = {row[columns]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
+    down, across = ([names] if isinstance(names, str) else list(names) for names in (rows, columns))
+    summary = results.summary([*down, *across], value, where)
+    summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
+    titles = list(dict.fromkeys(summary["_title"]))
+    body = []
+    for names, group in summary.groupby(down, sort=False, dropna=False):
+        found = {row["_title"]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
                  for _, row in group.iterrows() if row["n"]}  # fmt: skip
-        body.append((*(label(b, n) for b, n in zip(by, names, strict=True)), *(found.get(c) for c in across)))
-        incomplete += int(group["missing"].sum())
-    titles = [title(columns, c) for c in across]
-    notes = (f"{incomplete} egos are left out because a run of theirs failed.",) if incomplete else ()
+        body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(found.get, titles)))
+    missing = int(summary["missing"].sum())
     return Table(
-        (*map(words, by), *titles), tuple(body), caption or f"{words(value)}: mean and 95 % interval.", best,
-        "column" if "method" in by else "row", decimals=decimals, intervals=intervals, notes=notes,
+        (*map(words, down), *titles), tuple(body), caption or f"{words(value)}: mean and 95 % interval.", best,
+        along or ("column" if "method" in down else "row"), decimals=decimals, intervals=intervals,
+        notes=(f"{missing} egos are left out because a run of theirs failed.",) if missing else (),
     )  # fmt: skip
 
 

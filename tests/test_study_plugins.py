@@ -1,0 +1,47 @@
+"""Entry points: names, mappings, clashes, and distributions that are broken."""
+
+from pathlib import Path
+
+import pytest
+
+from coopoc import plugins
+from coopoc.errors import InputError
+
+
+def install(folder: Path, name: str, points: str) -> None:
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(points)
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return tmp_path
+
+
+def test_an_entry_point_is_one_object_or_a_mapping_of_several(site: Path) -> None:
+    install(site, "one", "[some.group]\nwave = math:pi\ntable = string_table:TABLE\n")
+    (site / "string_table.py").write_text("TABLE = {'a': 1, 'b': 2}\n")
+    assert plugins.names("some.group") == ("a", "b", "wave")
+    assert plugins.find("some.group", "wave") == pytest.approx(3.14159265)
+    assert plugins.find("some.group", "b") == 2
+    with pytest.raises(InputError, match=r"some\.group = 'wav': must be one of a, b, wave\. Did you mean wave\?"):
+        plugins.find("some.group", "wav")
+
+
+def test_what_cannot_be_loaded_hides_nothing_else(site: Path) -> None:
+    install(site, "broken", "[some.group]\nbroken = no_such_module:THING\nfine = math:pi\n")
+    assert plugins.names("some.group") == ("broken", "fine")
+    with pytest.raises(ModuleNotFoundError, match="no_such_module"):
+        plugins.find("some.group", "broken")
+    with pytest.raises(InputError, match="must be one of broken, fine"):
+        plugins.find("some.group", "other")
+
+
+def test_two_distributions_may_not_claim_one_name(site: Path) -> None:
+    install(site, "first", "[some.group]\nx = math:pi\n")
+    install(site, "second", "[some.group]\nx = math:tau\n")
+    with pytest.raises(InputError, match=r"'x': is claimed by math:\w+ and math:\w+\. Uninstall one"):
+        plugins.find("some.group", "x")
