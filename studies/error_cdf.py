@@ -49,6 +49,7 @@ def _noise(results: Results, scenario: int, ratio: float) -> str:
 
 def _table(scenario: int, ratio: float) -> Any:
     def table(results: Results) -> Table:
+        from coopoc.study.style import look
         from coopoc.study.tables import Table
 
         gnss = results.interval("max_error_m", method="gnss", **_where(scenario, ratio)).mean
@@ -57,7 +58,7 @@ def _table(scenario: int, ratio: float) -> Any:
             where = _where(scenario, ratio, method=method, knowledge=known)
             worst = results.interval("max_error_m", where)
             body.append((
-                method, known, results.interval("rt_le_m", where), seed_spread(results, where), worst,
+                look(method).label, known, results.interval("rt_le_m", where), seed_spread(results, where), worst,
                 gnss - worst.mean, 100 * results.interval("worse_than_gnss", where).mean,
             ))  # fmt: skip
         header = ("Method", "Knowledge", "RT-LE [m]", "Seed std [m]", "Maximum [m]", "Reduction [m]", "Worse than GNSS [%]")
@@ -80,7 +81,7 @@ def _cdf(scenario: int, ratio: float) -> Any:
 
         methods = ["gnss", "kalman", "okf", "fedkalmannet", "centralised", "individual1"]
         where = _where(scenario, ratio, method=methods, knowledge=["none", "identity", "fitted", "trained"])
-        return figures.cdf(results, where=where, caption=f"Distribution of the error over all steps; markers: mean of the "
+        return figures.cdf(results, where=where, log=True, caption=f"Distribution of the error over all steps; markers: mean of the "
                            f"per-run maxima. {_noise(results, scenario, ratio)}")  # fmt: skip
 
     return figure

@@ -56,6 +56,7 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
         "msmv-r": Msmv(assumed),
         "joint": JointFilter(assumed),
         "cooperative-map": CooperativeMAP(knowledge=assumed, backend=p.get("backend", "gauss-newton")),
+        "cooperative-map-5": CooperativeMAP(knowledge=assumed, backend=p.get("backend", "gauss-newton"), window=5),
     }
     if name not in found:
         raise InputError("method", repr(name), f"must be one of {[*found, *weights.LEARNED]}", "See coopoc list.")
@@ -103,7 +104,7 @@ def _rows(
         "sent_bytes_per_second": track.sent_bytes / duration,
     }
     fixes = np.sqrt(((recording.gnss - drive.position) ** 2).sum(axis=-1).mean(axis=1))[:, list(track.egos)]
-    columns["worse_than_gnss"] = (columns["rt_le_m"] > fixes).astype(float)
+    columns["worse_than_gnss"] = (columns["rt_le_m"] > 1.001 * fixes).astype(float)
     if track.covariance is not None:
         columns["nees"] = nees(track, drive).mean(axis=1)
         columns["nees_inside"] = np.broadcast_to(nees_inside(track, drive), columns["nees"].shape)

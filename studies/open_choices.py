@@ -28,11 +28,12 @@ def _where(start: str, reading: str, scenario: int, ratio: float) -> dict[str, A
 
 def _table(start: str, reading: str) -> Any:
     def table(results: Results) -> Table:
+        from coopoc.study.style import look
         from coopoc.study.tables import Table
 
         body = []
         for method, known in (*CLASSIC, *((name, "trained") for name in weights.LEARNED)):
-            row: list[Any] = [method, known]
+            row: list[Any] = [look(method).label, known]
             for scenario, ratio in CASES:
                 where = {**_where(start, reading, scenario, ratio), "method": method, "knowledge": known}
                 row += [results.interval("rt_le_m", where), seed_spread(results, where)]

@@ -11,7 +11,9 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
-from coopoc import Fleet, InputError, Sensors, observe
+from coopoc import V2X, Fleet, Gnss, InputError, Sensors, observe
+from coopoc import load as load_fleet
+from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import Checkpoint, GainNet, LearnedGain, OptimisedKF, Schedule, load, load_method, save, train_all
 from coopoc.learned.checkpoint import read_card
 from coopoc.learned.rollout import flatten
@@ -128,3 +130,17 @@ def test_recipes_follow_the_paper() -> None:
     assert (centralised.schedule.epochs, individual.schedule.epochs) == (1500, 500)
     assert {(r.piece, r.split, r.noise) for r in recipes.RECIPES.values()} == {(100, 0.8, "static")}
     assert len({replace(r.schedule, epochs=1) for r in (fed, centralised, individual)}) == 1
+
+
+@pytest.mark.parametrize("name", ["fedkalmannet", "centralised", "okf", *(f"individual{i}" for i in range(1, 5))])
+def test_shipped_weights_hold_over_unseen_drives(name: str) -> None:
+    """They trained on pieces of 100 steps and other vehicles; here are 900 steps, and no run may drift away."""
+    fleet, method = load_fleet("town10"), load_method(name)
+    card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
+    assert card["digest"] == load_fleet("town10-clients").digest
+    some = fleet.select(fleet.ids[::10])
+    recording = observe(some, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=3)
+    found, egos = method(recording, range(6)), range(6)
+    assert rt_le(found, some).max() < 2.0
+    assert rt_le(found, some).mean() < 0.3 * rt_le(Gnss()(recording, egos), some).mean()
+    assert found.notes == ()

@@ -56,11 +56,14 @@ def sweep(
     return Plot(figure, caption or f"{words(y)} against {words(x)}. Bands: 95 % intervals over egos, then runs.")
 
 
-def cdf(results: Results, value: str = "error_quantiles_m", where: Where = None, caption: str = "") -> Plot:
+def cdf(
+    results: Results, value: str = "error_quantiles_m", where: Where = None, caption: str = "", log: bool = False
+) -> Plot:
     """Share of errors below each value, with a marker at the mean of the per-run maxima.
 
     Args:
         value: column of lists: equally likely quantiles of the errors of one run and ego, the last its maximum.
+        log: horizontal axis.
 
     Raises:
         InputError: an unknown column or value.
@@ -79,7 +82,11 @@ def cdf(results: Results, value: str = "error_quantiles_m", where: Where = None,
             drawn.append(names)
             text[names["method"]] = _maximum(text.get(names["method"], ""), worst)
         axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
-        axes.set_xlim(left=0)
+        if log:
+            plain_log(axes.xaxis)
+            axes.set_xlim(left=0.1)
+        else:
+            axes.set_xlim(left=0)
         legend(axes, drawn, text)
     return Plot(figure, caption or "Cumulative distribution of the error. Markers: mean of the per-run maxima.")
 
@@ -115,6 +122,8 @@ def convergence(
         axes.set_xlim(left=0)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         _levels(axes, levels or {})
+        low, high = axes.get_ylim()
+        axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend above the curves
         legend(axes, drawn, inside=True)
     return Plot(figure, caption or f"{words(y)} after every round: mean over training seeds; bands: lowest to highest.")
 

@@ -42,7 +42,7 @@ def pareto(
         for names, group in groups(summary, by):
             _front(axes, names, group.sort_values("bytes"))
             drawn.append(names)
-        _share_height(axes[0], axes[1], words(y))
+        _share_height(axes[0], axes[1], words(y), 0.8 * float(summary["low"].min()))
         plain_log(axes[1].xaxis)
         axes[1].set_xlabel(words(x))
         if training:
@@ -61,11 +61,13 @@ def _front(axes: Sequence[Axes], names: Mapping[str, Any], group: pd.DataFrame) 
         panel.errorbar(at, part["mean"], yerr=spread[:, chosen], elinewidth=0.7, **options)
 
 
-def _share_height(left: Axes, right: Axes, label: str) -> None:
+def _share_height(left: Axes, right: Axes, label: str, low: float) -> None:
     top = 1.03 * max(left.get_ylim()[1], right.get_ylim()[1])
-    left.set(ylim=(0, top), ylabel=label, xticks=[0], xlim=(-1, 1))
+    for panel in (left, right):
+        plain_log(panel.yaxis)
+        panel.set_ylim(low, top)
+    left.set(ylabel=label, xticks=[0], xlim=(-1, 1))
     left.set_xticklabels(["0"])
-    right.set_ylim(0, top)
     right.tick_params(labelleft=False)
 
 

@@ -135,6 +135,7 @@ def _compute(function: Callable[[Params], list[Row]], cells: Sequence[Cell], job
     if jobs == 1 or len(cells) < 2:
         yield from (attempt(function, cell) for cell in cells)
         return
+    os.environ.setdefault("TQDM_DISABLE", "1")  # workers read it when they import tqdm: one bar, ours, is enough
     with parallel_config(backend="loky", inner_max_num_threads=1):
         workers = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
         try:

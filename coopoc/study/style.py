@@ -63,13 +63,18 @@ RC: Any = {
 
 
 def look(method: str) -> Look:
-    """The look of a method; one that is not in METHODS gets a spare one that depends on its name alone.
+    """The look of a method; a number at its end is a client; an unknown one has a look that its name alone decides.
 
-    >>> look("okf").label
-    'OKF'
+    >>> look("okf").label, look("individual2").label
+    ('OKF', 'Individual KalmanNet 2')
     """
-    if method.replace("_", "-") in METHODS:
-        return METHODS[method.replace("_", "-")]
+    name = method.replace("_", "-")
+    if name in METHODS:
+        return METHODS[name]
+    family = name.rstrip("0123456789-")
+    if family in METHODS:
+        shown = METHODS[family]
+        return Look(f"{shown.label} {name[len(family):].strip('-')}", shown.color, shown.marker)
     color, marker = _SPARE[zlib.crc32(method.encode()) % len(_SPARE)]
     return Look(method, color, marker)
 
