@@ -36,9 +36,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
     print(DATASETS[name].card().render())
 
 
-def make(
-    recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fleets"), seed: int | None = None
-) -> None:
+def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fleets"), seed: int | None = None) -> None:
     """Make a fleet with SUMO from an OpenDRIVE map: the same seed gives the same bytes.
 
     Example: coopoc data make town10 --maps carla_maps

@@ -1,1 +1,1 @@
-"""Studies: one short script each, saying what varies, what is held, and which tables and figures answer the question."""
+"""Studies: one short script each: what varies, what is held, which tables and figures answer the question."""

@@ -49,15 +49,6 @@ def key(p: Params) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _noise(results: Results) -> str:
-    p = results.settings
-    return (
-        f"Scenario {p['scenario']}, velocity {100 * p['velocity_ratio']:g} % ({p['velocity_reading']}), start at the "
-        f"{'first fix' if p['start'] == 'gnss' else 'truth'}, {p['runs']} runs, {p['egos']} egos of {p['data']}, "
-        f"{p['train_seeds']} training seeds."
-    )
-
-
 def _mean(results: Results, method: str, number: int) -> float:
     return results.interval("rt_le_m", method=method, round=number).mean
 
@@ -70,7 +61,7 @@ def _figure(results: Results) -> Plot:
     return figures.convergence(
         results, where={"method": ["fedkalmannet", "centralised"]}, levels=levels,
         caption=f"RT-LE after every round (mean over training seeds, band from the lowest to the highest); dashed: "
-        f"individual nets at their end. {_noise(results)}",
+        f"individual nets at their end. {scene.conditions(results.settings)}",
     )  # fmt: skip
 
 
@@ -83,7 +74,7 @@ def _clients(results: Results) -> Plot:
 def _table(results: Results) -> Table:
     return results.table(
         rows="round", columns="method", value="rt_le_m", where={"method": ["fedkalmannet", "centralised"]}, decimals=3,
-        intervals=False, caption=f"RT-LE [m] after every round. {_noise(results)}",
+        intervals=False, caption=f"RT-LE [m] after every round. {scene.conditions(results.settings)}",
     )  # fmt: skip
 
 
@@ -92,10 +83,11 @@ def _findings(results: Results) -> Sequence[str]:
     fed, centralised = _mean(results, "fedkalmannet", last), _mean(results, "centralised", last)
     reached = next((n for n in range(last + 1) if _mean(results, "fedkalmannet", n) <= 1.03 * centralised), None)
     when = f"within 3 % of it from round {reached} on" if reached is not None else "not within 3 % of it"
+    gap = f"{100 * (fed / centralised - 1):+.1f} %"
     return [
-        f"After {last} rounds federated {fed:.3f} m, centralised {centralised:.3f} m ({100 * (fed / centralised - 1):+.1f} %): "
-        f"the federation is {when}. Both start at {_mean(results, 'fedkalmannet', 0):.2f} m, the untrained net.",
-    ]  # fmt: skip
+        f"After {last} rounds federated {fed:.3f} m, centralised {centralised:.3f} m ({gap}): the federation is {when}.",
+        f"Both start at {_mean(results, 'fedkalmannet', 0):.2f} m, the untrained net.",
+    ]
 
 
 STUDY = Study(
@@ -108,7 +100,8 @@ STUDY = Study(
     where=lambda p: p["train_seed"] < p["train_seeds"],
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 1, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "start": "gnss", "egos": "3", "runs": 30, "seed": 0, "rounds": 20, "train_seeds": 5,
+        "velocity_reading": "axis", "start": "gnss", "egos": "3", "runs": 30, "seed": 0, "rounds": 20,
+        "train_seeds": 5,
     },
     tables={"rounds": _table},
     figures={"clients": _clients, "rounds": _figure},

@@ -8,16 +8,12 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.errors import InputError
 from coopoc.evaluate.metrics import errors, max_error, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.cooperative_map import CooperativeMAP
-from coopoc.methods.gnss import Gnss
-from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.knowledge import Knowledge
-from coopoc.methods.lkf_sa import LaplacianKalman
-from coopoc.methods.msmv import Msmv
 from coopoc.methods.track import Method, Track
+from coopoc.plugins import find
 from coopoc.study.study import Params, Row
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
@@ -47,20 +43,12 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
     name, start = p["method"], _start(p)
     if name in weights.LEARNED:
         return [(seed, _learned(name, p, seed, start)) for seed in weights.seeds(p)]
-    assumed = knowledge(p)
-    found: dict[str, Method] = {
-        "gnss": Gnss(),
-        "kalman": Kalman(assumed, start=start),
-        "lkf-sa": LaplacianKalman(assumed),
-        "lkf-sa-edge": JointFilter(assumed, exact=False),
-        "msmv-r": Msmv(assumed),
-        "joint": JointFilter(assumed),
-        "cooperative-map": CooperativeMAP(knowledge=assumed, backend=p.get("backend", "gauss-newton")),
-        "cooperative-map-5": CooperativeMAP(knowledge=assumed, backend=p.get("backend", "gauss-newton"), window=5),
-    }
-    if name not in found:
-        raise InputError("method", repr(name), f"must be one of {[*found, *weights.LEARNED]}", "See coopoc list.")
-    return [(None, found[name])]
+    method: Method = find("coopoc.methods", name)(knowledge(p))
+    if isinstance(method, Kalman):
+        method = replace(method, start=start)
+    if isinstance(method, CooperativeMAP):
+        method = replace(method, backend=p.get("backend", method.backend))
+    return [(None, method)]
 
 
 def _start(p: Params) -> Floats | None:

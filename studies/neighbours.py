@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.study.environment import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.sensing import find_links
+from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import lineup, scene, weights
 
@@ -63,14 +65,19 @@ def cell(p: Params) -> list[Row]:
         column = drive.index(ego)
         bound = bound_rt_le(posterior_bound(drive, acting, column, scene.channel(p)))
         links = find_links(drive, [column], p["max_neighbours"], float(p["radius_m"]), acting.min_range)
-        found.append({"run": 0, "ego": ego, "rt_le_m": bound, "neighbours_mean": len(links) / len(drive.t)})
+        near = len(links) / len(drive.t)
+        received = near * FIX_AND_VELOCITY.payload / drive.dt
+        found.append({"run": 0, "ego": ego, "rt_le_m": bound, "neighbours_mean": near, "bytes_per_second": received})
     return found
 
 
 def key(p: Params) -> dict[str, str]:
     """What else changes the numbers."""
     scene.channel(p)
-    extra = {"fleet": scene.fleet(p["data"]).digest, "code": revision("coopoc.world", "coopoc.methods", "coopoc.optimize")}
+    extra = {
+        "fleet": scene.fleet(p["data"]).digest,
+        "code": revision("coopoc.world", "coopoc.methods", "coopoc.optimize"),
+    }
     if p["method"] in weights.LEARNED:
         extra["weights"] = weights.key(p["method"], p)
     return extra
@@ -85,24 +92,11 @@ def _bounded(results: Results) -> list[str]:
     return ["bound"] if (results.frame["method"] == "bound").any() else []
 
 
-def _noise(results: Results) -> str:
-    """The noise settings, for captions."""
-    p = results.settings
-    if scene.is_real(p["data"]):
-        return " ".join(scene.labels(p["data"]))
-    acting = scene.sensors(p)
-    return (
-        f"GNSS {acting.gnss_std[0]:g} m per axis, velocity {100 * acting.velocity_std_ratio:g} % ({p['velocity_reading']}), "
-        f"range {acting.range_std:g} m, angles 4 deg, {p['radius_m']:g} m radius, {p['runs']} runs, "
-        f"{p['egos']} egos of {p['data']}."
-    )
-
-
 def _table(known: str) -> Any:
     def table(results: Results) -> Table:
         return results.table(
             rows="max_neighbours", columns="method", value="rt_le_m", where=_of(known, *_bounded(results)), along="row",
-            intervals=False, caption=f"RT-LE [m], {known} knowledge. {_noise(results)}",
+            intervals=False, caption=f"RT-LE [m], {known} knowledge. {scene.conditions(results.settings)}",
         )  # fmt: skip
 
     return table
@@ -112,7 +106,7 @@ def _nees(results: Results) -> Table:
     where = {"method": ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"], **IDEAL, "knowledge": "nominal"}
     return results.table(
         rows="max_neighbours", columns="method", value="nees", where=where, best=None, intervals=False,
-        caption=f"NEES (3 is consistent), nominal knowledge. {_noise(results)}",
+        caption=f"NEES (3 is consistent), nominal knowledge. {scene.conditions(results.settings)}",
     )  # fmt: skip
 
 
@@ -121,7 +115,7 @@ def _neighbours_errors(results: Results) -> Table:
     where["max_neighbours"] = [k for k in results.frame["max_neighbours"].unique() if k]
     return results.table(
         rows=["knowledge", "max_neighbours"], columns="method", value="neighbour_rt_le_m", where=where, intervals=False,
-        caption=f"Error of what the egos think of their neighbours [m]. {_noise(results)}",
+        caption=f"Error of what the egos think of their neighbours [m]. {scene.conditions(results.settings)}",
     )  # fmt: skip
 
 
@@ -132,7 +126,8 @@ def _budget(results: Results) -> Table | None:
     where = {"method": ["lkf-sa", "joint"], "max_neighbours": 10, "knowledge": ["identity", "nominal", "fitted"]}
     return results.table(
         rows=["rate_hz", "cap_bytes_per_second"], columns=["method", "knowledge"], value="rt_le_m", where=where,
-        intervals=False, caption=f"RT-LE [m] at K = 10 under rates and caps (0: no cap). {_noise(results)}",
+        intervals=False,
+        caption=f"RT-LE [m] at K = 10 under rates and caps (0: no cap). {scene.conditions(results.settings)}",
     )  # fmt: skip
 
 
@@ -142,7 +137,7 @@ def _sweep(known: str) -> Any:
 
         return figures.sweep(
             results, x="max_neighbours", where=_of(known, *_bounded(results)), log=True,
-            caption=f"RT-LE against the number of neighbours, {known} knowledge. {_noise(results)} "
+            caption=f"RT-LE against the number of neighbours, {known} knowledge. {scene.conditions(results.settings)} "
             "Bands: 95 % intervals over egos, then runs.",
         )  # fmt: skip
 
@@ -153,12 +148,13 @@ def _pareto(results: Results) -> Plot:
     from coopoc.study import figures
 
     chosen = ["gnss", "kalman", "okf", "fedkalmannet", "lkf-sa", "joint", *_bounded(results)]
-    where = {"method": [m for m in chosen if m != "bound"], "knowledge": ["fitted", "identity", "none", "trained"]}
+    where = {"method": chosen, "knowledge": ["fitted", "identity", "none", "trained", *_bounded(results)]}
     return figures.pareto(
         results, along=("max_neighbours", "rate_hz", "cap_bytes_per_second"), where=where,
         training=weights.training_bytes(results.settings),
-        caption=f"RT-LE against the payload that an ego receives: K = 1 to 10 at 10 Hz, and K = 10 under lower rates and "
-        f"caps. Right: what a vehicle sends and receives in training, once. {_noise(results)}",
+        caption="RT-LE against the payload that an ego receives: K = 1 to 10 at 10 Hz, and K = 10 under lower rates "
+        "and caps. Right: what a vehicle sends and receives in training, once. "
+        f"{scene.conditions(results.settings)}",
     )  # fmt: skip
 
 
@@ -186,13 +182,13 @@ def _findings(results: Results) -> Sequence[str]:
     last = steps[-1]
     paper = [_mean(results, "lkf-sa", "identity", k) for k in steps]
     holds = all(fed < value < gnss for value in paper)
-    falls = all(b <= a + 0.005 for a, b in zip(paper, paper[1:], strict=False))
+    falls = all(b <= a + 0.005 for a, b in pairwise(paper))
     kf, joint = _mean(results, "kalman", "fitted", last), _mean(results, "joint", "fitted", last)
     ranked = sorted([("FedKalmanNet", fed), ("fitted KF", kf), ("fitted joint filter", joint)], key=lambda row: row[1])
     return [
-        f"Identity covariances, as the paper's baselines: federated {fed:.3g} m, LKF-SA {paper[0]:.3g} to {paper[-1]:.3g} m "
-        f"(K = {steps[0]} to {last}), GNSS {gnss:.3g} m. The paper's order, federated < LKF-SA < GNSS, "
-        f"{'holds at every' if holds else 'does NOT hold at every'} K >= 1; LKF-SA "
+        f"Identity covariances, as the paper's baselines: federated {fed:.3g} m, LKF-SA {paper[0]:.3g} to "
+        f"{paper[-1]:.3g} m (K = {steps[0]} to {last}), GNSS {gnss:.3g} m. The paper's order, federated < LKF-SA < "
+        f"GNSS, {'holds at every' if holds else 'does NOT hold at every'} K >= 1; LKF-SA "
         f"{'falls with K' if falls else 'does NOT fall with K throughout'}.",
         f"Fitted covariances, K = {last}: " + " < ".join(f"{name} {value:.3g} m" for name, value in ranked)
         + ". The same Laplacian filter with fitted covariances reaches "
@@ -206,7 +202,7 @@ def _mean(results: Results, method: str, known: str, k: int) -> float:
 
 STUDY = Study(
     name="neighbours",
-    question="What does another neighbour buy while deciding, what does it cost, and does training together replace it?",
+    question="What does another neighbour buy while deciding, at what cost, and does training together replace it?",
     cell=cell,
     key=key,
     prepare=weights.prepare,
@@ -214,23 +210,25 @@ STUDY = Study(
     where=_meaningful,
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "backend": "gauss-newton",
         "velocity_reading": "axis", "start": "gnss", "radius_m": 30.0, "egos": "5", "runs": 30, "seed": 0,
-        "train_seeds": 5,
+        "train_seeds": 5, "backend": "gauss-newton",
     },
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
         "rt_le_identity": _table("identity"), "rt_le_fitted": _table("fitted"), "rt_le_nominal": _table("nominal"),
         "budget": _budget, "nees": _nees, "neighbours_errors": _neighbours_errors,
     },
-    figures={"rt_le_identity": _sweep("identity"), "rt_le_fitted": _sweep("fitted"), "bytes": _pareto, "innovations": _innovations},
+    figures={
+        "rt_le_identity": _sweep("identity"), "rt_le_fitted": _sweep("fitted"), "bytes": _pareto,
+        "innovations": _innovations,
+    },
     findings=_findings,
     recipe=weights.described,
     limitations=(
-        "Azimuth and inclination are in the world frame: the heading that turns a body bearing into an azimuth is taken as known.",
+        "Azimuth and inclination are in the world frame: the heading that turns a bearing into an azimuth is known.",
         "The bound is that of an ideal channel at each K; it leaves out the bias and is for causal estimates.",
         "MSMV-R is a reconstruction; no reading of MSMV that we tried is flat in K as the paper's curve is.",
-        "Fitted knowledge and the nets come from vehicles that drive alone with 1.5 m and 10 %; the test has other noise.",
+        "Fitted knowledge and the nets come from vehicles that drive alone with 1.5 m and 10 %; the test is noisier.",
     ),
     minutes=5,
 )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from coopoc.study.study import Params, Row, Study
 
-from . import lineup, scene, weights
+from . import lineup, weights
 from .error_cdf import CASES, CLASSIC, key, seed_spread
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ def _table(start: str, reading: str) -> Any:
         where_from = "first fix" if start == "gnss" else "true position"
         p = results.settings
         caption = (
-            f'RT-LE, start at the {where_from}, velocity noise read per {reading}; {p["runs"]} paired runs, {p["egos"]} egos '
-            f'of {p["data"]}, {p["train_seeds"]} training seeds. Last column: runs worse than GNSS in the last case.'
+            f"RT-LE, start at the {where_from}, velocity noise read per {reading}; {p['runs']} paired runs, "
+            f"{p['egos']} egos of {p['data']}, {p['train_seeds']} training seeds. Last column: of the last case."
         )
         return Table((*header, "Worse [%]"), tuple(body), caption, best=None)
 

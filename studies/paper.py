@@ -42,6 +42,6 @@ def paper(
 
 TITLE = "Collaborative training against collaborative decision"
 LEAD = (
-    "Three results of “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on bundled fleets.",
+    "Three results of “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on our fleets.",
     "The paper's baselines use identity covariances; each comparison is shown with them and with fitted ones.",
 )

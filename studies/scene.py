@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
         return tuple(drive.ids[drive.index(i)] for i in wanted.split("+"))
     count = int(wanted)
     if not 1 <= count <= len(throughout):
-        raise InputError("egos", wanted, f"must be 1..{len(throughout)}, the vehicles present throughout", "Take fewer.")
+        raise InputError("egos", wanted, f"must be 1..{len(throughout)}, who is there throughout", "Take fewer.")
     return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
 
 
@@ -61,6 +62,22 @@ def sensors(p: Params) -> Sensors:
     else:
         raise InputError("scenario", p["scenario"], "must be 1 or 2", "See section IV.B of the paper.")
     return Sensors(**{**acting.__dict__, "velocity_std_ratio": ratio, "velocity_reading": reading})
+
+
+def conditions(p: Params) -> str:
+    """Noise, start and size of a cell, for captions; of real data, what is simulated in it and what uses truth."""
+    size = f"{p['runs']} runs, {p['egos']} egos of {Path(p['data']).name}, {p['train_seeds']} training seeds."
+    if is_real(p["data"]):
+        return f"Real data: {'; '.join(labels(p['data']))}. {size}"
+    acting = sensors(p)
+    low, high = acting.gnss_bias
+    bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
+    near = f", range {acting.range_std:g} m, angles 4°, radius {p['radius_m']:g} m" if "radius_m" in p else ""
+    start = "first fix" if p.get("start", "gnss") == "gnss" else "true position"
+    return (
+        f"Scenario {p['scenario']}: GNSS {acting.gnss_std[0]:g} m per axis{bias}, velocity "
+        f"{100 * acting.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}, start at the {start}; {size}"
+    )
 
 
 def channel(p: Params) -> V2X:
@@ -81,9 +98,7 @@ def recording(p: Params) -> Recording:
 
 
 @lru_cache(maxsize=2)
-def _recording(
-    data: str, acting: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...]
-) -> Recording:
+def _recording(data: str, acting: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...]) -> Recording:
     real = recorder(data)
     if real is not None:
         measured: Recording = real(v2x, runs=runs, seed=seed)

@@ -89,8 +89,8 @@ def _fitted(clients: str, reading: str) -> Knowledge:
 def training_bytes(p: Params) -> dict[str, float]:
     """Bytes that one vehicle sends and receives in training, on average over the clients.
 
-    A federation moves the weights both ways in every round. A centralised net needs the raw drives, six float32 per step
-    (noisy fixes and velocities; the reference drive comes on top), and sends the net back once.
+    A federation moves the weights both ways in every round. A centralised net needs the raw drives, six float32 per
+    step (noisy fixes and velocities; the reference drive comes on top), and sends the net back once.
     """
     card = checkpoint("fedkalmannet", p, 0).card
     drives = fleet(p["clients"])

@@ -1,4 +1,4 @@
-"""Imports run one way: world -> optimize -> methods -> evaluate -> study -> cli, and the core names no plug-in package."""
+"""Imports run one way: world, optimize, methods, evaluate, study, cli; and the core names no plug-in package."""
 
 from __future__ import annotations
 

@@ -48,8 +48,8 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
     """The ego's star at every step, with what the newest message of each member says.
 
     A fix sent `age` steps ago is brought forward with the velocity that came with it. A velocity that is used for the
-    n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this step
-    adds (2n - 1) times the variance of one. Nothing is assumed of who is seen but not heard.
+    n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this
+    step adds (2n - 1) times the variance of one. Nothing is assumed of who is seen but not heard.
     """
     variance = knowledge.process_variance(recording)
     before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)

@@ -38,7 +38,7 @@ class Backend:
         return self.library is None or find_spec(self.library) is not None
 
 
-_BACKENDS = {
+BACKENDS = {
     b.name: b
     for b in (
         Backend("gauss-newton", "gauss_newton", "reference: Levenberg-Marquardt, batched over noise runs"),
@@ -54,7 +54,7 @@ def backends() -> dict[str, Backend]:
     >>> backends()["gauss-newton"].installed
     True
     """
-    return dict(_BACKENDS)
+    return dict(BACKENDS)
 
 
 def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, **options: Any) -> Solution:
@@ -103,9 +103,9 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
 
 def usable(backend: str) -> Backend:
     """The backend of a name; InputError that lists the names, MissingLibraryError with the line that installs it."""
-    if backend not in _BACKENDS:
-        raise InputError("backend", repr(backend), f"must be one of {sorted(_BACKENDS)}", "See backends().")
-    known = _BACKENDS[backend]
+    if backend not in BACKENDS:
+        raise InputError("backend", repr(backend), f"must be one of {sorted(BACKENDS)}", "See backends().")
+    known = BACKENDS[backend]
     if not known.installed:
         raise MissingLibraryError(str(known.library), f"backend {backend!r}", str(known.library))
     return known

@@ -1,0 +1,28 @@
+"""The methods that need no training, by the names of tables, figures and the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from .cooperative_map import CooperativeMAP
+from .gnss import Gnss
+from .joint_filter import JointFilter
+from .kalman import Kalman
+from .knowledge import Knowledge
+from .lkf_sa import LaplacianKalman
+from .msmv import Msmv
+from .track import Method
+
+Factory = Callable[[Knowledge | str], Method]
+"""What a method assumes about noise -> the method. A third party's entry point in `coopoc.methods` is one, too."""
+
+METHODS: Mapping[str, Factory] = {
+    "gnss": lambda knowledge: Gnss(),
+    "kalman": lambda knowledge: Kalman(knowledge),
+    "lkf-sa": lambda knowledge: LaplacianKalman(knowledge),
+    "lkf-sa-edge": lambda knowledge: JointFilter(knowledge, exact=False, name="lkf-sa-edge"),
+    "msmv-r": lambda knowledge: Msmv(knowledge),
+    "joint": lambda knowledge: JointFilter(knowledge),
+    "cooperative-map": lambda knowledge: CooperativeMAP(knowledge=knowledge),
+    "cooperative-map-5": lambda knowledge: CooperativeMAP(knowledge=knowledge, window=5, name="cooperative-map-5"),
+}
