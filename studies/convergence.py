@@ -44,7 +44,7 @@ def cell(p: Params) -> list[Row]:
 def key(p: Params) -> dict[str, str]:
     """What else changes the numbers."""
     return {
-        "fleet": scene.fleet(p["data"]).digest, "code": revision("coopoc.world", "coopoc.methods"),
+        **scene.facts(p), "code": revision("coopoc.world", "coopoc.methods"),
         "weights": weights.key(p["method"], p),
     }  # fmt: skip
 
@@ -85,7 +85,7 @@ def _findings(results: Results) -> Sequence[str]:
     when = f"within 3 % of it from round {reached} on" if reached is not None else "not within 3 % of it"
     gap = f"{100 * (fed / centralised - 1):+.1f} %"
     return [
-        f"After {last} rounds federated {fed:.3f} m, centralised {centralised:.3f} m ({gap}): the federation is {when}.",
+        f"After {last} rounds: federated {fed:.3f} m, centralised {centralised:.3f} m ({gap}); federated is {when}.",
         f"Both start at {_mean(results, 'fedkalmannet', 0):.2f} m, the untrained net.",
     ]
 

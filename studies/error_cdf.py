@@ -31,7 +31,7 @@ def cell(p: Params) -> list[Row]:
 
 def key(p: Params) -> dict[str, str]:
     """What else changes the numbers."""
-    extra = {"fleet": scene.fleet(p["data"]).digest, "code": revision("coopoc.world", "coopoc.methods")}
+    extra = {**scene.facts(p), "code": revision("coopoc.world", "coopoc.methods")}
     return extra | ({"weights": weights.key(p["method"], p)} if p["method"] in weights.LEARNED else {})
 
 

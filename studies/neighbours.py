@@ -73,11 +73,7 @@ def cell(p: Params) -> list[Row]:
 
 def key(p: Params) -> dict[str, str]:
     """What else changes the numbers."""
-    scene.channel(p)
-    extra = {
-        "fleet": scene.fleet(p["data"]).digest,
-        "code": revision("coopoc.world", "coopoc.methods", "coopoc.optimize"),
-    }
+    extra = {**scene.facts(p), "code": revision("coopoc.world", "coopoc.methods", "coopoc.optimize")}
     if p["method"] in weights.LEARNED:
         extra["weights"] = weights.key(p["method"], p)
     return extra

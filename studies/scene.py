@@ -91,6 +91,12 @@ def channel(p: Params) -> V2X:
     )
 
 
+def facts(p: Params) -> dict[str, str]:
+    """What of the scene changes the numbers beyond its parameters; InputError for a scene that cannot be."""
+    sensors(p), channel(p), egos(p["data"], str(p["egos"]))
+    return {"fleet": fleet(p["data"]).digest}
+
+
 def recording(p: Params) -> Recording:
     """What the vehicles of the cell see; the real measurements where there are any."""
     who = egos(p["data"], str(p["egos"]))
