@@ -49,7 +49,7 @@ class Recipe:
     split: float = 0.8
     in_mult: int = 40
     out_mult: int = 5
-    start_gain: float = 0.1
+    start_gain: float | None = 0.1
 
 
 RECIPES: dict[str, Recipe] = {

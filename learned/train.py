@@ -13,7 +13,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from coopoc.arrays import Floats, Ints
-from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
 from .clients import Batch, Pieces, mirrored
@@ -78,9 +77,6 @@ def fit(
         seed: of the order of the batches. progress: name of the stage for a progress bar on stderr, None for no bar.
         long: long pieces that weights must hold on to be kept.
 
-    Raises:
-        InputError: a start that is not finite on the validation pieces.
-
     Source: arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
 
     >>> from coopoc.world.fleet import Fleet
@@ -104,8 +100,6 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     long = [t.long for t in tasks if t.long is not None]
     judge = Judge([[t.validation for t in tasks], *([long] if len(long) == len(tasks) else [])], like)
     best, lowest = theta.clone(), judge(theta)
-    if not lowest.isfinite().all():
-        raise InputError("model", "untrained net", "has no finite validation loss", "Use GainNet(start_gain=0.1).")
     history = [[Progress(0, w.clone(), math.nan, float(low))] for w, low in zip(theta, lowest, strict=True)]
     stopped: dict[int, str] = {}
     seen: list[Tensor] = []
@@ -122,6 +116,8 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
                 if row not in stopped:
                     history[row].append(Progress(step, theta[row].clone(), float(mean[row]), float(found[row])))
             seen.clear()
+    for row in torch.nonzero(lowest.isinf()).flatten().tolist():
+        stopped.setdefault(row, "no weights had a finite validation loss; start from GainNet(start_gain=0.1)")
     seconds = (time.perf_counter() - began) / len(tasks)
     models = unflatten(best, like)
     return [Fit(m, tuple(h), stopped.get(i), seconds) for i, (m, h) in enumerate(zip(models, history, strict=True))]

@@ -38,11 +38,14 @@ def test_everything_imports_from_the_wheel(site: Path, tmp_path: Path) -> None:
     code = """
 import coopoc, coopoc.learned, coopoc.studies, coopoc.data, joblib
 from coopoc.data.registry import load
+from coopoc.learned.recipes import load_method
+print(load_method("fedkalmannet").name)
 print(coopoc.__file__, coopoc.learned.__file__, coopoc.studies.__file__, coopoc.data.__file__)
 print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in ("town10", "town10-clients")))
 """
     out = outside(site, tmp_path, sys.executable, "-W", "error", "-c", code)
-    assert out.splitlines()[0].count(str(site)) == 4
+    assert out.splitlines()[0] == "fedkalmannet"
+    assert out.splitlines()[1].count(str(site)) == 4
     assert "town04: 60 vehicles" in out
     assert "town10: 60 vehicles" in out
 

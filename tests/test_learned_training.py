@@ -168,6 +168,13 @@ def test_a_net_that_breaks_stops_with_a_reason_and_the_others_go_on() -> None:
     assert not torch.equal(flatten([good.model]), flatten([GainNet()]))
 
 
+def test_a_net_without_finite_weights_says_so() -> None:
+    (client,) = clients(drives((300,)), piece=100)
+    theirs = fit(GainNet(start_gain=20.0), client.training, client.validation, replace(QUICK, epochs=2))
+    assert theirs.stopped is not None
+    assert "finite" in theirs.stopped
+
+
 def test_a_client_that_breaks_is_left_out_of_the_round() -> None:
     one, two = clients(drives(), piece=10)
     broken = replace(two, training=replace(two.training, gnss=two.training.gnss.clone().fill_(float("nan"))))

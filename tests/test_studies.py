@@ -85,6 +85,18 @@ def test_mistakes_end_with_a_sentence_and_status_2(arguments: list[str], words: 
     assert "Traceback" not in done.stderr
 
 
+def test_train_command_makes_a_checkpoint_that_loads(tmp_path: Path) -> None:
+    coopoc = str(Path(sys.executable).with_name("coopoc"))
+    command = [coopoc, "train", "okf", "--seed", "3", "--out", str(tmp_path)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    method = load_method(tmp_path / "okf-gnss-axis-3.safetensors")
+    assert np.array(method.gnss_std) == pytest.approx([1.5, 1.5, 1.5], rel=0.1)
+    unknown = subprocess.run([coopoc, "train", "magic"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert unknown.returncode == 2
+    assert "fedkalmannet" in unknown.stderr
+
+
 def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path: Path) -> None:
     """MR.CLAM set 6: K <= 4, real range and bearing, labels on every table."""
     from dataclasses import replace

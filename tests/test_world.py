@@ -119,6 +119,7 @@ def test_links_are_the_nearest_within_the_radius(crossing: Fleet) -> None:
             expected = [j for j in np.argsort(gap) if j != observer and S2.min_range <= gap[j] <= 25.0][:3]
             mine = (recording.links.step == step) & (recording.links.observer == observer)
             assert recording.links.neighbour[mine].tolist() == expected
+            assert recording.neighbours(observer)[step] == len(expected)
 
 
 def test_spherical_there_and_back() -> None:

@@ -76,6 +76,10 @@ class Recording:
         """R."""
         return int(self.gnss.shape[0])
 
+    def neighbours(self, ego: int) -> Ints:
+        """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
+        return np.bincount(self.links.step[self.links.of(ego)], minlength=len(self.t)).astype(np.int64)
+
     def columns(self, egos: Sequence[int | str]) -> list[int]:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, or absent at times."""
         cols = []
