@@ -25,6 +25,7 @@ def cell(p: Params) -> list[Row]:
     The centralised net's schedule is cut into as many equal parts as there are rounds.
     """
     from coopoc.learned.method import LearnedGain
+    from coopoc.learned.net import GainNet
 
     checkpoint = weights.checkpoint(p["method"], p, p["train_seed"])
     rounds, last = int(p["rounds"]), len(checkpoint.card["history"]) - 1
@@ -32,8 +33,9 @@ def cell(p: Params) -> list[Row]:
     alone = p["method"].startswith("individual")
     found: list[Row] = []
     for number in (rounds,) if alone else range(rounds + 1):
-        model = checkpoint.model if alone else checkpoint.after(round(number * last / rounds))
-        score = rt_le(LearnedGain(model)(recording, who), drive)
+        net = checkpoint.model if alone else checkpoint.after(round(number * last / rounds))
+        assert isinstance(net, GainNet)
+        score = rt_le(LearnedGain(net)(recording, who), drive)
         found += [
             {"round": number, "run": r, "ego": ego, "rt_le_m": float(score[r, e])}
             for e, ego in enumerate(who) for r in range(len(score))

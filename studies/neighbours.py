@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from coopoc.study.tables import Table
 
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
-IDEAL = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
+IDEAL: dict[str, Any] = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
 RATES_HZ = (5.0, 2.0, 1.0)
 WINDOWED = (0, 2, 6, 10)
 """K at which the sliding window is solved, too; it is the slowest method here."""

@@ -53,7 +53,8 @@ class Study:
         where: parameters -> False for combinations that mean nothing.
         shares: names of parameters on which the expensive part (a Recording) depends: cells that agree on them follow
             each other in one worker, where functools.lru_cache then serves.
-        tables, figures: name -> function of Results. findings: Results -> sentences for the top of the report.
+        tables, figures: name -> function of Results; None where the results do not call for the view.
+            findings: Results -> sentences for the top of the report.
         recipe: Results -> what the report says about the training.
         limitations: sentences. minutes: expected on one core.
 
@@ -73,8 +74,8 @@ class Study:
     prepare: Callable[[Sequence[Params]], None] = _nothing_to_prepare
     where: Callable[[Params], bool] | None = None
     shares: tuple[str, ...] = ()
-    tables: Mapping[str, Callable[[Results], Table]] = field(default_factory=dict)
-    figures: Mapping[str, Callable[[Results], Plot]] = field(default_factory=dict)
+    tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
     findings: Callable[[Results], Sequence[str]] | None = None
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
     limitations: tuple[str, ...] = ()
