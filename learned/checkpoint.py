@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import safetensors
 import torch
 from safetensors.torch import save_file
@@ -43,6 +44,16 @@ class Checkpoint:
             held = 0 if self.history is None else len(self.history)
             raise InputError("row", row, f"must be in 0..{held - 1}", "This checkpoint holds no more weights.")
         return unflatten(self.history[row][None], self.model)[0]
+
+    def kept(self, row: int) -> int:
+        """Row up to `row` whose weights validated best: what a training that ended there would have kept.
+
+        The loss of a federation is the mean over its clients, weighted by their training pieces.
+        """
+        losses = [np.asarray(r["validation_loss"], dtype=float) for r in self.card["history"][: row + 1]]
+        weights = np.asarray(self.card["training_pieces"], dtype=float)
+        means = [float(np.average(loss, weights=weights)) if loss.ndim else float(loss) for loss in losses]
+        return int(np.argmin(np.where(np.isfinite(means), means, np.inf)))
 
 
 def save(path: Path | str, checkpoint: Checkpoint) -> Path:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -106,19 +105,26 @@ def training_bytes(p: Params) -> dict[str, float]:
 
 def described(results: Results) -> Mapping[str, str]:
     """What the report says about the training, from the cards of the first seed."""
-    told = {}
-    for name in LEARNED:
-        card = checkpoint(name, results.settings, 0).card
-        plan, schedule = card["settings"], card["settings"]["schedule"]
-        steps = f"{plan['rounds']} rounds of {plan['local_epochs']} local epochs" if name == "fedkalmannet" else (
-            f"{schedule['epochs']} epochs"
-        )  # fmt: skip
-        told[name] = (
-            f"{card['parameters']} parameters; clients {', '.join(card['clients'])}; {steps}, {json.dumps(schedule)}; "
-            f"{plan['noise']} noise, pieces of {plan['piece']}, {card['seconds']:.0f} s of training per net; "
-            f"seeds 0-{int(results.settings['train_seeds']) - 1}; key {card['key'][:12]}"
-        )
-    return told
+    p = results.settings
+    cards = {name: checkpoint(name, p, 0).card for name in LEARNED}
+    plan = cards["fedkalmannet"]["settings"]
+    how = plan["schedule"]
+    pieces = "mirrored at random" if how["mirror"] else "as they are"
+    told = {
+        "nets": f"{cards['fedkalmannet']['parameters']} parameters, AdamW at {how['learning_rate']:g} falling as a "
+        f"half cosine, decoupled decay {how['weight_decay']:g}, batch {how['batch']}, gradient norm at most "
+        f"{how['clip']:g}, pieces of {plan['piece']} steps {pieces}, {plan['noise']} noise, "
+        f"{100 * plan['split']:.0f} % for training, best weights of {how['checks']} validations; training seeds 0 to "
+        f"{int(p['train_seeds']) - 1}",
+        "fedkalmannet": f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces",
+    }
+    for name in LEARNED[1:]:
+        told[name] = f"{cards[name]['settings']['schedule']['epochs']} optimiser steps"
+    return {
+        name: f"{text}; clients {', '.join(cards[name]['clients'])}; {cards[name]['seconds']:.0f} s per net; "
+        f"key {cards[name]['key'][:12]}" if name in cards else text
+        for name, text in told.items()
+    }  # fmt: skip
 
 
 def fitted(p: Params) -> Knowledge:

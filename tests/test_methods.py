@@ -11,7 +11,7 @@ from filterpy.kalman import KalmanFilter
 from coopoc import V2X, Fleet, Gnss, InputError, JointFilter, Kalman, Knowledge, LaplacianKalman, Msmv, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.star import FORGOTTEN
-from coopoc.world.spherical import to_vector
+from coopoc.world.spherical import spherical, to_vector
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
@@ -104,9 +104,7 @@ def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
     peer = KalmanFilter(dim_x=3 * n, dim_z=3 * n + 9, dim_u=3 * n)
     peer.B, peer.H = 0.1 * np.eye(3 * n), np.vstack([np.eye(3 * n), sight])
     peer.Q = np.kron(np.eye(n), np.diag(np.square(known.process_std)))
-    vectors = known.relative_cov(recording.relative[0])
     where = to_vector(recording.relative[0])
-    peer.x = recording.gnss[0, 0, 0].repeat(n).reshape(3, n).T.ravel()
     peer.x = np.concatenate([recording.gnss[0, 0, 0], (recording.gnss[0, 0, 0] + where[:3]).ravel()])
     peer.P = FORGOTTEN * np.eye(3 * n)
     for t in range(40):
@@ -116,7 +114,8 @@ def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
         noise[: 3 * n, : 3 * n] = np.kron(np.eye(n), np.diag(known.gnss_variance))
         for k in range(3):
             at = slice(3 * n + 3 * k, 3 * n + 3 * k + 3)
-            noise[at, at] = vectors[3 * t + k]
+            expected = np.array(spherical(*(peer.x[3 * k + 3 : 3 * k + 6] - peer.x[:3])))
+            noise[at, at] = known.relative_cov(expected)
         peer.update(np.concatenate([recording.gnss[0, t, order].ravel(), where[3 * t : 3 * t + 3].ravel()]), R=noise)
         assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-6)
 

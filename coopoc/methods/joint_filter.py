@@ -23,8 +23,9 @@ class JointFilter:
     """Kalman filter of the star {ego} + neighbours in information form; axes couple through the relative covariances.
 
     Lambda = P^-1 + blkdiag(GNSS^-1) + B blkdiag(C_e^-1) B^T with C_e the rotated covariance of the converted vector
-    (methods.md section 3.5), then, if `exact`, one Gauss-Newton step on (range, azimuth, inclination) themselves, which
-    is within 3e-5 of the maximum-likelihood cost (performance.md section 1.1). Who joins or leaves resets nobody else.
+    (methods.md section 3.5) at the predicted geometry: at the measured one the weight would depend on the noise. Then,
+    if `exact`, one Gauss-Newton step on (range, azimuth, inclination) themselves, which is within 3e-5 of the
+    maximum-likelihood cost (performance.md section 1.1). Who joins or leaves resets nobody else.
 
     Args:
         knowledge: "identity", "nominal" or a Knowledge. exact: False stops at the linear update (LKF-SA's edge form).
@@ -98,9 +99,10 @@ def update(state: Floats, spread: Floats, star: StarStep, known: Knowledge, exac
     if n == 1:
         cov = np.linalg.inv(information)
         return state + (cov @ pull[..., None])[..., 0].reshape(state.shape), cov
-    edge = np.linalg.inv(known.relative_cov(star.relative))
+    expected = state[:, 1:] - state[:, :1]
+    edge = np.linalg.inv(known.relative_cov(np.stack(spherical(*np.moveaxis(expected, -1, 0)), axis=-1)))
     linear, linear_pull = information.copy(), pull.copy()
-    gap = star.vector - (state[:, 1:] - state[:, :1])
+    gap = star.vector - expected
     add_edges(linear, linear_pull, edge, (edge @ gap[..., None])[..., 0])
     if not exact:
         cov = np.linalg.inv(linear)

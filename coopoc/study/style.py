@@ -45,7 +45,9 @@ _LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1
 UNITS = {
     "rt_le_m": ("RT-LE", "m"), "max_error_m": ("Maximum error", "m"), "bytes_per_second": ("Received", "B/s"),
     "nees": ("NEES", ""), "max_neighbours": ("Neighbours K", ""), "round": ("Round", ""), "seconds": ("Time", "s"),
-    "error_cdf": ("Error CDF", ""), "loss": ("Message loss", ""), "latency": ("Latency", "s"),
+    "error_cdf": ("Error CDF", ""), "rate_hz": ("Rate", "Hz"),
+    "cap_bytes_per_second": ("Cap", "B/s"), "nees_inside": ("NEES inside its band", ""),
+    "neighbour_rt_le_m": ("Error of neighbours", "m"), "loss": ("Message loss", ""), "latency": ("Latency", "s"),
 }  # fmt: skip
 """Column -> (words, unit)."""
 
