@@ -21,6 +21,6 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
     """
     array = np.asarray(values, dtype=dtype)
     if array.flags.writeable:
-        array = array.view()
+        array = array.copy()  # the caller may go on writing to its own
         array.flags.writeable = False
     return array

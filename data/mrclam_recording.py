@@ -42,7 +42,7 @@ def recording(
     azimuth = log.bearing[index] + log.observer_heading[index]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
     relative = np.column_stack([log.range[index], azimuth, np.full(len(index), np.pi / 2)])
-    sent, arrival = schedule(log.fleet, links, v2x, runs, seed)
+    broadcasts, arrival = schedule(log.fleet, links, v2x, runs, seed)
     return Recording(
         ids=log.fleet.ids,
         t=log.fleet.t,
@@ -50,7 +50,7 @@ def recording(
         velocity=np.broadcast_to(_velocity(log), fixes.shape),
         links=links,
         relative=np.broadcast_to(relative, (runs, *relative.shape)),
-        sent=sent,
+        broadcasts=broadcasts,
         arrival=arrival,
         sensors=known,
         v2x=v2x,

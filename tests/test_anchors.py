@@ -22,7 +22,6 @@ def fixture(fleet: Fleet, neighbours: int, ratio: float = 1.0, sensors: Sensors 
         recording,
         links=Links(links.step[late], links.observer[late], links.neighbour[late]),
         relative=recording.relative[:, late],
-        sent=recording.sent[late],
         arrival=recording.arrival[:, late],
     )
     noise = np.random.default_rng(7).standard_normal(recording.velocity.shape) * np.array([0.707, 0.707, 0.01])

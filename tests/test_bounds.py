@@ -91,5 +91,9 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours: in
 
 
 def test_exact_fixes_have_no_bound(crossing: Fleet) -> None:
+    with pytest.raises(InputError, match="relative_std"):
+        posterior_bound(crossing, Sensors(range_std=0), 0, V2X(max_neighbours=2))
+    with pytest.raises(InputError, match="vehicle"):
+        posterior_bound(crossing, S2, -1)
     with pytest.raises(InputError, match="gnss_std"):
         posterior_bound(crossing, Sensors(gnss_std=(0, 1, 1)), 0)

@@ -22,7 +22,8 @@ def imports(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
-            found.add(".".join([*base, *([node.module] if node.module else [])]))
+            source = [*base, *([node.module] if node.module else [])]
+            found |= {".".join(source), *(".".join([*source, alias.name]) for alias in node.names)}
     return found
 
 

@@ -58,6 +58,16 @@ def test_order_of_vehicles_changes_nothing(method, crossing: Fleet) -> None:
     assert there == pytest.approx(here, abs=1e-7)
 
 
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> None:
+    """One run is the first of eight, and a short drive the beginning of a long one: estimates are causal."""
+    budget = V2X(max_neighbours=4, loss=0.2, latency=0.1)
+    many = method(observe(crossing, S2, budget, runs=8), [0]).x
+    assert np.array_equal(method(observe(crossing, S2, budget, runs=1), [0]).x, many[:1])
+    short = method(observe(crossing.between(0, 25), S2, budget, runs=8), [0]).x
+    assert np.array_equal(short, many[:, :25])
+
+
 @pytest.mark.parametrize("method", COOPERATIVE, ids=label)
 def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=0), runs=3)
@@ -181,6 +191,17 @@ def test_filters_that_claim_a_covariance_are_consistent(method, formation: Fleet
     assert nees_inside(method(recording, [0]), fleet).min() >= 0.95
 
 
+def test_a_known_start_has_no_nees(formation: Fleet) -> None:
+    """At the known start error and covariance are zero: NaN there, and the gate looks at the other steps."""
+    fleet, everywhere = formation.between(0, 100), replace(S2, velocity_reading="speed")
+    recording = observe(fleet, everywhere, V2X(max_neighbours=0), runs=30, observers=[0])
+    track = Kalman("nominal", start=fleet.position[0, :1])(recording, [0])
+    found = nees(track, fleet)
+    assert np.isnan(found[:, 0]).all()
+    assert np.isfinite(found[:, 1:]).all()
+    assert nees_inside(track, fleet).min() >= 0.95
+
+
 def test_fitted_knowledge_finds_the_acting_noise(formation: Fleet) -> None:
     training = observe(formation, Sensors(gnss_std=(1.0, 2.0, 3.0), velocity_reading="speed"), runs=2)
     fitted = Knowledge.fitted(training, formation)
@@ -194,6 +215,8 @@ def test_bad_knowledge_is_named(crossing: Fleet) -> None:
         Kalman("guess")(recording)
     with pytest.raises(InputError, match="process_std"):
         Knowledge("mine", S2, process_std=(0.1, 0.1, 0.0))
+    with pytest.raises(InputError, match="membership = 'rest'"):
+        LaplacianKalman(membership="rest")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="start"):
         Kalman("nominal", start=np.zeros((2, 3)))(recording, [0])
 

@@ -49,7 +49,10 @@ def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
         (lambda: V2X(loss=1.5), "loss"),
         (lambda: V2X(rate=0), "rate"),
         (lambda: V2X(burst=0.5), "burst"),
+        (lambda: V2X(max_age=-1.0), "max_age"),
         (lambda: Sensors(gnss_std=(1, -1, 1)), "gnss_std"),
+        (lambda: Sensors(gnss_std=3.5), "gnss_std = 3.5: must be 3 numbers"),  # type: ignore[arg-type]
+        (lambda: Sensors(gnss_bias=(1.0, 0.5)), "low <= high"),
         (lambda: Sensors(azimuth_std=4.0), "radians"),
         (lambda: Sensors(gnss_bias_mode="daily"), "gnss_bias_mode"),
         (lambda: Sensors(velocity_std_ratio=float("nan")), "velocity_std_ratio"),
@@ -79,6 +82,9 @@ def test_draws_belong_to_their_key(crossing: Fleet) -> None:
     }
     same = [key[row] for row in zip(few.links.step, few.links.observer, few.links.neighbour, strict=True)]
     assert np.array_equal(few.relative, many.relative[:3, same])
+    poor = V2X(max_neighbours=6, loss=0.3, burst=3.0, rate=4.0, latency=0.1)
+    lossy, fewer = (observe(crossing, S2, replace(poor, max_neighbours=k), runs=r, seed=5) for k, r in ((6, 5), (2, 3)))
+    assert np.array_equal(fewer.arrival, lossy.arrival[:3, same])
     part = observe(crossing.select(["c3", "c1"]), S2, runs=3, seed=5)
     assert np.array_equal(part.gnss[:, :, 0], few.gnss[:, :, 3])
     assert not np.array_equal(observe(crossing, S2, runs=3, seed=6).gnss, few.gnss)
@@ -179,6 +185,14 @@ def test_a_fix_is_fresh_once(crossing: Fleet) -> None:
         assert len(used) == len(set(used))
 
 
+def test_any_step_will_do(crossing: Fleet) -> None:
+    """By default everybody broadcasts at every step, however long a step is."""
+    slow = Fleet(crossing.ids, crossing.t * 5, crossing.position, crossing.velocity)
+    assert observe(slow, S2, V2X(max_neighbours=2)).broadcasts.all()
+    with pytest.raises(InputError, match="seed = -1"):
+        observe(slow, S2, seed=-1)
+
+
 def test_rate_above_the_step_is_refused(crossing: Fleet) -> None:
     with pytest.raises(InputError, match="rate = 20"):
         observe(crossing, S2, V2X(rate=20.0))
@@ -187,11 +201,12 @@ def test_rate_above_the_step_is_refused(crossing: Fleet) -> None:
 def test_recording_holds_no_truth(crossing: Fleet) -> None:
     """No array of the recording holds a true position or velocity, and no field leads to the fleet."""
     recording = observe(crossing, S2, V2X(max_neighbours=3), runs=2)
+    truths = (crossing.position, crossing.velocity)
     for name in recording.__dataclass_fields__:
         value = getattr(recording, name)
         assert not isinstance(value, Fleet)
-        if isinstance(value, np.ndarray) and value.ndim == 4:
-            assert not np.isclose(value, crossing.position, atol=1e-6).all(axis=(2, 3)).any()
+        if isinstance(value, np.ndarray) and value.shape[-3:] == crossing.position.shape:
+            assert not any(np.isclose(value, truth, atol=1e-6).all(axis=-1).any() for truth in truths), name
 
 
 def test_unknown_and_unrecorded_egos(crossing: Fleet) -> None:

@@ -26,7 +26,7 @@ class _Stage:
 
 
 def posterior_bound(
-    fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X | None = None, *, smoothing: bool = False
+    fleet: Fleet, sensors: Sensors, ego: int | str, v2x: V2X | None = None, *, smoothing: bool = False
 ) -> Floats:
     """Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
 
@@ -37,19 +37,25 @@ def posterior_bound(
     heard of its motion. The bias is left out: it is unobservable from a GNSS start.
 
     Args:
-        fleet: truth. sensors: the noise that acts, stds positive. ego: column. v2x: K and radius; loss is ignored.
+        fleet: truth. sensors: the noise that acts, stds positive. ego: column or id. v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
 
     Raises:
-        InputError: an acting std of zero, for which the bound is zero.
+        InputError: an acting std of zero, for which the bound is zero; an ego that is unknown or absent.
 
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
     >>> float(posterior_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0)[1, 0, 0])  # standing still: 4 / 2
     2.0
     """
+    v2x = v2x or V2X(max_neighbours=0)
     if min(sensors.gnss_std) <= 0:
         raise InputError("gnss_std", sensors.gnss_std, "must be > 0", "With exact fixes the bound is zero.")
-    stages = _stages(fleet, sensors, ego, v2x or V2X(max_neighbours=0))
+    if v2x.max_neighbours and min(sensors.relative_std) <= 0:
+        raise InputError("relative_std", sensors.relative_std, "must be > 0", "Exact sightings merge two vehicles.")
+    ego = fleet.index(ego)
+    if not fleet.present[:, ego].all():
+        raise InputError("ego", fleet.ids[ego], "is absent at some steps", "Choose another or cut the drive.")
+    stages = _stages(fleet, sensors, ego, v2x)
     filtered: list[Floats] = []
     before: Floats = np.zeros((0, 0))
     for stage in stages:

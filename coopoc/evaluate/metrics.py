@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from ..arrays import Bools, Floats
+from ..arrays import Floats
 from ..errors import InputError
 from ..methods.track import Track
 from ..world.fleet import Fleet
@@ -58,13 +58,19 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
 
 
 def nees(track: Track, fleet: Fleet) -> Floats:
-    """Normalised estimation error squared, e^T P^-1 e, (R, T, E); its mean is 3 for a consistent filter."""
+    """Normalised estimation error squared, e^T P^-1 e, (R, T, E); its mean is 3 for a consistent filter.
+
+    NaN where the covariance is zero: at a start that is known, there is nothing to normalise by.
+    """
     if track.covariance is None:
         raise InputError(
             "covariance", None, "this method claims none", "NEES needs a method that reports a covariance."
         )
     error = track.x - fleet.position[:, list(track.egos)]
-    return np.asarray(np.einsum("rtei,rtei->rte", error, np.linalg.solve(track.covariance, error[..., None])[..., 0]))
+    certain = np.asarray((track.covariance == 0).all(axis=(-2, -1)))
+    cov = np.where(certain[..., None, None], np.eye(3), track.covariance)
+    found = np.einsum("rtei,rtei->rte", error, np.linalg.solve(cov, error[..., None])[..., 0])
+    return np.asarray(np.where(certain, np.nan, found))
 
 
 def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, float]:
@@ -83,5 +89,5 @@ def nees_inside(track: Track, fleet: Fleet, level: float = 0.99) -> Floats:
     """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
     low, high = nees_band(len(track.x), level)
     average = nees(track, fleet).mean(axis=0)
-    inside: Bools = (average >= low) & (average <= high)
-    return np.asarray(inside.mean(axis=0))
+    inside = np.where(np.isnan(average), np.nan, (average >= low) & (average <= high))
+    return np.asarray(np.nanmean(inside, axis=0))

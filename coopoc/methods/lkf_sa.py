@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import Floats
+from ..errors import InputError
 from ..world.inbox import inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -39,6 +40,11 @@ class LaplacianKalman:
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
+    def __post_init__(self) -> None:
+        for field, allowed in (("transition", ("identity", "ones")), ("membership", ("keep", "reset"))):
+            if getattr(self, field) not in allowed:
+                raise InputError(field, repr(getattr(self, field)), f"must be one of {allowed}", "Pick one.")
+
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         began = time.perf_counter()
@@ -51,31 +57,21 @@ class LaplacianKalman:
         for e, ego in enumerate(columns):
             box = inbox(recording, ego, self.message)
             received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-            edge_variance = self._edge_variance(recording, known, ego)
             state: Floats = np.empty((recording.runs, 0, 3))
             spread: Floats = np.empty((1, 3, 0, 0))
             for star in star_steps(recording, ego, box, known):
-                state, spread = self._step(state, spread, star, edge_variance)
+                state, spread = self._step(state, spread, star, edge_variance(star, known))
                 x[:, star.step, e] = state[:, 0]
                 cov[:, star.step, e] = spread[:, :, 0, 0, None] * np.eye(3)
                 neighbours[:, star.links] = state[:, 1:]
         return Track(recording.t, tuple(columns), x, cov, received, sent, time.perf_counter() - began, neighbours)
 
-    def _edge_variance(self, recording: Recording, known: Knowledge, ego: int) -> float | None:
-        """Mean per-axis variance of the ego's converted vectors, m^2; None for unit variance of delta itself."""
-        relative = recording.relative[:, recording.links.of(ego)]
-        if known.sensors is None or relative.shape[1] == 0:
-            return None
-        return float(np.trace(known.relative_cov(relative), axis1=-2, axis2=-1).mean() / 3)
-
-    def _step(
-        self, state: Floats, spread: Floats, star: StarStep, edge_variance: float | None
-    ) -> tuple[Floats, Floats]:
+    def _step(self, state: Floats, spread: Floats, star: StarStep, variance: Floats | None) -> tuple[Floats, Floats]:
         changed = len(star.kept) != state.shape[1] or bool((star.kept != np.arange(len(star.kept))).any())
         if self.membership == "reset" and changed:
             return self._restart(star)
         state, spread = self._predict(state, spread, star)
-        return laplacian_update(state, spread, star, edge_variance)
+        return laplacian_update(state, spread, star, variance)
 
     def _predict(self, state: Floats, spread: Floats, star: StarStep) -> tuple[Floats, Floats]:
         """Per-axis prediction; spread is (R or 1, 3, n, n), shared by the runs while it does not depend on them."""
@@ -106,13 +102,18 @@ class LaplacianKalman:
         return state, np.broadcast_to(np.eye(n), (1, 3, n, n))
 
 
-def laplacian_update(
-    state: Floats, spread: Floats, star: StarStep, edge_variance: float | None
-) -> tuple[Floats, Floats]:
-    """Update with delta and GNSS: Lambda = P^-1 + L W L + diag(1/r), W = 1 or 1/(deg edge_variance).
+def edge_variance(star: StarStep, known: Knowledge) -> Floats | None:
+    """Mean per-axis variance (R,) m^2 of the star's converted vectors; None for unit variance of delta itself."""
+    if known.sensors is None or len(star.links) == 0:
+        return None
+    return np.asarray(np.trace(known.relative_cov(star.relative), axis1=-2, axis2=-1).mean(axis=1) / 3)
+
+
+def laplacian_update(state: Floats, spread: Floats, star: StarStep, variance: Floats | None) -> tuple[Floats, Floats]:
+    """Update with delta and GNSS: Lambda = P^-1 + L W L + diag(1/r), W = 1 or 1/(deg variance).
 
     Args:
-        state: (R, n, 3). spread: (R or 1, 3, n, n) per axis. edge_variance: m^2 or None for W = I.
+        state: (R, n, 3) m. spread: (R or 1, 3, n, n) m^2 per axis. variance: (R,) m^2 of an edge, or None for W = I.
 
     Returns:
         the same two after the update.
@@ -122,13 +123,14 @@ def laplacian_update(
     degree[0] = n - 1.0
     laplacian = np.diag(degree if n > 1 else np.zeros(1))
     laplacian[0, 1:] = laplacian[1:, 0] = -1.0
-    weight = np.ones(n) if edge_variance is None else 1.0 / (np.maximum(degree, 1.0) * edge_variance)
+    weight = np.ones((1, n)) if variance is None else 1.0 / (degree * variance[:, None])
+    weighted = laplacian * weight[:, None]
     delta = np.concatenate([-star.vector.sum(axis=1, keepdims=True), star.vector], axis=1)
     fixes = np.where(star.heard[..., None], 1.0 / star.fix_variance, 0.0)
     fixes = fixes[:1] if star.heard.all() and len(star.fix_variance) == 1 else fixes
-    information = np.linalg.inv(spread) + (laplacian * weight) @ laplacian
+    information = np.linalg.inv(spread) + (weighted @ laplacian)[:, None]
     information = information + np.swapaxes(fixes, 1, 2)[..., None] * np.eye(n)
     cov = np.linalg.inv(information)
-    pull = np.einsum("ij,rja->rai", laplacian * weight, delta - np.einsum("ij,rja->ria", laplacian, state))
-    pull = pull + np.swapaxes(fixes * (star.fix - state), 1, 2)
-    return state + np.swapaxes((cov @ pull[..., None])[..., 0], 1, 2), cov
+    pull = weighted @ (delta - laplacian @ state) + fixes * (star.fix - state)
+    moved = (cov @ np.swapaxes(pull, 1, 2)[..., None])[..., 0]
+    return state + np.swapaxes(moved, 1, 2), cov

@@ -79,7 +79,8 @@ def _pseudo_fixes(
 ) -> tuple[Floats, Floats, Floats]:
     """What the neighbours say of themselves (R, k, 3), hence of the ego (R, k, 3), and its information (R, k, 3, 3).
 
-    A late estimate is brought forward with its velocity; its variance grows by the process noise of each step.
+    A late estimate is brought forward with its velocity; its variance grows by the process noise of each step. Each
+    message makes one pseudo-fix, at the step at which it arrives.
     """
     span = slice(box.start[t], box.start[t + 1])
     runs = np.arange(recording.runs)[:, None]
@@ -92,7 +93,7 @@ def _pseudo_fixes(
     if known.sensors is not None:
         spread = solo[1][runs, sent, who] + age * process[runs, sent, who]
         pseudo_cov = pseudo_cov + spread[..., None] * np.eye(3)
-    weight = np.linalg.inv(pseudo_cov) * held[..., None, None]
+    weight = np.linalg.inv(pseudo_cov) * box.fresh[:, span][..., None, None]
     return np.where(held[..., None], theirs, np.nan), theirs - to_vector(relative), weight
 
 

@@ -31,13 +31,12 @@ class Inbox:
     sent_bytes: float
 
 
-def inbox(recording: Recording, ego: int, message: Message, max_age: float = 1.0) -> Inbox:
+def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     """What `ego` has received when each neighbour broadcasts `message`.
 
     Args:
         recording: the links, the sending schedule and the arrivals. ego: column.
         message: its size counts against `v2x.bytes_per_second`.
-        max_age: s, older messages are forgotten.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -57,9 +56,9 @@ def inbox(recording: Recording, ego: int, message: Message, max_age: float = 1.0
         held = _newest_held(arrival[:, pair], at[pair], steps)[:, at[pair]]
         newest[:, pair] = held
         fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0
-    too_old = at - newest > max_age / recording.dt + 1e-9
+    too_old = at - newest > recording.v2x.max_age / recording.dt + 1e-9
     newest[too_old] = -1
-    broadcasts = np.floor(recording.v2x.rate * recording.dt * steps + 1e-9) if recording.v2x.max_neighbours else 0
+    broadcasts = recording.broadcasts[:, ego].sum() if recording.v2x.max_neighbours else 0
     arrived = (arrival >= 0) & (arrival < steps)
     return Inbox(
         link, np.searchsorted(at, np.arange(steps + 1)), newest, fresh & ~too_old,

@@ -42,8 +42,8 @@ class Recording:
         gnss: (R, T, N, 3) m. velocity: (R, T, N, 3) m/s, with x_t ~ x_{t-1} + dt u_t; NaN where absent.
         links: L directed links; `observers` are the columns whose links were recorded.
         relative: (R, L, 3) range m, world azimuth rad, inclination rad of the neighbour as the observer sees it.
-        sent: (L,) True where the neighbour broadcasts at the link's step.
-        arrival: (R, L) step at which that broadcast arrives, -1 if it is lost or not sent.
+        broadcasts: (T, N) True where a vehicle broadcasts.
+        arrival: (R, L) step at which the neighbour's broadcast of the link's step arrives, -1 if lost or not sent.
         sensors, v2x: what a method may know (the bias is not among it).
         notes: labels that every table and figure carries (what is simulated, what uses truth).
     """
@@ -54,7 +54,7 @@ class Recording:
     velocity: Floats
     links: Links
     relative: Floats
-    sent: Bools
+    broadcasts: Bools
     arrival: Ints
     sensors: Sensors
     v2x: V2X

@@ -39,7 +39,7 @@ def observe(
         assumed: what methods may know, default `sensors` without its bias.
 
     Raises:
-        InputError: runs < 1, an unknown observer, or an assumed std of zero.
+        InputError: runs < 1, seed < 0, a rate above 1/dt, an unknown observer, or an assumed std of zero.
 
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
     >>> observe(fleet, Sensors(), V2X(max_neighbours=1), runs=3)
@@ -47,14 +47,17 @@ def observe(
     """
     if runs < 1:
         raise InputError("runs", runs, "must be >= 1", "Use at least one noise run.")
+    if seed < 0:
+        raise InputError("seed", seed, "must be >= 0", "Any whole number from 0 on will do.")
     v2x = v2x or V2X.ideal()
     columns = list(range(len(fleet.ids))) if observers is None else sorted({fleet.index(o) for o in observers})
     links = find_links(fleet, columns, v2x.max_neighbours, v2x.radius, sensors.min_range)
-    sent, arrival = schedule(fleet, links, v2x, runs, seed)
+    broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
     return Recording(
         ids=fleet.ids, t=fleet.t,
         gnss=_gnss(fleet, sensors, runs, seed), velocity=_velocity(fleet, sensors, runs, seed),
-        links=links, relative=_relative(fleet, links, sensors, runs, seed), sent=sent, arrival=arrival,
+        links=links, relative=_relative(fleet, links, sensors, runs, seed),
+        broadcasts=broadcasts, arrival=arrival,
         sensors=assumed or sensors.without_bias(), v2x=v2x, observers=tuple(columns),
     )  # fmt: skip
 
@@ -122,8 +125,8 @@ def _relative(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int
 
 
 def schedule(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
-    """Sending schedule (L,) and arrival step (R, L) of the neighbour's broadcast over each link."""
-    per_step = v2x.rate * fleet.dt
+    """Who broadcasts when (T, N), and the arrival step (R, L) of the neighbour's broadcast over each link."""
+    per_step = 1.0 if v2x.rate is None else v2x.rate * fleet.dt
     if per_step > 1 + 1e-9:
         limit = f"must be <= 1/dt = {1 / fleet.dt:g} Hz"
         raise InputError("rate", f"{v2x.rate} Hz", limit, "Broadcast at most once a step.")
@@ -141,4 +144,4 @@ def schedule(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tupl
             draws = np.stack([stream(seed, "loss", r, observer, neighbour).uniform(size=size) for r in range(runs)])
             gone = lost(draws, v2x.loss, v2x.burst)[:, number[index]]
             arrival[:, index] = np.where(gone, -1, arrival[:, index])
-    return sent, arrival
+    return sends, arrival

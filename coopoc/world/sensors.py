@@ -45,13 +45,18 @@ class Sensors:
     """m, centres closer than a vehicle is wide are not measured (a range near zero makes angles seem exact)."""
 
     def __post_init__(self) -> None:
+        for name, size in (("gnss_std", 3), ("gnss_bias", 2)):
+            given = np.asarray(getattr(self, name), dtype=float)
+            if given.shape != (size,):
+                raise InputError(name, getattr(self, name), f"must be {size} numbers", "Give metres in a tuple.")
+            object.__setattr__(self, name, tuple(float(v) for v in given))
+        if self.gnss_bias[0] > self.gnss_bias[1]:
+            raise InputError("gnss_bias", self.gnss_bias, "must be (low, high) with low <= high", "Swap the two.")
         for field in fields(self):
             value = getattr(self, field.name)
             numbers = value if isinstance(value, tuple) else (value,)
             if not isinstance(value, str) and not all(np.isfinite(n) and n >= 0 for n in numbers):
                 raise InputError(field.name, value, "must be finite and >= 0", "Give a standard deviation in SI units.")
-        if len(self.gnss_std) != 3:
-            raise InputError("gnss_std", self.gnss_std, "must have three numbers", "Give one per axis, in metres.")
         for name, allowed in (("gnss_bias_mode", BiasMode), ("velocity_reading", VelocityReading)):
             if getattr(self, name) not in get_args(allowed):
                 raise InputError(name, repr(getattr(self, name)), f"must be one of {get_args(allowed)}", "Pick one.")

@@ -18,14 +18,16 @@ class V2X:
     """K: at most this many neighbours, nearest first."""
     radius: float = 30.0
     """m, the paper's range."""
-    rate: float = 10.0
-    """Hz at which each vehicle broadcasts; relative measurements are on board and come at every step."""
+    rate: float | None = None
+    """Hz at which each vehicle broadcasts, None for every step; relative measurements come at every step anyway."""
     latency: float = 0.0
     """s from sending to arrival, rounded up to whole steps."""
     loss: float = 0.0
     """Share of messages that never arrive."""
     burst: float = 1.0
     """Mean length of a run of losses, in messages (Gilbert-Elliott); 1/(1 - loss) or less means independent losses."""
+    max_age: float = 1.0
+    """s, older messages are forgotten: their sender is seen, but nothing is assumed of it."""
     bytes_per_second: float = float("inf")
     """Cap on what one vehicle receives: messages beyond it are dropped, farthest neighbour first."""
     overhead: int = 0
@@ -34,15 +36,17 @@ class V2X:
     def __post_init__(self) -> None:
         limits = {"max_neighbours": (0, 1e6, ">= 0"), "radius": (0, np.inf, ">= 0 m"), "rate": (1e-3, 1e4, "> 0 Hz"),
                   "latency": (0, 3600, ">= 0 s"), "loss": (0, 1, "in [0, 1]"), "burst": (1, 1e6, ">= 1 message"),
+                  "max_age": (0, 3600, ">= 0 s"),
                   "bytes_per_second": (0, np.inf, ">= 0"), "overhead": (0, 1e6, ">= 0 bytes")}  # fmt: skip
         for field in fields(self):
             low, high, words = limits[field.name]
             value = getattr(self, field.name)
-            if not low <= value <= high:
+            if value is not None and not low <= value <= high:
                 mend = "Use 0 for no neighbours." if field.name == "max_neighbours" else f"Give V2X({field.name}=...)."
                 raise InputError(field.name, value, f"must be {words}", mend)
         if self.max_neighbours != int(self.max_neighbours):
             raise InputError("max_neighbours", self.max_neighbours, "must be a whole number", "Use an int.")
+        object.__setattr__(self, "max_neighbours", int(self.max_neighbours))
 
     @classmethod
     def ideal(cls, max_neighbours: int = 6) -> V2X:
