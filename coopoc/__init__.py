@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from .optimize.solution import Solution as Solution
     from .optimize.solve import backends as backends
     from .optimize.solve import solve as solve
+    from .study.results import Results as Results
+    from .study.run import run as run
+    from .study.study import Study as Study
     from .world.fleet import Fleet as Fleet
     from .world.recording import Links as Links
     from .world.recording import Recording as Recording
@@ -50,6 +53,7 @@ _HOME = {
     "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds",
     "CooperativeMAP": "methods.cooperative_map", "Factor": "optimize.factor", "Problem": "optimize.problem",
     "Solution": "optimize.solution", "backends": "optimize.solve", "solve": "optimize.solve",
+    "Results": "study.results", "Study": "study.study", "run": "study.run",
     "load": "fleets", "Method": "methods.track", "Track": "methods.track",
 }  # fmt: skip
 

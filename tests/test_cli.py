@@ -74,7 +74,7 @@ def test_a_report(folder: Path) -> None:
 def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     done = coopoc("list", cwd=tmp_path)
     assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
-    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["datasets", "methods", "studies", "backends"]
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["datasets", "methods", "studies", "backends", "recipes"]
 
 
 def test_commands_of_others(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""coopoc train: one recipe, one setting, one checkpoint (or one per client)."""
+"""coopoc train: one recipe, one setting, one checkpoint (or one per client). It loads torch only when it is called."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ def train(
         reading: of "10 % of the velocity": per axis or of the speed on every axis.
     """
     from coopoc.fleets import load
-
-    from .recipes import train_all
+    from coopoc.learned.recipes import train_all
 
     made = train_all(load(data), out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe])
     for label, checkpoint in made.items():

@@ -1,0 +1,36 @@
+"""The examples and the README's Python run as they stand; the lazy names of the package are those that types see."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import coopoc
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_first_steps_runs() -> None:
+    script = ROOT / "examples" / "first_steps.py"
+    out = subprocess.run([sys.executable, "-W", "error", script], capture_output=True, text=True, check=True).stdout
+    assert out.count("SOLVED") == 3
+    assert "FedKalmanNet" in out
+
+
+def test_readme_python_runs(tmp_path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    assert blocks
+    script = tmp_path / "readme.py"
+    script.write_text("\n".join(blocks))
+    subprocess.run([sys.executable, "-W", "error", script], cwd=tmp_path, capture_output=True, text=True, check=True)
+
+
+def test_lazy_names_are_the_typed_names() -> None:
+    tree = ast.parse((ROOT / "coopoc" / "__init__.py").read_text())
+    typed = {alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert typed - {None, "annotations"} == set(coopoc.__all__)
+    for name in coopoc.__all__:
+        assert getattr(coopoc, name).__name__.split(".")[-1] == name
