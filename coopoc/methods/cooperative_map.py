@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from tqdm import tqdm
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
@@ -18,9 +16,10 @@ from ..optimize.problem import Problem
 from ..optimize.sights import Sight, chain
 from ..optimize.solution import Status
 from ..optimize.solve import solve, usable
-from ..world.inbox import Inbox, inbox
+from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
+from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .star import StarStep, star_steps
 from .track import Track
@@ -64,31 +63,20 @@ class CooperativeMAP:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        began = time.perf_counter()
-        columns = recording.columns(egos)
         known = resolve(self.knowledge, recording)
-        shape = (recording.runs, len(recording.t), len(columns), 3)
-        x, cov = np.empty(shape), np.empty((*shape, 3))
-        neighbours = np.full_like(recording.relative, np.nan)
-        received, sent = np.zeros((2, recording.runs, len(columns)))
-        replaced = 0
-        with tqdm(total=len(columns) * len(recording.t), desc=self.name, unit="step", delay=2.0) as bar:
-            for e, ego in enumerate(columns):
-                box = inbox(recording, ego, self.message)
-                received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-                for windows in alike(_windows(recording, ego, box, known, self.window)):
-                    points, spread, met = self._solve(windows, known)
-                    for k, window in enumerate(windows):
-                        newest = window[-1]
-                        t = newest.star.step
-                        x[:, t, e], cov[:, t, e] = points[k, :, 0], spread[k]
-                        neighbours[:, newest.star.links] = np.where(newest.held[:, 1:, None], points[k, :, 1:], np.nan)
-                    replaced += met
-                    bar.update(len(windows))
-        return Track(
-            recording.t, tuple(columns), x, cov, received, sent, time.perf_counter() - began, neighbours,
-            self._notes(replaced),
-        )  # fmt: skip
+        replaced: list[int] = []
+
+        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
+            for windows in alike(_windows(recording, ego, box, known, self.window)):
+                points, spread, met = self._solve(windows, known)
+                replaced.append(met)
+                for k, window in enumerate(windows):
+                    star, held = window[-1].star, window[-1].held
+                    theirs = np.where(held[:, 1:, None], points[k, :, 1:], np.nan)
+                    yield Estimate(star.step, points[k, :, 0], spread[k], star.links, theirs)
+
+        track = follow_egos(self, recording, egos, follow)
+        return replace(track, notes=self._notes(sum(replaced)))
 
     def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, int]:
         """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were replaced."""

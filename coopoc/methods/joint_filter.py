@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Floats
-from ..world.inbox import inbox
+from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import spherical, to_vector, wrap
 from ..world.v2x import FIX_AND_VELOCITY, Message
+from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .star import FORGOTTEN, StarStep, rows, star_steps
 from .track import Track
@@ -39,26 +39,16 @@ class JointFilter:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        began = time.perf_counter()
-        columns = recording.columns(egos)
         known = resolve(self.knowledge, recording)
-        shape = (recording.runs, len(recording.t), len(columns), 3)
-        x, cov = np.empty(shape), np.empty((*shape, 3))
-        neighbours = np.full_like(recording.relative, np.nan)
-        received, sent = np.zeros((2, recording.runs, len(columns)))
-        for e, ego in enumerate(columns):
-            box = inbox(recording, ego, self.message)
-            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-            state: Floats = np.empty((recording.runs, 0, 3))
-            spread: Floats = np.empty((recording.runs, 0, 0))
-            for star in star_steps(recording, ego, box, known):
-                state, spread = predict(state, spread, star)
-                state, spread = update(state, spread, star, known, self.exact and known.exact_relative)
-                x[:, star.step, e], cov[:, star.step, e] = state[:, 0], spread[:, :3, :3]
-                neighbours[:, star.links] = state[:, 1:]
-        return Track(
-            recording.t, tuple(columns), x, cov, received, sent, time.perf_counter() - began, neighbours
-        )  # fmt: skip
+        return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known))
+
+    def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
+        state: Floats = np.empty((recording.runs, 0, 3))
+        spread: Floats = np.empty((recording.runs, 0, 0))
+        for star in star_steps(recording, ego, box, known):
+            state, spread = predict(state, spread, star)
+            state, spread = update(state, spread, star, known, self.exact and known.exact_relative)
+            yield Estimate(star.step, state[:, 0], spread[:, :3, :3], star.links, state[:, 1:])
 
 
 def predict(state: Floats, spread: Floats, star: StarStep) -> tuple[Floats, Floats]:

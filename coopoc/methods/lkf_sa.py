@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,9 +10,10 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..world.inbox import inbox
+from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
+from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .star import FORGOTTEN, StarStep, star_steps
 from .track import Track
@@ -47,24 +47,16 @@ class LaplacianKalman:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        began = time.perf_counter()
-        columns = recording.columns(egos)
         known = resolve(self.knowledge, recording)
-        shape = (recording.runs, len(recording.t), len(columns), 3)
-        x, cov = np.empty(shape), np.empty((*shape, 3))
-        neighbours = np.full_like(recording.relative, np.nan)
-        received, sent = np.zeros((2, recording.runs, len(columns)))
-        for e, ego in enumerate(columns):
-            box = inbox(recording, ego, self.message)
-            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-            state: Floats = np.empty((recording.runs, 0, 3))
-            spread: Floats = np.empty((1, 3, 0, 0))
-            for star in star_steps(recording, ego, box, known):
-                state, spread = self._step(state, spread, star, edge_variance(star, known))
-                x[:, star.step, e] = state[:, 0]
-                cov[:, star.step, e] = spread[:, :, 0, 0, None] * np.eye(3)
-                neighbours[:, star.links] = state[:, 1:]
-        return Track(recording.t, tuple(columns), x, cov, received, sent, time.perf_counter() - began, neighbours)
+        return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known))
+
+    def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
+        state: Floats = np.empty((recording.runs, 0, 3))
+        spread: Floats = np.empty((1, 3, 0, 0))
+        for star in star_steps(recording, ego, box, known):
+            state, spread = self._step(state, spread, star, edge_variance(star, known))
+            own = spread[:, :, 0, 0, None] * np.eye(3)
+            yield Estimate(star.step, state[:, 0], own, star.links, state[:, 1:])
 
     def _step(self, state: Floats, spread: Floats, star: StarStep, variance: Floats | None) -> tuple[Floats, Floats]:
         changed = len(star.kept) != state.shape[1] or bool((star.kept != np.arange(len(star.kept))).any())

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Floats
-from ..world.inbox import Inbox, inbox
+from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import to_vector
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, Message
+from .egos import Estimate, follow_egos
 from .kalman import solo_filter
 from .knowledge import Knowledge, resolve
 from .track import Track
@@ -46,32 +46,23 @@ class Msmv:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
-        began = time.perf_counter()
-        columns = recording.columns(egos)
         known = resolve(self.knowledge, recording)
-        shape = (recording.runs, len(recording.t), len(columns), 3)
-        x, cov = np.empty(shape), np.empty((*shape, 3))
-        neighbours = np.full_like(recording.relative, np.nan)
-        received, sent = np.zeros((2, recording.runs, len(columns)))
         process = known.process_variance(recording)
         solo = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
         process = np.broadcast_to(process, recording.gnss.shape)
-        for e, ego in enumerate(columns):
-            box = inbox(recording, ego, self.message)
-            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-            x[:, 0, e] = recording.gnss[:, 0, ego]
-            cov[:, 0, e] = FLAT * np.eye(3)
+
+        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x: Floats = recording.gnss[:, 0, ego]
+            cov: Floats = np.broadcast_to(FLAT * np.eye(3), (recording.runs, 3, 3))
             for t in range(len(recording.t)):
                 if t > 0:
-                    x[:, t, e] = x[:, t - 1, e] + recording.dt * recording.velocity[:, t, ego]
-                    cov[:, t, e] = cov[:, t - 1, e] + process[:, t, ego, :, None] * np.eye(3)
+                    x = x + recording.dt * recording.velocity[:, t, ego]
+                    cov = cov + process[:, t, ego, :, None] * np.eye(3)
                 theirs, pseudo, weight = _pseudo_fixes(recording, box, t, solo, process, known)
-                x[:, t, e], cov[:, t, e] = _fuse(
-                    x[:, t, e], cov[:, t, e], recording.gnss[:, t, ego], known.gnss_variance, pseudo, weight
-                )
-                neighbours[:, box.link[box.start[t] : box.start[t + 1]]] = theirs
-        seconds = time.perf_counter() - began
-        return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, (RECONSTRUCTION,))
+                x, cov = _fuse(x, cov, recording.gnss[:, t, ego], known.gnss_variance, pseudo, weight)
+                yield Estimate(t, x, cov, box.link[box.start[t] : box.start[t + 1]], theirs)
+
+        return follow_egos(self, recording, egos, follow, (RECONSTRUCTION,))
 
 
 def _pseudo_fixes(

@@ -1,0 +1,56 @@
+"""What all cooperative methods share: each ego opens its inbox, follows its star, and fills its part of the Track."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from tqdm import tqdm
+
+from ..arrays import Floats, Ints
+from ..world.inbox import Inbox, inbox
+from ..world.recording import Recording
+from .track import Method, Track
+
+
+class Estimate(NamedTuple):
+    """One ego at one step: position (R, 3) m, covariance (R or 1, 3, 3) m^2, its links there, and its neighbours
+    (R, k, 3) m, NaN where it says nothing of them."""
+
+    step: int
+    x: Floats
+    covariance: Floats
+    links: Ints
+    neighbours: Floats
+
+
+def follow_egos(
+    method: Method,
+    recording: Recording,
+    egos: Sequence[int | str],
+    follow: Callable[[int, Inbox], Iterable[Estimate]],
+    notes: tuple[str, ...] = (),
+) -> Track:
+    """Track of the egos from what `follow(column, inbox)` yields, every step once in any order; bytes counted.
+
+    Raises:
+        InputError: an ego that is unknown, no observer of this recording, or absent at times.
+    """
+    began = time.perf_counter()
+    columns = recording.columns(egos)
+    shape = (recording.runs, len(recording.t), len(columns), 3)
+    x, cov = np.empty(shape), np.empty((*shape, 3))
+    neighbours = np.full_like(recording.relative, np.nan)
+    received, sent = np.zeros((2, recording.runs, len(columns)))
+    with tqdm(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
+        for e, ego in enumerate(columns):
+            box = inbox(recording, ego, method.message)
+            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
+            for found in follow(ego, box):
+                x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
+                neighbours[:, found.links] = found.neighbours
+                bar.update()
+    seconds = time.perf_counter() - began
+    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes)
