@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Floats
+from coopoc.errors import InputError
 from coopoc.evaluate.metrics import errors, max_error, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
@@ -21,15 +22,29 @@ from coopoc.world.recording import Recording
 from . import scene, weights
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
-SOLO = ("gnss", "kalman")
-KNOWLEDGE = ("identity", "nominal", "fitted", "oracle", "trained")
+
+
+def key(p: Params) -> dict[str, str]:
+    """What changes the numbers of a cell beyond its parameters: data, code, and what was trained or fitted."""
+    found = dict(scene.facts(p))
+    if p["method"] in weights.LEARNED:
+        found["weights"] = weights.key(p["method"], p)
+    if p.get("knowledge") == "fitted":
+        found["clients"] = scene.fleet(p["clients"]).digest
+    return found
 
 
 def knowledge(p: Params) -> Knowledge | str:
-    """What the cell's method assumes."""
+    """What the cell's method assumes.
+
+    Raises:
+        InputError: an oracle for real data, whose noise nobody knows.
+    """
     if p["knowledge"] == "fitted":
         return weights.fitted(p)
     if p["knowledge"] == "oracle":
+        if scene.is_real(p["data"]):
+            raise InputError("knowledge", "'oracle'", "is for simulated noise", "Take nominal or fitted on real data.")
         return Knowledge.oracle(scene.sensors(p), scene.fleet(p["data"]))
     return str(p["knowledge"])
 
@@ -40,33 +55,33 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
     Raises:
         InputError: an unknown name.
     """
-    name, start = p["method"], _start(p)
+    name, known = p["method"], start(p)
     if name in weights.LEARNED:
-        return [(seed, _learned(name, p, seed, start)) for seed in weights.seeds(p)]
+        return [(seed, _learned(name, p, seed, known)) for seed in weights.seeds(p)]
     method: Method = find("coopoc.methods", name)(knowledge(p))
     if isinstance(method, Kalman):
-        method = replace(method, start=start)
+        method = replace(method, start=known)
     if isinstance(method, CooperativeMAP):
         method = replace(method, backend=p.get("backend", method.backend))
     return [(None, method)]
 
 
-def _start(p: Params) -> Floats | None:
+def start(p: Params) -> Floats | None:
     """True positions of the egos at the first step if the cell starts there, as KalmanNet's published loop does."""
-    if p.get("start", "gnss") == "gnss":
+    if scene.start(p) == "gnss":
         return None
     drive = scene.fleet(p["data"])
     return drive.position[0, [drive.index(i) for i in scene.egos(p["data"], str(p["egos"]))]]
 
 
-def _learned(name: str, p: Params, seed: int, start: Floats | None) -> Method:
+def _learned(name: str, p: Params, seed: int, known: Floats | None) -> Method:
     from coopoc.learned.method import LearnedGain
     from coopoc.learned.net import GainNet
 
     model = weights.checkpoint(name, p, seed).model
     if isinstance(model, GainNet):
-        return LearnedGain(model, name=name, start=start)
-    return replace(model, start=start)
+        return LearnedGain(model, name=name, start=known)
+    return replace(model, start=known)
 
 
 def rows(p: Params, *, quantiles: int = 0) -> list[Row]:
@@ -94,7 +109,7 @@ def _rows(
     fixes = np.sqrt(((recording.gnss - drive.position) ** 2).sum(axis=-1).mean(axis=1))[:, list(track.egos)]
     columns["worse_than_gnss"] = (columns["rt_le_m"] > 1.001 * fixes).astype(float)
     if track.covariance is not None:
-        columns["nees"] = nees(track, drive).mean(axis=1)
+        columns["nees"] = np.nanmean(nees(track, drive), axis=1)
         columns["nees_inside"] = np.broadcast_to(nees_inside(track, drive), columns["nees"].shape)
     links = [len(recording.links.of(column)) / len(track.t) for column in track.egos]
     distance = errors(track, drive) if quantiles else None

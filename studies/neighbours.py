@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
-from coopoc.study.environment import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
-from . import lineup, scene, weights
+from . import lineup, scene, views, weights
+from .claims import IDEAL, findings, ks
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
     from coopoc.study.tables import Table
 
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
-IDEAL: dict[str, Any] = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
 RATES_HZ = (5.0, 2.0, 1.0)
 WINDOWED = (0, 2, 6, 10)
 """K at which the sliding window is solved, too; it is the slowest method here."""
@@ -66,105 +64,100 @@ def cell(p: Params) -> list[Row]:
         bound = bound_rt_le(posterior_bound(drive, acting, column, scene.channel(p)))
         links = find_links(drive, [column], p["max_neighbours"], float(p["radius_m"]), acting.min_range)
         near = len(links) / len(drive.t)
-        received = near * FIX_AND_VELOCITY.payload / drive.dt
+        received = near * FIX_AND_VELOCITY.payload * min(p["rate_hz"], 1 / drive.dt)
         found.append({"run": 0, "ego": ego, "rt_le_m": bound, "neighbours_mean": near, "bytes_per_second": received})
     return found
 
 
-def key(p: Params) -> dict[str, str]:
-    """What else changes the numbers."""
-    extra = {**scene.facts(p), "code": revision("coopoc.world", "coopoc.methods", "coopoc.optimize")}
-    if p["method"] in weights.LEARNED:
-        extra["weights"] = weights.key(p["method"], p)
-    return extra
-
-
 def _of(*knowledge: str, **more: Any) -> dict[str, Any]:
     """Cells over the ideal channel with these kinds of knowledge, and those that have none."""
-    return {"knowledge": [*knowledge, "none", "trained"], **IDEAL, **more}
-
-
-def _bounded(results: Results) -> list[str]:
-    return ["bound"] if (results.frame["method"] == "bound").any() else []
+    return {"knowledge": [*knowledge, "none", "trained", "bound"], **IDEAL, **more}
 
 
 FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
+NEES = "NEES against K (3 is consistent), nominal knowledge."
+INSIDE = "Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal knowledge."
+BOUND = "The bound is for the rms over runs of causal estimates, over an ideal channel and without the bias."
+
+
+def _caption(results: Results, text: str, where: dict[str, Any]) -> str:
+    bounded = "bound" in results.select(where)["method"].values
+    return f"{text} {scene.conditions(results.settings)}" + (f" {BOUND}" if bounded else "")
 
 
 def _table(known: str) -> Any:
-    def table(results: Results) -> Table:
-        caption = f"RT-LE [m] against K, {known} knowledge."
-        return _against_k(results, "rt_le_m", _of(known, *_bounded(results)), caption)
+    return _against_k("rt_le_m", _of(known), f"RT-LE [m] against K, {known} knowledge.")
+
+
+def _against_k(
+    value: str, wanted: dict[str, Any], text: str, rows: Sequence[str] = ("method",), **options: Any
+) -> Any:  # fmt: skip
+    """View of methods down, K across."""
+
+    def table(results: Results) -> Table | None:
+        where = views.present(results, wanted, value)
+        if where is None:
+            return None
+        return results.table(
+            rows=rows, columns="max_neighbours", value=value, where=where, intervals=False,
+            decimals=scene.decimals(results.settings), caption=_caption(results, text, where), **options,
+        )  # fmt: skip
 
     return table
 
 
-def _nees(results: Results) -> Table:
-    where = {"method": FILTERS, **IDEAL, "knowledge": "nominal"}
-    return _against_k(results, "nees", where, "NEES against K (3 is consistent), nominal knowledge.", best=None)
-
-
-def _nees_inside(results: Results) -> Table:
-    where = {"method": FILTERS, **IDEAL, "knowledge": "nominal"}
-    caption = "Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal knowledge."
-    return _against_k(results, "nees_inside", where, caption, best=None)
-
-
-def _neighbours_errors(results: Results) -> Table:
-    steps = [k for k in results.frame["max_neighbours"].unique() if k]
-    where = {"method": FILTERS[1:], **IDEAL, "knowledge": ["identity", "fitted"], "max_neighbours": steps}
-    caption = "Error of what the egos think of their neighbours [m]."
-    return _against_k(results, "neighbour_rt_le_m", where, caption, rows=("method", "knowledge"))
-
-
-def _against_k(
-    results: Results, value: str, where: dict[str, Any], caption: str, rows: Sequence[str] = ("method",), **options: Any
-) -> Table:
-    """Methods down, K across; a digit more where errors are centimetres."""
-    decimals = 3 if scene.is_real(results.settings["data"]) else 2
-    return results.table(
-        rows=rows, columns="max_neighbours", value=value, where=where, intervals=False, decimals=decimals,
-        caption=f"{caption} {scene.conditions(results.settings)}", **options,
-    )  # fmt: skip
-
-
 def _budget(results: Results) -> Table | None:
     """None where there are no ten vehicles."""
-    if not (results.frame["max_neighbours"] == 10).any():
+    wanted = {"method": ["lkf-sa", "joint"], "max_neighbours": 10, "knowledge": ["identity", "nominal", "fitted"]}
+    where = views.present(results, wanted)
+    if where is None:
         return None
-    where = {"method": ["lkf-sa", "joint"], "max_neighbours": 10, "knowledge": ["identity", "nominal", "fitted"]}
     return results.table(
         rows=["rate_hz", "cap_bytes_per_second"], columns=["method", "knowledge"], value="rt_le_m", where=where,
-        intervals=False,
-        caption=f"RT-LE [m] at K = 10 under rates and caps (0: no cap). {scene.conditions(results.settings)}",
+        intervals=False, caption=_caption(results, "RT-LE [m] at K = 10 under rates and caps (0: no cap).", where),
     )  # fmt: skip
 
 
 def _sweep(known: str) -> Any:
-    def figure(results: Results) -> Plot:
+    def figure(results: Results) -> Plot | None:
         from coopoc.study import figures
 
-        return figures.sweep(
-            results, x="max_neighbours", where=_of(known, *_bounded(results)), log=True,
-            caption=f"RT-LE against the number of neighbours, {known} knowledge. {scene.conditions(results.settings)} "
-            "Bands: 95 % intervals over egos, then runs.",
-        )  # fmt: skip
+        where = views.present(results, _of(known))
+        if where is None:
+            return None
+        text = f"RT-LE against the number of neighbours, {known} knowledge; bands: 95 % intervals over egos, then runs."
+        return figures.sweep(results, x="max_neighbours", where=where, log=True, caption=_caption(results, text, where))
 
     return figure
 
 
-def _pareto(results: Results) -> Plot:
+def _pareto(results: Results) -> Plot | None:
+    """None where nobody receives anything."""
     from coopoc.study import figures
 
-    chosen = ["gnss", "kalman", "okf", "fedkalmannet", "lkf-sa", "joint", *_bounded(results)]
-    where = {"method": chosen, "knowledge": ["fitted", "identity", "none", "trained", *_bounded(results)]}
+    chosen = ["gnss", "kalman", "okf", "fedkalmannet", "lkf-sa", "joint", "bound"]
+    known = ["fitted", "identity", "none", "trained", "bound"]
+    where = views.present(results, {"method": chosen, "knowledge": known})
+    if where is None or not (results.select(where)["bytes_per_second"] > 0).any():
+        return None
+    names = [name for name in weights.trained(results) if name in TRAINED]
+    text = f"RT-LE against the payload that an ego receives: {'; '.join(_budgets(results, where))}."
+    if names:
+        text += " Right: what a vehicle sends and receives in training, once."
     return figures.pareto(
         results, along=("max_neighbours", "rate_hz", "cap_bytes_per_second"), where=where,
-        training=weights.training_bytes(results.settings),
-        caption="RT-LE against the payload that an ego receives: K = 1 to 10 at 10 Hz, and K = 10 under lower rates "
-        "and caps. Right: what a vehicle sends and receives in training, once. "
-        f"{scene.conditions(results.settings)}",
+        training=weights.training_bytes(results.settings, names), caption=_caption(results, text, where),
     )  # fmt: skip
+
+
+def _budgets(results: Results, where: dict[str, Any]) -> list[str]:
+    """The channels that were run, each with its K."""
+    found = []
+    for (rate, cap), rows in results.groups(["rate_hz", "cap_bytes_per_second"], where):
+        received = rows[rows["bytes_per_second"] > 0]["max_neighbours"].unique()
+        if len(received):
+            found.append(f"{ks(received)} at {rate:g} Hz" + (f" and at most {cap:g} B/s" if cap else ""))
+    return found
 
 
 def _innovations(results: Results) -> Plot | None:
@@ -183,64 +176,41 @@ def _innovations(results: Results) -> Plot | None:
     )  # fmt: skip
 
 
-def _findings(results: Results) -> Sequence[str]:
-    """The paper's order under identity covariances, then the honest one."""
-    steps = [k for k in sorted(results.frame["max_neighbours"].unique()) if k]
-    fed = results.interval("rt_le_m", method="fedkalmannet", max_neighbours=steps[0], **IDEAL).mean
-    gnss = results.interval("rt_le_m", method="gnss", max_neighbours=steps[0], **IDEAL).mean
-    last = steps[-1]
-    paper = [_mean(results, "lkf-sa", "identity", k) for k in steps]
-    holds = all(fed < value < gnss for value in paper)
-    falls = all(b <= a + 0.005 for a, b in pairwise(paper))
-    kf, joint = _mean(results, "kalman", "fitted", last), _mean(results, "joint", "fitted", last)
-    ranked = sorted([("FedKalmanNet", fed), ("fitted KF", kf), ("fitted joint filter", joint)], key=lambda row: row[1])
-    return [
-        f"Identity covariances, as the paper's baselines: federated {fed:.3g} m, LKF-SA {paper[0]:.3g} to "
-        f"{paper[-1]:.3g} m (K = {steps[0]} to {last}), GNSS {gnss:.3g} m. The paper's order, federated < LKF-SA < "
-        f"GNSS, {'holds at every' if holds else 'does NOT hold at every'} K >= 1; LKF-SA "
-        f"{'falls with K' if falls else 'does NOT fall with K throughout'}.",
-        f"Fitted covariances, K = {last}: " + " < ".join(f"{name} {value:.3g} m" for name, value in ranked)
-        + ". The same Laplacian filter with fitted covariances reaches "
-        f"{_mean(results, 'lkf-sa', 'fitted', last):.3g} m.",
-        f"Known covariances, K = {last}: KF {_mean(results, 'kalman', 'nominal', last):.3g} m alone, joint filter "
-        f"{_mean(results, 'joint', 'nominal', last):.3g} m"
-        + (f", bound {_mean(results, 'bound', 'bound', last):.3g} m." if _bounded(results) else "."),
-    ]  # fmt: skip
-
-
-def _mean(results: Results, method: str, known: str, k: int) -> float:
-    return results.interval("rt_le_m", method=method, knowledge=known, max_neighbours=k, **IDEAL).mean
-
-
 STUDY = Study(
     name="neighbours",
     question="What does another neighbour buy while deciding, at what cost, and does training together replace it?",
     cell=cell,
-    key=key,
+    key=lineup.key,
     prepare=weights.prepare,
     grid=_grid(),
     where=_meaningful,
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "start": "gnss", "radius_m": 30.0, "egos": "5", "runs": 30, "seed": 0,
+        "velocity_reading": "axis", "radius_m": 30.0, "egos": "5", "runs": 30, "seed": 0,
         "train_seeds": 5, "backend": "gauss-newton",
     },
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
         "rt_le_identity": _table("identity"), "rt_le_fitted": _table("fitted"), "rt_le_nominal": _table("nominal"),
-        "budget": _budget, "nees": _nees, "nees_inside": _nees_inside, "neighbours_errors": _neighbours_errors,
+        "budget": _budget,
+        "nees": _against_k("nees", _of("nominal", method=FILTERS), NEES, best=None),
+        "nees_inside": _against_k("nees_inside", _of("nominal", method=FILTERS), INSIDE, best=None),
+        "neighbours_errors": _against_k(
+            "neighbour_rt_le_m", _of("identity", "fitted", method=FILTERS[1:], max_neighbours=list(NEIGHBOURS[1:])),
+            "Error of what the egos think of their neighbours [m].", rows=("method", "knowledge"),
+        ),
     },
     figures={
         "rt_le_identity": _sweep("identity"), "rt_le_fitted": _sweep("fitted"), "bytes": _pareto,
         "innovations": _innovations,
     },
-    findings=_findings,
+    findings=findings,
     recipe=weights.described,
     limitations=(
         "Azimuth and inclination are in the world frame: the heading that turns a bearing into an azimuth is known.",
-        "The bound is that of an ideal channel at each K; it leaves out the bias and is for causal estimates.",
         "MSMV-R is a reconstruction; no reading of MSMV that we tried is flat in K as the paper's curve is.",
-        "Fitted knowledge and the nets come from vehicles that drive alone with 1.5 m and 10 %; the test is noisier.",
+        "The nets and the fitted noise come from vehicles that drive alone with 1.5 m and 10 %; the noise of the test "
+        "is another one.",
     ),
     minutes=5,
 )  # fmt: skip

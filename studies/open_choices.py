@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from coopoc.study.study import Params, Row, Study
 
-from . import lineup, weights
-from .error_cdf import CASES, CLASSIC, key, seed_spread
+from . import lineup, scene, views, weights
+from .error_cdf import CASES, LINEUP, case, meaningful
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -22,70 +22,89 @@ def cell(p: Params) -> list[Row]:
     return lineup.rows(p)
 
 
-def _where(start: str, reading: str, scenario: int, ratio: float) -> dict[str, Any]:
-    return {"start": start, "velocity_reading": reading, "scenario": scenario, "velocity_ratio": ratio}
+def _of(start: str, reading: str) -> dict[str, str]:
+    return {"start": start, "velocity_reading": reading}
+
+
+def _cases(results: Results, start: str, reading: str) -> list[dict[str, Any]]:
+    """The cases that were run under a pair of choices, as selections."""
+    found = [{**_of(start, reading), **case(*pair)} for pair in CASES]
+    return [at for at in found if views.present(results, at)]
 
 
 def _table(start: str, reading: str) -> Any:
-    def table(results: Results) -> Table:
+    def table(results: Results) -> Table | None:
         from coopoc.study.style import look
         from coopoc.study.tables import Table
 
-        body = []
-        for method, known in (*CLASSIC, *((name, "trained") for name in weights.LEARNED)):
-            row: list[Any] = [look(method).label, known]
-            for scenario, ratio in CASES:
-                where = {**_where(start, reading, scenario, ratio), "method": method, "knowledge": known}
-                row += [results.interval("rt_le_m", where), seed_spread(results, where)]
-            body.append((*row, 100 * results.interval("worse_than_gnss", where).mean))
+        cases, body = _cases(results, start, reading), []
+        for method, known in LINEUP:
+            row: list[Any] = []
+            for at in cases:
+                where = {**at, "method": method, "knowledge": known}
+                ran = views.present(results, where)
+                row += _numbers(results, where) if ran else [None] * 3
+            if any(entry is not None for entry in row):
+                body.append((look(method).label, known, *row))
         header = ["Method", "Knowledge"]
-        for scenario, ratio in CASES:
-            header += [f"Sc. {scenario}, {100 * ratio:g} % [m]", "Seed std [m]"]
-        where_from = "first fix" if start == "gnss" else "true position"
-        p = results.settings
-        caption = (
-            f"RT-LE, start at the {where_from}, velocity noise read per {reading}; {p['runs']} paired runs, "
-            f"{p['egos']} egos of {p['data']}, {p['train_seeds']} training seeds. Last column: of the last case."
-        )
-        return Table((*header, "Worse [%]"), tuple(body), caption, best=None)
+        for at in cases:
+            header += [f"{_name(results, at)} [m]", "Seed std [m]", "Worse than GNSS [%]"]
+        digits = scene.decimals(results.settings)
+        text = " ".join(scene.conditions({**results.settings, **at}) for at in cases)
+        return Table(tuple(header), tuple(body), f"RT-LE. {text}", decimals=digits) if body else None
 
     return table
 
 
+def _numbers(results: Results, where: dict[str, Any]) -> list[Any]:
+    worse = 100 * results.interval("worse_than_gnss", where).mean
+    return [results.interval("rt_le_m", where), views.seed_std(results, where), worse]
+
+
+def _name(results: Results, at: dict[str, Any]) -> str:
+    if scene.is_real(results.settings["data"]):
+        return "Real data"
+    return f"Sc. {at['scenario']}, {100 * at['velocity_ratio']:g} %"
+
+
 def _findings(results: Results) -> Sequence[str]:
-    found = []
-    for start, reading in CHOICES:
-        text = []
-        for scenario, ratio in CASES:
-            where = _where(start, reading, scenario, ratio)
+    found = [_finding(results, at) for start, reading in CHOICES for at in _cases(results, start, reading)]
+    return [sentences for sentences in found if sentences]
 
-            def mean(method: str, known: str = "trained", at: dict[str, Any] = where) -> float:
-                return results.interval("rt_le_m", {**at, "method": method, "knowledge": known}).mean
 
-            fed, centralised, oracle = mean("fedkalmannet"), mean("centralised"), mean("kalman", "oracle")
-            text.append(
-                f"scenario {scenario} at {100 * ratio:g} %: federated {fed:.3f} m = {fed / oracle:.2f} x oracle, "
-                f"{100 * (fed / centralised - 1):+.1f} % of centralised, fitted KF {mean('kalman', 'fitted'):.3f} m"
-            )
-        found.append(f"Start {start}, per {reading}: " + "; ".join(text) + ".")
-    return found
+def _finding(results: Results, at: dict[str, Any]) -> str:
+    names = {
+        "federated": ("fedkalmannet", "trained"), "centralised": ("centralised", "trained"), "OKF": ("okf", "trained"),
+        "fitted KF": ("kalman", "fitted"), "oracle KF": ("kalman", "oracle"),
+    }  # fmt: skip
+    found = {
+        words: views.mean(results, {**at, "method": method, "knowledge": known})
+        for words, (method, known) in names.items()
+    }
+    if not views.listed(found):
+        return ""
+    fed, ratios = found["federated"], ""
+    if fed:
+        ratios = ", ".join(f"{fed / v:.2f} x {words}" for words, v in found.items() if v and words != "federated")
+    shown = f"RT-LE: {views.listed(found)}"
+    return f"{scene.heading({**results.settings, **at})}. {shown}" + (f"; federated is {ratios}." if ratios else ".")
 
 
 STUDY = Study(
     name="open_choices",
     question="How much do the start and the reading of the velocity noise move the comparison of learned gains?",
     cell=cell,
-    key=key,
+    key=lineup.key,
     prepare=weights.prepare,
     grid=[
-        {**_where(start, reading, scenario, ratio), "method": method, "knowledge": known}
-        for start, reading in CHOICES for scenario, ratio in CASES
-        for method, known in (*CLASSIC, *((name, "trained") for name in weights.LEARNED))
+        {**_of(start, reading), **case(*pair), "method": method, "knowledge": known}
+        for start, reading in CHOICES for pair in CASES for method, known in LINEUP
     ],
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "egos": "5", "runs": 100, "seed": 0,
         "train_seeds": 5,
     },
+    where=meaningful,
     shares=("scenario", "velocity_ratio", "velocity_reading"),
     tables={f"{start}_{reading}": _table(start, reading) for start, reading in CHOICES},
     findings=_findings,

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
 from coopoc.data.registry import load, recorder
 from coopoc.errors import InputError
+from coopoc.study.environment import revision
 from coopoc.study.study import Params
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
+
+Start = Literal["gnss", "true"]
+CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "optimize", "evaluate", "learned", "data", "studies"))
+"""The packages whose code makes the numbers of a cell."""
 
 
 @lru_cache(maxsize=4)
@@ -25,14 +34,19 @@ def fleet(data: str) -> Fleet:
 
 def is_real(data: str) -> bool:
     """True for data that holds real measurements between vehicles, which nobody needs to simulate."""
-    return recorder(data) is not None
+    return _recorder(data) is not None
 
 
 @lru_cache(maxsize=4)
-def labels(data: str) -> tuple[str, ...]:
-    """What must be said of real data: what is simulated in it, and what uses truth."""
-    real = recorder(data)
-    return () if real is None else real(V2X(max_neighbours=0), runs=1, seed=0).notes
+def _recorder(data: str) -> Callable[..., Recording] | None:
+    return recorder(data)
+
+
+@lru_cache(maxsize=4)
+def measured(data: str) -> Recording | None:
+    """One run of real data with all that its vehicles measured of each other; None where that is simulated."""
+    real = _recorder(data)
+    return None if real is None else real(V2X(len(fleet(data).ids), radius=float("inf")), runs=1, seed=0)
 
 
 @lru_cache(maxsize=4)
@@ -56,28 +70,64 @@ def sensors(p: Params) -> Sensors:
     """What acts in scenario 1 or 2 of the paper, with the velocity noise of the cell."""
     ratio, reading = float(p["velocity_ratio"]), p["velocity_reading"]
     if p["scenario"] == 1:
-        acting = Sensors.paper_scenario1()
+        found = Sensors.paper_scenario1()
     elif p["scenario"] == 2:
-        acting = Sensors.paper_scenario2()
+        found = Sensors.paper_scenario2()
     else:
         raise InputError("scenario", p["scenario"], "must be 1 or 2", "See section IV.B of the paper.")
-    return Sensors(**{**acting.__dict__, "velocity_std_ratio": ratio, "velocity_reading": reading})
+    return replace(found, velocity_std_ratio=ratio, velocity_reading=reading)
+
+
+def acting(p: Params) -> Sensors:
+    """The noise of the cell's measurements: what is simulated, or what was measured of real data."""
+    real = measured(p["data"])
+    return sensors(p) if real is None else real.sensors
+
+
+def start(p: Params) -> Start:
+    """Where the filters of a cell start: "gnss", the first fix, unless it names "true", the true position."""
+    found: Start = p.get("start", "gnss")
+    if found not in get_args(Start):
+        raise InputError("start", repr(found), "must be gnss or true", "The first fix, or the true position.")
+    return found
+
+
+def heading(p: Params) -> str:
+    """Data, noise and start of a cell in a few words, for findings."""
+    begin = "start at the " + ("first fix" if start(p) == "gnss" else "true position")
+    if is_real(p["data"]):
+        return f"Real data, trained with velocity noise per {p['velocity_reading']}, {begin}"
+    noise = acting(p)
+    low, high = noise.gnss_bias
+    bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
+    near = f", {relative(noise)}, radius {p['radius_m']:g} m" if "radius_m" in p else ""
+    return (
+        f"Scenario {p['scenario']}: GNSS {noise.gnss_std[0]:g} m per axis{bias}, velocity "
+        f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}, {begin}"
+    )
+
+
+def decimals(p: Params) -> int:
+    """Digits of RT-LE in tables: one more where errors are centimetres."""
+    return 3 if is_real(p["data"]) else 2
+
+
+def relative(noise: Sensors) -> str:
+    """Noise of range and angles in words."""
+    return f"range {noise.range_std:.2g} m, angles {np.rad2deg(noise.azimuth_std):.2g}°"
 
 
 def conditions(p: Params) -> str:
-    """Noise, start and size of a cell, for captions; of real data, what is simulated in it and what uses truth."""
-    size = f"{p['runs']} runs, {p['egos']} egos of {Path(p['data']).name}, {p['train_seeds']} training seeds."
-    if is_real(p["data"]):
-        return f"Real data: {'; '.join(labels(p['data']))}. {size}"
-    acting = sensors(p)
-    low, high = acting.gnss_bias
-    bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
-    near = f", range {acting.range_std:g} m, angles 4°, radius {p['radius_m']:g} m" if "radius_m" in p else ""
-    start = "first fix" if p.get("start", "gnss") == "gnss" else "true position"
-    return (
-        f"Scenario {p['scenario']}: GNSS {acting.gnss_std[0]:g} m per axis{bias}, velocity "
-        f"{100 * acting.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}, start at the {start}; {size}"
-    )
+    """Heading and size of a cell, for captions; of real data also what is simulated in it and what uses truth."""
+    real = measured(p["data"])
+    labels = "" if real is None else f" ({'; '.join(real.notes)})"
+    who = egos(p["data"], str(p["egos"]))
+    size = f"{_count(p['runs'], 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
+    return f"{heading(p)}{labels}; {size}, {_count(p['train_seeds'], 'training seed')}."
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def channel(p: Params) -> V2X:
@@ -86,15 +136,26 @@ def channel(p: Params) -> V2X:
     return V2X(
         max_neighbours=int(p.get("max_neighbours", 0)),
         radius=float(p.get("radius_m", 30.0)),
-        rate=float(p.get("rate_hz", 10.0)),
+        rate=p.get("rate_hz"),
         bytes_per_second=cap or float("inf"),
     )
 
 
-def facts(p: Params) -> dict[str, str]:
-    """What of the scene changes the numbers beyond its parameters; InputError for a scene that cannot be."""
-    sensors(p), channel(p), egos(p["data"], str(p["egos"]))
-    return {"fleet": fleet(p["data"]).digest}
+def facts(p: Params) -> Mapping[str, str]:
+    """What changes the numbers beyond a cell's parameters: its data and all code; InputError for what cannot be."""
+    sensors(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
+    return {"code": revision(*CODE), **_digests(p["data"])}
+
+
+@lru_cache(maxsize=4)
+def _digests(data: str) -> Mapping[str, str]:
+    real = measured(data)
+    if real is None:
+        return {"fleet": fleet(data).digest}
+    links, sha = real.links, hashlib.sha256(repr(real.sensors).encode())
+    for array in (real.gnss, real.velocity, real.relative, links.step, links.observer, links.neighbour):
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return {"fleet": fleet(data).digest, "recording": sha.hexdigest()}
 
 
 def recording(p: Params) -> Recording:
@@ -104,9 +165,8 @@ def recording(p: Params) -> Recording:
 
 
 @lru_cache(maxsize=2)
-def _recording(data: str, acting: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...]) -> Recording:
-    real = recorder(data)
+def _recording(data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...]) -> Recording:
+    real = _recorder(data)
     if real is not None:
-        measured: Recording = real(v2x, runs=runs, seed=seed)
-        return measured
-    return observe(fleet(data), acting, v2x, runs=runs, seed=seed, observers=observers)
+        return real(v2x, runs=runs, seed=seed)
+    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers)

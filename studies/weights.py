@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from coopoc.errors import InputError
 from coopoc.methods.knowledge import Knowledge
+from coopoc.plugins import unknown
 from coopoc.study.study import Params
 from coopoc.world.sensing import observe
+from coopoc.world.sensors import VelocityReading
 from coopoc.world.v2x import V2X
 
-from .scene import fleet
+from .scene import Start, fleet, start
 
 if TYPE_CHECKING:
     from coopoc.learned.checkpoint import Checkpoint
     from coopoc.study.results import Results
 
-LEARNED = ("fedkalmannet", "centralised", "individual1", "individual2", "individual3", "individual4", "okf")
-"""Methods that are trained, the individual nets one per client."""
+INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
+"""Nets of single clients, of as many as there are, at most six."""
+LEARNED = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
+"""Methods that are trained."""
 
 
 def seeds(p: Params) -> range:
@@ -28,103 +33,132 @@ def seeds(p: Params) -> range:
     return range(int(p["train_seeds"]))
 
 
+def trainable(p: Params) -> bool:
+    """False for the individual net of a client that is not there."""
+    return p["method"] not in INDIVIDUAL[len(fleet(p["clients"]).ids) :]
+
+
 def label(name: str, p: Params, seed: int) -> str:
     """Name of a checkpoint, such as fedkalmannet-gnss-axis-0."""
-    return f"{name}-{p['start']}-{p['velocity_reading']}-{seed}"
+    return f"{name}-{start(p)}-{p['velocity_reading']}-{seed}"
 
 
 def key(name: str, p: Params) -> str:
     """Hash of everything that changes the weights of a method, known before any training."""
-    keys = _keys(p["clients"], p["start"], p["velocity_reading"], int(p["train_seeds"]))
-    return hashlib.sha256("".join(keys[label(name, p, seed)] for seed in seeds(p)).encode()).hexdigest()
+    return hashlib.sha256("".join(_key(name, p, seed) for seed in seeds(p)).encode()).hexdigest()
+
+
+def _key(name: str, p: Params, seed: int) -> str:
+    keys = _keys(p["clients"], start(p), p["velocity_reading"], int(p["train_seeds"]))
+    if label(name, p, seed) not in keys:
+        raise unknown("trained method", name, LEARNED)
+    return keys[label(name, p, seed)]
 
 
 @lru_cache
-def _keys(clients: str, start: str, reading: str, count: int) -> Mapping[str, str]:
+def _keys(clients: str, begin: Start, reading: VelocityReading, count: int) -> Mapping[str, str]:
     from coopoc.learned.recipes import RECIPES, Setting, jobs
 
     drives = fleet(clients)
-    settings = [Setting(seed, start, reading) for seed in range(count)]  # type: ignore[arg-type]
+    settings = [Setting(seed, begin, reading) for seed in range(count)]
     return {
         job.label: job.key(drives) for setting in settings for name in RECIPES for job in jobs(name, setting, drives)
     }
 
 
 def prepare(cells: Iterable[Params]) -> None:
-    """Train what the cells need and is not there yet: in this process, one setting after another, with progress."""
-    from coopoc.learned.recipes import train_all
+    """Train what the cells need and is not there yet: in this process, one recipe after another, with progress."""
+    from coopoc.learned.recipes import RECIPES, train_all
 
-    wanted: dict[tuple[str, str, int], tuple[set[str], set[str]]] = {}
+    wanted: dict[tuple[str, str, int], list[Params]] = {}
     for p in cells:
-        if p.get("method") in LEARNED:
-            starts, readings = wanted.setdefault((p["clients"], p["weights"], int(p["train_seeds"])), (set(), set()))
-            starts.add(p["start"])
-            readings.add(p["velocity_reading"])
-    for (clients, folder, count), (starts, readings) in wanted.items():
-        train_all(fleet(clients), folder, seeds=range(count), starts=sorted(starts), readings=sorted(readings))  # type: ignore[arg-type]
+        if p["method"] in LEARNED:
+            wanted.setdefault((p["clients"], p["weights"], len(seeds(p))), []).append(p)
+    for (clients, folder, count), asking in wanted.items():
+        named = {p["method"].rstrip("0123456789") for p in asking}
+        train_all(
+            fleet(clients), folder, seeds=range(count), starts=sorted({start(p) for p in asking}),
+            readings=sorted({p["velocity_reading"] for p in asking}), recipes=[r for r in RECIPES if r in named],
+        )  # fmt: skip
 
 
 @lru_cache(maxsize=64)
-def _checkpoint(path: Path) -> Checkpoint:
+def _checkpoint(path: Path, key: str) -> Checkpoint:
     from coopoc.learned.checkpoint import load
 
-    return load(path)
+    found = load(path)
+    if found.card.get("key") != key:
+        raise InputError("weights", path, "were trained otherwise", "Train again, or use another folder.")
+    return found
 
 
 def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
-    """The trained checkpoint of a method for one training seed."""
-    return _checkpoint(Path(p["weights"]) / f"{label(name, p, seed)}.safetensors")
+    """The trained checkpoint of a method for one training seed.
+
+    Raises:
+        InputError: it is not there, or it is of another training than these parameters ask for.
+    """
+    return _checkpoint(Path(p["weights"]) / f"{label(name, p, seed)}.safetensors", _key(name, p, seed))
 
 
 @lru_cache
-def _fitted(clients: str, reading: str) -> Knowledge:
+def _fitted(clients: str, reading: VelocityReading) -> Knowledge:
     from coopoc.learned.recipes import Setting, sensors
 
     drives = fleet(clients)
-    acting = sensors(Setting(reading=reading))  # type: ignore[arg-type]
+    acting = sensors(Setting(reading=reading))
     return Knowledge.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
 
 
-def training_bytes(p: Params) -> dict[str, float]:
+def trained(results: Results) -> list[str]:
+    """The trained methods that a study has run."""
+    ran = set(results.frame.get("method", ()))
+    return [name for name in LEARNED if name in ran]
+
+
+def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
     """Bytes that one vehicle sends and receives in training, on average over the clients.
 
-    A federation moves the weights both ways in every round. A centralised net needs the raw drives, six float32 per
-    step (noisy fixes and velocities; the reference drive comes on top), and sends the net back once.
+    A federation moves the weights both ways in every round. What is trained in one place needs the raw drives, six
+    float32 per step (noisy fixes and velocities; the reference drive comes on top), and sends the weights back once.
     """
-    card = checkpoint("fedkalmannet", p, 0).card
-    drives = fleet(p["clients"])
-    upload = 4 * 6 * float(drives.present.sum(axis=0).mean())
-    rounds = card["history"][1:]
-    moved = sum(row["sent_bytes"] + row["received_bytes"] for row in rounds) / len(card["clients"])
-    return {
-        "fedkalmannet": float(moved),
-        "centralised": upload + 4 * card["parameters"],
-        "okf": upload + 4 * checkpoint("okf", p, 0).card["parameters"],
-    }
+    upload = 4 * 6 * float(fleet(p["clients"]).present.sum(axis=0).mean())
+    found = {}
+    for name in names:
+        card = checkpoint(name, p, 0).card
+        found[name] = upload + 4.0 * card["parameters"]
+        if name == "fedkalmannet":
+            moved = sum(row["sent_bytes"] + row["received_bytes"] for row in card["history"][1:])
+            found[name] = moved / len(card["clients"])
+    return found
 
 
 def described(results: Results) -> Mapping[str, str]:
-    """What the report says about the training, from the cards of the first seed."""
-    p = results.settings
-    cards = {name: checkpoint(name, p, 0).card for name in LEARNED}
-    plan = cards["fedkalmannet"]["settings"]
-    how = plan["schedule"]
+    """What the report says about the training of the methods that were run, from the cards of the first seed."""
+    cards = {name: checkpoint(name, results.settings, 0).card for name in trained(results)}
+    nets = [card for name, card in cards.items() if name != "okf"]
+    told = {"nets": _nets(nets[0], len(seeds(results.settings)))} if nets else {}
+    for name, card in cards.items():
+        plan = card["settings"]
+        text = f"{plan['schedule']['epochs']} optimiser steps"
+        if name == "fedkalmannet":
+            text = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
+        seconds, clients = f"{card['seconds']:.0f} s per net", ", ".join(card["clients"])
+        told[name] = f"{text}; clients {clients}; {seconds}; key {card['key'][:12]}"
+    return told
+
+
+def _nets(card: Mapping[str, Any], count: int) -> str:
+    """What all nets have in common, from the card of one."""
+    plan, how = card["settings"], card["settings"]["schedule"]
     pieces = "mirrored at random" if how["mirror"] else "as they are"
-    told = {
-        "nets": f"{cards['fedkalmannet']['parameters']} parameters, AdamW at {how['learning_rate']:g} falling as a "
-        f"half cosine, decoupled decay {how['weight_decay']:g}, batch {how['batch']}, gradient norm at most "
-        f"{how['clip']:g}, pieces of {plan['piece']} steps {pieces}, {plan['noise']} noise, "
-        f"{100 * plan['split']:.0f} % for training, best weights of {how['checks']} validations; training seeds 0 to "
-        f"{int(p['train_seeds']) - 1}",
-        "fedkalmannet": f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces",
-    }
-    for name in LEARNED[1:]:
-        told[name] = f"{cards[name]['settings']['schedule']['epochs']} optimiser steps"
-    return {
-        name: f"{text}; clients {', '.join(cards[name]['clients'])}; {cards[name]['seconds']:.0f} s per net; "
-        f"key {cards[name]['key'][:12]}" if name in cards else text
-        for name, text in told.items()
-    }  # fmt: skip
+    which = f"seeds 0 to {count - 1}" if count > 1 else "seed 0"
+    return (
+        f"{card['parameters']} parameters, AdamW at {how['learning_rate']:g} falling as a half cosine, decoupled decay "
+        f"{how['weight_decay']:g}, batch {how['batch']}, gradient norm at most {how['clip']:g}, pieces of "
+        f"{plan['piece']} steps {pieces}, {plan['noise']} noise, {100 * plan['split']:.0f} % for training, best "
+        f"weights of {how['checks']} validations; training {which}"
+    )
 
 
 def fitted(p: Params) -> Knowledge:

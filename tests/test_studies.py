@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import coopoc as co
+from coopoc.data.table import write_table
 from coopoc.evaluate.metrics import rt_le
-from coopoc.learned.recipes import load_method
+from coopoc.learned.checkpoint import Checkpoint, load, save
+from coopoc.learned.method import LearnedGain
+from coopoc.learned.net import GainNet
+from coopoc.learned.recipes import Setting, jobs, load_method
+from coopoc.learned.rollout import flatten
+from coopoc.plugins import find
+from coopoc.studies import claims, convergence, error_cdf, neighbours, paper, scene, weights
+from coopoc.study.publish import views as published
+from coopoc.study.results import Results
 from coopoc.study.run import run
+from coopoc.study.study import Params, Study
 
+WEIGHTS = Path(__file__).resolve().parents[1] / "learned" / "weights"
 CLASSIC = {"method": "gnss,kalman,lkf-sa,joint,bound", "runs": 4, "egos": "2", "max_neighbours": "0,2,6"}
 
 
@@ -22,14 +38,19 @@ def town10() -> co.Fleet:
     return co.load("town10")
 
 
+def study(name: str, **changes: object) -> Study:
+    found: Study = find("coopoc.studies", name)
+    return found.override(changes)
+
+
+def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Results:
+    """Results of a study whose rows are given: what may be said of them is known beforehand."""
+    return Results(name, "", axes, {**study(name).settings, **settings}, frame, pd.DataFrame(), 0, {})
+
+
 def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
-    """Only what is asked for is made: no weights for classical methods; findings need the nets and say so."""
-    from coopoc.plugins import find
-
-    study = find("coopoc.studies", "neighbours").override({**CLASSIC, "weights": str(tmp_path / "weights")})
-    from dataclasses import replace
-
-    results = run(replace(study, findings=None, recipe=None, figures={}, tables={}), out=tmp_path, progress=False)
+    """Only what is asked for is made: no weights for classical methods, and views of what was run."""
+    results = run(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)
     assert results.failed == 0
     assert not (tmp_path / "weights").exists()
     ideal = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
@@ -40,6 +61,165 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     ]
     assert bound == sorted(bound, reverse=True)
     assert np.array(joint) == pytest.approx(np.array(bound), rel=0.15)
+    shown = published(tmp_path / "neighbours")
+    said = "\n".join(shown["findings"])
+    assert "LKF-SA falls from K = 2 to 6" in said
+    assert "order" not in said  # there is no net to order
+    rms = np.sqrt(
+        (results.values("rt_le_m", method="joint", knowledge="nominal", max_neighbours=6) ** 2).mean(1)
+    ).mean()
+    assert "K = 6, rms over runs: KF alone" in said
+    assert f"joint filter {rms:.3g} m, bound {bound[-1]:.3g} m." in said
+    captions = {view["name"]: view["caption"] for kind in ("tables", "figures") for view in shown[kind]}
+    assert "bound is for the rms over runs" in captions["rt_le_nominal"]
+    assert "bound" not in captions["nees"]
+    assert ": K = 2, 6 at 10 Hz." in captions["bytes"]
+    assert "budget" not in captions
+
+
+def test_neighbours_of_solo_filters_alone_ends_well(tmp_path: Path) -> None:
+    coopoc = str(Path(sys.executable).with_name("coopoc"))
+    command = [coopoc, "run", "neighbours", "--set", "method=gnss,kalman", "runs=2", "egos=1"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    shown = published(tmp_path / "runs" / "neighbours")
+    assert [view["name"] for view in shown["tables"]] == ["rt_le_identity", "rt_le_fitted", "rt_le_nominal", "nees",
+                                                           "nees_inside"]  # fmt: skip
+    assert shown["findings"] == []
+
+
+@pytest.mark.parametrize("rate", [10.0, 2.0])
+def test_the_bound_receives_what_the_channel_sends(rate: float) -> None:
+    """As many bytes as the joint filter counts by itself, at every step and at a fifth of them."""
+    p = {**study("neighbours", runs=1, egos="1").settings, "max_neighbours": 4, "rate_hz": rate,
+         "cap_bytes_per_second": 0.0}  # fmt: skip
+    (bound,) = neighbours.cell({**p, "method": "bound", "knowledge": "bound"})
+    (joint,) = neighbours.cell({**p, "method": "joint", "knowledge": "nominal"})
+    assert bound["bytes_per_second"] == pytest.approx(joint["bytes_per_second"], rel=0.1)
+
+
+def lkf(*levels: float) -> pd.DataFrame:
+    """RT-LE of LKF-SA under identity covariances at K = 0, 1, ..., five runs of two egos."""
+    return pd.DataFrame([
+        {"method": "lkf-sa", "knowledge": "identity", "rate_hz": 10.0, "cap_bytes_per_second": 0.0, "max_neighbours": k,
+         "ego": ego, "run": run, "rt_le_m": level + 0.01 * (run + ego)}
+        for k, level in enumerate(levels) for ego in range(2) for run in range(5)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("levels", "words"),
+    [((3.0,), None), ((3.0, 2.0), "LKF-SA (K = 1) 2.02 m."), ((3.0, 2.0, 1.0), "falls from K = 1 to 2"),
+     ((3.0, 1.0, 1.004), "does NOT fall"), ((3.0, 1.0, 2.0), "does NOT fall")],
+)  # fmt: skip
+def test_a_fall_with_k_is_claimed_only_if_it_was_seen(levels: tuple[float, ...], words: str | None) -> None:
+    said = claims.findings(drawn("neighbours", lkf(*levels), "method", "max_neighbours"))
+    assert [words in said[0]] == [True] if words else said == []
+
+
+def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
+    """The fitted KF at about 1 m, and a federated net that differs from it by a constant for each training seed."""
+    both = {"scenario": 1, "velocity_ratio": 0.15, **at}
+    noise = np.random.default_rng(0).uniform(0.9, 1.1, (2, runs))
+    rows = [{**both, "method": "kalman", "knowledge": "fitted", "ego": e, "run": r, "rt_le_m": noise[e, r]}
+            for e in range(2) for r in range(runs)]  # fmt: skip
+    rows += [{**row, "method": "fedkalmannet", "knowledge": "trained", "train_seed": s, "rt_le_m": row["rt_le_m"] + gap}
+             for s, gap in enumerate(net) for row in rows]  # fmt: skip
+    return drawn("error_cdf", pd.DataFrame(rows), "method", "knowledge", "scenario", "velocity_ratio")
+
+
+@pytest.mark.parametrize(
+    ("net", "runs", "words"),
+    [
+        ((-0.1, -0.11, -0.12), 4, "beats the fitted KF"),
+        ((0.1, 0.11, 0.12), 4, "is worse than the fitted KF"),
+        ((-0.1, 0.12, -0.05), 4, "cannot be told from the fitted KF"),
+        (
+            (0.5, 0.01),
+            4,
+            "cannot be told from the fitted KF",
+        ),  # every run is worse, yet two seeds do not agree how much
+        ((0.1,), 4, "of one training seed, whose spread is unknown"),
+    ],
+)
+def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: int, words: str) -> None:
+    (said,) = error_cdf.STUDY.findings(cdf(net, runs))  # type: ignore[misc]
+    assert words in said
+
+
+def test_nothing_is_claimed_where_the_interval_is_not_finite() -> None:
+    results = cdf((0.1, 0.1))
+    one = replace(results, frame=results.frame[(results.frame["ego"] == 0) & (results.frame["run"] == 0)])
+    (said,) = error_cdf.STUDY.findings(one)  # type: ignore[misc]
+    assert "cannot be judged against the fitted KF: too few seeds, egos or runs" in said
+
+
+def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:
+    """The shipped weights of a method as the first seed's checkpoint of a training that these parameters ask for."""
+    shipped = load(WEIGHTS / f"{name}.safetensors")
+    drives = co.load(str(p["clients"]))
+    (job,) = jobs(name, Setting(0, p["start"], p["velocity_reading"]), drives)
+    card, history = {**shipped.card, "key": job.key(drives)}, None
+    if isinstance(shipped.model, GainNet):
+        card["history"] = shipped.card["history"][: rounds + 1]
+        history = flatten([shipped.model]).repeat(rounds + 1, 1)
+    made = Checkpoint(shipped.model, card, history)
+    save(folder / f"{job.label}.safetensors", made)
+    return made
+
+
+def test_weights_of_another_training_are_refused(tmp_path: Path) -> None:
+    """Two client fleets share a folder in one process: what one has trained is not taken for the other's."""
+    p = {**study("error_cdf", weights=str(tmp_path), train_seeds=1).settings, "method": "okf"}
+    plant(tmp_path, "okf", p)
+    assert weights.checkpoint("okf", p, 0).card["fleet"] == "town10-clients"
+    for use in (lambda q: weights.checkpoint("okf", q, 0), lambda q: weights.training_bytes(q, ["okf"])):
+        use(p)
+        with pytest.raises(co.InputError, match=r"weights = .*okf-gnss-axis-0.*were trained otherwise"):
+            use({**p, "clients": "town04"})
+
+
+def test_only_what_the_cells_name_is_trained(tmp_path: Path) -> None:
+    p = study("error_cdf", weights=str(tmp_path), train_seeds=1).settings
+    weights.prepare([{**p, "method": name} for name in ("gnss", "okf")])
+    assert [path.name for path in tmp_path.iterdir()] == ["okf-gnss-axis-0.safetensors"]
+
+
+def test_there_are_as_many_individual_nets_as_clients(tmp_path: Path) -> None:
+    write_table(co.load("town10-clients").select([0, 2]), tmp_path / "two.csv")
+    for name in ("convergence", "error_cdf"):
+        cells = study(name, clients=str(tmp_path / "two.csv"), train_seeds=1).cells()
+        named = {c.given["method"] for c in cells}
+        assert {m for m in named if m.startswith("individual")} == {"individual1", "individual2"}
+    with pytest.raises(co.InputError, match="individual9"):
+        study("convergence", method="individual9").cells()
+
+
+def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_path: Path, town10: co.Fleet) -> None:
+    """The start moves the result; the last row is the net itself from that start."""
+    for start in ("gnss", "true"):
+        p = {**study("convergence", weights=str(tmp_path), start=start, runs=2, egos="1", train_seeds=1).settings,
+             "method": "fedkalmannet", "train_seed": 0}  # fmt: skip
+        net = plant(tmp_path, "fedkalmannet", p, rounds=2)
+        found = convergence.cell(p)
+        assert [row["round"] for row in found] == [0, 0, 1, 1, 2, 2]
+        seen = co.observe(town10, scene.sensors(p), co.V2X(max_neighbours=0), runs=2, observers=["town10-00"])
+        begin = town10.position[0, :1] if start == "true" else None
+        alone = LearnedGain(net.after(2), start=begin)(seen, ["town10-00"])
+        assert [row["rt_le_m"] for row in found[-2:]] == pytest.approx(rt_le(alone, town10)[:, 0])
+
+
+def test_a_known_start_is_scored(tmp_path: Path) -> None:
+    """The covariance of a known start is zero, which must not stop the cells that report one."""
+    wanted = study("open_choices", start="true", velocity_reading="axis", scenario=2, method="kalman,okf",
+                   knowledge="oracle,trained", runs=2, egos="town10-00+town10-24", train_seeds=1,
+                   weights=str(tmp_path / "weights"))  # fmt: skip
+    plant(tmp_path / "weights", "okf", {**wanted.settings, "start": "true", "velocity_reading": "axis"})
+    results = run(wanted, out=tmp_path, progress=False)
+    assert results.failed == 0
+    assert results.interval("nees", method="kalman", velocity_ratio=0.15).mean == pytest.approx(3, rel=0.5)
+    (table,) = published(tmp_path / "open_choices")["tables"]
+    assert "start at the true position; 2 runs, 2 egos of town10, 1 training seed." in table["caption"]
 
 
 def test_order_of_the_paper_under_identity_and_the_honest_order(town10: co.Fleet) -> None:
@@ -98,22 +278,51 @@ def test_train_command_makes_a_checkpoint_that_loads(tmp_path: Path) -> None:
 
 
 def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path: Path) -> None:
-    """MR.CLAM set 6: K <= 4, real range and bearing, labels on every table."""
-    from dataclasses import replace
-
-    from coopoc.plugins import find
-
-    study = find("coopoc.studies", "neighbours").override(
-        {"data": str(shared / "mrclam" / "MRCLAM_Dataset6"), "method": "gnss,kalman,joint", "knowledge": "nominal,none",
-         "max_neighbours": "0,4", "runs": 2, "egos": "2"}
+    """MR.CLAM set 6: K <= 4, real range and bearing, labels on every table, no bound; what was fitted elsewhere."""
+    results = run(
+        study("neighbours", data=str(shared / "mrclam" / "MRCLAM_Dataset6"), method="gnss,kalman,joint,bound",
+              max_neighbours="0,4", runs=2, egos="2", weights=str(tmp_path / "weights")),
+        out=tmp_path, progress=False,
     )  # fmt: skip
-    study = replace(study, findings=None, recipe=None, tables={"nominal": study.tables["nees"]},
-                    figures={"innovations": study.figures["innovations"]})  # fmt: skip
-    with pytest.raises(co.InputError, match="lkf-sa"):
-        run(study, out=tmp_path, progress=False)
-    results = run(replace(study, tables={}), out=tmp_path, progress=False)
     assert results.frame["max_neighbours"].max() == 4
+    assert "bound" not in set(results.frame["method"])
     assert (tmp_path / "neighbours" / "figures" / "innovations.png").stat().st_size > 10_000
-    kalman = results.interval("rt_le_m", method="kalman", max_neighbours=0)
-    joint = results.interval("rt_le_m", method="joint", max_neighbours=4)
+    kalman = results.interval("rt_le_m", method="kalman", knowledge="nominal", max_neighbours=0)
+    joint = results.interval("rt_le_m", method="joint", knowledge="nominal", max_neighbours=4)
     assert joint.mean < kalman.mean < 0.12
+    shown = published(tmp_path / "neighbours")
+    assert all("GNSS is simulated" in view["caption"] for view in shown["tables"])
+    assert "range 1 m, angles 4°, nobody nearer than 2 m; in this data it is range 0.09" in shown["findings"][-1]
+
+
+def test_real_measurements_are_one_case_without_an_oracle(shared: Path, tmp_path: Path) -> None:
+    data = str(shared / "mrclam" / "MRCLAM_Dataset6")
+    run(study("error_cdf", data=data, method="gnss,kalman", runs=2, egos="robot1", train_seeds=1), tmp_path,
+        progress=False)  # fmt: skip
+    shown = published(tmp_path / "error_cdf")
+    assert [view["name"] for view in shown["tables"]] == ["scenario1_15"]
+    assert [view["name"] for view in shown["figures"]] == ["cdf_scenario1_15"]
+    (said,) = shown["findings"]
+    assert said.startswith("Real data, trained with velocity noise per axis, start at the first fix. RT-LE: fitted KF")
+    assert "2 runs, 1 ego of MRCLAM_Dataset6, 1 training seed." in shown["tables"][0]["caption"]
+    p = {**study("error_cdf", data=data, egos="1").settings, "scenario": 1, "velocity_ratio": 0.15, "method": "kalman"}
+    with pytest.raises(co.InputError, match="oracle"):
+        error_cdf.cell({**p, "knowledge": "oracle"})
+
+
+def test_another_measurement_between_robots_is_another_cell(shared: Path, tmp_path: Path) -> None:
+    """The truth stays as it is and so does the fleet; what a robot measured does not."""
+    folder = shutil.copytree(shared / "mrclam" / "MRCLAM_Dataset6", tmp_path / "MRCLAM_Dataset6")
+    p = {**study("error_cdf", data=str(folder), egos="1").settings, "scenario": 1, "velocity_ratio": 0.15}
+    before, file = scene.facts(p), folder / "Robot1_Measurement.dat"
+    file.write_text(re.sub(r"([0-9.]+)(\s+\S+\s*)$", r"9\1\2", file.read_text(), count=1, flags=re.M))
+    for cached in (scene.fleet, scene._recorder, scene.measured, scene._digests):
+        cached.cache_clear()
+    after = scene.facts(p)
+    assert after["fleet"] == before["fleet"]
+    assert after["recording"] != before["recording"]
+
+
+def test_the_report_says_which_fleet_it_is_of() -> None:
+    assert "on our fleets" in paper.lead("town10")[0]
+    assert "our fleets" not in paper.lead("somewhere/MRCLAM_Dataset6")[0]
