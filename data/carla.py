@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+from zipfile import BadZipFile
 
 import numpy as np
 from tqdm import tqdm
@@ -21,7 +22,7 @@ from coopoc.world.fleet import Fleet
 
 from .conventions import INTERVALS, disagreement, frame, interval, row_order
 from .rows import assemble
-from .table import numeric
+from .table import numeric, read_csv
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,6 +32,8 @@ ORDERS = ("time", "vehicle")
 LAYOUT = ("id", "x", "y", "z", "yaw", "vx", "vy", "vz")
 """Columns 0..7 after the index column; accelerations and angular velocities follow and are not used."""
 NEEDED = ("x", "y", "z", "vx", "vy", "vz")
+AGREED = 0.3
+"""|dx/dt - v| / |v| below which an interval is believed: the candidates differ by factors of 1.5 and more."""
 
 
 def read_carla(
@@ -58,7 +61,7 @@ def read_carla(
             says which option to pass.
     """
     _check_options(order, handedness, dt)
-    table = _xlsx(path) if path.suffix == ".xlsx" else _csv(path)
+    table = _xlsx(path) if path.suffix == ".xlsx" else read_csv(path)
     names = _columns(table, dict(columns or {}), path.name)
     rows = {key: numeric(table, name, path.name) for key, name in names.items() if key != "id"}
     ids = [str(v) for v in table[names["id"]]] if "id" in names and vehicles is None else None
@@ -68,7 +71,15 @@ def read_carla(
                 f"{path.name}: column t", "given", "needs a column id", "Name it in columns=, drop vehicles=."
             )
         fleet = assemble(ids, rows["t"], _xyz(rows, "{}"), _xyz(rows, "v{}"), dt=dt, file=path.name)
-        notes = [f"stamps given, |dx/dt - v| is {disagreement(fleet.position, fleet.velocity, fleet.dt):.1%} of |v|"]
+        size = disagreement(fleet.position, fleet.velocity, fleet.dt)
+        if np.isfinite(size) and size >= AGREED:
+            raise InputError(
+                f"{path.name}: column t",
+                f"dt {fleet.dt:g} s leaves {size:.0%} of |v|",
+                "must be seconds that agree with positions and velocities",
+                "Name another column t, drop it, or check the units.",
+            )
+        notes = [f"stamps given, |dx/dt - v| is {size:.1%} of |v|"]
     else:
         fleet, notes = _without_stamps(rows, ids, vehicles, order, dt, path.name)
     side, why = (handedness, "as told") if handedness else frame(rows.get("yaw"), _xyz(rows, "v{}"), fleet)
@@ -89,14 +100,17 @@ def _without_stamps(
     """Fleet in the frame of the file, and what was found out."""
     count = vehicles or len(set(ids or ()))
     steps, rest = divmod(len(rows["x"]), max(count, 1))
-    if not count or rest or steps < 2:
+    if count < 1 or rest or steps < 2:
         raise InputError(
             f"{file}: vehicles",
             count,
             f"must divide the {len(rows['x'])} rows into two or more steps",
             "Pass vehicles= (their number), or columns= with id and t.",
         )
-    found = order or (row_order(ids) if ids is not None else None)
+    told = row_order(ids) if ids is not None else None
+    if order and told and count > 1 and order != told:
+        raise InputError("order", repr(order), f"must be {told!r} by the ids", "Leave it out, or pass vehicles=.")
+    found = order or told
     if ids is not None and found is None:
         raise InputError(
             f"{file}: column id",
@@ -111,7 +125,7 @@ def _without_stamps(
     if others and residuals[best][1] > 0.5 * residuals[others[0]][1]:
         raise InputError("order", "unknown", 'must be "time" or "vehicle": both fit the motion', "Pass order=.")
     step, size = residuals[best]
-    if dt is None and not size < 0.3:
+    if dt is None and not size < AGREED:
         raise InputError(
             "dt",
             f"{step:g} s fits best but leaves {size:.0%} of |v|",
@@ -168,12 +182,6 @@ def _check_options(order: str | None, handedness: str | None, dt: float | None) 
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
 
 
-def _csv(path: Path) -> pd.DataFrame:
-    import pandas as pd
-
-    return pd.read_csv(path, skipinitialspace=True)
-
-
 def _xlsx(path: Path) -> pd.DataFrame:
     import pandas as pd
 
@@ -181,8 +189,11 @@ def _xlsx(path: Path) -> pd.DataFrame:
         from openpyxl import load_workbook
     except ImportError:
         raise MissingLibraryError("openpyxl", "reading a spreadsheet", "'coopoc[excel]'") from None
-    book = load_workbook(path, read_only=True, data_only=True)
+    try:
+        book = load_workbook(path, read_only=True, data_only=True)
+    except BadZipFile as error:
+        raise InputError(path.name, error, "must be an .xlsx spreadsheet", "Export it again.") from None
     sheet = book.worksheets[0]
-    header, *rows = tqdm(sheet.iter_rows(values_only=True), total=sheet.max_row, desc=path.name, leave=False)
+    header, *rows = [*tqdm(sheet.iter_rows(values_only=True), total=sheet.max_row, desc=path.name, leave=False)] or [()]
     book.close()
     return pd.DataFrame(rows, columns=[f"column {k}" if h is None else str(h) for k, h in enumerate(header)])

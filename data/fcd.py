@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0
         vehicle_length: m, of every vehicle (5.0 is SUMO's default; the file does not tell).
 
     Raises:
-        InputError: no XML, an attribute missing, or what Fleet refuses.
+        InputError: no XML, an attribute missing or no finite number, or what Fleet refuses.
     """
     vehicle, t, numbers = _rows(path)
     position, velocity = centre(numbers, vehicle_length)
@@ -53,6 +54,17 @@ def centre(numbers: Floats, vehicle_length: float) -> tuple[Floats, Floats]:
     return numbers[:, :3] - 0.5 * vehicle_length * ahead, numbers[:, 5:6] * ahead
 
 
+def _finite(row: Sequence[str | int], place: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(map(float, row))
+    except ValueError:
+        numbers = (np.nan,)
+    if not np.isfinite(numbers).all():
+        allowed = "must be seven finite numbers: time, x, y, z, angle, slope, speed"
+        raise InputError(place, " ".join(map(str, row)), allowed, "Mend the numbers or remove the vehicle.")
+    return numbers
+
+
 def _rows(path: Path) -> tuple[list[str], Floats, Floats]:
     vehicle: list[str] = []
     rows: list[tuple[float, ...]] = []
@@ -65,7 +77,7 @@ def _rows(path: Path) -> tuple[list[str], Floats, Floats]:
                 a = element.attrib
                 vehicle.append(a["id"])
                 row = (now, a["x"], a["y"], a.get("z", 0), a["angle"], a.get("slope", 0), a["speed"])
-                rows.append(tuple(map(float, row)))
+                rows.append(_finite(row, f"{path.name}: vehicle {a['id']} at time {now} s"))
             elif event == "end" and element.tag == "timestep":
                 element.clear()
     except ElementTree.ParseError as error:

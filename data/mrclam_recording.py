@@ -25,9 +25,10 @@ def recording(
 ) -> Recording:
     """Recording of the real drive: runs differ only in the simulated GNSS, everything else was measured.
 
-    velocity = v (cos th, sin th, 0) with wheel speed v and Vicon's heading th in the middle of the step; relative =
-    (measured range, measured bearing + Vicon's heading, pi/2). Of several measurements of one robot in a step the one
-    nearest to the step's instant is kept; at most K <= 4 neighbours, nearest first by measured range.
+    velocity = v (cos th, sin th, 0) with wheel speed v and Vicon's heading th in the middle of the step (after a gap of
+    Vicon: at its end); relative = (measured range, measured bearing + Vicon's heading, pi/2). Of several measurements
+    of one robot in a step the one nearest to the step's instant is kept; at most K <= 4 neighbours, nearest first by
+    measured range.
 
     Args:
         log: of read_mrclam. v2x: K, radius and channel.
@@ -80,7 +81,8 @@ def _calibrated(log: MrclamLog, gnss_std: float) -> Sensors:
 
 
 def _velocity(log: MrclamLog) -> Floats:
-    middle = np.vstack([log.heading[:1], (log.heading[1:] + log.heading[:-1]) / 2])
+    before = np.where(np.isfinite(log.heading[:-1]), log.heading[:-1], log.heading[1:])
+    middle = np.vstack([log.heading[:1], (log.heading[1:] + before) / 2])
     velocity = log.speed[..., None] * np.stack([np.cos(middle), np.sin(middle), 0 * middle], axis=-1)
     return np.where(log.fleet.present[..., None], velocity, np.nan)
 

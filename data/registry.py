@@ -22,7 +22,7 @@ from .fcd import read_fcd
 from .mrclam import read_mrclam
 from .mrclam_recording import recording
 from .rows import assemble
-from .table import NEEDED, read_table, write_table
+from .table import NEEDED, VELOCITY, read_table, write_table
 from .tum import read_tum, tum_files, write_tum
 
 
@@ -112,6 +112,8 @@ def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable
 def detect(path: Path) -> str:
     """Format of a file or folder by its name and, for CSV and folders, by its contents.
 
+    A CSV file is CARLA's if it has yaw and velocities, whose frame must be found out, or many columns of other names.
+
     >>> detect(Path("drive.parquet"))
     'table'
     """
@@ -122,9 +124,10 @@ def detect(path: Path) -> str:
             return "tum"
     known = {".parquet": "table", ".xml": "fcd", ".xlsx": "carla", ".tum": "tum", ".txt": "tum"}
     if path.suffix == ".csv":
-        with path.open(errors="replace") as file:
-            header = [word.strip().strip('"') for word in file.readline().split(",")]
-        return "carla" if len(header) >= 14 and not set(NEEDED) <= set(header) else "table"
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            header = [word.strip().strip('"').lower() for word in file.readline().split(",")]
+        framed = {"yaw", *VELOCITY} <= set(header) or (len(header) >= 14 and not set(NEEDED) <= set(header))
+        return "carla" if framed else "table"
     if path.suffix not in known:
         raise InputError(
             "data",
@@ -178,7 +181,9 @@ def convert(
     return fleet
 
 
-def _resampled(fleet: Fleet, dt: float | None = None) -> Fleet:
+def _resampled(fleet: Fleet, dt: float | None = None, **unknown: Any) -> Fleet:
+    if unknown:
+        raise InputError("options", sorted(unknown), f"{fleet.name} is bundled and takes dt only", "Leave them out.")
     if dt is None:
         return fleet
     step, column = np.nonzero(fleet.present)

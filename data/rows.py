@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
@@ -32,8 +32,8 @@ def assemble(
         file: named in errors. name, source, licence: of the Fleet.
 
     Raises:
-        InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, or
-            what Fleet refuses.
+        InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, a
+            vehicle that would vanish or never be there at two instants in a row, or what Fleet refuses.
 
     >>> assemble(["a", "a"], np.array([0, 0.1]), np.array([[0.0, 0, 0], [1, 0, 0]])).velocity[0, 0, 0]
     np.float64(10.0)
@@ -52,6 +52,7 @@ def assemble(
         increasing(stamps[rows], lambda row, rows=rows: f"{file}: row {rows[row] + 1}", one)  # type: ignore[misc]
     grid, table = _on_stamps(stamps, column, numbers, file) if dt is None else _resampled(stamps, column, numbers, dt)
     ids = tuple(str(n) for n in names[order])
+    _refuse_holes(np.isfinite(table[..., 0]), np.bincount(column), ids, file)
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
     return Fleet(ids, grid, table[..., :3], u, name=name, source=source, licence=licence)
 
@@ -136,11 +137,22 @@ def _regular(instants: Floats, file: str) -> tuple[Floats, Ints]:
     return grid, place
 
 
+def _refuse_holes(present: Bools, rows: Ints, ids: Sequence[str], file: str) -> None:
+    """InputError if a vehicle has rows but no instant, or more than one row and never two instants in a row."""
+    runs = (present[1:] & present[:-1]).any(axis=0)
+    for column in np.flatnonzero(~present.any(axis=0) | ((rows > 1) & ~runs)).tolist():
+        raise InputError(
+            f"{file}: vehicle {ids[column]}",
+            f"{rows[column]} rows, but {present[:, column].sum()} instants, no two in a row",
+            "must be there at instants in a row",
+            "Resample all vehicles with a dt like that of its rows, or leave the vehicle out.",
+        )
+
+
 def _resampled(stamps: Floats, column: Ints, numbers: Floats, dt: float) -> tuple[Floats, Floats]:
     grid = stamps.min() + dt * np.arange(int(np.floor((np.ptp(stamps) + 1e-9) / dt)) + 1)
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
     for k in range(table.shape[1]):
         rows = np.flatnonzero(column == k)
-        if len(rows) > 1:
-            table[:, k] = interpolate(stamps[rows], numbers[rows], grid, max(5 * dt, 0.5))
+        table[:, k] = interpolate(stamps[rows], numbers[rows], grid, max(5 * dt, 0.5))
     return grid, table

@@ -34,8 +34,8 @@ def read_table(path: Path, *, dt: float | None = None, columns: Mapping[str, str
     """
     import pandas as pd
 
-    frame = pd.read_parquet(path) if path.suffix == ".parquet" else _csv(path)
     names = dict(columns or {})
+    frame = pd.read_parquet(path) if path.suffix == ".parquet" else read_csv(path, names.get("id", "id"))
     given = [c for c in VELOCITY if names.get(c, c) in frame.columns]
     wanted = [*NEEDED, *(VELOCITY if given else ())]
     for column in wanted:
@@ -91,17 +91,29 @@ def numeric(frame: pd.DataFrame, column: str, file: str) -> Floats:
     return values
 
 
-def _csv(path: Path) -> pd.DataFrame:
+def read_csv(path: Path, text: str = "") -> pd.DataFrame:
+    """Table of a CSV file whose column `text`, if it has one, is kept as it is written: "007" stays "007".
+
+    Raises:
+        InputError: no commas, no header, or rows that are longer than the header (pandas would shift the columns).
+    """
     import pandas as pd
 
+    allowed, mend = "must be comma separated text with a header", "Export it again, with commas and decimal points."
     try:
-        return pd.read_csv(path, skipinitialspace=True)
+        frame = pd.read_csv(path, skipinitialspace=True, converters={text: str.strip})
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise InputError(path.name, error, "must be comma separated text with a header", "Export it again.") from None
+        raise InputError(path.name, error, allowed, mend) from None
+    if len(frame.columns) == 1:
+        raise InputError(path.name, repr(frame.columns[0]), allowed, mend)
+    if len(frame) and not isinstance(frame.index, pd.RangeIndex):
+        longer = f"{frame.index.nlevels + len(frame.columns)} cells under {len(frame.columns)} names"
+        raise InputError(path.name, longer, "must have one name per column", "Name every column in the header.")
+    return frame
 
 
 def _ids(frame: pd.DataFrame, column: str, file: str) -> list[str]:
-    bad = np.flatnonzero(frame[column].isna().to_numpy())
+    bad = np.flatnonzero((frame[column].isna() | (frame[column] == "")).to_numpy())
     if len(bad):
         raise InputError(f"{file}: row {bad[0] + 1}, column {column}", "empty", "must be a name", "Fill it in.")
     return [str(v) for v in frame[column]]

@@ -33,7 +33,8 @@ def read_tum(path: Path, *, dt: float | None = None) -> Fleet:
         dt: s, resample: needed when the vehicles' stamps differ.
 
     Raises:
-        InputError: no file, a line that is not eight finite numbers (with its number), stamps that do not increase.
+        InputError: no file, an empty one, a line that is not eight finite numbers (with its number), stamps that do not
+            increase.
     """
     files = tum_files(path)
     if not files:
@@ -63,7 +64,8 @@ def write_tum(fleet: Fleet, folder: Path) -> None:
 
 
 def _read(file: Path) -> Floats:
-    lines = [(k, text.split()) for k, text in enumerate(file.read_text().splitlines(), 1) if not _comment(text)]
+    texts = file.read_text("utf-8-sig").splitlines()
+    lines = [(k, text.split()) for k, text in enumerate(texts, 1) if not _comment(text)]
     rows = []
     for number, words in lines:
         try:
@@ -78,7 +80,9 @@ def _read(file: Path) -> Floats:
                 "Mend or remove the line.",
             )
         rows.append(row)
-    table = np.array(rows).reshape(-1, 8)
+    if not rows:
+        raise InputError(file.name, "0 lines", "must hold at least two poses", "Check that the file is complete.")
+    table = np.array(rows)
     increasing(table[:, 0], lambda row: f"{file.name}: line {lines[row][0]}", file.stem)
     return table
 

@@ -80,16 +80,22 @@ def load(path: Path | str) -> Checkpoint:
     """Read a checkpoint and check every tensor's shape against what its card promises.
 
     Raises:
-        InputError: no such file, no card, or tensors of another shape than the model of the card has.
+        InputError: no such file, no card or one of another kind, or tensors of another shape than its model has.
     """
     tensors, card = _read(Path(path))
     history = tensors.pop(_HISTORY, None)
-    if card["kind"] == "okf":
+    kind = card.get("kind")
+    if kind not in ("gain_net", "okf"):
+        raise InputError(f"checkpoint {path}: kind", repr(kind), 'must be "gain_net" or "okf"', "Write it with save.")
+    if kind == "okf":
         _match(path, dict.fromkeys(_NOISE, (3,)), tensors)
         process, ratio, gnss = (tuple(tensors[name].tolist()) for name in _NOISE)
         return Checkpoint(OptimisedKF(process, ratio, gnss), card, history)
     model = GainNet(card["in_mult"], card["out_mult"])
     load_into(model, tensors, path)
+    if history is not None:
+        count = sum(p.numel() for p in model.parameters())
+        _match(path, {_HISTORY: (len(history), count)}, {_HISTORY: history})
     return Checkpoint(model, card, history)
 
 

@@ -158,7 +158,7 @@ def clients(
     if noise == "fresh" and sensors.gnss_bias[1] > 0:
         raise InputError("gnss_bias", sensors.gnss_bias, "must be (0, 0) with fresh noise", "Train without a bias.")
     seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
-    found, longest = [], min(LONG * piece, int(fleet.present.sum(0).min()) - 1)
+    found, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
         there = np.flatnonzero(fleet.present[:, column])
         if len(there) and there[-1] - there[0] >= len(there):

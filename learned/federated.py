@@ -28,6 +28,7 @@ from .train import Judge, descend, pooled
 class Round:
     """A communication round: global weights (P,), losses of each client (C,) m^2, bytes over all clients.
 
+    `validation_loss` is the score of `Judge`: the validation loss, or that of the long pieces if it is larger.
     A client's `training_loss` is NaN and `rejected` names a reason if its local training broke; it then did not count.
     """
 

@@ -15,11 +15,13 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.track import Track
+from coopoc.world.noise import stream
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .clients import Batch, Pieces
 from .machine import one_core
+from .schedule import generator
 
 Three = tuple[float, float, float]
 
@@ -99,7 +101,7 @@ def fit_okf_many(
 ) -> list[OkfFit]:
     """`fit_okf` for many settings, stacked; `progress` names the stage of a progress bar on stderr."""
     began = time.perf_counter()
-    data, judge = (_stacked([task[i] for task in tasks]) for i in (0, 1))
+    data, judge = (_stacked([task[i] for task in tasks], kind) for i, kind in enumerate(("training", "validation")))
     logs = torch.log(torch.tensor([0.1, 0.1 if velocity_part else 1e-30, 1.0], dtype=torch.float64))
     logs = logs[None, :, None].repeat(len(tasks), 1, 3).requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
@@ -127,13 +129,16 @@ def fit_okf_many(
     ]
 
 
-def _stacked(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:
-    """All pieces of S settings in float64; (2, S, B): weight in the mean, 0 for padding, and uncertain start."""
+def _stacked(parts: Sequence[Pieces], kind: str) -> tuple[Batch, Tensor]:
+    """All pieces of S settings in float64; (2, S, B): weight in the mean, 0 for padding, and uncertain start.
+
+    Fresh noise is drawn once, the same for every setting and another for training than for validation.
+    """
     pool, most = Pieces.join(parts), max(map(len, parts))
     ends = np.cumsum([len(p) for p in parts])
     rows = [np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)]
     index = torch.from_numpy(np.stack(rows))
-    batch = pool.batch(index, [torch.Generator().manual_seed(i) for i in range(len(parts))])
+    batch = pool.batch(index, [generator(stream(0, kind, 0, "")) for _ in parts])
     weight = torch.tensor([[float(i < len(p)) / len(p) for i in range(most)] for p in parts], dtype=torch.float64)
     gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
     uncertain = 1.0 - pool.true_start[index].double()

@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from coopoc.arrays import Floats, Ints
+from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
 from .clients import Batch, Pieces, mirrored
@@ -37,8 +38,8 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Progress:
-    """A row of a history: optimiser steps so far, weights (P,), mean training loss since the last row and validation
-    loss, m^2."""
+    """A row of a history: optimiser steps so far, weights (P,), mean training loss since the last row, and the score of
+    `Judge` (the validation loss, or that of the long pieces if it is larger), m^2."""
 
     step: int
     weights: Tensor
@@ -91,31 +92,38 @@ def fit(
 
 @one_core()
 def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: str | None = None) -> list[Fit]:
-    """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding."""
+    """`fit` for many nets in one rollout; each gets the weights that it would get alone, up to rounding.
+
+    Raises:
+        InputError: some of the tasks have long pieces and some have none.
+    """
     schedule, began = schedule or Schedule(), time.perf_counter()
     like, theta = tasks[0].model, flatten([t.model for t in tasks])
     pool, members = pooled([t.training for t in tasks])
     streams = [stream(t.seed, "batches", 0, t.name) for t in tasks]
     plans = [rows[schedule.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
     long = [t.long for t in tasks if t.long is not None]
-    judge = Judge([[t.validation for t in tasks], *([long] if len(long) == len(tasks) else [])], like)
+    if long and len(long) < len(tasks):
+        given = f"with {len(long)} of {len(tasks)} tasks"
+        raise InputError("long", given, "must be given with all tasks or with none", "Train them apart.")
+    judge = Judge([[t.validation for t in tasks], *([long] if long else [])], like)
     best, lowest = theta.clone(), judge(theta)
     history = [[Progress(0, w.clone(), math.nan, float(low))] for w, low in zip(theta, lowest, strict=True)]
     stopped: dict[int, str] = {}
     seen: list[Tensor] = []
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
-    due = set(np.linspace(0, max(map(len, plans)), schedule.checks + 1).round().astype(int).tolist())
+    due = [set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist()) for plan in plans]
     draws = [generator(draw) for draw in streams]
     for step, losses in bar(descend(theta, like, pool, plans, rates, schedule, draws, stopped), plans, progress):
         seen.append(losses)
-        if step in due:
-            found, mean = judge(theta), torch.stack(seen).nanmean(0)
-            better = found < lowest
-            best[better], lowest[better] = theta[better], found[better]
-            for row in range(len(tasks)):
-                if row not in stopped:
-                    history[row].append(Progress(step, theta[row].clone(), float(mean[row]), float(found[row])))
-            seen.clear()
+        checked = [row for row in range(len(tasks)) if step in due[row] and row not in stopped]
+        if checked:
+            found = judge(theta)
+            for row in checked:
+                mean = torch.stack([one[row] for one in seen[history[row][-1].step :]]).mean()
+                history[row].append(Progress(step, theta[row].clone(), float(mean), float(found[row])))
+                if found[row] < lowest[row]:
+                    best[row], lowest[row] = theta[row], found[row]
     for row in torch.nonzero(lowest.isinf()).flatten().tolist():
         stopped.setdefault(row, "no weights had a finite validation loss; start from GainNet(start_gain=0.1)")
     seconds = (time.perf_counter() - began) / len(tasks)
@@ -173,7 +181,7 @@ class Judge:
     def __call__(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
             means = [(loss(layers(theta, self.like), batch) * share).sum(1) for batch, share in self.batches]
-        return torch.stack(means).nan_to_num(math.inf).amax(0)
+        return torch.stack(means).nan_to_num(math.inf, math.inf).amax(0)
 
 
 def _padded(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:

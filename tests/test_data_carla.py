@@ -111,7 +111,23 @@ BAD: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], dict[str, Any], str
     "order": (lambda f: f, {"order": "rows"}, "order = 'rows'", "detected"),
     "option": (lambda f: f, {"handedness": "up"}, "handedness = 'up'", "detected"),
     "interval": (lambda f: f, {"dt": -0.1}, "dt = -0.1 s", "in seconds"),
+    "contradiction": (lambda f: f, {"order": "vehicle", "dt": 0.1}, "'vehicle': must be 'time'", "Leave it out"),
+    "negative": (lambda f: f, {"vehicles": -3}, "vehicles = -3", "Pass vehicles="),
+    "frames as t": (lambda f: f.assign(t=f.index // 20), {}, "column t = dt 1 s leaves 90% of |v|", "check the units"),
 }
+
+
+@pytest.mark.parametrize("name", ["carla.csv", "carla.xlsx"])
+def test_a_file_without_a_table_is_named(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("")
+    with pytest.raises(InputError, match=name):
+        read_carla(tmp_path / name)
+
+
+def test_a_spreadsheet_without_a_row_is_named(tmp_path: Path) -> None:
+    pd.DataFrame().to_excel(tmp_path / "empty.xlsx", index=False, header=False)
+    with pytest.raises(InputError, match=r"empty\.xlsx: column x = missing"):
+        read_carla(tmp_path / "empty.xlsx")
 
 
 @pytest.mark.parametrize("case", BAD)

@@ -120,6 +120,8 @@ def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Pat
         load(tmp_path, format="bag")
     with pytest.raises(InputError, match=r"must end in \.csv"):
         detect(tmp_path / "drive.bag")
+    with pytest.raises(InputError, match=r"options = \['columns'\]: town10 is bundled"):
+        load("town10", columns={})
     convert("town10-clients", tmp_path / "a.csv")
     with pytest.raises(InputError, match="vehicle_lenght"):
         load(tmp_path / "a.csv", vehicle_lenght=4)

@@ -68,6 +68,13 @@ def test_odometry_with_vicons_heading_dead_reckons(log: MrclamLog) -> None:
 
 
 @present
+def test_velocity_is_known_wherever_a_robot_is(log: MrclamLog) -> None:
+    """Also at the first step after a gap, whose beginning Vicon did not see."""
+    known = np.isfinite(recording(log, V2X(max_neighbours=0)).velocity[0]).all(axis=-1)
+    np.testing.assert_array_equal(known, log.fleet.present)
+
+
+@present
 def test_runs_differ_only_in_the_simulated_gnss(log: MrclamLog) -> None:
     rec, more = (recording(log, V2X(max_neighbours=4), runs=runs, seed=3) for runs in (2, 3))
     np.testing.assert_array_equal(rec.gnss, more.gnss[:2])

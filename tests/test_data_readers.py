@@ -10,8 +10,10 @@ import pytest
 
 from coopoc.data.registry import convert, detect, load
 from coopoc.data.rows import assemble
+from coopoc.data.table import write_table
 from coopoc.data.tum import read_tum
 from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
 
@@ -50,6 +52,7 @@ def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path: Pa
     assert "backward difference" in fleet.source
 
 
+OFFSETS = (("a", 0.0), ("b", 0.05))
 BAD = {
     "missing column": (GOOD.replace(",y,", ",north,", 1), "column y = missing", 'columns={"y"'),
     "missing velocity": ("id,t,x,y,z,vx\na,0,0,0,0,1\n", "column vy = missing", "go together"),
@@ -62,6 +65,13 @@ BAD = {
     "once": (GOOD + "c,0.2,0,0,0\n", "none for c at t = 0.2 s", "vx, vy, vz"),
     "empty": ("id,t,x,y,z\n", "0 rows", "complete"),
     "no header": ("", "header", "Export"),
+    "semicolons": (GOOD.replace(",", ";"), "comma separated", "commas and decimal points"),
+    "more cells than names": (GOOD.replace("0\n", "0,9\n"), "6 cells under 5 names", "header"),
+    "interleaved": (
+        "id,t,x,y,z,vx,vy,vz\n" + "".join(f"{v},{k / 10 + s},{k},0,0,9,0,0\n" for k in range(4) for v, s in OFFSETS),
+        "vehicle a = 4 rows, but 4 instants",
+        "Resample",
+    ),
 }
 
 
@@ -83,6 +93,22 @@ def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path: Path) ->
     fleet = load(tmp_path / "b.csv", dt=0.05)
     np.testing.assert_allclose(fleet.position[:, 0, 0], [0, 0.5, 1, 1.5, 2], atol=1e-12)
     assert fleet.dt == 0.05
+
+
+@pytest.mark.parametrize(("stamp", "thing"), [("0.2", "none for c at t = 0.2 s"), ("0.17", "c = 1 rows, but 0")])
+def test_resampling_loses_no_vehicle(tmp_path: Path, stamp: str, thing: str) -> None:
+    (tmp_path / "a.csv").write_text(GOOD + f"c,{stamp},9,9,9\n")
+    with pytest.raises(InputError, match=thing):
+        load(tmp_path / "a.csv", dt=0.1)
+
+
+@pytest.mark.parametrize("out", ["fleet.csv", "fleet.parquet"])
+def test_ids_that_look_like_numbers_stay_as_they_are(tmp_path: Path, out: str) -> None:
+    x = np.arange(12.0).reshape(2, 2, 3)
+    fleet = Fleet(("007", "1e3"), [0, 0.1], x, x)
+    write_table(fleet, tmp_path / out)
+    assert load(tmp_path / out).ids == ("007", "1e3")
+    assert load(tmp_path / out).digest == fleet.digest
 
 
 def test_resampling_leaves_long_gaps_absent() -> None:
@@ -115,6 +141,14 @@ def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str) -> None:
         read_tum(tmp_path / "car.tum")
 
 
+def test_an_empty_tum_file_is_named_and_a_byte_order_mark_skipped(tmp_path: Path) -> None:
+    (tmp_path / "car.tum").write_text(TUM, encoding="utf-8-sig")
+    assert load(tmp_path).ids == ("car",)
+    (tmp_path / "lost.tum").write_text("# t x y z qx qy qz qw\n")
+    with pytest.raises(InputError, match=r"lost\.tum = 0 lines"):
+        load(tmp_path)
+
+
 def test_an_empty_folder_is_no_tum_folder(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"\.tum"):
         read_tum(tmp_path)
@@ -140,7 +174,14 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
 
 
 @pytest.mark.parametrize(
-    ("text", "thing"), [(FCD.replace('angle="0"', ""), "angle"), (FCD[:-9], "XML"), ("<a/>", "0 rows")]
+    ("text", "thing"),
+    [
+        (FCD.replace('angle="0"', ""), "angle"),
+        (FCD[:-9], "XML"),
+        ("<a/>", "0 rows"),
+        (FCD.replace('"10.7"', '"ten"'), "vehicle e at time 0.10 s = 0.10 ten"),
+        (FCD.replace('"0.10"', '"nan"'), "vehicle e at time nan s"),
+    ],
 )
 def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
     (tmp_path / "a.xml").write_text(text)
@@ -154,6 +195,19 @@ def test_formats_are_told_apart(tmp_path: Path) -> None:
     assert [detect(tmp_path / n) for n in ("table.csv", "carla.csv", "a.parquet", "a.xml", "a.xlsx", "a.txt")] == [
         "table", "carla", "table", "fcd", "carla", "tum",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("header", "format"),
+    [
+        ("id,t,x,y,z,yaw,vx,vy,vz", "carla"), ("ID,x,y,z,Yaw,Vx,Vy,Vz", "carla"), ("id,t,x,y,z,yaw", "table"),
+        ("id,t,x,y,z," + ",".join("abcdefghi"), "table"),
+    ],
+)  # fmt: skip
+def test_a_table_with_yaw_and_velocity_has_a_frame_to_find(tmp_path: Path, header: str, format: str) -> None:
+    for encoding in ("utf-8", "utf-8-sig"):
+        (tmp_path / "a.csv").write_text(header + "\n", encoding=encoding)
+        assert detect(tmp_path / "a.csv") == format
 
 
 def test_an_unknown_vehicle_is_named_with_the_known_ones() -> None:

@@ -69,6 +69,16 @@ def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
         load(path)
 
 
+def test_a_history_of_another_net_and_another_kind_are_refused(tmp_path: Path) -> None:
+    longer = torch.zeros(2, 19_939)
+    path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(), {}, longer))
+    with pytest.raises(InputError, match=r"history of shape \(2, 19939\): expected \(2, 19938\)"):
+        load(path)
+    save_file({"x": torch.zeros(1)}, path, metadata={"card": "{}"})
+    with pytest.raises(InputError, match="kind = None"):
+        load(path)
+
+
 def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.safetensors").write_text("not weights")
     save_file({"x": torch.zeros(1)}, tmp_path / "bare.safetensors")

@@ -93,6 +93,11 @@ def test_clients_refuse_what_cannot_be(field: str, options: dict[str, object]) -
         clients(drives((130,)), **options)  # type: ignore[arg-type]
 
 
+def test_a_vehicle_that_is_never_there_is_named() -> None:
+    with pytest.raises(InputError, match="c1 with 0 pieces"):
+        clients(drives((130, 0)), piece=10)
+
+
 def test_one_federated_client_is_local_training() -> None:
     """Law: federating one client for one round is `fit` on its pieces, bit for bit, and so is a uniform average."""
     (client,) = clients(drives((300,)), piece=10)
@@ -140,6 +145,26 @@ def test_stacking_changes_no_net() -> None:
         torch.testing.assert_close(flatten([alone.model]), flatten([fitted.model]), rtol=1e-5, atol=1e-6)
 
 
+def test_stacking_changes_no_check_either() -> None:
+    """A net with few pieces passes through them in fewer steps than its neighbour there; its checks are its own."""
+    short, long = clients(drives(), piece=10)
+    schedule = replace(QUICK, epoch="pass")
+    tasks = [Task(GainNet(), c.training, c.validation, 3) for c in (short, long)]
+    alone = [fit_many([task], schedule)[0] for task in tasks]
+    for one, stacked in zip(alone, fit_many(tasks, schedule), strict=True):
+        assert [row.step for row in stacked.history] == [row.step for row in one.history]
+        for field in ("training_loss", "validation_loss"):
+            ours, theirs = ([getattr(row, field) for row in found.history] for found in (stacked, one))
+            np.testing.assert_allclose(ours, theirs, rtol=1e-5)
+
+
+def test_long_pieces_for_some_tasks_only_are_refused() -> None:
+    (client,) = clients(drives((300,)), piece=10)
+    tasks = [Task(GainNet(), client.training, client.validation, long=long) for long in (client.long, None)]
+    with pytest.raises(InputError, match="long = with 1 of 2 tasks"):
+        fit_many(tasks, QUICK)
+
+
 def test_training_lowers_the_loss_and_keeps_the_best_weights() -> None:
     group = clients(drives((600, 600)), piece=20)
     training, validation = (Pieces.join([getattr(c, part) for c in group]) for part in ("training", "validation"))
@@ -173,6 +198,13 @@ def test_a_net_without_finite_weights_says_so() -> None:
     theirs = fit(GainNet(start_gain=20.0), client.training, client.validation, replace(QUICK, epochs=2))
     assert theirs.stopped is not None
     assert "finite" in theirs.stopped
+
+
+def test_a_loss_that_overflows_is_infinite() -> None:
+    """A loop with gain 3 grows by 2 a step: over 100 steps its squared error is beyond float32."""
+    (client,) = clients(drives((300,)), piece=100)
+    net = GainNet(start_gain=3.0)
+    assert train.Judge([[client.validation]], net)(flatten([net])).tolist() == [np.inf]
 
 
 def test_a_client_that_breaks_is_left_out_of_the_round() -> None:
