@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -58,6 +59,7 @@ def run(
         dry_run: count the cells and stop.
     """
     from .study.parse import assignments
+    from .study.publish import tables
     from .study.run import plan
     from .study.run import run as run_study
 
@@ -69,8 +71,8 @@ def run(
         return 0
     results = run_study(name, out, jobs, changes)
     folder = out / results.study
-    for path in sorted((folder / "tables").glob("*.md")):
-        print(path.read_text(), end="\n\n")
+    for text in tables(folder):
+        print(text, end="\n\n")
     for _, row in results.failures.head(5).iterrows():
         print(f"coopoc: failed: {row['reason']}", file=sys.stderr)
     failed = f"; cells failed: {results.failed}, repeat the command to try them again" if results.failed else ""
@@ -152,13 +154,18 @@ def _status(argv: list[str]) -> int:
         if argv[:1] in (["--version"], ["-V"]):
             print(version("coopoc"))
             return 0
-        return _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
+        status = _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
+        sys.stdout.flush()
+        return status
     except (InputError, MissingLibraryError) as error:
         print(f"coopoc: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("coopoc: interrupted. Finished cells are kept: repeat the command to resume.", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # whoever reads stdout has seen enough, as in: coopoc table FOLDER | head
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except OSError as error:
         print(f"coopoc: {error}", file=sys.stderr)
         return 1

@@ -47,7 +47,7 @@ def find(group: str, name: str) -> Any:
     >>> find("nothing", "x")
     Traceback (most recent call last):
     ...
-    coopoc.errors.InputError: nothing = 'x': must be one of (none is installed). List all with: coopoc list.
+    coopoc.errors.InputError: nothing = 'x': must be one of (there is none). There is none to use.
     """
     registered = points(group)
     loaded = registered[name].load() if name in registered else None
@@ -78,5 +78,7 @@ def unknown(noun: str, name: str, known: Iterable[str]) -> InputError:
     """
     known = list(known)
     near = difflib.get_close_matches(name, known, n=1)
-    mend = f"Did you mean {near[0]}?" if near else "List all with: coopoc list."
-    return InputError(noun, repr(name), "must be one of " + (", ".join(known) or "(none is installed)"), mend)
+    listed = noun in GROUPS.values()
+    other = "List all with: coopoc list." if listed else "Use one of these names." if known else "There is none to use."
+    mend = f"Did you mean {near[0]}?" if near else other
+    return InputError(noun, repr(name), "must be one of " + (", ".join(known) or "(there is none)"), mend)

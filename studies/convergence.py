@@ -169,7 +169,7 @@ STUDY = Study(
     where=meaningful,
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 1, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "start": "gnss", "egos": "3", "runs": 30, "seed": 0,
+        "velocity_reading": "axis", "start": "gnss", "egos": "auto", "runs": 30, "seed": 0,
         "train_seeds": 5,
     },
     tables={"rounds": _table},

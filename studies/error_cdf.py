@@ -122,7 +122,7 @@ STUDY = Study(
     ],
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "velocity_reading": "axis",
-        "start": "gnss", "egos": "5", "runs": 100, "seed": 0, "train_seeds": 5,
+        "start": "gnss", "egos": "auto", "runs": 100, "seed": 0, "train_seeds": 5,
     },
     where=meaningful,
     shares=("scenario", "velocity_ratio"),

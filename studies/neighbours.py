@@ -186,7 +186,7 @@ STUDY = Study(
     where=_meaningful,
     settings={
         "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "egos": "5", "runs": 30, "seed": 0,
+        "velocity_reading": "axis", "radius_m": 30.0, "egos": "auto", "runs": 30, "seed": 0,
         "train_seeds": 5, "backend": "gauss-newton",
     },
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),

@@ -53,11 +53,15 @@ def measured(data: str) -> Recording | None:
 def egos(data: str, wanted: str) -> tuple[str, ...]:
     """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+".
 
+    "auto" is five of them, or all where there are fewer.
+
     >>> egos("town10", "3")
     ('town10-00', 'town10-20', 'town10-40')
     """
     drive = fleet(data)
     throughout = [i for column, i in enumerate(drive.ids) if drive.present[:, column].all()]
+    if wanted == "auto":
+        wanted = str(min(5, len(throughout)))
     if not wanted.isdigit():
         return tuple(drive.ids[drive.index(i)] for i in wanted.split("+"))
     count = int(wanted)

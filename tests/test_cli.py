@@ -60,6 +60,14 @@ def test_tables_on_stdout(folder: Path) -> None:
     assert done.stderr == ""
 
 
+@pytest.mark.parametrize("format", ["markdown", "latex"])
+def test_a_reader_that_leaves_early_is_no_error(folder: Path, format: str) -> None:
+    words = " ".join([*COMMAND, "table", "runs/small", "--format", format])
+    done = subprocess.run(["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"], cwd=folder, env=ENV,
+                          capture_output=True, text=True, timeout=60)  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_a_dry_run_counts(folder: Path) -> None:
     plan = json.loads(coopoc("run", "small", "--set", "runs=3", "--dry-run", cwd=folder).stdout)
     assert (plan["cells"], plan["finished"], plan["to_compute"]) == (9, 6, 3)
@@ -74,7 +82,8 @@ def test_a_report(folder: Path) -> None:
 def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     done = coopoc("list", cwd=tmp_path)
     assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
-    assert [line.split(":")[0] for line in done.stdout.splitlines()] == ["datasets", "methods", "studies", "backends", "recipes"]
+    groups = [line.split(":")[0] for line in done.stdout.splitlines()]
+    assert groups == ["datasets", "methods", "studies", "backends", "recipes"]
 
 
 def test_commands_of_others(tmp_path: Path) -> None:

@@ -234,6 +234,15 @@ def test_a_batch_with_hard_realisations_solves_them_all() -> None:
         assert batch.cost[k] == pytest.approx(solve(single).cost, rel=1e-9)
 
 
+def test_a_batch_does_not_claim_what_is_free() -> None:
+    """Rounding makes a singular J^T J invertible: variances of 1e15 m^2 are no answer."""
+    problem = Problem(("a", "b", "c"), x0=[[0, 0, 0], [9, 0, 0], [12, 5, 1]])
+    problem = problem.add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    batch = solve_batch(problem.add("range", [("b", "c")], [[[10.0]], [[5.0]]], std=0.3))
+    assert not batch.converged.any()
+    assert np.isnan(batch.covariance).all()
+
+
 @pytest.mark.parametrize("backend", backends())
 @pytest.mark.parametrize("seed", range(5))
 def test_a_bad_start_is_survived(seed: int, backend: str) -> None:

@@ -38,7 +38,7 @@ def test_torch_runs_the_same_formula(kind: str) -> None:
 
 def test_dual_arithmetic_equals_casadis() -> None:
     def formula(x, y, z, m):
-        return 2.0 / x - (3.0 - y) / (x * x + 1.0) + m.sqrt(y * y + z * z) * m.atan2(z, -x) / 4.0 - 1.0
+        return 2.0 / x - (3.0 - y) / (x * x + 1.0) + m.sqrt(y**2 + z * z) * m.atan2(z, -x) / 4.0 - 1.0
 
     v = ca.SX.sym("v", 3)
     expression = formula(v[0], v[1], v[2], ca)
@@ -77,3 +77,14 @@ def test_a_decorated_function_is_all_it_takes() -> None:
             measurement("squared range", arity=2, components=("coordinate",))(squared)
     finally:
         del MEASUREMENTS["squared range"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [({"arity": 3}, "arity = 3"), ({"components": ("length",)}, "'coordinate', 'distance', 'angle'"),
+     ({"components": ()}, "one per number"), ({"linear": True}, "the vector itself")],
+)  # fmt: skip
+def test_a_measurement_that_cannot_be(options: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        measurement("odd", **{"arity": 2, "components": ("distance",), **options})
+    assert "odd" not in MEASUREMENTS

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coopoc import V2X, Fleet, InputError, Knowledge, Sensors, observe
-from coopoc.optimize import MEASUREMENTS, Factor, Problem, SolveError, Status, solve
+from coopoc.optimize import MEASUREMENTS, Factor, Problem, SolveError, Status, solve, solve_batch
 from coopoc.optimize.initial import converted, initial_guess
 from coopoc.optimize.sights import relative_std
 from coopoc.world.recording import Recording
@@ -142,6 +142,21 @@ BAD = {
     "twice a name": (lambda: Problem(("a", "a")), "must be unique"),
     "x0": (lambda: Problem(("a", "b"), x0=np.zeros((3, 3))), "shape"),
     "no factors": (lambda: solve(Problem(("a",))), "no measurements"),
+    "no factors in a batch": (lambda: solve_batch(Problem(("a",))), "no measurements"),
+    "count of z": (lambda: PAIR.add("range", [("a", "b"), ("b", "a")], [1, 2, 3], std=1.0), "must have shape"),
+    "words for z": (lambda: PAIR.add("range", ("a", "b"), "far", std=1.0), "array of numbers"),
+    "ragged z": (lambda: PAIR.add("position", ["a", "b"], [[1, 2, 3], [1, 2]], std=1.0), "array of numbers"),
+    "words for std": (lambda: PAIR.add("range", ("a", "b"), 5.0, std="x"), "array of numbers"),
+    "node between two": (lambda: PAIR.add("range", (0.2, 1.7), 5.0, std=1.0), "node = 0.2"),
+    "factor between two": (lambda: Factor("range", [[0.2, 1.7]], [[5.0]], std=1.0), "whole numbers"),
+    "no nodes": (lambda: PAIR.add("range", None, 5.0, std=1.0), "must name 2 points"),
+    "unknown hub": (lambda: Problem(("a",), hub=(5,)), "index < 1"),
+    "hub twice": (lambda: Problem(("a", "b"), hub=(0, 0)), "twice"),
+    "x0 not finite": (lambda: Problem(("a",), x0=[[np.nan, 0, 0]]), "x0 = not finite"),
+    "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
+    "unknown point": (lambda: solve(PAIR)["c"], "must be one of a, b"),
+    "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
+    "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),
     "coincident": (
         lambda: solve(replace(PAIR.add("range", ("a", "b"), 5.0, std=1.0), x0=np.zeros((2, 3)))), "a and b coincide"
     ),

@@ -97,5 +97,7 @@ def test_folders_that_cannot_be_shown_are_named(made: tuple[Path, Page], tmp_pat
     folder = made[0].parents[1] / "small"
     with pytest.raises(InputError, match="different studies"):
         report([folder, folder], tmp_path / "r.html")
+    with pytest.raises(InputError, match=r"is a folder\. Name the file"):
+        report([folder], tmp_path)
     with pytest.raises(InputError, match=r"holds no manifest\.json"):
         report([tmp_path], tmp_path / "r.html")

@@ -125,6 +125,16 @@ def test_convergence_bands_reach_from_seed_to_seed(rounds: Results) -> None:
     assert axes.lines[0].get_ydata()[0] == pytest.approx(4.1)
 
 
+@pytest.mark.parametrize("suffix", ["svg", "png"])
+def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, suffix: str) -> None:
+    """Letters are hinted wider at the 72 dpi of PDF and SVG than at others, and the legend must fit in all of them."""
+    plot = figures.cdf(results, where={"max_neighbours": 2})
+    plot.save(tmp_path / "a")
+    plot.figure.set_dpi({"svg": 72, "png": 200}[suffix])
+    plot.figure.draw_without_rendering()
+    assert plot.figure.axes[0].get_legend().get_window_extent().x1 <= plot.figure.bbox.x1
+
+
 def test_too_many_paths_are_refused() -> None:
     with pytest.raises(InputError, match="7 vehicles: must be at most 6"):
         figures.paths(fleet(7))

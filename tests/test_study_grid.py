@@ -75,6 +75,8 @@ def test_grids_that_cannot_be() -> None:
         study(settings={"k": 1})
     with pytest.raises(InputError, match="must have at least one"):
         study(where=lambda p: False).cells()
+    with pytest.raises(InputError, match=r"grid = \{'k': 4, 'method': 'a'\}: must not be there twice"):
+        study().override({"k": "4,4"}).cells()
     with pytest.raises(InputError, match="must be a number, a word"):
         study(grid={"k": ({"x": 1},)}).cells()
     with pytest.raises(InputError, match="lists of them"):

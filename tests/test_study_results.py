@@ -74,6 +74,39 @@ def test_an_ego_without_all_its_runs_is_left_out_and_said_so(rows: list[dict[str
     assert "1 egos are left out" in table.notes[0]
 
 
+def test_a_seed_that_diverged_is_not_averaged_away(rows: list[dict[str, Any]]) -> None:
+    """The mean over the other seeds would look like a mean over all."""
+    one = pd.DataFrame(rows).query("method == 'gnss' and k == 0")
+    many = pd.concat([one.assign(train_seed=s) for s in (0, 1)], ignore_index=True)
+    many.loc[many.query("train_seed == 1 and ego == 'b' and run == 2").index, "rt_le_m"] = np.nan
+    summary = results(many, ("method", "train_seed")).summary(["method"], "rt_le_m")
+    assert summary[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
+    many.loc[many.query("train_seed == 0 and ego == 'a' and run == 1").index, "rt_le_m"] = np.nan
+    summary = results(many, ("method", "train_seed")).summary(["method"], "rt_le_m")
+    assert summary[["n", "missing"]].to_numpy().tolist() == [[0, 2]]
+
+
+def test_values_that_no_row_has_together_are_no_empty_table(rows: list[dict[str, Any]]) -> None:
+    with pytest.raises(InputError, match=r"where = .*gnss.*must have a row with all of these"):
+        results(pd.DataFrame(rows)).table("k", "method", "rt_le_m", where={"method": "gnss", "knowledge": "fitted"})
+
+
+def test_words_are_no_metric(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows).assign(quantiles=[[0.1, 0.2]] * len(rows))
+    for name in ("ego", "quantiles"):
+        with pytest.raises(InputError, match=f"metric = '{name}': must be a column of numbers"):
+            results(frame).interval(name, method="gnss", k=0)
+
+
+def test_the_bound_is_not_the_best_under_any_knowledge(rows: list[dict[str, Any]]) -> None:
+    frame = pd.DataFrame(rows).assign(rt_le_m=lambda f: np.where(f["method"] == "bound", 0.1, f["rt_le_m"]))
+    table = results(frame).table("k", ["method", "knowledge"], "rt_le_m", intervals=False)
+    assert table.header[-1] == "Cramér-Rao bound, nominal"
+    for line in table.to_markdown().splitlines()[2:4]:
+        assert line.count("**") == 2
+        assert "**" not in line.split("|")[-2]
+
+
 def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str, Any]]) -> None:
     frame = pd.DataFrame(rows).query("knowledge == 'identity'").copy()
     frame["nees"] = np.where(frame["method"] == "gnss", np.nan, 3.0)

@@ -214,6 +214,51 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert path.read_text() == "old"
 
 
+def test_two_runs_do_not_share_a_folder(study: Study, tmp_path: Path) -> None:
+    """The second would swap the manifest, and the first would publish the second's cells as its own."""
+    first = start(tmp_path, 1)
+    wait_for(tmp_path / "small" / "cells", 1)
+    with pytest.raises(InputError, match=r"small: is in use by another run\. Wait until it ends"):
+        run(study, tmp_path, settings={"runs": 2}, progress=False)
+    first.communicate()
+    assert first.returncode == 0
+    assert Results.load(tmp_path / "small").settings["runs"] == 4
+    assert run(study, tmp_path, settings={"runs": 2}, progress=False).failed == 0
+
+
+def test_the_damaged_row_of_a_failure_hides_nothing(study: Study, tmp_path: Path) -> None:
+    trouble = tmp_path / "trouble"
+    trouble.write_text("raise")
+    run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
+    next((tmp_path / "small/failed").iterdir()).write_bytes(b"")
+    with pytest.warns(RuntimeWarning, match="damaged and will be computed again"):
+        found = Results.load(tmp_path / "small")
+    assert (found.failed, found.pending, len(found.frame)) == (0, 1, 8 * 2 * 4)
+    with pytest.warns(RuntimeWarning, match="damaged"):
+        assert plan(study, tmp_path, {"trouble": str(trouble)})["to_compute"] == 1
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "views.json"])
+def test_a_damaged_description_is_named_and_mended_by_the_next_run(study: Study, tmp_path: Path, name: str) -> None:
+    run(study, tmp_path, progress=False)
+    before = files(tmp_path / "small")
+    (tmp_path / "small" / name).write_text('{"half": ')
+    with pytest.raises(InputError, match=rf"holds a damaged {name} .*Repeat coopoc run"):
+        views(tmp_path / "small") if name == "views.json" else Results.load(tmp_path / "small")
+    assert run(study, tmp_path, progress=False).failed == 0
+    assert files(tmp_path / "small") == before
+
+
+def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study: Study, tmp_path: Path) -> None:
+    more = replace(study, tables={**study.tables, "extra": study.tables["rt_le"]})
+    run(more, tmp_path, progress=False)
+    (tmp_path / "small/tables/mine.md").write_text("by hand")
+    assert len(list((tmp_path / "small/tables").glob("extra.*"))) == 4
+    run(study, tmp_path, progress=False)
+    left = {path.name for path in (tmp_path / "small/tables").iterdir()}
+    assert left == {"rt_le.md", "rt_le.csv", "rt_le.tex", "rt_le.html", "mine.md"}
+
+
 def test_results_of_a_folder_that_holds_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no manifest\.json"):
         Results.load(tmp_path)

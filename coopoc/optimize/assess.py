@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from .arrowhead import eliminate, marginals, structure
-from .normal import normal_equations
+from .normal import Pattern, normal_equations
 from .problem import Problem, jacobian
 
 INFLATION = 1e10
@@ -38,9 +38,6 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     small = bool(problem.hub) or len(x) <= 200
     scheme, frame = structure(problem)
     blocks, gradient = normal_equations(scheme, linear)
-    own = np.zeros((len(x), 3))
-    diagonal = scheme.pairs[:, 0] == scheme.pairs[:, 1]
-    own[scheme.pairs[diagonal, 0]] = np.einsum("pii->pi", blocks[0, diagonal])
     size = float(np.linalg.norm(gradient))
     try:
         if small:
@@ -48,14 +45,22 @@ def assess(problem: Problem, x: Floats) -> Assessment:
             dx = eliminate(frame, blocks, gradient, np.zeros_like(gradient))[0]
         else:
             cov, dx = _sparse(jacobian(problem, linear), gradient[0])
-        inflation = own * np.einsum("nii->ni", cov)
-        sound = np.isfinite(inflation) & (inflation > 0) & (inflation < INFLATION)
-        if sound.all() and np.isfinite(dx).all():
+        if bounded(scheme, blocks, cov[None]).all() and np.isfinite(dx).all():
             return Assessment(cost, size, cov, float(np.abs(dx).max(initial=0.0)), ())
     except np.linalg.LinAlgError:
         pass
     unknown = np.full((len(x), 3, 3), np.nan)
     return Assessment(cost, size, unknown, np.nan, _free(problem, jacobian(problem, linear)))
+
+
+def bounded(scheme: Pattern, blocks: Floats, cov: Floats) -> Bools:
+    """(B,) True where no variance of cov (B, n, 3, 3) exceeds INFLATION times what it would be with all else known."""
+    own = np.zeros(cov.shape[:3])
+    diagonal = scheme.pairs[:, 0] == scheme.pairs[:, 1]
+    own[:, scheme.pairs[diagonal, 0]] = np.einsum("bpii->bpi", blocks[:, diagonal])
+    inflation = own * np.einsum("bnii->bni", cov)
+    sound: Bools = ((inflation > 0) & (inflation < INFLATION)).all(axis=(1, 2))
+    return sound
 
 
 def _sparse(J: object, gradient: Floats) -> tuple[Floats, Floats]:

@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..errors import InputError
 from .arrowhead import marginals, structure
+from .assess import bounded
 from .backends.gauss_newton import linear_step
 from .descend import MAX_ITERATIONS, TOLERANCE, descend
 from .initial import initial_guess
@@ -20,7 +22,11 @@ CHUNK = 40_000
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Solutions of B realisations: x (B, n, 3) m, covariance (B, n, 3, 3) m^2, the others (B,)."""
+    """Solutions of B realisations: x (B, n, 3) m, covariance (B, n, 3, 3) m^2, the others (B,).
+
+    Not converged: the last step was still long, or a point is free; then the covariance is NaN. Unlike `solve` it does
+    not look whether the stationary point is a saddle.
+    """
 
     x: Floats
     covariance: Floats
@@ -37,12 +43,15 @@ def solve_batch(problem: Problem, max_iterations: int = MAX_ITERATIONS, toleranc
         max_iterations: of Gauss-Newton steps. tolerance: m, largest move of a point in the last step.
 
     Raises:
-        numpy.linalg.LinAlgError: a realisation is not observable: solve it alone to see what is free.
+        InputError: no measurements.
+        numpy.linalg.LinAlgError: the structure is not observable: solve one realisation alone to see what is free.
 
     >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
     >>> solve_batch(problem).x.shape
     (2, 1, 3)
     """
+    if not problem.factors:
+        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     step = linear_step(problem)
     scheme, frame = structure(problem)
     count = problem.batch or 1
@@ -52,6 +61,9 @@ def solve_batch(problem: Problem, max_iterations: int = MAX_ITERATIONS, toleranc
         part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
         end = descend(part, step, initial_guess(part), max_iterations, tolerance)
         linear = part.linearise(end.x)
-        cov = marginals(frame, normal_equations(scheme, linear)[0])
-        parts.append((end.x, cov, linear.cost, end.iterations, end.converged))
+        blocks, _ = normal_equations(scheme, linear)
+        cov = marginals(frame, blocks)
+        sound = bounded(scheme, blocks, cov)
+        cov[~sound] = np.nan
+        parts.append((end.x, cov, linear.cost, end.iterations, end.converged & sound))
     return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..errors import InputError
 from .problem import Linear, Problem, half_squares, vector
 
 Step = Callable[[Linear, Floats], Floats]
@@ -47,7 +48,14 @@ def descend(
     Args:
         problem: one or B realisations. step: the backend's linear solver. x: (B, n, 3) m start.
         max_iterations: of linear steps. tolerance: m.
+
+    Raises:
+        InputError: max_iterations that is no whole number >= 0, tolerance that is not > 0.
     """
+    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
+        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
+    if not isinstance(tolerance, float | int) or not tolerance > 0:
+        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
     best, count = x.copy(), np.zeros(len(x), dtype=np.int64)
     done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
     active, now = np.arange(len(x)), problem

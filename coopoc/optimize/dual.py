@@ -58,6 +58,9 @@ class Dual:
         ratio = other / self.value
         return Dual(ratio, -ratio / self.value * self.slope)
 
+    def __pow__(self, power: float) -> Dual:
+        return Dual(self.value**power, power * self.value ** (power - 1) * self.slope)
+
     __radd__ = __add__
     __rmul__ = __mul__
 

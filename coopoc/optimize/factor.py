@@ -48,8 +48,8 @@ class Factor:
         if self.std is not None:
             object.__setattr__(self, "std", _std(known, self.std, self.z.shape))
         else:
-            root = np.asarray(self.sqrt_information, dtype=np.float64)
-            object.__setattr__(self, "sqrt_information", _root(known, root, self.z.shape))
+            assert self.sqrt_information is not None
+            object.__setattr__(self, "sqrt_information", _root(known, self.sqrt_information, self.z.shape))
 
     @property
     def measurement(self) -> Measurement:
@@ -112,7 +112,20 @@ def _pick(array: Floats, rank: int, which: Ints | int) -> Floats:
     return array[which]
 
 
+def numbers(field: str, values: npt.ArrayLike) -> Floats:
+    """Read-only array of what a user gave; InputError if it is no array of numbers."""
+    try:
+        return frozen(values)
+    except (TypeError, ValueError):
+        mend = "Rows must be equally long and hold numbers only."
+        raise InputError(field, repr(values)[:60], "must be an array of numbers", mend) from None
+
+
 def _nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
+    given = np.asarray(nodes)
+    if given.size and given.dtype.kind not in "iu":
+        mend = "Problem.add takes names; a Factor takes indices."
+        raise InputError("nodes", repr(nodes)[:60], "must be whole numbers", mend)
     array = frozen(nodes, np.int64)
     if array.ndim != 2 or array.shape[1] != known.arity:
         mend = "Give one row per measurement."
@@ -124,7 +137,7 @@ def _nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
 
 
 def _values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
-    array = frozen(z)
+    array = numbers(f"z of {known.name}", z)
     if array.ndim not in (2, 3) or array.shape[-2:] != (count, known.size):
         shape = f"must have shape ({count}, {known.size}) or (B, {count}, {known.size}) for {known.name}"
         raise InputError("z", array.shape, shape, "One row per row of nodes.")
@@ -133,18 +146,18 @@ def _values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
         mend = "Drop the measurement, or give it std = inf and any finite z."
         raise InputError(f"z of {known.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", mend)
     for k, component in enumerate(known.components):
-        numbers = array[..., k]
-        if component == "distance" and (numbers <= 0).any():
+        column = array[..., k]
+        if component == "distance" and (column <= 0).any():
             mend = "Coincident vehicles have no direction: drop the pair."
-            raise InputError(f"z of {known.name}", numbers.min(), "must be a distance > 0 m", mend)
-        if component == "angle" and (np.abs(numbers) > 2 * np.pi).any():
+            raise InputError(f"z of {known.name}", column.min(), "must be a distance > 0 m", mend)
+        if component == "angle" and (np.abs(column) > 2 * np.pi).any():
             mend = "This looks like degrees: use np.deg2rad."
-            raise InputError(f"z of {known.name}", np.abs(numbers).max(), "must be within 2 pi rad", mend)
+            raise InputError(f"z of {known.name}", np.abs(column).max(), "must be within 2 pi rad", mend)
     return array
 
 
 def _std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
-    array = frozen(std)
+    array = numbers(f"std of {known.name}", std)
     wide = np.broadcast_to(array, (known.size,)) if array.ndim < 2 and array.size in (1, known.size) else array
     wide = wide[None] if wide.ndim == 1 else wide
     fits = wide.ndim in (2, 3) and wide.shape[-1] == known.size and wide.shape[-2] in (1, shape[-2])
@@ -160,8 +173,8 @@ def _std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) -> Floa
     return frozen(wide)
 
 
-def _root(known: Measurement, root: Floats, shape: tuple[int, ...]) -> Floats:
-    array = frozen(root)
+def _root(known: Measurement, root: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
+    array = numbers("sqrt_information", root)
     array = array[None] if array.ndim == 2 else array
     size = known.size
     if array.ndim not in (3, 4) or array.shape[-2:] != (size, size) or array.shape[-3] not in (1, shape[-2]):

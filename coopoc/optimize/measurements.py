@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -80,11 +80,20 @@ def measurement(
     """Register a formula (x, y, z, m) -> components as a measurement; the formula itself is returned.
 
     Raises:
-        InputError: the name is taken, so that nothing is silently overwritten.
+        InputError: the name is taken, so that nothing is silently overwritten; an arity other than 1 or 2, an unknown
+            component, or `linear` without three coordinates.
 
     >>> MEASUREMENTS["range"].predict(np.array([3.0, 4.0, 0.0]))
     array([5.])
     """
+
+    if arity not in (1, 2):
+        raise InputError("arity", arity, "must be 1 (a point) or 2 (a pair)", "The formula gets one vector x, y, z.")
+    if not components or not set(components) <= set(get_args(Component)):
+        mend = "Give one per number that the formula returns."
+        raise InputError("components", components, f"must be among {get_args(Component)}", mend)
+    if linear and components != ("coordinate",) * 3:
+        raise InputError("linear", linear, "means that the formula is the vector itself", "Leave it out.")
 
     def register(formula: Formula) -> Formula:
         if name in MEASUREMENTS:

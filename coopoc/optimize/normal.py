@@ -61,19 +61,24 @@ def pattern(n: int, nodes: Sequence[Ints]) -> Pattern:
 
 def normal_equations(scheme: Pattern, linear: Linear) -> tuple[Floats, Floats]:
     """Blocks (B, P, 3, 3) of J^T J in the pattern's order and the gradient J^T r (B, n, 3)."""
-    batch = len(linear.x)
-    count = sum(r.shape[1] for r in linear.residual)
-    squares, pulls = np.empty((batch, count, 3, 3)), np.empty((batch, count, 3))
-    top = 0
-    for residual, slope in zip(linear.residual, linear.slope, strict=True):
-        turned, at = np.swapaxes(slope, -1, -2), slice(top, top + residual.shape[1])
-        squares[:, at] = turned @ slope
-        pulls[:, at] = (turned @ residual[..., None])[..., 0]
-        top = at.stop
-    gathered = squares.reshape(batch, count, 9)[:, scheme.rows]
-    blocks = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(batch, -1, 3, 3)
-    blocks[:, scheme.pairs[:, 0] != scheme.pairs[:, 1]] *= -1.0
-    gradient = np.zeros((batch, scheme.points, 3))
-    signed = pulls[:, scheme.pull_rows] * scheme.pull_signs
+    pulls = [(np.swapaxes(slope, -1, -2) @ residual[..., None])[..., 0]
+             for residual, slope in zip(linear.residual, linear.slope, strict=True)]  # fmt: skip
+    gradient = np.zeros((len(linear.x), scheme.points, 3))
+    signed = np.concatenate(pulls, axis=1)[:, scheme.pull_rows] * scheme.pull_signs
     gradient[:, scheme.pull_points] = np.add.reduceat(signed, scheme.pull_starts, axis=1)
-    return blocks, gradient
+    return assemble(scheme, squares(linear)), gradient
+
+
+def squares(linear: Linear) -> list[Floats]:
+    """Per factor (B, M, 3, 3) S^T S of its whitened derivatives."""
+    return [np.broadcast_to(np.swapaxes(slope, -1, -2) @ slope, (*residual.shape[:2], 3, 3))
+            for residual, slope in zip(linear.residual, linear.slope, strict=True)]  # fmt: skip
+
+
+def assemble(scheme: Pattern, parts: Sequence[Floats]) -> Floats:
+    """Blocks (B, P, 3, 3) in the pattern's order from what each measurement adds, (B, M, 3, 3) per factor."""
+    every = np.concatenate(parts, axis=1)
+    gathered = every.reshape(*every.shape[:2], 9)[:, scheme.rows]
+    blocks: Floats = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(len(every), -1, 3, 3)
+    blocks[:, scheme.pairs[:, 0] != scheme.pairs[:, 1]] *= -1.0
+    return blocks

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from .factor import Factor
+from .factor import Factor, numbers
 
 if TYPE_CHECKING:
     from ..world.recording import Recording
@@ -55,7 +55,7 @@ class Problem:
             small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
 
     Raises:
-        InputError: repeated names, factors on unknown points, shapes that do not agree.
+        InputError: repeated names, factors or a hub on unknown points, shapes that do not agree.
 
     >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
     >>> problem = problem.add("displacement", ("a", "b"), [5, 0, 0], std=1.0)
@@ -73,10 +73,13 @@ class Problem:
         if len(set(self.names)) != len(self.names):
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
+        object.__setattr__(self, "hub", tuple(self.index(point) for point in self.hub))
+        if len(set(self.hub)) < len(self.hub):
+            raise InputError("hub", self.hub, "must not name a point twice", "Name each point of the hub once.")
         for factor in self.factors:
             _check_nodes(self, factor.nodes)
         if self.x0 is not None:
-            object.__setattr__(self, "x0", _start(self, self.x0))
+            object.__setattr__(self, "x0", _points(self, "x0", self.x0))
         sizes = {b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None and b > 1}
         if len(sizes) > 1:
             mend = "Use the same number of realisations throughout."
@@ -96,7 +99,7 @@ class Problem:
         """Index of a point given by name or index; InputError if there is none."""
         if isinstance(point, str) and point in self.names:
             return self.names.index(point)
-        if not isinstance(point, str) and 0 <= int(point) < len(self.names):
+        if isinstance(point, int | np.integer) and 0 <= point < len(self.names):
             return int(point)
         known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
         raise InputError("node", repr(point), f"must be an index < {len(self.names)} or one of {known}",
@@ -150,12 +153,12 @@ class Problem:
 
     def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
         """Residual r (rows,) and sparse Jacobian J (rows, 3n) of a single problem at x (n, 3): cost = 1/2 r.r."""
-        linear = self.linearise(np.asarray(x, dtype=np.float64)[None])
+        linear = self.linearise(_points(self, "x", x, (2,))[None])
         return np.concatenate([r.ravel() for r in linear.residual]), jacobian(self, linear)
 
     def cost(self, x: npt.ArrayLike) -> float:
         """1/2 sum of squared whitened residuals of a single problem at x (n, 3)."""
-        return float(half_squares(self.residuals(np.asarray(x, dtype=np.float64)[None]), 1)[0])
+        return float(half_squares(self.residuals(_points(self, "x", x, (2,))[None]), 1)[0])
 
     @classmethod
     def from_snapshot(
@@ -235,13 +238,13 @@ def _rows(problem: Problem, kind: str, nodes: Any, z: npt.ArrayLike) -> tuple[In
     from .measurements import lookup
 
     known = lookup(kind)
-    flat = [nodes] if isinstance(nodes, str | int | np.integer) else list(nodes)
+    flat = [nodes] if isinstance(nodes, str) or not isinstance(nodes, Iterable) else list(nodes)
     flat = [p for row in flat for p in (row if isinstance(row, list | tuple | np.ndarray) else [row])]
     if len(flat) % known.arity or not flat:
         raise InputError("nodes", nodes, f"must name {known.arity} points per {kind}", "Give points by name or index.")
-    index = np.array([problem.index(p if isinstance(p, str) else int(p)) for p in flat]).reshape(-1, known.arity)
-    values = np.asarray(z, dtype=np.float64)
-    return index, values.reshape(len(index), -1) if values.ndim < 2 else values
+    index = np.array([problem.index(p) for p in flat]).reshape(-1, known.arity)
+    values = numbers(f"z of {kind}", z)
+    return index, values.reshape(len(index), -1) if values.ndim < 2 and values.size % len(index) == 0 else values
 
 
 def _check_nodes(problem: Problem, nodes: Ints) -> None:
@@ -250,9 +253,10 @@ def _check_nodes(problem: Problem, nodes: Ints) -> None:
         problem.index(int(nodes[bad][0]))
 
 
-def _start(problem: Problem, x0: npt.ArrayLike) -> Floats:
-    array = frozen(x0)
-    if array.ndim not in (2, 3) or array.shape[-2:] != (len(problem.names), 3) or not np.isfinite(array).all():
-        shape = f"must be finite with shape ({len(problem.names)}, 3), or (B, n, 3)"
-        raise InputError("x0", f"shape {array.shape}", shape, "One row of metres per point, or None.")
+def _points(problem: Problem, field: str, x: npt.ArrayLike, ranks: tuple[int, ...] = (2, 3)) -> Floats:
+    array = numbers(field, x)
+    if array.ndim not in ranks or array.shape[-2:] != (len(problem.names), 3) or not np.isfinite(array).all():
+        shape = f"must be finite with shape ({len(problem.names)}, 3)" + (", or (B, n, 3)" if 3 in ranks else "")
+        given = f"shape {array.shape}" if np.isfinite(array).all() else "not finite"
+        raise InputError(field, given, shape, "Give one row of metres per point.")
     return array

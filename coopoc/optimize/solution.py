@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
+from ..errors import InputError
 
 
 class Status(Enum):
@@ -20,6 +21,7 @@ class Status(Enum):
 
     SOLVED = "At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m."
     MAX_ITERATIONS = "Stopped at the limit of iterations before a minimum: raise max_iterations or give a better x0."
+    SADDLE = "At a stationary point that is no minimum: give an x0 to the side of it, where the cost falls."
     RANK_DEFICIENT = "Some points can move without changing the cost: measure them, or add a position factor."
     FAILED = "The backend stopped before a minimum: give a better x0, or try another backend."
 
@@ -51,7 +53,10 @@ class Solution:
     extras: dict[str, Any] = field(default_factory=dict)
 
     def __getitem__(self, point: str) -> Floats:
-        """(3,) m estimate of a point by name."""
+        """(3,) m estimate of a point by name; InputError that lists the names if there is none."""
+        if point not in self.names:
+            known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
+            raise InputError("point", repr(point), f"must be one of {known}", "See solution.names.")
         where: Floats = self.x[self.names.index(point)]
         return where
 

@@ -13,7 +13,9 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError, MissingLibraryError
-from .assess import assess
+from .assess import Assessment, assess
+from .backends.run import Ended
+from .curvature import is_minimum
 from .descend import MAX_ITERATIONS
 from .initial import initial_guess
 from .problem import Problem
@@ -92,7 +94,7 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     truth = assess(problem, ended.x)
     solution = Solution(
         x=ended.x, covariance=truth.covariance, cost=truth.cost, gradient=truth.gradient,
-        status=_status(truth.free, truth.remaining, ended.iterations, options.get("max_iterations", MAX_ITERATIONS)),
+        status=_status(problem, ended, truth, options.get("max_iterations", MAX_ITERATIONS)),
         iterations=ended.iterations, build_seconds=built - began, solve_seconds=solved - built, backend=backend,
         names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, extras=ended.extras,
     )  # fmt: skip
@@ -135,12 +137,12 @@ def _check_start(problem: Problem, start: Floats) -> None:
             )  # fmt: skip
 
 
-def _status(free: tuple[str, ...], remaining: float, iterations: int, limit: int) -> Status:
-    if free:
+def _status(problem: Problem, ended: Ended, truth: Assessment, limit: int) -> Status:
+    if truth.free:
         return Status.RANK_DEFICIENT
-    if remaining <= POSITION_TOLERANCE:
-        return Status.SOLVED
-    return Status.MAX_ITERATIONS if iterations >= limit else Status.FAILED
+    if truth.remaining <= POSITION_TOLERANCE:
+        return Status.SOLVED if is_minimum(problem, ended.x) else Status.SADDLE
+    return Status.MAX_ITERATIONS if ended.iterations >= limit else Status.FAILED
 
 
 def _raise(solution: Solution) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,8 +23,8 @@ VIEWS = "views.json"
 def publish(study: Study, results: Results, folder: str | Path, progress: bool = True) -> None:
     """Write results.parquet, tables/*.{md,csv,tex,html}, figures/*.{pdf,png,svg} and views.json into a folder.
 
-    If cells have failed, a view that cannot be made without them is named with its reason; otherwise its error is
-    the study's own and is raised.
+    Views that an earlier run left there and that this one does not make are removed. If cells have failed, a view that
+    cannot be made without them is named with its reason; otherwise its error is the study's own and is raised.
     """
     folder = Path(folder)
     results.to_parquet(folder / "results.parquet")
@@ -43,6 +44,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         **made, "findings": list(findings or ()), "recipe": dict(recipe or {}), "missing": missing,
         "limitations": list(study.limitations), "minutes": study.minutes,
     }  # fmt: skip
+    _forget(folder, made)
     store.write(folder / VIEWS, json.dumps(content, indent=1, default=str, ensure_ascii=False) + "\n")
 
 
@@ -54,6 +56,18 @@ def _made(view: Callable[[Results], Any], results: Results, missing: dict[str, s
     except Exception as error:
         missing[name] = f"{type(error).__name__}: {error}"
         return None
+
+
+def _forget(folder: Path, made: Mapping[str, list[dict[str, str]]]) -> None:
+    """Remove the files of views that an earlier run made here and this one does not: their numbers are not these."""
+    try:
+        before = views(folder)
+    except InputError:
+        return
+    for kind, now in made.items():
+        for name in {view["name"] for view in before[kind]} - {view["name"] for view in now}:
+            for path in (folder / kind).glob(f"{glob.escape(name)}.*"):
+                path.unlink()
 
 
 def _save_table(table: Table, path: Path) -> str:
@@ -68,11 +82,7 @@ def _save_figure(plot: Any, path: Path) -> str:
 
 def views(folder: str | Path) -> Mapping[str, Any]:
     """What `publish` wrote; InputError if the study has not come so far."""
-    path = Path(folder) / VIEWS
-    if not path.is_file():
-        raise InputError("folder", str(folder), "holds no views yet", "Run the study to its end: coopoc run NAME.")
-    found: Mapping[str, Any] = json.loads(path.read_text())
-    return found
+    return store.content(Path(folder) / VIEWS, "holds no views yet", "Run the study to its end: coopoc run NAME.")
 
 
 def tables(folder: str | Path, form: str = "markdown", name: str | None = None) -> list[str]:

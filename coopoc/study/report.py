@@ -36,8 +36,10 @@ def report(
         cards: name -> field -> value of the data that the studies stand on.
 
     Raises:
-        InputError: no folder, a folder that holds no study, or two studies of one name.
+        InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
     """
+    if Path(out).is_dir():
+        raise InputError("out", str(out), "is a folder", f"Name the file, such as {Path(out) / 'report.html'}.")
     sections = [_section(Path(folder)) for folder in folders]
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,9 +50,7 @@ class Results:
     def load(cls, folder: str | Path) -> Results:
         """Results in the folder of a study, finished or not; InputError if it holds none."""
         path = Path(folder) / "manifest.json"
-        if not path.is_file():
-            raise InputError("folder", str(folder), "holds no manifest.json", "Give a folder that coopoc run has made.")
-        manifest = json.loads(path.read_text())
+        manifest = store.content(path, "holds no manifest.json", "Give a folder that coopoc run has made.")
         done, failed, pending = [], [], 0
         for cell in manifest["cells"]:
             table = store.load(path.parent, cell["name"])
@@ -105,8 +102,10 @@ class Results:
     def groups(
         self, by: Sequence[str], where: Mapping[str, Any] | None = None
     ) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
-        """Rows of each combination of the columns `by`, in the order of the grid."""
+        """Rows of each combination of the columns `by`, in the order of the grid; InputError if `where` leaves none."""
         frame = self.select(where)
+        if frame.empty and where:
+            raise InputError("where", dict(where), "must have a row with all of these values", "Name fewer of them.")
         for name in by:
             if name not in frame:
                 raise unknown("column", name, frame.columns)
@@ -156,6 +155,8 @@ class Results:
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
         if value not in frame:
             raise unknown("metric", value, frame.columns)
+        if not pd.api.types.is_numeric_dtype(given := frame[value].dropna()) and len(given):
+            raise InputError("metric", repr(value), "must be a column of numbers", "It names or lists things.")
         for axis in self.axes:
             if axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
                 mixed = ", ".join(map(str, frame[axis].unique()))
@@ -171,8 +172,9 @@ def _joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
 
 
 def _grid(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
-    """(E, R) means over training seeds, and how many egos are left out because a run of theirs is missing."""
-    frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame})
-    table = frame.pivot_table(index="ego", columns="run", values=value, aggfunc="mean", sort=True, dropna=False)
+    """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing."""
+    frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame}, _value=frame[value].astype(float))
+    cells = frame.groupby(["ego", "run"])["_value"]
+    table = cells.mean().where(cells.count() == cells.size()).unstack("run")
     whole = table.dropna()
-    return whole.to_numpy(dtype=float), len(table) - len(whole) if len(whole) else 0
+    return whole.to_numpy(dtype=float), len(table) - len(whole) if frame["_value"].notna().any() else 0

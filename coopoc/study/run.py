@@ -48,12 +48,18 @@ def run(
         progress: show a bar on stderr.
 
     Raises:
-        InputError: an unknown study or setting, jobs < 1, a folder that cannot be written, or what `study.key` raises.
+        InputError: an unknown study or setting, jobs < 1, a folder that cannot be written or that another run holds,
+            or what `study.key` raises.
         WorkerDiedError: a worker process was killed, mostly for want of memory; finished cells are kept.
     """
     study, cells, folder = _resolve(study, out, settings)
     if jobs < 1:
         raise InputError("jobs", jobs, "must be >= 1", "Give the number of worker processes.")
+    with store.held(folder):
+        return _run(study, cells, folder, jobs, progress)
+
+
+def _run(study: Study, cells: Sequence[Cell], folder: Path, jobs: int, progress: bool) -> Results:
     store.prepare(folder, _manifest(study, cells))
     todo = [cell for cell in cells if store.load(folder, cell.name) is None]
     if todo:

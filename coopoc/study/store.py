@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +43,51 @@ def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
         raise
 
 
+@contextmanager
+def held(folder: Path) -> Iterator[None]:
+    """Make the folder and keep it for this process: a second run would swap the manifest under the first.
+
+    The lock goes with the process, however that ends.
+
+    Raises:
+        InputError: another process holds it, or it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = (folder / ".lock").open("w")
+    except OSError as error:
+        raise _unwritable(folder, error) from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            mend = "Wait until it ends, or choose another --out."
+            raise InputError("out", str(folder), "is in use by another run", mend) from None
+        yield
+
+
 def prepare(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Make the folder and write its manifest; InputError if it cannot be written."""
+    """Write the manifest of a folder; InputError if it cannot be written."""
     try:
         write(folder / "manifest.json", json.dumps(manifest, indent=1, default=str) + "\n")
     except OSError as error:
-        raise InputError("out", str(folder), f"cannot be written ({error.strerror})", "Choose another --out.") from None
+        raise _unwritable(folder, error) from None
+
+
+def _unwritable(folder: Path, error: OSError) -> InputError:
+    return InputError("out", str(folder), f"cannot be written ({error.strerror})", "Choose another --out.")
+
+
+def content(path: Path, absent: str, mend: str) -> dict[str, Any]:
+    """What a JSON file of a folder holds; InputError with `absent` and `mend` if there is none, or if it is damaged."""
+    if not path.is_file():
+        raise InputError("folder", str(path.parent), absent, mend)
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except ValueError as error:
+        damage = f"holds a damaged {path.name} ({error})"
+        raise InputError("folder", str(path.parent), damage, "Repeat coopoc run: finished cells are kept.") from None
+    return found
 
 
 def save(folder: Path, cell: Cell, rows: Sequence[Row], seconds: float) -> None:
@@ -66,7 +107,15 @@ def save_failure(folder: Path, cell: Cell, reason: str, trace: str, seconds: flo
 
 def load(folder: Path, name: str) -> pa.Table | None:
     """Rows of a finished cell; None if there are none, or (with a warning) if the file is damaged."""
-    path = _finished(folder, name)
+    return _read(_finished(folder, name), name)
+
+
+def load_failure(folder: Path, name: str) -> pa.Table | None:
+    """The row of a failed cell, if that was its last outcome; None (with a warning) if the file is damaged."""
+    return _read(_failed(folder, name), name)
+
+
+def _read(path: Path, name: str) -> pa.Table | None:
     if not path.exists():
         return None
     try:
@@ -76,14 +125,8 @@ def load(folder: Path, name: str) -> pa.Table | None:
         damage = "it does not hold the rows of this cell"
     except (pa.ArrowException, OSError) as error:
         damage = str(error)
-    warnings.warn(f"{path} is damaged and will be computed again: {damage}", RuntimeWarning, stacklevel=2)
+    warnings.warn(f"{path} is damaged and will be computed again: {damage}", RuntimeWarning, stacklevel=3)
     return None
-
-
-def load_failure(folder: Path, name: str) -> pa.Table | None:
-    """The row of a failed cell, if that was its last outcome."""
-    path = _failed(folder, name)
-    return pq.read_table(path, partitioning=None) if path.exists() else None
 
 
 def to_table(rows: Sequence[Row]) -> pa.Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
@@ -59,7 +60,7 @@ class Study:
         limitations: sentences. minutes: expected on one core.
 
     Raises:
-        InputError: an empty grid, a parameter that is no scalar, or a name that is both axis and setting.
+        InputError: an empty grid, a cell twice, a parameter that is no scalar, or a name that is both axis and setting.
 
     >>> Study("demo", "Does x matter?", cell=dict, grid={"x": (1, 2)}, settings={"runs": 3}).cells()[1].params
     {'x': 2}
@@ -98,6 +99,9 @@ class Study:
         found = [_named(self, params) for params in _expand(self)]
         if not found:
             raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
+        count = Counter(cell.name for cell in found)
+        if twice := [dict(cell.params) for cell in found if count[cell.name] > 1]:
+            raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
         return found
 
     def override(self, changes: Mapping[str, Any]) -> Study:

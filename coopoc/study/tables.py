@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
-REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label)
+REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
 _LATEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
@@ -38,7 +38,7 @@ class Table:
         header: column titles, with units. rows: entries, as many per row as titles.
         caption: with the noise settings; it goes under the table in every format.
         best: "min" or "max": which number is set in bold. along: "row" or "column" in which it is sought.
-        unranked: titles and row labels that are never the best: bounds, oracles.
+        unranked: row labels and titles (or parts of a title between commas) that are never the best: bounds, oracles.
         decimals: of numbers. intervals: show the ends. notes: sentences under the table.
 
     Raises:
@@ -153,8 +153,9 @@ class Table:
         places: dict[int, list[tuple[float, int, int]]] = {}
         for i, row in enumerate(self.rows):
             for j, entry in enumerate(row):
+                names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                if isinstance(mean, float) and math.isfinite(mean) and not {self.header[j], *row} & set(self.unranked):
+                if isinstance(mean, float) and math.isfinite(mean) and not names & set(self.unranked):
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         pick = min if self.best == "min" else max
         return {(i, j) for group in places.values() if len(group) > 1

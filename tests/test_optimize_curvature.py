@@ -1,0 +1,69 @@
+"""SOLVED is a minimum: the curvature against CasADi's own Hessian, and a saddle that every backend stops at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from coopoc.optimize import MEASUREMENTS, Problem, SolveError, Status, backends, solve
+from coopoc.optimize.curvature import is_minimum
+
+
+def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:
+    v = ca.SX.sym("x", 3, len(problem.names))
+    cost = 0
+    for factor in problem.factors:
+        for k, nodes in enumerate(factor.nodes.tolist()):
+            gap = v[:, nodes[-1]] - (v[:, nodes[0]] if len(nodes) == 2 else 0)
+            h = ca.vertcat(*MEASUREMENTS[factor.kind].formula(gap[0], gap[1], gap[2], ca)) - factor.z[k]
+            h = [ca.atan2(ca.sin(h[c]), ca.cos(h[c])) if angle else h[c]
+                 for c, angle in enumerate(factor.measurement.angles)]  # fmt: skip
+            cost += 0.5 * ca.sumsqr(ca.DM(factor.root[k]) @ ca.vertcat(*h))
+    return np.asarray(ca.Function("H", [v], [ca.hessian(cost, ca.vec(v))[0]])(x.T))
+
+
+def tangle(seed: int) -> Problem:
+    """Every nonlinear kind, measured far from where the points are: curvature of either sign."""
+    rng = np.random.default_rng(seed)
+    problem = Problem("abcd", x0=rng.normal(size=(4, 3)) * 10)
+    problem = problem.add("position", list("abcd"), problem.x0, std=rng.uniform(2, 6))
+    problem = problem.add("range", [("a", "b"), ("c", "d")], rng.uniform(5, 30, (2, 1)), std=2.0)
+    problem = problem.add("spherical", ("b", "c"), [rng.uniform(5, 30), 0.3, 1.4], std=[3.0, 0.6, 0.6])
+    root = np.tril(rng.uniform(0.2, 0.5, (3, 3)))
+    problem = problem.add("spherical", ("d", "a"), [rng.uniform(5, 30), 2.0, 1.7], sqrt_information=root)
+    return problem.add("azimuth", ("a", "c"), 1.0, std=0.5).add("inclination", ("b", "d"), 1.5, std=0.5)
+
+
+def test_the_sign_of_the_curvature_is_that_of_casadis_hessian() -> None:
+    signs = []
+    for seed in range(40):
+        problem = tangle(seed)
+        lowest = np.linalg.eigvalsh(casadis_hessian(problem, problem.x0)).min()
+        assert abs(lowest) > 1e-4
+        assert is_minimum(problem, problem.x0) == (lowest > 0)
+        signs.append(lowest > 0)
+    assert 5 < sum(signs) < 35
+
+
+def between_two() -> Problem:
+    """An ego whose fix lies on the line of 10 m between two others, which are both 10 m away: it stands beside it."""
+    fixes = [[0, 0, 0], [-5, 0, 0], [5, 0, 0]]
+    stds = np.outer([10, 0.1, 0.1], np.ones(3))
+    problem = Problem(("ego", "a", "b")).add("position", ["ego", "a", "b"], fixes, std=stds)
+    return problem.add("range", [("ego", "a"), ("ego", "b")], [10.0, 10.0], std=0.5)
+
+
+@pytest.mark.parametrize("backend", backends())
+def test_a_saddle_is_not_solved(backend: str) -> None:
+    problem = between_two()
+    stuck = solve(problem, backend, throw=False)
+    assert stuck.status is Status.SADDLE
+    assert np.linalg.eigvalsh(casadis_hessian(problem, stuck.x)).min() < -0.1
+    with pytest.raises(SolveError, match="to the side"):
+        solve(problem, backend)
+    aside = solve(replace(problem, x0=stuck.x + np.outer([1, 0, 0], [0, 1, 1])), backend)
+    assert aside.status is Status.SOLVED
+    assert aside.cost < stuck.cost / 100
