@@ -101,7 +101,8 @@ STUDY = Study(
         for start, reading in CHOICES for pair in CASES for method, known in LINEUP
     ],
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "egos": "auto", "runs": 100, "seed": 0,
+        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "egos": "auto", "runs": 100,
+        "seed": 0,
         "train_seeds": 5,
     },
     where=meaningful,
