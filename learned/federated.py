@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from coopoc.arrays import Ints
 from coopoc.errors import InputError
@@ -17,7 +16,7 @@ from coopoc.world.noise import stream
 
 from .aggregate import Aggregate, rule
 from .clients import Client, Pieces
-from .machine import one_core
+from .machine import one_core, watched
 from .net import GainNet
 from .rollout import flatten, unflatten
 from .schedule import Epoch, Schedule, cosine, generator
@@ -128,7 +127,7 @@ def federate_many(
     theta = flatten(models)
     copies = torch.tensor([len(group) for group in groups])
     history = [_rows(0, theta, judge(theta.repeat_interleave(copies, 0)), None, {}, groups)]
-    for number in tqdm(range(1, rounds + 1), desc=progress, unit="round", disable=progress is None):
+    for number in watched(range(1, rounds + 1), progress, "round"):
         adapted = theta.repeat_interleave(copies, 0)
         losses, stopped = adapt(adapted, models[0], pool, members, keys, number, rounds, local)
         alive = torch.tensor([i not in stopped for i in range(len(everyone))]).split(copies.tolist())

@@ -1,13 +1,19 @@
-"""How a rollout uses the machine: one core, and memory that the process keeps."""
+"""How training uses the machine: one core per process, memory that it keeps, a line of the terminal to report on."""
 
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
+from typing import TypeVar
 
 import torch
+from tqdm import tqdm
+
+Item = TypeVar("Item")
+_line: ContextVar[int] = ContextVar("line", default=0)
 
 
 @contextmanager
@@ -38,3 +44,18 @@ def _keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(mmap_threshold, 32 * 2**20)
         mallopt(trim_threshold, most)
+
+
+@contextmanager
+def reporting_on(line: int) -> Iterator[None]:
+    """Draw bars on this line of the terminal, so that processes side by side do not draw over each other."""
+    token = _line.set(line)
+    try:
+        yield
+    finally:
+        _line.reset(token)
+
+
+def watched(items: Iterable[Item], name: str | None, unit: str, total: int | None = None) -> Iterator[Item]:
+    """The items, with a bar of that name on stderr; None: without."""
+    return iter(tqdm(items, desc=name, unit=unit, total=total, disable=name is None, position=_line.get()))

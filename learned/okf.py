@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
@@ -20,7 +19,7 @@ from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .clients import Batch, Pieces
-from .machine import one_core
+from .machine import one_core, watched
 from .schedule import generator
 
 Three = tuple[float, float, float]
@@ -107,7 +106,7 @@ def fit_okf_many(
     adam = torch.optim.Adam([logs], lr=0.1)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
     lowest, best, history = torch.full((len(tasks),), torch.inf, dtype=torch.float64), logs.detach().clone(), []
-    for step in tqdm(range(steps), desc=progress, unit="step", disable=progress is None):
+    for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
                 found = _loss(logs, *judge)

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from coopoc.errors import InputError
+from coopoc.workers import leave_with
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
 from .clients import Client, Noise, Pieces, Start, clients
 from .federated import federate_many
+from .machine import reporting_on
 from .method import LearnedGain
 from .net import GainNet
 from .okf import OptimisedKF, fit_okf_many
@@ -97,7 +102,7 @@ def sensors(setting: Setting) -> Sensors:
     return replace(Sensors.paper_training(), velocity_reading=setting.reading)
 
 
-def jobs(name: str, setting: Setting, fleet: Fleet) -> list[Job]:
+def jobs_of(name: str, setting: Setting, fleet: Fleet) -> list[Job]:
     """The checkpoints of a recipe in a setting: one, or one per vehicle of the fleet for individual nets.
 
     Raises:
@@ -119,17 +124,19 @@ def train_all(
     starts: Sequence[Start] = ("gnss",),
     readings: Sequence[VelocityReading] = ("axis",),
     recipes: Sequence[str] | None = None,
+    jobs: int = 1,
     progress: bool = True,
 ) -> dict[str, Checkpoint]:
     """Train every recipe in every setting, or read it from `out` where the same was trained before.
 
-    All settings of a recipe are trained together. A checkpoint is reused if its card's key, the hash of all that
-    changes the weights, is the same; each is written whole or not at all.
+    All settings of a recipe are trained together, on one core; recipes side by side on `jobs` cores. A checkpoint is
+    reused if its card's key, the hash of all that changes the weights, is the same; each is written whole or
+    not at all.
 
     Args:
         fleet: the clients' drives, such as the bundled "town10-clients". out: folder of the checkpoints.
         seeds, starts, readings: the settings, every combination. recipes: names, default all of `RECIPES`.
-        progress: bars on stderr that name the stage.
+        jobs: processes; the weights do not depend on it. progress: bars on stderr that name the stage.
 
     Returns:
         Checkpoints by label, such as "fedkalmannet-gnss-axis-0".
@@ -138,19 +145,36 @@ def train_all(
         InputError: an unknown recipe.
     """
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
-    found: dict[str, Checkpoint] = {}
-    for name in RECIPES if recipes is None else recipes:
-        wanted = [job for setting in settings for job in jobs(name, setting, fleet)]
-        paths = {job.label: Path(out) / f"{job.label}.safetensors" for job in wanted}
-        missing = [job for job in wanted if not _made(paths[job.label], job.key(fleet))]
-        if missing:
-            data = {job.setting: _data(fleet, job) for job in missing}
-            trained = TRAINERS[missing[0].recipe.kind](missing, data, f"train {name}" if progress else None)
-            for job, made in zip(missing, trained, strict=True):
-                card = _card(job, fleet, data[job.setting]) | dict(made.card)
-                save(paths[job.label], Checkpoint(made.model, card, made.history))
-        found |= {job.label: load(paths[job.label]) for job in wanted}
-    return found
+    wanted = {name: [job for setting in settings for job in jobs_of(name, setting, fleet)]
+              for name in (RECIPES if recipes is None else recipes)}  # fmt: skip
+    paths = {job: Path(out) / f"{job.label}.safetensors" for group in wanted.values() for job in group}
+    groups = ([job for job in group if not _made(paths[job], job.key(fleet))] for group in wanted.values())
+    missing = [group for group in groups if group]
+    if jobs > 1 and len(missing) > 1:
+        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+            todo = [pool.submit(_in_worker, group, fleet, Path(out), line if progress else None, os.getpid())
+                    for line, group in enumerate(missing)]  # fmt: skip
+            for done in todo:
+                done.result()
+    else:
+        for group in missing:
+            _train(group, fleet, Path(out), progress)
+    return {job.label: load(path) for job, path in paths.items()}
+
+
+def _train(group: Sequence[Job], fleet: Fleet, out: Path, progress: bool) -> None:
+    """Train and save the checkpoints of one recipe."""
+    data = {job.setting: _data(fleet, job) for job in group}
+    trained = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
+    for job, made in zip(group, trained, strict=True):
+        card = _card(job, fleet, data[job.setting]) | dict(made.card)
+        save(out / f"{job.label}.safetensors", Checkpoint(made.model, card, made.history))
+
+
+def _in_worker(group: Sequence[Job], fleet: Fleet, out: Path, line: int | None, parent: int) -> None:
+    leave_with(parent)
+    with reporting_on(line or 0):
+        _train(group, fleet, out, line is not None)
 
 
 def load_method(name_or_path: Path | str) -> LearnedGain | OptimisedKF:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
@@ -18,7 +17,7 @@ from coopoc.world.noise import stream
 
 from .clients import Batch, Pieces, mirrored
 from .gradient import loss, loss_and_gradient
-from .machine import one_core
+from .machine import one_core, watched
 from .net import GainNet
 from .rollout import flatten, layers, unflatten
 from .schedule import Schedule, adamw, clip, cosine, generator
@@ -201,4 +200,4 @@ def pooled(parts: Sequence[Pieces]) -> tuple[Pieces, list[Ints]]:
 
 def bar(steps: Iterator[tuple[int, Tensor]], plans: Sequence[Ints], name: str | None) -> Iterator[tuple[int, Tensor]]:
     """The same steps with a progress bar of that name on stderr, or without one."""
-    return iter(tqdm(steps, total=max(map(len, plans)), desc=name, unit="step", disable=name is None))
+    return watched(steps, name, "step", max(map(len, plans)))

@@ -62,9 +62,9 @@ def key(p: Params) -> dict[str, str]:
     return {**scene.facts(p), "weights": weights.key(p["method"], p), "rounds": weights.key(FEDERATED, p)}
 
 
-def prepare(cells: Sequence[Params]) -> None:
+def prepare(cells: Sequence[Params], jobs: int) -> None:
     """Train what the cells need, and the federated net in any case."""
-    weights.prepare([{**p, "method": name} for p in cells for name in (p["method"], FEDERATED)])
+    weights.prepare([{**p, "method": name} for p in cells for name in (p["method"], FEDERATED)], jobs)
 
 
 def meaningful(p: Params) -> bool:

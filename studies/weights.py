@@ -57,17 +57,17 @@ def _key(name: str, p: Params, seed: int) -> str:
 
 @lru_cache
 def _keys(clients: str, begin: Start, reading: VelocityReading, count: int) -> Mapping[str, str]:
-    from coopoc.learned.recipes import RECIPES, Setting, jobs
+    from coopoc.learned.recipes import RECIPES, Setting, jobs_of
 
     drives = fleet(clients)
     settings = [Setting(seed, begin, reading) for seed in range(count)]
     return {
-        job.label: job.key(drives) for setting in settings for name in RECIPES for job in jobs(name, setting, drives)
+        job.label: job.key(drives) for setting in settings for name in RECIPES for job in jobs_of(name, setting, drives)
     }
 
 
-def prepare(cells: Iterable[Params]) -> None:
-    """Train what the cells need and is not there yet: in this process, one recipe after another, with progress."""
+def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
+    """Train what the cells need and is not there yet, with progress: `jobs` recipes at a time."""
     from coopoc.learned.recipes import RECIPES, train_all
 
     wanted: dict[tuple[str, str, int], list[Params]] = {}
@@ -79,6 +79,7 @@ def prepare(cells: Iterable[Params]) -> None:
         train_all(
             fleet(clients), folder, seeds=range(count), starts=sorted({start(p) for p in asking}),
             readings=sorted({p["velocity_reading"] for p in asking}), recipes=[r for r in RECIPES if r in named],
+            jobs=jobs,
         )  # fmt: skip
 
 

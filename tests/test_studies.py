@@ -20,7 +20,7 @@ from coopoc.evaluate.metrics import rt_le
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain
 from coopoc.learned.net import GainNet
-from coopoc.learned.recipes import Setting, jobs, load_method
+from coopoc.learned.recipes import Setting, jobs_of, load_method
 from coopoc.learned.rollout import flatten
 from coopoc.plugins import find
 from coopoc.studies import claims, convergence, error_cdf, neighbours, paper, scene, weights
@@ -158,7 +158,7 @@ def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:
     """The shipped weights of a method as the first seed's checkpoint of a training that these parameters ask for."""
     shipped = load(WEIGHTS / f"{name}.safetensors")
     drives = co.load(str(p["clients"]))
-    (job,) = jobs(name, Setting(0, p["start"], p["velocity_reading"]), drives)
+    (job,) = jobs_of(name, Setting(0, p["start"], p["velocity_reading"]), drives)
     card, history = {**shipped.card, "key": job.key(drives)}, None
     if isinstance(shipped.model, GainNet):
         card["history"] = shipped.card["history"][: rounds + 1]

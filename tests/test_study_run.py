@@ -136,7 +136,7 @@ def test_a_damaged_file_is_computed_again(study: Study, tmp_path: Path, damage: 
 
 def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study: Study, tmp_path: Path) -> None:
     asked: list[list[int]] = []
-    study = replace(study, prepare=lambda cells: asked.append(sorted({p["max_neighbours"] for p in cells})))
+    study = replace(study, prepare=lambda cells, jobs: asked.append(sorted({p["max_neighbours"] for p in cells})))
     run(study, tmp_path, settings={"max_neighbours": "0"}, progress=False)
     run(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
     run(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)

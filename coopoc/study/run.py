@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import itertools
 import os
-import signal
-import threading
 import time
 import traceback
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +19,7 @@ from tqdm import tqdm
 
 from .. import plugins
 from ..errors import InputError
+from ..workers import leave_with
 from . import store
 from .environment import environment
 from .publish import publish
@@ -63,7 +61,7 @@ def _run(study: Study, cells: Sequence[Cell], folder: Path, jobs: int, progress:
     store.prepare(folder, _manifest(study, cells))
     todo = [cell for cell in cells if store.load(folder, cell.name) is None]
     if todo:
-        study.prepare([cell.given for cell in todo])
+        study.prepare([cell.given for cell in todo], jobs)
     bar = tqdm(total=len(cells), initial=len(cells) - len(todo), desc=study.name, unit="cell", disable=not progress)
     with bar, closing(_compute(study.cell, schedule(todo, study.shares, jobs), jobs)) as outcomes:
         failed = 0
@@ -154,22 +152,8 @@ def _compute(function: Callable[[Params], list[Row]], cells: Sequence[Cell], job
 
 
 def _in_worker(function: Callable[[Params], list[Row]], cell: Cell, parent: int) -> Outcome:
-    _leave_with(parent)
+    leave_with(parent)
     return attempt(function, cell)
-
-
-@lru_cache
-def _leave_with(parent: int) -> None:
-    """End this worker when the process that started it does: Ctrl-C is for that one, and a kill leaves no orphan."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    if os.getppid() == parent:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        threading.Thread(target=watch, daemon=True).start()
 
 
 def _keep(folder: Path, outcome: Outcome) -> bool:

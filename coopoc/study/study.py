@@ -27,7 +27,7 @@ Params: TypeAlias = Mapping[str, Any]
 Row: TypeAlias = dict[str, Any]
 
 
-def _nothing_to_prepare(cells: Sequence[Params]) -> None:
+def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:
     pass
 
 
@@ -49,8 +49,9 @@ class Study:
         settings: what all cells share (runs, seed, data, egos ...) with defaults, overridden by --set key=value.
         key: parameters -> what else changes the numbers (fleet digest, hash of weights, revision of the methods).
             Evaluated for every cell before any work, so an InputError raised here is reported at once.
-        prepare: called once with the parameters of the cells that are not finished, before they are computed, in the
-            process that started the run: trains or downloads what several cells share. It must resume by itself.
+        prepare: called once with the parameters of the cells that are not finished and the number of processes,
+            before they are computed, in the process that started the run: trains or downloads what several cells
+            share. It must resume by itself.
         where: parameters -> False for combinations that mean nothing.
         shares: names of parameters on which the expensive part (a Recording) depends: cells that agree on them follow
             each other in one worker, where functools.lru_cache then serves.
@@ -72,7 +73,7 @@ class Study:
     grid: Mapping[str, Sequence[Scalar]] | Sequence[Mapping[str, Scalar]]
     settings: Mapping[str, Any] = field(default_factory=dict)
     key: Callable[[Params], Mapping[str, Any]] = _no_extras
-    prepare: Callable[[Sequence[Params]], None] = _nothing_to_prepare
+    prepare: Callable[[Sequence[Params], int], None] = _nothing_to_prepare
     where: Callable[[Params], bool] | None = None
     shares: tuple[str, ...] = ()
     tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)
