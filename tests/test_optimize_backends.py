@@ -165,7 +165,7 @@ def custom(factor: Factor, node: list[int], z: np.ndarray):
             step = 1e-5 * np.eye(3)
             slope = [(known.predict(v + d) - known.predict(v - d)) / 2e-5 for d in step]
             jacobians[0], jacobians[1] = -np.array(slope).T, np.array(slope).T
-        return known.difference(known.predict(v), z)
+        return known.difference(v, None, z, np.empty(0))
 
     return error
 

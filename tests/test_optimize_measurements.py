@@ -6,34 +6,96 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from coopoc import InputError
 from coopoc.optimize import MEASUREMENTS, Problem, backends, measurement, solve
 from coopoc.optimize import dual as dual_numbers
 from coopoc.optimize.dual import seeds
+from coopoc.optimize.space import Space, exp
 
 VECTORS = np.random.default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
 
 
-@pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
-def test_derivative_equals_casadis(kind: str) -> None:
+ROTATIONS = Rotation.random(50, random_state=1).as_matrix()
+PLAIN = sorted(kind for kind, known in MEASUREMENTS.items() if known.frame != "relative")
+CONSTANTS = [0.1]
+
+
+class Symbolic:
+    """CasADi as the namespace of a formula."""
+
+    sqrt, atan2, where = ca.sqrt, ca.atan2, ca.if_else
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kind", PLAIN)
+def test_derivative_equals_casadis(kind: str, dimension: int) -> None:
     known = MEASUREMENTS[kind]
-    v = ca.SX.sym("v", 3)
-    formula = ca.vertcat(*known.formula(v[0], v[1], v[2], ca))
+    if dimension == 2 and known.plane is None:
+        pytest.skip(f"{kind} does not exist in the plane")
+    v, given, size = ca.SX.sym("v", dimension), CONSTANTS[: known.constants], known.size(dimension)
+    formula = ca.vertcat(*known.residual(ca.vertsplit(v), [0.0] * size, given, Symbolic))
     reference = ca.Function("h", [v], [formula, ca.jacobian(formula, v)])
-    value, slope = known.differentiate(VECTORS)
-    slope = np.broadcast_to(slope, (len(VECTORS), known.size, 3))
-    for i, vector in enumerate(VECTORS):
+    vectors = VECTORS[:, :dimension]
+    zero, constants = np.zeros((len(vectors), size)), np.broadcast_to(given, (len(vectors), len(given)))
+    value, slope = known.differentiate(vectors, None, zero, constants)
+    slope = np.broadcast_to(slope, (len(vectors), size, dimension))
+    for i, vector in enumerate(vectors):
         h, J = (np.asarray(a) for a in reference(vector))
         assert value[i] == pytest.approx(h[:, 0], abs=1e-13)
         assert slope[i] == pytest.approx(J, abs=1e-13)
+    assert known.predict(vectors, given) == pytest.approx(value, abs=1e-13)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("kind", ["relative_pose", "relative_pose_chordal"])
+def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
+    """By the position and by a right turn R Exp(w), w = 0, for a small and for any error of the rotation."""
+    known, space = MEASUREMENTS[kind], Space(dimension, turning=True)
+    v, w = ca.SX.sym("v", dimension), ca.SX.sym("w", space.angles)
+    turn, d = ca.SX.sym("R", dimension, dimension), dimension
+    skew = ca.skew(w) if d == 3 else ca.vertcat(ca.horzcat(0, -w), ca.horzcat(w, 0))
+    turned = turn @ (ca.SX.eye(d) + skew)
+    z = ca.SX.sym("z", space.width)
+    local = [*ca.vertsplit(v), *(turned[i, j] for i in range(d) for j in range(d))]
+    formula = ca.vertcat(*known.residual(local, ca.vertsplit(z), [], Symbolic))
+    slopes = [ca.substitute(ca.jacobian(formula, s), w, 0) for s in (v, w)]
+    reference = ca.Function("h", [v, turn, z], [ca.substitute(formula, w, 0), ca.horzcat(*slopes)])
+    if d == 3:
+        turns, others = ROTATIONS, ROTATIONS[::-1]
+    else:
+        angles = np.linspace(-3.0, 3.0, 50)
+        turns, others = exp(angles[:, None]), exp(angles[::-1, None])
+    near = turns @ exp(np.full((50, space.angles), 1e-3))
+    for measured in (others, near, turns):
+        z_values = space.join(VECTORS[::-1, :d], measured)
+        value, slope = known.differentiate(VECTORS[:, :d], turns, z_values, np.empty((50, 0)))
+        for i in range(50):
+            h, J = (np.asarray(a) for a in reference(VECTORS[i, :d], turns[i], z_values[i]))
+            assert value[i] == pytest.approx(h[:, 0], abs=1e-9)
+            assert slope[i] == pytest.approx(J, abs=1e-9)
+
+
+def test_a_relative_pose_is_scipys_logarithm() -> None:
+    known, space = MEASUREMENTS["relative_pose"], Space(3, turning=True)
+    z = space.join(VECTORS[::-1], ROTATIONS[::-1])
+    found = known.difference(VECTORS, ROTATIONS, z, np.empty((50, 0)))
+    back = Rotation.from_matrix(ROTATIONS[::-1]).inv()
+    assert found[:, :3] == pytest.approx(back.apply(VECTORS - VECTORS[::-1]), abs=1e-12)
+    assert found[:, 3:] == pytest.approx((back * Rotation.from_matrix(ROTATIONS)).as_rotvec(), abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
 def test_torch_runs_the_same_formula(kind: str) -> None:
-    known = MEASUREMENTS[kind]
-    parts = known.formula(*torch.tensor(VECTORS).unbind(-1), torch)
-    assert torch.stack(parts, -1).numpy() == pytest.approx(known.predict(VECTORS), abs=1e-13)
+    known, space = MEASUREMENTS[kind], Space(3, turning=True)
+    z = space.join(VECTORS, ROTATIONS[::-1]) if known.compares_poses else np.zeros((50, known.size()))
+    rotation = ROTATIONS if known.frame == "relative" else None
+    constants = np.full((50, known.constants), 0.1)
+    local = VECTORS if rotation is None else space.join(VECTORS, rotation)
+    columns = (torch.tensor(a).unbind(-1) for a in (local, z, constants))
+    parts = torch.stack(known.residual(*columns, torch), -1).numpy()
+    assert known.wrapped(parts) == pytest.approx(known.difference(VECTORS, rotation, z, constants), abs=1e-13)
 
 
 def test_dual_arithmetic_equals_casadis() -> None:

@@ -44,7 +44,7 @@ def test_jacobian_equals_casadis() -> None:
             vector = x[:, nodes[-1]] - (x[:, nodes[0]] if len(nodes) == 2 else 0)
             gap = ca.vertcat(*MEASUREMENTS[factor.kind].formula(vector[0], vector[1], vector[2], ca)) - factor.z[k]
             gap = [ca.atan2(ca.sin(gap[c]), ca.cos(gap[c])) if angle else gap[c]
-                   for c, angle in enumerate(factor.measurement.angles)]  # fmt: skip
+                   for c, angle in enumerate(factor.measurement.angles())]  # fmt: skip
             rows.append(ca.DM(factor.root[k]) @ ca.vertcat(*gap))
     residual = ca.vertcat(*rows)
     reference = ca.Function("r", [x], [residual, ca.jacobian(residual, ca.vec(x))])
@@ -132,9 +132,9 @@ BAD = {
     "unknown index": (lambda: Problem(("a",), (Factor("position", [[3]], [[0, 0, 0]], std=1.0),)), "index < 1"),
     "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "two different points"),
     "unknown kind": (lambda: PAIR.add("doppler", ("a", "b"), 5.0, std=1.0), "spherical"),
-    "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "one of the two"),
-    "both std": (lambda: PAIR.add("range", ("a", "b"), 5.0, 1.0, [[1.0]]), "one of the two"),
-    "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1], std=1.0), "must have shape"),
+    "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "exactly one of std, cov"),
+    "both std": (lambda: PAIR.add("range", ("a", "b"), 5.0, 1.0, cov=[[1.0]]), "exactly one of std, cov"),
+    "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0], std=1.0), "must have 2 or 3"),
     "shape of std": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
     "shape of root": (lambda: PAIR.add("range", ("a", "b"), 5.0, sqrt_information=np.eye(3)), "must have shape"),
     "nan root": (lambda: PAIR.add("range", ("a", "b"), 5.0, sqrt_information=[[np.nan]]), "finite"),

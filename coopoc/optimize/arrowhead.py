@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from .linear import opposite
 from .normal import Pattern, pattern
 from .problem import Problem
 
@@ -22,7 +23,8 @@ class Arrow:
 
     Args:
         hub: (h,) points. group: (G, s) points, -1 where a group is smaller.
-        corner, arm, head: source block and destination (group, row, column) of the three parts; blocks are symmetric.
+        corner, arm, head: source block and destination (group, row, column) of the three parts; block (j, i) is that of
+            (i, j) turned over, the last of the numbers says so.
     """
 
     hub: Ints
@@ -34,19 +36,23 @@ class Arrow:
 
 def structure(problem: Problem) -> tuple[Pattern, Arrow]:
     """Pattern and arrowhead of a problem, kept for the next problems of the same structure: a drive has few."""
-    nodes = tuple((f.nodes.shape[1], f.nodes.tobytes()) for f in problem.factors)
-    return _structure(len(problem.names), problem.hub, nodes)
+    factors = tuple((f.nodes.shape[1], f.nodes.tobytes(), opposite(f, problem.free)) for f in problem.factors)
+    still = b"" if problem.free is None else (~problem.free).tobytes()
+    return _structure(len(problem.names), problem.space.dof, problem.hub, factors, still)
 
 
 @lru_cache(maxsize=512)
-def _structure(n: int, hub: tuple[int, ...], nodes: tuple[tuple[int, bytes], ...]) -> tuple[Pattern, Arrow]:
-    scheme = pattern(n, [np.frombuffer(raw, np.int64).reshape(-1, arity) for arity, raw in nodes])
+def _structure(
+    n: int, dof: int, hub: tuple[int, ...], factors: tuple[tuple[int, bytes, bool], ...], still: bytes
+) -> tuple[Pattern, Arrow]:
+    nodes = [(np.frombuffer(raw, np.int64).reshape(-1, arity), signs) for arity, raw, signs in factors]
+    scheme = pattern(n, nodes, np.frombuffer(still, bool).reshape(n, dof) if still else None)
     return scheme, _arrow(np.array(hub or range(n), dtype=np.int64), scheme)
 
 
 def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
     """Groups are what is left connected when the hub is taken out (no hub: all is hub)."""
-    n = scheme.points
+    n = scheme.nodes
     label = _groups(n, hub, scheme.pairs)
     count = int(label.max(initial=-1)) + 1
     members = [np.flatnonzero(label == g) for g in range(count)]
@@ -60,10 +66,11 @@ def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
     i, j = scheme.pairs.T
     row, col = np.concatenate([scheme.pairs, scheme.pairs[i != j][:, ::-1]]).T
     source = np.concatenate([np.arange(len(i)), np.flatnonzero(i != j)])
+    turned = (np.arange(len(source)) >= len(i)).astype(np.int64)
     in_hub = label < 0
 
     def part(chosen: Bools) -> tuple[Ints, ...]:
-        return source[chosen], label[row[chosen]], place[row[chosen]], place[col[chosen]]
+        return source[chosen], label[row[chosen]], place[row[chosen]], place[col[chosen]], turned[chosen]
 
     corner = part(in_hub[row] & in_hub[col])
     return Arrow(hub, group, (corner[0], 0 * corner[1], *corner[2:]),
@@ -86,36 +93,40 @@ def _groups(n: int, hub: Ints, pairs: Ints) -> Ints:
 
 
 def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Floats, Floats]:
-    """Corner (B, 3h, 3h), arms (B, G, 3s, 3h) and heads (B, G, 3s, 3s), damping added to the diagonal."""
-    batch, h, (count, size) = len(blocks), len(frame.hub), frame.group.shape
+    """Corner (B, dh, dh), arms (B, G, ds, dh) and heads (B, G, ds, ds), damping added to the diagonal; d is dof."""
+    batch, d, h, (count, size) = len(blocks), blocks.shape[-1], len(frame.hub), frame.group.shape
 
     def fill(part: tuple[Ints, ...], groups: int, rows: int, cols: int) -> Floats:
-        out = np.zeros((batch, groups, rows, 3, cols, 3))
-        np.swapaxes(out, 3, 4)[:, part[1], part[2], part[3]] = blocks[:, part[0]]
-        return out.reshape(batch, groups, 3 * rows, 3 * cols)
+        out = np.zeros((batch, groups, rows, d, cols, d))
+        source, group, row, col, turned = part
+        inside = np.swapaxes(out, 3, 4)
+        straight, over = turned == 0, turned == 1
+        inside[:, group[straight], row[straight], col[straight]] = blocks[:, source[straight]]
+        inside[:, group[over], row[over], col[over]] = np.swapaxes(blocks[:, source[over]], -1, -2)
+        return out.reshape(batch, groups, d * rows, d * cols)
 
     corner = fill(frame.corner, 1, h, h)[:, 0]
-    at = np.arange(3 * h)
+    at = np.arange(d * h)
     corner[:, at, at] += damping[:, frame.hub].reshape(batch, -1)
     arm, head = fill(frame.arm, count, size, h), fill(frame.head, count, size, size)
     extra = np.where((frame.group >= 0)[None, :, :, None], damping[:, frame.group], 1.0)
-    at = np.arange(3 * size)
-    head[:, :, at, at] += extra.reshape(batch, count, 3 * size)
+    at = np.arange(d * size)
+    head[:, :, at, at] += extra.reshape(batch, count, d * size)
     return corner, arm, head
 
 
 def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -> Floats:
-    """dx (B, n, 3) of (J^T J + diag(damping)) dx = -gradient by the Schur complement on the hub.
+    """dx (B, n, dof) of (J^T J + diag(damping)) dx = -gradient by the Schur complement on the hub.
 
     Raises:
         numpy.linalg.LinAlgError: a singular block.
     """
     corner, arm, head = _parts(frame, blocks, damping)
-    batch = len(blocks)
+    batch, d = len(blocks), blocks.shape[-1]
     pull = gradient[:, frame.hub].reshape(batch, -1, 1)
     dx = np.empty_like(gradient)
     if not frame.group.size:
-        dx[:, frame.hub] = -np.linalg.solve(corner, pull).reshape(batch, -1, 3)
+        dx[:, frame.hub] = -np.linalg.solve(corner, pull).reshape(batch, -1, d)
         return dx
     there = frame.group >= 0
     side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
@@ -124,36 +135,36 @@ def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -
     schur = corner - taken[..., :-1].sum(axis=1)
     hub = np.linalg.solve(schur, taken[..., -1:].sum(axis=1) - pull)
     rest = -(reduced[..., -1:] + reduced[..., :-1] @ hub[:, None])
-    dx[:, frame.hub] = hub.reshape(batch, -1, 3)
-    dx[:, frame.group[there]] = rest.reshape(batch, *frame.group.shape, 3)[:, there]
+    dx[:, frame.hub] = hub.reshape(batch, -1, d)
+    dx[:, frame.group[there]] = rest.reshape(batch, *frame.group.shape, d)[:, there]
     return dx
 
 
 def marginals(frame: Arrow, blocks: Floats) -> Floats:
-    """(B, n, 3, 3) diagonal blocks of (J^T J)^-1.
+    """(B, n, dof, dof) diagonal blocks of (J^T J)^-1.
 
     Raises:
         numpy.linalg.LinAlgError: a singular block.
     """
-    batch, n = len(blocks), len(frame.hub) + int((frame.group >= 0).sum())
-    corner, arm, head = _parts(frame, blocks, np.zeros((batch, n, 3)))
-    cov = np.empty((batch, n, 3, 3))
+    batch, d, n = len(blocks), blocks.shape[-1], len(frame.hub) + int((frame.group >= 0).sum())
+    corner, arm, head = _parts(frame, blocks, np.zeros((batch, n, d)))
+    cov = np.empty((batch, n, d, d))
     if not frame.group.size:
-        cov[:, frame.hub] = _own(np.linalg.inv(corner))
+        cov[:, frame.hub] = _own(np.linalg.inv(corner), d)
         return cov
     inverse = np.linalg.inv(head)
     reduced = inverse @ arm
     hub = np.linalg.inv(corner - (np.swapaxes(arm, -1, -2) @ reduced).sum(axis=1))
-    cov[:, frame.hub] = _own(hub)
+    cov[:, frame.hub] = _own(hub, d)
     there = frame.group >= 0
-    rest = _own(inverse + reduced @ hub[:, None] @ np.swapaxes(reduced, -1, -2))
+    rest = _own(inverse + reduced @ hub[:, None] @ np.swapaxes(reduced, -1, -2), d)
     cov[:, frame.group[there]] = rest[:, there]
     return cov
 
 
-def _own(matrix: Floats) -> Floats:
-    """(..., m, 3, 3) diagonal blocks of (..., 3m, 3m)."""
-    m = matrix.shape[-1] // 3
-    split = matrix.reshape(*matrix.shape[:-2], m, 3, m, 3)
+def _own(matrix: Floats, d: int) -> Floats:
+    """(..., m, d, d) diagonal blocks of (..., dm, dm)."""
+    m = matrix.shape[-1] // d
+    split = matrix.reshape(*matrix.shape[:-2], m, d, m, d)
     at = np.arange(m)
     return np.moveaxis(split[..., at, :, at, :], 0, -3)

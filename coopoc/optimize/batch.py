@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from .arrowhead import marginals, structure
+from .arrowhead import Arrow, marginals, structure
 from .assess import bounded
 from .backends.gauss_newton import linear_step
 from .descend import MAX_ITERATIONS, TOLERANCE, descend
@@ -22,7 +22,7 @@ CHUNK = 40_000
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Solutions of B realisations: x (B, n, 3) m, covariance (B, n, 3, 3) m^2, the others (B,).
+    """Solutions of B realisations: x (B, n, width), covariance (B, n, dof, dof), the others (B,).
 
     Not converged: the last step was still long, or a point is free; then the covariance is NaN. Unlike `solve` it does
     not look whether the stationary point is a saddle.
@@ -44,8 +44,6 @@ def solve_batch(problem: Problem, max_iterations: int = MAX_ITERATIONS, toleranc
 
     Raises:
         InputError: no measurements.
-        numpy.linalg.LinAlgError: the structure is not observable: solve one realisation alone to see what is free.
-
     >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
     >>> solve_batch(problem).x.shape
     (2, 1, 3)
@@ -61,9 +59,19 @@ def solve_batch(problem: Problem, max_iterations: int = MAX_ITERATIONS, toleranc
         part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
         end = descend(part, step, initial_guess(part), max_iterations, tolerance)
         linear = part.linearise(end.x)
-        blocks, _ = normal_equations(scheme, linear)
-        cov = marginals(frame, blocks)
+        blocks, _ = normal_equations(scheme, linear, [f.nodes for f in part.factors])
+        cov = _marginals(frame, blocks)
         sound = bounded(scheme, blocks, cov)
         cov[~sound] = np.nan
         parts.append((end.x, cov, linear.cost, end.iterations, end.converged & sound))
     return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _marginals(frame: Arrow, blocks: Floats) -> Floats:
+    """Marginals of the realisations, NaN where one is singular."""
+    try:
+        return marginals(frame, blocks)
+    except np.linalg.LinAlgError:
+        if len(blocks) == 1:
+            return np.full((1, len(frame.hub) + int((frame.group >= 0).sum()), *blocks.shape[-2:]), np.nan)
+        return np.concatenate([_marginals(frame, block[None]) for block in blocks])

@@ -8,9 +8,10 @@ import numpy as np
 
 from ..arrays import Floats
 from .arrowhead import structure
-from .factor import Factor
+from .factor import Factor, unchecked
+from .linear import Linear, linearise, opposite
 from .normal import Pattern, assemble, squares
-from .problem import Problem, vector
+from .problem import Problem
 
 STEP = 1e-4
 """Of the vector's length: the second derivative is a central difference of the exact first."""
@@ -19,38 +20,69 @@ SLACK = 1e-6
 
 
 def is_minimum(problem: Problem, x: Floats) -> bool:
-    """True unless the cost of a single problem curves downwards at x (n, 3) m, where its gradient vanishes.
+    """True unless the cost of a single problem curves downwards at x (n, width), where its gradient vanishes.
 
     The Hessian is J^T J + sum_k r_k d2 r_k / dx2. J^T J alone is positive definite at a saddle too, such as an ego on
-    the line between two others whose ranges are longer than the line.
+    the line between two others whose ranges are longer than the line. Where there are constraints it is not looked at.
     """
-    if all(factor.measurement.linear for factor in problem.factors):
+    if problem.linear or problem.constraints:
         return True
     linear = problem.linearise(x[None])
-    parts = squares(linear)
-    bent = [part if factor.measurement.linear else part + _bend(factor, vector(x[None], factor.nodes), residual)
-            for factor, part, residual in zip(problem.factors, parts, linear.residual, strict=True)]  # fmt: skip
     scheme, _ = structure(problem)
-    flat, true = (assemble(scheme, p)[0] for p in (parts, bent))
+    flat = assemble(scheme, squares(linear, [f.nodes for f in problem.factors]))[0]
+    true = assemble(scheme, [part for factor in problem.factors for part in _hessian(problem, factor, x, linear)])[0]
     own = scheme.pairs[:, 0] == scheme.pairs[:, 1]
-    true[own] += SLACK * flat[own] * np.eye(3)
+    true[own] += SLACK * flat[own] * np.eye(problem.space.dof)
     return _positive(scheme, true)
 
 
-def _bend(factor: Factor, v: Floats, residual: Floats) -> Floats:
-    """(1, M, 3, 3) sum over components of whitened residual times second derivative by the vector v (1, M, 3)."""
-    reach = np.maximum(STEP * np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
-    shift = reach * np.eye(3)[:, None, None]
+def _hessian(problem: Problem, factor: Factor, x: Floats, linear: Linear) -> list[Floats]:
+    """Second derivatives of what each measurement costs, as `squares` orders them: (1, M, dof, dof) each."""
+    k = next(i for i, f in enumerate(problem.factors) if f is factor)
+    slopes = linear.slope[k]
+    if factor.measurement.linear and factor.loss is None:
+        return squares(Linear(linear.x, (linear.residual[k],), (slopes,), linear.cost), [factor.nodes])
+    pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.free)
+    count, dof = len(factor.nodes), problem.space.dof
+    local = x[factor.nodes]
+    reach = STEP * np.maximum(np.linalg.norm(problem.space.position(local[:, -1] - local[:, 0] * pair), axis=-1), 1e-3)
+    columns = [np.empty((count, len(slopes) * dof, dof)) for _ in slopes]
+    for node in range(len(slopes)):
+        moved = factor.nodes.shape[1] - len(slopes) + node
+        for c in range(dof):
+            size = np.where(c < problem.dimension, reach, STEP)
+            up, down = (_pulls(problem, factor, local, moved, c, sign * size) for sign in (1.0, -1.0))
+            columns[node][:, :, c] = (up - down) / (2.0 * size[:, None])
+    whole = np.concatenate(columns, axis=2)
+    whole = 0.5 * (whole + np.swapaxes(whole, 1, 2))
+    if not pair or opposed:
+        return [whole[None]]
+    first, second, between = whole[:, :dof, :dof], whole[:, dof:, dof:], whole[:, :dof, dof:]
+    swapped = (factor.nodes[:, 0] > factor.nodes[:, 1])[:, None, None]
+    return [first[None], second[None], np.where(swapped, np.swapaxes(between, 1, 2), between)[None]]
+
+
+def _pulls(problem: Problem, factor: Factor, local: Floats, node: int, coordinate: int, size: Floats) -> Floats:
+    """(M, nodes * dof) gradient of each measurement's own cost when one coordinate of one of its nodes is moved.
+
+    Every measurement gets nodes of its own, so that one call moves them all.
+    """
+    space, (count, arity) = problem.space, factor.nodes.shape
+    step = np.zeros((count, arity, space.dof))
+    step[:, node, coordinate] = size
+    nodes = np.arange(count * arity).reshape(count, arity)
+    free = None if problem.free is None else problem.free[factor.nodes].reshape(count * arity, -1)
+    alone = unchecked(factor, nodes=nodes)
     with np.errstate(all="ignore"):
-        rise = factor.measurement.differentiate(v + shift)[1] - factor.measurement.differentiate(v - shift)[1]
-        second = factor.whiten(residual, rise / (2.0 * reach[..., None]))[1]
-    assert second is not None
-    bend: Floats = np.einsum("kbmcj,bmc->bmkj", second, residual)
-    return 0.5 * (bend + np.swapaxes(bend, -1, -2))
+        moved = linearise(space, [alone], free, space.retract(local, step).reshape(1, count * arity, -1))
+    slopes, residual = moved.slope[0], moved.residual[0]
+    if len(slopes) > 1 and opposite(factor, problem.free):
+        slopes = slopes[1:]
+    return np.concatenate([(np.swapaxes(s, -1, -2) @ residual[..., None])[0, :, :, 0] for s in slopes], axis=1)
 
 
 def _positive(scheme: Pattern, blocks: Floats) -> bool:
-    """Whether the symmetric matrix of the blocks (P, 3, 3) is positive definite: all pivots of L D L^T are."""
+    """Whether the symmetric matrix of the blocks (P, dof, dof) is positive definite: all pivots of L D L^T are."""
     from scipy.sparse.linalg import splu
 
     if not np.isfinite(blocks).all():
@@ -69,6 +101,7 @@ def _matrix(scheme: Pattern, blocks: Floats) -> Any:
 
     off = scheme.pairs[:, 0] != scheme.pairs[:, 1]
     i, j = np.concatenate([scheme.pairs, scheme.pairs[off, ::-1]]).T[:, :, None, None]
-    values = np.concatenate([blocks, blocks[off]])
-    row, col = np.broadcast_arrays(3 * i + np.arange(3)[:, None], 3 * j + np.arange(3))
-    return csc_array((values.ravel(), (row.ravel(), col.ravel())), shape=(3 * scheme.points, 3 * scheme.points))
+    values = np.concatenate([blocks, np.swapaxes(blocks[off], -1, -2)])
+    dof = blocks.shape[-1]
+    row, col = np.broadcast_arrays(dof * i + np.arange(dof)[:, None], dof * j + np.arange(dof))
+    return csc_array((values.ravel(), (row.ravel(), col.ravel())), shape=(dof * scheme.nodes, dof * scheme.nodes))

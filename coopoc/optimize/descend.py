@@ -9,15 +9,16 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from .problem import Linear, Problem, half_squares, vector
+from .linear import Linear
+from .problem import Problem
 
 Step = Callable[[Linear, Floats], Floats]
-"""(linearisation, damping (B, n, 3)) -> dx (B, n, 3) of (J^T J + diag(damping)) dx = -J^T r; LinAlgError: singular."""
+"""(linearisation, damping (B, n, dof)) -> dx (B, n, dof), (J^T J + diag(damping)) dx = -J^T r; LinAlgError: singular."""
 
 MAX_ITERATIONS = 500
 """About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
 TOLERANCE = 1e-8
-"""m, largest move of a point in the last step."""
+"""m or rad, largest move of a node in the last step."""
 GIVE_UP = 1e12
 """Damping beyond which no step can help."""
 
@@ -27,7 +28,7 @@ class Descent:
     """Where the loop ended.
 
     Args:
-        x: (B, n, 3) m. iterations: (B,) linear steps taken. converged: (B,) the last step was below the tolerance.
+        x: (B, n, width). iterations: (B,) linear steps taken. converged: (B,) the last step was below the tolerance.
     """
 
     x: Floats
@@ -46,7 +47,7 @@ def descend(
     leaves the batch when no point of it moves by more than `tolerance`.
 
     Args:
-        problem: one or B realisations. step: the backend's linear solver. x: (B, n, 3) m start.
+        problem: one or B realisations. step: the backend's linear solver. x: (B, n, width) start.
         max_iterations: of linear steps. tolerance: m.
 
     Raises:
@@ -64,7 +65,7 @@ def descend(
         dx, solved = _try(step, problem, linear, mu[active])
         count[active] += 1
         with np.errstate(all="ignore"):
-            trial = now.linearise(linear.x + dx)
+            trial = now.linearise(problem.space.retract(linear.x, dx))
             small = solved & (np.abs(dx).max(axis=(1, 2)) <= tolerance)
             better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
         mu[active] = _damping(mu[active], better, linear.cost, trial.cost, _promised(problem, linear, dx))
@@ -84,12 +85,12 @@ def descend(
 
 
 def _promised(problem: Problem, linear: Linear, dx: Floats) -> Floats:
-    """(B,) cost that the linear model expects after the step: 1/2 |r + J dx|^2."""
-    residuals = [
-        r + (s @ vector(dx, f.nodes)[..., None])[..., 0]
-        for f, r, s in zip(problem.factors, linear.residual, linear.slope, strict=True)
-    ]
-    return half_squares(residuals, len(dx))
+    """(B,) cost that the linear model expects after the step, 1/2 |r + J dx|^2 in place of 1/2 |r|^2."""
+    expected = linear.cost.copy()
+    for factor, r, slopes in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
+        moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(slopes, factor.nodes.T, strict=True))
+        expected += np.einsum("bmk,bmk->b", r + 0.5 * moved, np.broadcast_to(moved, r.shape))
+    return expected
 
 
 def _damping(mu: Floats, better: Bools, before: Floats, after: Floats, promised: Floats) -> Floats:
@@ -104,22 +105,22 @@ def _damping(mu: Floats, better: Bools, before: Floats, after: Floats, promised:
 
 def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Bools]:
     """The step, and for which realisations it is finite; a singular system counts as none."""
-    damping = np.zeros_like(linear.x)
+    damping = np.zeros((*linear.x.shape[:2], problem.space.dof))
     if mu.any():
         damping = mu[:, None, None] * np.maximum(_scale(problem, linear), 1e-9)
     try:
         with np.errstate(all="ignore"):
             dx = step(linear, damping)
     except np.linalg.LinAlgError:
-        return np.zeros_like(linear.x), np.zeros(len(linear.x), dtype=bool)
+        return np.zeros_like(damping), np.zeros(len(linear.x), dtype=bool)
     finite = np.asarray(np.isfinite(dx).all(axis=(1, 2)))
     return np.where(finite[:, None, None], dx, 0.0), finite
 
 
 def _scale(problem: Problem, linear: Linear) -> Floats:
-    """(B, n, 3) diagonal of J^T J."""
-    total = np.zeros_like(linear.x)
-    for factor, slope in zip(problem.factors, linear.slope, strict=True):
-        for column in factor.nodes.T:
+    """(B, n, dof) diagonal of J^T J."""
+    total = np.zeros((*linear.x.shape[:2], problem.space.dof))
+    for factor, slopes in zip(problem.factors, linear.by_node(problem.factors), strict=True):
+        for column, slope in zip(factor.nodes.T, slopes, strict=True):
             np.add.at(total.swapaxes(0, 1), column, np.square(slope).sum(axis=-2).swapaxes(0, 1))
     return total

@@ -12,12 +12,12 @@ from ..arrays import Floats
 
 @dataclass(frozen=True, eq=False)
 class Dual:
-    """A value and its derivative by the three components of a vector (forward-mode differentiation).
+    """A value and its derivative by E coordinates (forward-mode differentiation).
 
     The module that defines it is also the namespace `m` of its functions, as numpy, torch and casadi are of theirs.
 
     Args:
-        value: any shape (...). slope: (3, ...), broadcastable.
+        value: any shape (...). slope: (E, ...), broadcastable.
 
     >>> x, y, _ = seeds(np.array([3.0, 4.0, 0.0]))
     >>> sqrt(x * x + y * y).slope
@@ -61,14 +61,21 @@ class Dual:
     def __pow__(self, power: float) -> Dual:
         return Dual(self.value**power, power * self.value ** (power - 1) * self.slope)
 
+    def __lt__(self, other: Any) -> Any:
+        return self.value < other
+
+    def __gt__(self, other: Any) -> Any:
+        return self.value > other
+
     __radd__ = __add__
     __rmul__ = __mul__
 
 
-def seeds(vector: Floats) -> tuple[Dual, Dual, Dual]:
-    """The components of vectors (..., 3), each with the derivative 1 by itself."""
-    unit = np.eye(3).reshape(3, 3, *(1,) * (vector.ndim - 1))
-    return Dual(vector[..., 0], unit[0]), Dual(vector[..., 1], unit[1]), Dual(vector[..., 2], unit[2])
+def seeds(vector: Floats, coordinates: int | None = None) -> tuple[Dual, ...]:
+    """The components of vectors (..., k), each with the derivative 1 by itself among E `coordinates` (default k)."""
+    k = vector.shape[-1]
+    unit = np.eye(k, coordinates or k).reshape(k, -1, *(1,) * (vector.ndim - 1))
+    return tuple(Dual(vector[..., i], unit[i]) for i in range(k))
 
 
 def sqrt(a: Dual) -> Dual:
@@ -77,7 +84,26 @@ def sqrt(a: Dual) -> Dual:
     return Dual(root, a.slope * (0.5 / root))
 
 
+def sin(a: Dual) -> Dual:
+    """Sine."""
+    return Dual(np.sin(a.value), np.cos(a.value) * a.slope)
+
+
+def cos(a: Dual) -> Dual:
+    """Cosine."""
+    return Dual(np.cos(a.value), -np.sin(a.value) * a.slope)
+
+
 def atan2(y: Dual, x: Dual) -> Dual:
     """Angle of (x, y), d atan2 = (x dy - y dx) / (x^2 + y^2)."""
     square = x.value * x.value + y.value * y.value
     return Dual(np.arctan2(y.value, x.value), (x.value / square) * y.slope - (y.value / square) * x.slope)
+
+
+def where(condition: Any, a: Any, b: Any) -> Dual:
+    """`a` where the condition holds, else `b`; both are computed, so both must be finite."""
+    first, second = (v if isinstance(v, Dual) else Dual(np.asarray(v, dtype=np.float64), np.zeros(1)) for v in (a, b))
+    value = np.where(condition, first.value, second.value)
+    slopes = (s.slope.reshape(len(s.slope), *(1,) * (np.ndim(value) - s.slope.ndim + 1), *s.slope.shape[1:])
+              for s in (first, second))  # fmt: skip
+    return Dual(value, np.where(condition, *slopes))

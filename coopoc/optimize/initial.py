@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Floats
+from ..errors import InputError
 from ..world.spherical import to_vector
 from .arrowhead import eliminate, structure
-from .factor import Factor
+from .factor import Factor, unchecked
 from .normal import normal_equations
 from .problem import Problem
 
@@ -28,30 +29,41 @@ def converted(problem: Problem) -> Problem:
     that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot
     (performance.md section 1.1 of the design notes).
     """
-    factors = [_vector(f) if f.kind == "spherical" else f for f in problem.factors]
-    return replace(problem, factors=tuple(f for f in factors if f.measurement.linear), x0=None)
+    factors = [_vector(f) if f.kind == "spherical" else unchecked(f, loss=None) for f in problem.factors]
+    return replace(problem, factors=tuple(f for f in factors if f.measurement.linear), x0=None, held=())
 
 
 def initial_guess(problem: Problem) -> Floats:
-    """(B, n, 3) m: x0 if the problem has one, else the solution of `converted`."""
+    """(B, n, width): x0 if the problem has one, else the solution of `converted`.
+
+    Raises:
+        InputError: poses without an x0.
+    """
     batch = problem.batch or 1
     if problem.x0 is not None:
-        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), 3)))
+        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.width)))
+    if problem.poses:
+        raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
     linear = converted(problem)
-    x = np.zeros((batch, len(problem.names), 3))
+    x = np.zeros((batch, len(problem.names), problem.dimension))
     if not linear.factors:
         return x
     scheme, frame = structure(linear)
-    blocks, gradient = normal_equations(scheme, linear.linearise(x))
+    blocks, gradient = normal_equations(scheme, linear.linearise(x), [f.nodes for f in linear.factors])
     return eliminate(frame, blocks, gradient, np.full_like(x, RIDGE))
 
 
 def _vector(factor: Factor) -> Factor:
-    d, az, inc = np.moveaxis(factor.z, -1, 0)
-    d = np.maximum(d, LEAST_RANGE)
-    sa, ca, si, ci = np.sin(az), np.cos(az), np.sin(inc), np.cos(inc)
-    sine = np.where(si < 0, -1.0, 1.0) * np.maximum(np.abs(si), LEAST_SINE)
-    zero = np.zeros_like(d)
-    rows = [[si * ca, si * sa, ci], [-sa / (d * sine), ca / (d * sine), zero], [ci * ca / d, ci * sa / d, -si / d]]
+    d, az = factor.z[..., 0], factor.z[..., 1]
+    d, sa, ca = np.maximum(d, LEAST_RANGE), np.sin(az), np.cos(az)
+    if factor.size == 2:
+        rows = [[ca, sa], [-sa / d, ca / d]]
+        z = np.stack([d * ca, d * sa], axis=-1)
+    else:
+        si, ci = np.sin(factor.z[..., 2]), np.cos(factor.z[..., 2])
+        sine = np.where(si < 0, -1.0, 1.0) * np.maximum(np.abs(si), LEAST_SINE)
+        zero = np.zeros_like(d)
+        rows = [[si * ca, si * sa, ci], [-sa / (d * sine), ca / (d * sine), zero], [ci * ca / d, ci * sa / d, -si / d]]
+        z = to_vector(factor.z)
     inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    return Factor("displacement", factor.nodes, to_vector(factor.z), sqrt_information=factor.root @ inverse)
+    return Factor("displacement", factor.nodes, z, sqrt_information=factor.root @ inverse)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -12,93 +12,188 @@ from ..arrays import Bools, Floats
 from ..errors import InputError
 from ..world import spherical as polar
 from . import dual
+from .space import Space, exp
 
-Component = Literal["coordinate", "distance", "angle"]
-Formula = Callable[[Any, Any, Any, Any], tuple[Any, ...]]
+Component = Literal["coordinate", "distance", "angle", "turn"]
+Frame = Literal["world", "body", "relative"]
+Formula = Callable[..., Sequence[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What a sensor sees of one point (arity 1) or of the vector from a first point to a second (arity 2).
+    """What a sensor sees of one node (arity 1) or of a second node from a first (arity 2).
 
     Args:
         name: kind of the factors that carry it.
-        arity: 1: the formula gets the point's x, y, z; 2: the difference second - first.
-        components: nature of each number: a coordinate (m), a distance (m, > 0) or an angle (rad, residuals wrap).
-        linear: the formula is the vector itself.
-        formula: (x, y, z, m) -> one number per component, m a namespace with sqrt and atan2.
+        arity: 1 or 2 nodes.
+        frame: what the formula gets. "world": the vector x, y, z of the point, or second - first. "body": that vector
+            as the first node, a pose, sees it, R_i^T (p_j - p_i). "relative": it and the 3x3 components of R_i^T R_j;
+            of one node, its own position and rotation.
+        components: nature of each residual: a coordinate, a distance (m, > 0), an angle (rad, residuals wrap) or part
+            of a rotation vector (rad).
+        formula: (x, y, z, m) or (x, y, z, R, m), with the `constants` before m -> one number per component; m is a
+            namespace with sqrt, atan2 and where.
+        linear: the formula is the world vector itself.
+        plane: components that a problem of dimension 2 keeps (z = 0 there); None if it has none of them.
+        constants: how many known numbers each measurement carries, such as the time between two positions.
+        compares_poses: z is a pose (Space.width numbers), and the formula also gets it: (x, y, z, R, pose z, m).
     """
 
     name: str
     arity: int
+    frame: Frame
     components: tuple[Component, ...]
-    linear: bool
     formula: Formula
+    linear: bool = False
+    plane: tuple[int, ...] | None = None
+    constants: int = 0
+    compares_poses: bool = False
 
-    @property
-    def size(self) -> int:
-        """Numbers per measurement."""
-        return len(self.components)
+    def kept(self, dimension: int) -> tuple[int, ...]:
+        """Components in a space of 2 or 3 dimensions; InputError if there are none."""
+        if dimension == 3:
+            return tuple(range(len(self.components)))
+        if self.plane is None:
+            raise InputError("kind", repr(self.name), "does not exist in two dimensions", "Use points (x, y, z).")
+        return self.plane
 
-    @property
-    def angles(self) -> Bools:
+    def size(self, dimension: int = 3) -> int:
+        """Residuals per measurement."""
+        return len(self.kept(dimension))
+
+    def given(self, dimension: int = 3) -> int:
+        """Numbers z per measurement."""
+        return Space(dimension, turning=True).width if self.compares_poses else self.size(dimension)
+
+    def angles(self, dimension: int = 3) -> Bools:
         """(size,) True where a component is an angle."""
-        return np.array([c == "angle" for c in self.components])
+        return np.array([self.components[k] == "angle" for k in self.kept(dimension)])
 
-    def predict(self, vector: Floats) -> Floats:
-        """(..., size) measurements that vectors (..., 3) would give."""
-        if self.linear:
-            return vector
-        return np.stack(self.formula(vector[..., 0], vector[..., 1], vector[..., 2], np), axis=-1)
+    def predict(self, vector: Floats, constants: Sequence[float] = ()) -> Floats:
+        """(..., size) h of vectors (..., d), for kinds that see no rotation."""
+        nothing = np.zeros(self.size(vector.shape[-1]))
+        return np.stack(np.broadcast_arrays(*self.residual([*np.moveaxis(vector, -1, 0)], nothing, constants, np)), -1)
 
-    def differentiate(self, vector: Floats) -> tuple[Floats, Floats]:
-        """(..., size) measurements and (..., size, 3) their derivatives by the vector, or (size, 3) if linear."""
+    def residual(self, local: Sequence[Any], z: Iterable[Any], constants: Iterable[Any], m: Any) -> list[Any]:
+        """h(x) - z in any namespace; angles are not wrapped.
+
+        Args:
+            local: x, y[, z] of the vector, then, if the frame is relative, the d^2 components of the rotation.
+            z: `given` numbers. constants: `constants` numbers.
+        """
+        dimension = 2 if len(local) in (2, 6) else 3
+        kept = self.kept(dimension)
+        arguments = embed(local, dimension)
+        if self.compares_poses:
+            return [self.formula(*arguments, embed([*z], dimension), m)[k] for k in kept]
+        found = self.formula(*arguments, *constants, m)
+        return [found[k] - number for k, number in zip(kept, z, strict=True)]
+
+    def differentiate(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> tuple[Floats, Floats]:
+        """(..., size) residuals and (..., size, E) their derivative by the local vector and, if relative, its turning.
+
+        Args:
+            local: (..., d) vector. rotation: (..., d, d) or None. z: (..., given). given: (..., constants).
+        """
         if self.linear:
-            return vector, np.eye(3)
-        value = np.empty((*vector.shape[:-1], self.size))
-        slope = np.empty((*vector.shape[:-1], self.size, 3))
-        for k, part in enumerate(self.formula(*dual.seeds(vector), dual)):
+            return local - z, np.eye(local.shape[-1])
+        numbers = _seed(local, rotation)
+        parts = self.residual(numbers, np.moveaxis(z, -1, 0), np.moveaxis(given, -1, 0), dual)
+        shape, coordinates = local.shape[:-1], len(numbers[0].slope)
+        value = np.empty((*shape, len(parts)))
+        slope = np.empty((*shape, len(parts), coordinates))
+        for k, part in enumerate(parts):
             value[..., k] = part.value
-            slope[..., k, :] = np.moveaxis(np.broadcast_to(part.slope, (3, *vector.shape[:-1])), 0, -1)
-        return value, slope
+            slope[..., k, :] = np.moveaxis(np.broadcast_to(part.slope, (coordinates, *shape)), 0, -1)
+        return self.wrapped(value), slope
 
-    def difference(self, predicted: Floats, measured: Floats) -> Floats:
-        """predicted - measured, angles in [-pi, pi)."""
-        gap = predicted - measured
-        for k, component in enumerate(self.components):
-            if component == "angle":
+    def difference(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> Floats:
+        """(..., size) residuals h(x) - z, angles in [-pi, pi); arguments as `differentiate`."""
+        if self.linear:
+            return local - z
+        numbers = [*np.moveaxis(local, -1, 0)]
+        if rotation is not None:
+            numbers += [*np.moveaxis(rotation.reshape(*rotation.shape[:-2], -1), -1, 0)]
+        parts = self.residual(numbers, np.moveaxis(z, -1, 0), np.moveaxis(given, -1, 0), np)
+        return self.wrapped(np.stack(np.broadcast_arrays(*parts), axis=-1))
+
+    def wrapped(self, gap: Floats) -> Floats:
+        """`gap` (..., size) with its angles in [-pi, pi), in place."""
+        dimension = 3 if gap.shape[-1] == len(self.components) else 2
+        for k, component in enumerate(self.kept(dimension)):
+            if self.components[component] == "angle":
                 gap[..., k] = polar.wrap(gap[..., k])
         return gap
+
+
+def embed(numbers: Sequence[Any], dimension: int) -> list[Any]:
+    """x, y, z and, if there are more numbers, the 3x3 components of the rotation: a plane is z = 0 in space."""
+    d = dimension
+    at = [*numbers[:d], *[0.0 * numbers[0]] * (3 - d)]  # of the namespace's own type
+    if len(numbers) == d:
+        return at
+    turned = [[numbers[d + d * i + j] if max(i, j) < d else float(i == j) for j in range(3)] for i in range(3)]
+    return [*at, turned]
+
+
+def _seed(local: Floats, rotation: Floats | None) -> list[dual.Dual]:
+    """Dual numbers of the vector (d of them) and of the rotation R Exp(w) at w = 0, by the vector and w."""
+    d = local.shape[-1]
+    if rotation is None:
+        return list(dual.seeds(local))
+    turns = Space(d, turning=True).angles
+    found = list(dual.seeds(local, d + turns))
+    generators = exp(0.5 * np.pi * np.eye(turns)) - exp(-0.5 * np.pi * np.eye(turns))
+    slopes = rotation[..., None, :, :] @ (0.5 * generators)
+    for i in range(d):
+        for j in range(d):
+            slope = np.moveaxis(slopes[..., i, j], -1, 0)
+            still = np.zeros((d, *slope.shape[1:]))
+            found.append(dual.Dual(rotation[..., i, j], np.concatenate([still, slope])))
+    return found
 
 
 MEASUREMENTS: dict[str, Measurement] = {}
 
 
 def measurement(
-    name: str, arity: int, components: tuple[Component, ...], linear: bool = False
+    name: str,
+    arity: int,
+    components: tuple[Component, ...],
+    frame: Frame = "world",
+    linear: bool = False,
+    plane: tuple[int, ...] | None = None,
+    constants: int = 0,
+    compares_poses: bool = False,
 ) -> Callable[[Formula], Formula]:
-    """Register a formula (x, y, z, m) -> components as a measurement; the formula itself is returned.
+    """Register a formula as a measurement (see Measurement for the arguments); the formula itself is returned.
 
     Raises:
         InputError: the name is taken, so that nothing is silently overwritten; an arity other than 1 or 2, an unknown
-            component, or `linear` without three coordinates.
+            component or frame, or `linear` without three coordinates of a world vector.
 
-    >>> MEASUREMENTS["range"].predict(np.array([3.0, 4.0, 0.0]))
-    array([5.])
+    >>> MEASUREMENTS["range"].difference(np.array([3.0, 4.0, 0.0]), None, np.array([4.0]), np.empty(0))
+    array([1.])
     """
 
     if arity not in (1, 2):
-        raise InputError("arity", arity, "must be 1 (a point) or 2 (a pair)", "The formula gets one vector x, y, z.")
+        raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
     if not components or not set(components) <= set(get_args(Component)):
         mend = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", mend)
-    if linear and components != ("coordinate",) * 3:
-        raise InputError("linear", linear, "means that the formula is the vector itself", "Leave it out.")
+    if frame not in get_args(Frame):
+        raise InputError("frame", repr(frame), f"must be one of {get_args(Frame)}", 'Use "world".')
+    if linear and (components != ("coordinate",) * 3 or frame != "world"):
+        raise InputError(
+            "linear", linear, "means that the formula is the vector itself, in the world frame", "Leave it out."
+        )
 
     def register(formula: Formula) -> Formula:
         if name in MEASUREMENTS:
             raise InputError("measurement", repr(name), "is registered already", "Choose another name.")
-        MEASUREMENTS[name] = Measurement(name, arity, components, linear, formula)
+        MEASUREMENTS[name] = Measurement(
+            name, arity, frame, components, formula, linear, plane, constants, compares_poses
+        )
         return formula
 
     return register
@@ -109,39 +204,3 @@ def lookup(kind: str) -> Measurement:
     if kind not in MEASUREMENTS:
         raise InputError("kind", repr(kind), f"must be one of {sorted(MEASUREMENTS)}", "Or register it: @measurement.")
     return MEASUREMENTS[kind]
-
-
-@measurement("position", arity=1, components=("coordinate",) * 3, linear=True)
-def position(x: Any, y: Any, z: Any, m: Any = np) -> tuple[Any, ...]:
-    """Where a point is, such as a GNSS fix: m."""
-    return x, y, z
-
-
-@measurement("displacement", arity=2, components=("coordinate",) * 3, linear=True)
-def displacement(dx: Any, dy: Any, dz: Any, m: Any = np) -> tuple[Any, ...]:
-    """The vector from the first point to the second, such as odometry dt u: m."""
-    return dx, dy, dz
-
-
-@measurement("range", arity=2, components=("distance",))
-def range_(dx: Any, dy: Any, dz: Any, m: Any = np) -> tuple[Any, ...]:
-    """Distance between two points: m."""
-    return polar.spherical(dx, dy, dz, m)[:1]
-
-
-@measurement("azimuth", arity=2, components=("angle",))
-def azimuth(dx: Any, dy: Any, dz: Any, m: Any = np) -> tuple[Any, ...]:
-    """Angle of the second point as the first sees it, atan2(dy, dx) in the world frame: rad."""
-    return polar.spherical(dx, dy, dz, m)[1:2]
-
-
-@measurement("inclination", arity=2, components=("angle",))
-def inclination(dx: Any, dy: Any, dz: Any, m: Any = np) -> tuple[Any, ...]:
-    """Angle from +z of the second point as the first sees it: rad."""
-    return polar.spherical(dx, dy, dz, m)[2:]
-
-
-@measurement("spherical", arity=2, components=("distance", "angle", "angle"))
-def spherical(dx: Any, dy: Any, dz: Any, m: Any = np) -> tuple[Any, ...]:
-    """Range, azimuth and inclination of the second point as the first sees it: m, rad, rad."""
-    return polar.spherical(dx, dy, dz, m)

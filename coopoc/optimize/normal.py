@@ -1,4 +1,4 @@
-"""Normal equations J^T J dx = -J^T r in 3x3 blocks, for B realisations at once."""
+"""Normal equations J^T J dx = -J^T r in square blocks, for B realisations at once."""
 
 from __future__ import annotations
 
@@ -7,78 +7,115 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, Ints
-from .problem import Linear
+from ..arrays import Bools, Floats, Ints
+from .linear import Linear
 
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Which 3x3 blocks of J^T J exist and which measurements add up in them; the same for all realisations.
+    """Which blocks (i, j), i <= j, of J^T J exist and what adds up in them; the same for all realisations.
 
-    A measurement with derivative S by its vector adds S^T S to the diagonal blocks of its points and, if it has two,
-    -S^T S to the block between them: every block is symmetric.
+    A measurement of two nodes adds S_i^T S_i, S_j^T S_j and S_i^T S_j. Where S_i = -S_j (see Linear) it is computed
+    once and the block between them subtracts it.
 
     Args:
-        points: n. pairs: (P, 2) blocks (i, j), i <= j. rows, starts: measurements of each block, one after the other.
-        pull_rows, pull_signs, pull_starts, pull_points: the same for the gradient, by point.
+        nodes: n. pairs: (P, 2). rows, starts: products of each block, one block after the other.
+        negated: (P,) blocks between nodes that only subtract. minus: rows that subtract in blocks that also add.
+        pull_rows, pull_signs, pull_starts, pull_nodes: the same for the gradient, by node.
+        still: (n, dof) True where a node cannot move, or None.
     """
 
-    points: int
+    nodes: int
     pairs: Ints
     rows: Ints
     starts: Ints
+    negated: Bools
+    minus: Ints
     pull_rows: Ints
     pull_signs: Floats
     pull_starts: Ints
-    pull_points: Ints
+    pull_nodes: Ints
+    still: Bools | None
 
 
-def pattern(n: int, nodes: Sequence[Ints]) -> Pattern:
-    """Pattern of n points whose factors touch `nodes`, (M, arity) per factor."""
-    keys, rows, points, signs, point_rows, top = [], [], [], [], [], 0
-    for touched in nodes:
-        row = top + np.arange(len(touched))
-        top += len(touched)
-        ends = ((-1.0, touched[:, 0]), (1.0, touched[:, -1]))[2 - touched.shape[1] :]
-        for sign, point in ends:
-            keys.append(point * n + point)
-            points.append(point)
-            signs.append(np.full(len(touched), sign))
-            point_rows.append(row)
-            rows.append(row)
-        if touched.shape[1] == 2:
-            keys.append(touched.min(axis=1) * n + touched.max(axis=1))
-            rows.append(row)
-    key, point = np.concatenate(keys), np.concatenate(points)
-    order, pull_order = np.argsort(key, kind="stable"), np.argsort(point, kind="stable")
+def pattern(n: int, factors: Sequence[tuple[Ints, bool]], still: Bools | None = None) -> Pattern:
+    """Pattern of n nodes from the nodes (M, arity) of each factor and whether its two derivatives are opposite."""
+    keys, rows, signs = [], [], []
+    ends, end_rows, end_signs = [], [], []
+    top = pull_top = 0
+    for nodes, opposite in factors:
+        count = len(nodes)
+        row, pull = top + np.arange(count), pull_top + np.arange(count)
+        first, last = nodes[:, 0], nodes[:, -1]
+        pair = nodes.shape[1] == 2
+        apart = pair and not opposite
+        added = [(last, row + apart * count, pull + apart * count)]
+        if pair:
+            added.append((first, row, pull))
+            keys.append(np.minimum(first, last) * n + np.maximum(first, last))
+            rows.append(row + 2 * apart * count)
+            signs.append(np.full(count, 1.0 if apart else -1.0))
+        for k, (node, at, pulls) in enumerate(added):
+            keys.append(node * n + node)
+            rows.append(at)
+            signs.append(np.ones(count))
+            ends.append(node)
+            end_rows.append(pulls)
+            end_signs.append(np.full(count, -1.0 if k and opposite else 1.0))
+        top += count * (3 if apart else 1)
+        pull_top += count * (2 if apart else 1)
+    key, end = np.concatenate(keys), np.concatenate(ends)
+    order, pull_order = np.argsort(key, kind="stable"), np.argsort(end, kind="stable")
     blocks, starts = np.unique(key[order], return_index=True)
-    pull_points, pull_starts = np.unique(point[pull_order], return_index=True)
+    pull_nodes, pull_starts = np.unique(end[pull_order], return_index=True)
+    sign = np.concatenate(signs)[order]
+    negated = np.maximum.reduceat(sign, starts) < 0
+    mixed = (sign < 0) & ~np.repeat(negated, np.diff(np.append(starts, len(sign))))
     return Pattern(
-        n, np.stack([blocks // n, blocks % n], axis=1), np.concatenate(rows)[order], starts,
-        np.concatenate(point_rows)[pull_order], np.concatenate(signs)[pull_order][:, None], pull_starts, pull_points,
+        n, np.stack([blocks // n, blocks % n], axis=1), np.concatenate(rows)[order], starts, negated,
+        np.flatnonzero(mixed), np.concatenate(end_rows)[pull_order], np.concatenate(end_signs)[pull_order][:, None],
+        pull_starts, pull_nodes, still,
     )  # fmt: skip
 
 
-def normal_equations(scheme: Pattern, linear: Linear) -> tuple[Floats, Floats]:
-    """Blocks (B, P, 3, 3) of J^T J in the pattern's order and the gradient J^T r (B, n, 3)."""
+def normal_equations(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> tuple[Floats, Floats]:
+    """Blocks (B, P, dof, dof) of J^T J in the pattern's order and the gradient J^T r (B, n, dof).
+
+    Args:
+        nodes: (M, arity) of each factor.
+    """
     pulls = [(np.swapaxes(slope, -1, -2) @ residual[..., None])[..., 0]
-             for residual, slope in zip(linear.residual, linear.slope, strict=True)]  # fmt: skip
-    gradient = np.zeros((len(linear.x), scheme.points, 3))
+             for residual, slopes in zip(linear.residual, linear.slope, strict=True) for slope in slopes]  # fmt: skip
+    gradient = np.zeros((len(linear.x), scheme.nodes, pulls[0].shape[-1]))
     signed = np.concatenate(pulls, axis=1)[:, scheme.pull_rows] * scheme.pull_signs
-    gradient[:, scheme.pull_points] = np.add.reduceat(signed, scheme.pull_starts, axis=1)
-    return assemble(scheme, squares(linear)), gradient
+    gradient[:, scheme.pull_nodes] = np.add.reduceat(signed, scheme.pull_starts, axis=1)
+    return assemble(scheme, squares(linear, nodes)), gradient
 
 
-def squares(linear: Linear) -> list[Floats]:
-    """Per factor (B, M, 3, 3) S^T S of its whitened derivatives."""
-    return [np.broadcast_to(np.swapaxes(slope, -1, -2) @ slope, (*residual.shape[:2], 3, 3))
-            for residual, slope in zip(linear.residual, linear.slope, strict=True)]  # fmt: skip
+def squares(linear: Linear, nodes: Sequence[Ints]) -> list[Floats]:
+    """Per factor the products of its derivatives (B, M, dof, dof): S_i^T S_i, S_j^T S_j, S_i^T S_j (i the smaller)."""
+    found: list[Floats] = []
+    for residual, slopes, touched in zip(linear.residual, linear.slope, nodes, strict=True):
+        products = [np.swapaxes(slope, -1, -2) @ slope for slope in slopes]
+        if len(slopes) == 2:
+            cross = np.swapaxes(slopes[0], -1, -2) @ slopes[1]
+            swapped = (touched[:, 0] > touched[:, 1])[:, None, None]
+            products.append(np.where(swapped, np.swapaxes(cross, -1, -2), cross))
+        found += [np.broadcast_to(p, (*residual.shape[:2], *p.shape[-2:])) for p in products]
+    return found
 
 
 def assemble(scheme: Pattern, parts: Sequence[Floats]) -> Floats:
-    """Blocks (B, P, 3, 3) in the pattern's order from what each measurement adds, (B, M, 3, 3) per factor."""
+    """Blocks (B, P, dof, dof) in the pattern's order from the products of `squares`; 1 on the diagonal of what is still."""
     every = np.concatenate(parts, axis=1)
-    gathered = every.reshape(*every.shape[:2], 9)[:, scheme.rows]
-    blocks: Floats = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(len(every), -1, 3, 3)
-    blocks[:, scheme.pairs[:, 0] != scheme.pairs[:, 1]] *= -1.0
+    dof = every.shape[-1]
+    gathered = every.reshape(*every.shape[:2], dof * dof)[:, scheme.rows]
+    if len(scheme.minus):
+        gathered[:, scheme.minus] *= -1.0
+    blocks: Floats = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(len(every), -1, dof, dof)
+    blocks[:, scheme.negated] *= -1.0
+    if scheme.still is not None:
+        own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
+        at = np.arange(dof)
+        blocks[:, own[:, None], at, at] += scheme.still[scheme.pairs[own, 0]]
     return blocks

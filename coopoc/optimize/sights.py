@@ -60,7 +60,8 @@ def chain(sights: Sequence[Sight], sensors: Sensors | None, names: Sequence[str]
         names: of the points, step by step; default their numbers.
     """
     top = np.concatenate([[0], np.cumsum([len(s.kept) for s in sights])])
-    factors = [Factor("position", np.arange(top[-1])[:, None], *_joined(sights, "fix", "fix_std"))]
+    fix, fix_std = _joined(sights, "fix", "fix_std")
+    factors = [Factor("position", np.arange(top[-1])[:, None], fix, fix_std)]
     stays = [np.flatnonzero(s.kept >= 0) for s in sights[1:]]
     if stays:
         pairs = np.concatenate([np.stack([top[k] + s.kept[i], top[k + 1] + i], axis=1)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from .space import Space
 
 
 class Status(Enum):
@@ -23,6 +24,7 @@ class Status(Enum):
     MAX_ITERATIONS = "Stopped at the limit of iterations before a minimum: raise max_iterations or give a better x0."
     SADDLE = "At a stationary point that is no minimum: give an x0 to the side of it, where the cost falls."
     RANK_DEFICIENT = "Some points can move without changing the cost: measure them, or add a position factor."
+    INFEASIBLE = "No point was found that satisfies the constraints: loosen the bounds that extras['violated'] names."
     FAILED = "The backend stopped before a minimum: give a better x0, or try another backend."
 
 
@@ -31,11 +33,15 @@ class Solution:
     """The answer of one backend, with all that can be checked recomputed by `solve`.
 
     Args:
-        x: (n, 3) m. covariance: (n, 3, 3) m^2 marginals of (J^T J)^-1 at x, NaN if rank deficient.
-        cost: 1/2 sum of squared whitened residuals. gradient: |J^T r| at x.
+        x: (n, width), see Space. covariance: (n, dof, dof) m^2, rad^2 marginals of (J^T J)^-1 at x, position in the
+            world's directions, then rotation in the body's; equalities taken as exact, inequalities as absent; NaN if
+            rank deficient.
+        cost: 1/2 sum of rho of the squared whitened residuals. gradient: |J^T r| at x, with constraints that of the
+            Lagrangian.
         status: how it ended. iterations: of the backend. build_seconds, solve_seconds: to prepare and to run it.
-        backend: its name. names: of the points. shown: the point that `print` shows.
-        free: names of the points that the measurements leave free. extras: the backend's own numbers.
+        backend: its name. names: of the nodes. shown: the node that `print` shows. space: of the problem.
+        free: names of the nodes that the measurements leave free. violation: largest of a constraint, in its unit.
+        extras: the backend's own numbers.
     """
 
     x: Floats
@@ -50,10 +56,22 @@ class Solution:
     names: tuple[str, ...]
     shown: int = 0
     free: tuple[str, ...] = ()
+    space: Space = field(default_factory=Space)
+    violation: float = 0.0
     extras: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def position(self) -> Floats:
+        """(n, d) m."""
+        return self.space.position(self.x)
+
+    @property
+    def rotation(self) -> Floats:
+        """(n, d, d) body to world, the identity for points."""
+        return self.space.rotation(self.x)
+
     def __getitem__(self, point: str) -> Floats:
-        """(3,) m estimate of a point by name; InputError that lists the names if there is none."""
+        """(width,) estimate of a node by name; InputError that lists the names if there is none."""
         if point not in self.names:
             known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
             raise InputError("point", repr(point), f"must be one of {known}", "See solution.names.")
@@ -61,8 +79,9 @@ class Solution:
         return where
 
     def __str__(self) -> str:
-        at = ", ".join(f"{v:.2f}" for v in self.x[self.shown])
-        spread = ", ".join(f"{v:.2f}" for v in np.sqrt(np.diag(self.covariance[self.shown])))
+        at = ", ".join(f"{v:.2f}" for v in self.position[self.shown])
+        variance = np.diag(self.covariance[self.shown])[: self.space.dimension]
+        spread = ", ".join(f"{v:.2f}" for v in np.sqrt(variance))
         return (
             f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; "
             f"cost {self.cost:.4g}, gradient {self.gradient:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"

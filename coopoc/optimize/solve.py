@@ -7,7 +7,7 @@ import inspect
 import time
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,16 +23,23 @@ from .solution import Solution, SolveError, Status
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
+FEASIBLE = 1e-6
+"""m, rad or m/s by which a constraint may be violated."""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """A solver by name: what it is for, the library that it needs (None: ours) and whether that is installed."""
+    """A solver by name: what it is for, the library that it needs (None: ours) and whether that is installed.
+
+    Args:
+        constraints: which it can hold: "none", "linear" (of kinds position and displacement) or "all".
+    """
 
     name: str
     module: str
     purpose: str
     library: str | None = None
+    constraints: Literal["none", "linear", "all"] = "none"
 
     @property
     def installed(self) -> bool:
@@ -45,7 +52,7 @@ BACKENDS = {
     for b in (
         Backend("gauss-newton", "gauss_newton", "reference: Levenberg-Marquardt, batched over noise runs"),
         Backend("gtsam", "gtsam_", "factor graph elimination by GTSAM", "gtsam"),
-        Backend("osqp", "osqp_", "sequential quadratic programming, persistent workspace", "osqp"),
+        Backend("osqp", "osqp_", "sequential quadratic programming, persistent workspace", "osqp", "linear"),
     )
 }
 
@@ -84,6 +91,7 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
         raise InputError("problem", repr(problem), "must be a single realisation", mend)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    _check_constraints(problem, BACKENDS[backend])
     began = time.perf_counter()
     start = initial_guess(problem)[0]
     _check_start(problem, start)
@@ -96,7 +104,8 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
         x=ended.x, covariance=truth.covariance, cost=truth.cost, gradient=truth.gradient,
         status=_status(problem, ended, truth, options.get("max_iterations", MAX_ITERATIONS)),
         iterations=ended.iterations, build_seconds=built - began, solve_seconds=solved - built, backend=backend,
-        names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, extras=ended.extras,
+        names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, space=problem.space,
+        violation=truth.violation, extras=ended.extras,
     )  # fmt: skip
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
@@ -123,12 +132,25 @@ def _module(backend: str, options: dict[str, Any]) -> Any:
     return module
 
 
+def _check_constraints(problem: Problem, known: Backend) -> None:
+    """InputError if the backend cannot hold the problem's constraints; it names those that can."""
+    if not problem.constraints:
+        return
+    needed = "linear" if all(c.measurement.linear for c in problem.constraints) else "all"
+    able = [b.name for b in BACKENDS.values() if b.constraints in (needed, "all")]
+    if known.name not in able:
+        kinds = sorted({c.kind for c in problem.constraints})
+        raise InputError("constraints", kinds, f"cannot be held by {known.name}, only by {able}", "Name one of those.")
+
+
 def _check_start(problem: Problem, start: Floats) -> None:
     """InputError if a measurement has no derivative at the start."""
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])
     for factor, residual, slope in zip(problem.factors, linear.residual, linear.slope, strict=True):
-        bad = ~(np.isfinite(residual[0]).all(axis=-1) & np.isfinite(slope[0]).all(axis=(-2, -1)))
+        bad = ~np.isfinite(residual[0]).all(axis=-1)
+        for by_node in slope:
+            bad = bad | ~np.isfinite(by_node[0]).all(axis=(-2, -1))
         if bad.any():
             pair = " and ".join(problem.names[n] for n in factor.nodes[np.flatnonzero(bad)[0]])
             raise InputError(
@@ -138,6 +160,8 @@ def _check_start(problem: Problem, start: Floats) -> None:
 
 
 def _status(problem: Problem, ended: Ended, truth: Assessment, limit: int) -> Status:
+    if truth.violation > FEASIBLE or ended.infeasible:
+        return Status.INFEASIBLE
     if truth.free:
         return Status.RANK_DEFICIENT
     if truth.remaining <= POSITION_TOLERANCE:

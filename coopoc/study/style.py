@@ -77,7 +77,7 @@ def look(method: str) -> Look:
     family = name.rstrip("0123456789-")
     if family in METHODS:
         shown = METHODS[family]
-        return Look(f"{shown.label} {name[len(family):].strip('-')}", shown.color, shown.marker)
+        return Look(f"{shown.label} {name[len(family) :].strip('-')}", shown.color, shown.marker)
     color, marker = _SPARE[zlib.crc32(method.encode()) % len(_SPARE)]
     return Look(method, color, marker)
 

@@ -8,9 +8,11 @@ import numpy as np
 
 from ...arrays import Floats
 from ..arrowhead import eliminate, structure
+from ..assess import factorise
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, descend
+from ..linear import Linear
 from ..normal import normal_equations
-from ..problem import Linear, Problem, jacobian
+from ..problem import Problem, jacobian
 from .run import Ended, Run
 
 DENSE_POINTS = 60
@@ -37,20 +39,17 @@ def linear_step(problem: Problem) -> Step:
     if not problem.hub and len(problem.names) > DENSE_POINTS:
         return partial(_sparse_step, problem)
     scheme, frame = structure(problem)
-    return lambda linear, damping: eliminate(frame, *normal_equations(scheme, linear), damping)
+    nodes = [f.nodes for f in problem.factors]
+    return lambda linear, damping: eliminate(frame, *normal_equations(scheme, linear, nodes), damping)
 
 
 def _sparse_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     from scipy.sparse import diags_array
-    from scipy.sparse.linalg import splu
 
-    out = np.empty_like(linear.x)
+    out = np.empty_like(damping)
+    still = None if problem.free is None else ~problem.free
     for b, residual in enumerate(zip(*linear.residual, strict=True)):
         J = jacobian(problem, linear, b)
-        hessian = (J.T @ J + diags_array(damping[b].ravel())).tocsc()
-        try:
-            factored = splu(hessian, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
-        except RuntimeError as singular:
-            raise np.linalg.LinAlgError(str(singular)) from singular
-        out[b] = -factored.solve(J.T @ np.concatenate([r.ravel() for r in residual])).reshape(-1, 3)
+        factored = factorise(J.T @ J + diags_array(damping[b].ravel()), still)
+        out[b] = -factored.solve(J.T @ np.concatenate([r.ravel() for r in residual])).reshape(out[b].shape)
     return out

@@ -16,7 +16,8 @@ import numpy as np
 from ...arrays import Floats
 from ..descend import MAX_ITERATIONS, TOLERANCE, descend
 from ..factor import Factor
-from ..problem import Linear, Problem
+from ..linear import Linear
+from ..problem import Problem
 from .run import Ended, Run
 
 
@@ -28,27 +29,32 @@ def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: flo
     """
     import gtsam
 
-    fixed = native(problem).linearize(_zeros(len(problem.names)))
-    unit = {size: gtsam.noiseModel.Unit.Create(size) for size in (1, 2, 3)}
+    space = problem.space
+    fixed = native(problem).linearize(_zeros(problem))
+    unit = {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 13)}
     ordering: list[Any] = []
+    still = [] if problem.free is None else np.flatnonzero(~problem.free.all(axis=1)).tolist()
 
     def step(linear: Linear, damping: Floats) -> Floats:
         graph = gtsam.GaussianFactorGraph()
         graph.push_back(fixed)
-        _add_linearised(graph, problem, linear, unit)
+        at = linear.x[0] if not space.turning else np.zeros((len(problem.names), space.dof))
+        _add_linearised(graph, problem, linear, at, unit)
+        for i in still:
+            graph.add(i, np.diag(1.0 - problem.free[i]), np.zeros(space.dof), unit[space.dof])  # type: ignore[index]
         if damping.any():
-            for i, (x, root) in enumerate(zip(linear.x[0], np.sqrt(damping[0]), strict=True)):
-                graph.add(i, np.diag(root), root * x, unit[3])
+            for i, (x, root) in enumerate(zip(at, np.sqrt(damping[0]), strict=True)):
+                graph.add(i, np.diag(root), root * x, unit[space.dof])
         if not ordering:
             ordering.append(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
         try:
             there: Floats = graph.optimize(ordering[0]).vector()
         except RuntimeError as singular:
             raise np.linalg.LinAlgError("gtsam: indeterminate linear system") from singular
-        if there.size < linear.x.size:
+        if there.size < at.size:
             ordering.clear()
             raise np.linalg.LinAlgError("gtsam: a point without measurements")
-        return there.reshape(linear.x.shape) - linear.x
+        return (there.reshape(at.shape) - at)[None]
 
     def run(x: Floats) -> Ended:
         end = descend(problem, step, x[None], max_iterations, tolerance)
@@ -62,15 +68,25 @@ def native(problem: Problem) -> Any:
     import gtsam
 
     graph = gtsam.NonlinearFactorGraph()
+    if problem.space.turning:
+        return graph
+    plane = problem.dimension == 2
+    prior = gtsam.PriorFactorPoint2 if plane else gtsam.PriorFactorPoint3
+    between = gtsam.BetweenFactorPoint2 if plane else gtsam.BetweenFactorPoint3
     for factor in problem.factors:
-        if not factor.measurement.linear:
+        if not _is_native(problem, factor):
             continue
         for node, z, model in zip(factor.nodes.tolist(), factor.z, _models(factor), strict=True):
             if model is not None and len(node) == 1:
-                graph.add(gtsam.PriorFactorPoint3(node[0], z, model))
+                graph.add(prior(node[0], z, model))
             elif model is not None:
-                graph.add(gtsam.BetweenFactorPoint3(node[0], node[1], z, model))
+                graph.add(between(node[0], node[1], z, model))
     return graph
+
+
+def _is_native(problem: Problem, factor: Factor) -> bool:
+    free = problem.free is None or bool(problem.free[factor.nodes].all())
+    return factor.measurement.linear and factor.loss is None and free and not problem.space.turning
 
 
 def _models(factor: Factor) -> list[Any]:
@@ -86,23 +102,29 @@ def _models(factor: Factor) -> list[Any]:
             for root, informative in zip(factor.root, says, strict=True)]  # fmt: skip
 
 
-def _add_linearised(graph: Any, problem: Problem, linear: Linear, unit: dict[int, Any]) -> None:
-    for factor, residual, slope in zip(problem.factors, linear.residual, linear.slope, strict=True):
-        known = factor.measurement
-        if known.linear:
+def _add_linearised(graph: Any, problem: Problem, linear: Linear, at: Floats, unit: dict[int, Any]) -> None:
+    """The other factors as r + J dx with dx = x - `at`: GTSAM's unknowns are absolute where its own factors are."""
+    derivatives = linear.by_node(problem.factors)
+    for factor, residual, slopes in zip(problem.factors, linear.residual, derivatives, strict=True):
+        if _is_native(problem, factor):
             continue
-        first, second = factor.nodes.T
-        gap = linear.x[0, second] - linear.x[0, first]
-        goal = (slope[0] @ gap[..., None])[..., 0] - residual[0]
-        model = unit[known.size]
-        for i, j, a, b, rhs in zip(first.tolist(), second.tolist(), -slope[0], slope[0], goal, strict=True):
-            graph.add(i, a, j, b, rhs, model)
+        count, model = len(factor.nodes), unit[factor.size]
+        parts = [np.broadcast_to(s[0], (count, *s.shape[2:])) for s in slopes]
+        goal = -residual[0]
+        for part, column in zip(parts, factor.nodes.T, strict=True):
+            goal = goal + (part @ at[column, :, None])[..., 0]
+        if len(parts) == 1:
+            for i, a, rhs in zip(factor.nodes[:, 0].tolist(), parts[0], goal, strict=True):
+                graph.add(i, a, rhs, model)
+        else:
+            for (i, j), a, b, rhs in zip(factor.nodes.tolist(), *parts, goal, strict=True):
+                graph.add(i, a, j, b, rhs, model)
 
 
-def _zeros(points: int) -> Any:
+def _zeros(problem: Problem) -> Any:
     import gtsam
 
     values = gtsam.Values()
-    for i in range(points):
-        values.insert(i, np.zeros(3))
+    for i in range(len(problem.names)):
+        values.insert(i, np.zeros(problem.dimension))
     return values

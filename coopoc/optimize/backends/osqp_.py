@@ -15,8 +15,9 @@ import numpy as np
 from ...arrays import Floats
 from ..arrowhead import structure
 from ..descend import MAX_ITERATIONS, TOLERANCE, descend
+from ..linear import Linear
 from ..normal import Pattern, normal_equations
-from ..problem import Linear, Problem
+from ..problem import Problem
 from .run import Ended, Run
 
 SETTINGS = {
@@ -41,17 +42,18 @@ def build(
     import osqp
 
     scheme, _ = structure(problem)
-    upper, source = _upper(scheme)
-    size = 3 * scheme.points
+    upper, source = _upper(scheme, problem.space.dof)
+    size = problem.space.dof * scheme.nodes
+    nodes, at_own = [f.nodes for f in problem.factors], np.arange(problem.space.dof)
     own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
     at = scheme.pairs[own, 0]
     solver: list[Any] = []
     counts = {"osqp_iterations": 0, "repairs": 0}
 
     def step(linear: Linear, damping: Floats) -> Floats:
-        blocks, gradient = normal_equations(scheme, linear)
+        blocks, gradient = normal_equations(scheme, linear, nodes)
         if damping.any():
-            blocks[:, own[:, None], np.arange(3), np.arange(3)] += damping[:, at]
+            blocks[:, own[:, None], at_own, at_own] += damping[:, at]
         upper.data[:] = blocks[0].ravel()[source]
         q = gradient.ravel()
         if not solver:
@@ -59,7 +61,7 @@ def build(
             solver[0].setup(P=upper.copy(), q=q, A=_no_rows(size), l=np.empty(0), u=np.empty(0), **SETTINGS)
         else:
             solver[0].update(Px=upper.data, q=q)
-        return _checked(solver[0], upper, q, kkt_tolerance, counts).reshape(linear.x.shape)
+        return _checked(solver[0], upper, q, kkt_tolerance, counts).reshape(damping.shape)
 
     def run(x: Floats) -> Ended:
         end = descend(problem, step, x[None], max_iterations, tolerance)
@@ -84,16 +86,16 @@ def _checked(solver: Any, upper: Any, q: Floats, tolerance: float, counts: dict[
     raise np.linalg.LinAlgError("osqp: the KKT residual of a quadratic programme stays too large")
 
 
-def _upper(scheme: Pattern) -> tuple[Any, Any]:
+def _upper(scheme: Pattern, dof: int) -> tuple[Any, Any]:
     """Upper triangle of J^T J as CSC with its structure, and where each value lies in the flat blocks."""
     from scipy.sparse import csc_array, csc_matrix
 
     i, j = scheme.pairs.T
-    row = np.broadcast_to(3 * i[:, None, None] + np.arange(3)[:, None], (len(i), 3, 3)).ravel()
-    col = np.broadcast_to(3 * j[:, None, None] + np.arange(3), (len(i), 3, 3)).ravel()
-    flat = np.arange(9 * len(i))
+    row = np.broadcast_to(dof * i[:, None, None] + np.arange(dof)[:, None], (len(i), dof, dof)).ravel()
+    col = np.broadcast_to(dof * j[:, None, None] + np.arange(dof), (len(i), dof, dof)).ravel()
+    flat = np.arange(dof * dof * len(i))
     keep = row <= col
-    shape = (3 * scheme.points, 3 * scheme.points)
+    shape = (dof * scheme.nodes, dof * scheme.nodes)
     numbered = csc_array((flat[keep] + 1.0, (row[keep], col[keep])), shape=shape)
     numbered.sort_indices()
     return csc_matrix(numbered), (numbered.data - 1).astype(np.int64)

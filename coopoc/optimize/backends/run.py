@@ -11,11 +11,12 @@ from ...arrays import Floats
 
 @dataclass(frozen=True, eq=False)
 class Ended:
-    """A backend's claim, which `solve` checks: x (n, 3) m, iterations, and extras of its own."""
+    """A backend's claim, which `solve` checks: x (n, width), iterations, extras of its own, "no point is feasible"."""
 
     x: Floats
     iterations: int
     extras: dict[str, Any] = field(default_factory=dict)
+    infeasible: bool = False
 
 
 Run: TypeAlias = Callable[[Floats], Ended]

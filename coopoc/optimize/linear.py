@@ -1,0 +1,84 @@
+"""Linear: a problem around a point, as whitened residuals and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from .factor import Factor
+from .local import chain, local
+from .space import Space
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A problem around x: per factor, whitened residuals and their derivative by the steps of its nodes.
+
+    Of a pair in the world frame only the second node's derivative is kept, the first's is minus it. A robust factor's
+    residual and derivatives carry the root of its weight rho'.
+
+    Args:
+        x: (B, n, width). residual: per factor (B, M, size). slope: per factor and node (B or 1, M or 1, size, dof).
+        cost: (B,) 1/2 sum of rho.
+    """
+
+    x: Floats
+    residual: tuple[Floats, ...]
+    slope: tuple[tuple[Floats, ...], ...]
+    cost: Floats
+
+    def pick(self, which: Bools | Ints) -> Linear:
+        """The realisations `which` of B."""
+        slope = tuple(tuple(s[which] if len(s) > 1 else s for s in nodes) for nodes in self.slope)
+        return Linear(self.x[which], tuple(r[which] for r in self.residual), slope, self.cost[which])
+
+    def by_node(self, factors: Sequence[Factor]) -> list[tuple[Floats, ...]]:
+        """Per factor one derivative for each of its nodes."""
+        return [(-slope[0], slope[0]) if len(slope) < factor.nodes.shape[1] else slope
+                for factor, slope in zip(factors, self.slope, strict=True)]  # fmt: skip
+
+
+def linearise(space: Space, factors: Sequence[Factor], free: Bools | None, x: Floats) -> Linear:
+    """Factors around x (B, n, width); what is not `free` (n, dof) has no derivative."""
+    residuals, slopes, cost = [], [], np.zeros(len(x))
+    for factor in factors:
+        residual, slope = _factor(space, factor, x)
+        square = np.einsum("bmk,bmk->bm", residual, residual)
+        if factor.loss is not None:
+            root = np.sqrt(factor.loss.weight(square))[..., None]
+            residual, slope = residual * root, tuple(s * root[..., None] for s in slope)
+            square = factor.loss.cost(square)
+        cost += 0.5 * square.sum(axis=1)
+        if free is not None:
+            slope = _masked(factor, slope, free)
+        residuals.append(residual)
+        slopes.append(slope)
+    return Linear(x, tuple(residuals), tuple(slopes), cost)
+
+
+def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
+    known = factor.measurement
+    assert factor.constants is not None
+    seen = local(space, known, x, factor.nodes)
+    gap, slope = known.differentiate(*seen, factor.z, factor.constants)
+    slope = factor.whiten_slope(slope)
+    slope = slope.reshape(*(1,) * (4 - slope.ndim), *slope.shape)
+    return factor.whiten(gap), chain(space, known, x, factor.nodes, seen, slope)
+
+
+def opposite(factor: Factor, free: Bools | None) -> bool:
+    """Whether the two nodes of the factor's measurements have derivatives that differ in sign only."""
+    pair = factor.measurement.frame == "world" and factor.nodes.shape[1] == 2
+    return pair and (free is None or bool(free[factor.nodes].all()))
+
+
+def _masked(factor: Factor, slope: tuple[Floats, ...], free: Bools) -> tuple[Floats, ...]:
+    nodes = factor.nodes.T
+    if opposite(factor, free):
+        return slope
+    if len(slope) < len(nodes):
+        slope = (-slope[0], slope[0])
+    return tuple(s * free[column][:, None, :] for s, column in zip(slope, nodes, strict=True))
