@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.formats import tum
+from coopoc.formats.trajectory import Trajectory
 from coopoc.world.fleet import Fleet
 
-from .rows import assemble, increasing
+from .rows import assemble
 
 SUFFIXES = (".tum", ".txt")
 
@@ -29,23 +30,20 @@ def read_tum(path: Path, *, dt: float | None = None) -> Fleet:
     """Fleet of a TUM file or a folder of them; ids are file names, velocity is the backward difference.
 
     Args:
-        path: file or folder; s and m; orientation is checked for its four numbers and not kept (a Fleet has none).
+        path: file or folder; s and m; orientation is checked for a unit quaternion and not kept (a Fleet has none).
         dt: s, resample: needed when the vehicles' stamps differ.
 
     Raises:
-        InputError: no file, an empty one, a line that is not eight finite numbers (with its number), stamps that do not
-            increase.
+        InputError: no file, or what `coopoc.formats.tum.read_tum` raises.
     """
     files = tum_files(path)
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
-    poses = [_read(file) for file in files]
-    vehicle = [file.stem for file, pose in zip(files, poses, strict=True) for _ in pose]
-    table = np.concatenate(poses)
+    poses = [tum.read_tum(file) for file in files]
     return assemble(
-        vehicle,
-        table[:, 0],
-        table[:, 1:4],
+        [file.stem for file, one in zip(files, poses, strict=True) for _ in range(len(one))],
+        np.concatenate([one.stamps for one in poses]),
+        np.concatenate([one.position for one in poses]),
         dt=dt,
         file=path.name,
         name=path.stem,
@@ -58,34 +56,6 @@ def write_tum(fleet: Fleet, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for column, name in enumerate(fleet.ids):
         present = fleet.present[:, column]
-        rows = zip(fleet.t[present], fleet.position[present, column], strict=True)
-        lines = [f"{t:.6f} {float(x)!r} {float(y)!r} {float(z)!r} 0 0 0 1" for t, (x, y, z) in rows]
-        (folder / f"{name}.tum").write_text("\n".join([*lines, ""]))
-
-
-def _read(file: Path) -> Floats:
-    texts = file.read_text("utf-8-sig").splitlines()
-    lines = [(k, text.split()) for k, text in enumerate(texts, 1) if not _comment(text)]
-    rows = []
-    for number, words in lines:
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != 8 or not np.isfinite(row).all():
-            raise InputError(
-                f"{file.name}: line {number}",
-                " ".join(words),
-                "must be eight finite numbers t x y z qx qy qz qw",
-                "Mend or remove the line.",
-            )
-        rows.append(row)
-    if not rows:
-        raise InputError(file.name, "0 lines", "must hold at least two poses", "Check that the file is complete.")
-    table = np.array(rows)
-    increasing(table[:, 0], lambda row: f"{file.name}: line {lines[row][0]}", file.stem)
-    return table
-
-
-def _comment(text: str) -> bool:
-    return not text.strip() or text.lstrip().startswith("#")
+        position = fleet.position[present, column]
+        poses = Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
+        tum.write_tum(poses, folder / f"{name}.tum")

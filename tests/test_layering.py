@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FLOORS = ["world", "optimize", "methods", "evaluate", "study", "cli"]
+FLOORS = ["formats", "world", "optimize", "methods", "evaluate", "study", "cli"]
 
 
 def imports(path: Path) -> set[str]:
@@ -35,6 +35,7 @@ def test_imports_run_one_way(path: Path) -> None:
         target = name.split(".")[1] if name.startswith("coopoc.") else ""
         if floor in FLOORS and target in FLOORS:
             assert FLOORS.index(target) <= FLOORS.index(floor), f"{path} imports {name}"
+            assert {floor, target} != {"formats", "world"}, f"{path} imports {name}: the two stand side by side"
 
 
 def test_import_is_light() -> None:

@@ -1,0 +1,126 @@
+"""g2o text files: pose graphs with landmarks, an initial guess and information matrices; no stamps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .check import NAME
+from .compose import to_lines
+from .graph import Graph
+from .lines import read_words, to_numbers
+from .parse import to_graph
+from .records import Grammar, Record
+
+OFFSET = "PARAMS_SE3OFFSET id x y z qx qy qz qw"
+
+
+def _name(word: str, kind: str) -> str:
+    """17 is the pose A17 or the point L17; a GTSAM symbol key carries its own letter."""
+    letter, number = divmod(int(word) if word.isdecimal() else -1, 1 << 56)
+    name = f"{chr(letter) if letter > 0 else 'A' if kind == 'pose' else 'L'}{number}"
+    return name if letter >= 0 and NAME.fullmatch(name) else ""
+
+
+GRAMMAR = Grammar(
+    "g2o",
+    {
+        "VERTEX_SE2": Record("pose", 2),
+        "VERTEX_XY": Record("point", 2),
+        "EDGE_PRIOR_SE2": Record("pose_prior", 2),
+        "EDGE_PRIOR_XY": Record("point_prior", 2),
+        "EDGE_SE2": Record("relative_pose", 2),
+        "EDGE_SE2_XY": Record("relative_point", 2),
+        "VERTEX_SE3:QUAT": Record("pose", 3),
+        "VERTEX_TRACKXYZ": Record("point", 3),
+        "EDGE_SE3_PRIOR": Record("pose_prior", 3, offset=True),
+        "EDGE_POINTXYZ_PRIOR": Record("point_prior", 3),
+        "EDGE_SE3:QUAT": Record("relative_pose", 3),
+        "EDGE_SE3_TRACKXYZ": Record("relative_point", 3, offset=True),
+        "EDGE_RANGE": Record("ranges", 0),
+    },
+    noise="information",
+    name=_name,
+    others=("PARAMS_SE3OFFSET", "FIX"),
+)
+
+
+def read_g2o(path: str | Path) -> Graph:
+    """Graph of a g2o file: the vertex with id 17 is called A17 if it is a pose and L17 if it is a point.
+
+    Ids of 2^56 and more are GTSAM's symbol keys, which multi-robot files use: letter * 2^56 + number. A pose and a
+    point may share an id, as GTSAM writes them. Covariances are the inverses of the file's information matrices as they
+    stand: rotations are rotation vectors, as GTSAM takes them, where g2o's own solver means qx, qy, qz, half of that.
+
+    Args:
+        path: lines `VERTEX_SE2 id x y theta`, `VERTEX_XY id x y`, `EDGE_SE2 i j x y theta info`,
+            `EDGE_SE2_XY i j x y info`, `EDGE_PRIOR_SE2 i x y theta info`, `EDGE_PRIOR_XY i x y info`;
+            `VERTEX_SE3:QUAT id x y z qx qy qz qw`, `VERTEX_TRACKXYZ id x y z`,
+            `EDGE_SE3:QUAT i j x y z qx qy qz qw info`, `EDGE_SE3_TRACKXYZ i j offset x y z info`,
+            `EDGE_SE3_PRIOR i offset x y z qx qy qz qw info`, `EDGE_POINTXYZ_PRIOR i x y z info`,
+            `PARAMS_SE3OFFSET id x y z qx qy qz qw` (the identity, where an edge uses it); `FIX id ...`; and
+            `EDGE_RANGE i j r information`, which g2o lacks and its users add under this name.
+            m and rad; info is the upper triangle by rows.
+
+    Raises:
+        InputError: with the line, a record that is none of these, words that are missing or no finite numbers, an
+            unknown, repeated or ambiguous vertex, 2-D beside 3-D, a singular information, or what `Graph` refuses.
+
+    Source: the g2o wiki (File Format), and the types that g2o registers in slam2d and slam3d.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "two.g2o"
+    >>> _ = file.write_text("VERTEX_SE2 0 0 0 0\\nVERTEX_SE2 1 1 0 0\\nEDGE_SE2 0 1 1 0 0 4 0 0 4 0 100\\nFIX 0\\n")
+    >>> read_g2o(file).relative_pose.covariance[0].diagonal()
+    array([0.25, 0.25, 0.01])
+    """
+    path = Path(path)
+    lines = list(read_words(path))
+    records = [line for line in lines if line[1][0] not in GRAMMAR.others]
+    identity = _identities(path.name, [line for line in lines if line[1][0] == "PARAMS_SE3OFFSET"])
+    for number, words in records:
+        _refuse_offset(path.name, number, words, identity)
+    fixed = [(number, word) for number, words in lines if words[0] == "FIX" for word in words[1:]]
+    return to_graph(path.name, records, GRAMMAR, fixed)
+
+
+def write_g2o(graph: Graph, path: str | Path) -> None:
+    """Write a g2o file: ids are the numbers of the names if poses are called A, points L, and no number comes twice.
+
+    Else poses get GTSAM's symbol keys, and points that are not called L, too. GTSAM reads such files; g2o's own program
+    reads ids of 32 bits only.
+
+    Raises:
+        InputError: a graph with stamps, which g2o has not, a singular covariance, or a vertex without a position.
+    """
+    numbers = {name[1:] for name in graph.names}
+    plain = len(numbers) == len(graph.names) and all(graph.names[k][0] == "A" for k in np.flatnonzero(graph.is_pose))
+    point = {name for name, pose in zip(graph.names, graph.is_pose, strict=True) if not pose}
+
+    def label(name: str) -> str:
+        short = name[0] == "L" if name in point else plain
+        return str(int(name[1:]) + (0 if short else ord(name[0]) << 56))
+
+    lines = to_lines(graph, GRAMMAR, label)
+    if graph.dimension == 3 and (len(graph.relative_point) or len(graph.pose_prior)):
+        lines.insert(0, "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1")
+    lines += [f"FIX {label(graph.names[k])}" for k in graph.fixed.tolist()]
+    Path(path).write_text("\n".join([*lines, ""]))
+
+
+def _identities(file: str, lines: list[tuple[int, list[str]]]) -> dict[str, bool]:
+    """Id of every sensor offset, and whether it is none."""
+    poses = to_numbers(file, [number for number, _ in lines], [words[2:] for _, words in lines], OFFSET, 7)
+    return {words[1]: bool((pose == np.eye(7)[6]).all()) for (_, words), pose in zip(lines, poses, strict=True)}
+
+
+def _refuse_offset(file: str, number: int, words: list[str], identity: dict[str, bool]) -> None:
+    """InputError where a measurement is made from an offset that is not given, or is not the identity."""
+    record = GRAMMAR.records.get(words[0])
+    if record and record.offset and len(words) == record.width:
+        word = words[1 + len(record.ends)]
+        if not identity.get(word, False):
+            allowed = "must be the identity" if word in identity else "must be given by a line PARAMS_SE3OFFSET"
+            raise InputError(f"{file}: line {number}", f"offset {word}", allowed, "Measure from the pose itself.")

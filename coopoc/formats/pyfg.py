@@ -1,0 +1,72 @@
+"""PyFG text files: range-aided factor graphs with ground truth, stamps and covariances (PyFactorGraph, CORA)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import InputError
+from .check import NAME
+from .compose import to_lines
+from .graph import Graph
+from .lines import read_words
+from .parse import to_graph
+from .records import Grammar, Record
+
+GRAMMAR = Grammar(
+    "PyFG",
+    {
+        "VERTEX_SE2": Record("pose", 2, stamped=True),
+        "VERTEX_XY": Record("point", 2),
+        "VERTEX_SE2:PRIOR": Record("pose_prior", 2, stamped=True),
+        "VERTEX_XY:PRIOR": Record("point_prior", 2, stamped=True),
+        "EDGE_SE2": Record("relative_pose", 2, stamped=True),
+        "EDGE_SE2_XY": Record("relative_point", 2, stamped=True),
+        "VERTEX_SE3:QUAT": Record("pose", 3, stamped=True),
+        "VERTEX_XYZ": Record("point", 3),
+        "VERTEX_SE3:QUAT:PRIOR": Record("pose_prior", 3, stamped=True),
+        "VERTEX_XYZ:PRIOR": Record("point_prior", 3, stamped=True),
+        "EDGE_SE3:QUAT": Record("relative_pose", 3, stamped=True),
+        "EDGE_SE3_XYZ": Record("relative_point", 3, stamped=True),
+        "EDGE_RANGE": Record("ranges", 0, stamped=True),
+    },
+    noise="covariance",
+    name=lambda word, kind: word if NAME.fullmatch(word) else "",
+)
+
+
+def read_pyfg(path: str | Path) -> Graph:
+    """Graph of a PyFG file: letters are robots (L by custom landmarks), vertex lines hold the ground truth.
+
+    Args:
+        path: lines `VERTEX_SE2 stamp A0 x y theta`, `VERTEX_XY L0 x y`, `EDGE_SE2 stamp A0 A1 x y theta cov`,
+            `EDGE_SE2_XY stamp A0 L0 x y cov`, `EDGE_RANGE stamp A0 L0 r variance`,
+            `VERTEX_SE2:PRIOR stamp A0 x y theta cov`, `VERTEX_XY:PRIOR stamp L0 x y cov`; in 3-D VERTEX_SE3:QUAT,
+            VERTEX_XYZ, EDGE_SE3:QUAT, EDGE_SE3_XYZ and their priors; s, m, rad; cov is the upper triangle by rows.
+
+    Raises:
+        InputError: with the line, a record that is none of these, words that are missing or no finite numbers, an
+            unknown or repeated vertex, 2-D beside 3-D, or what `Graph` refuses.
+
+    Source: the files and the reader and writer of PyFactorGraph (MarineRoboticsGroup).
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "two.pyfg"
+    >>> _ = file.write_text("VERTEX_XY L0 11 19\\nVERTEX_XY L1 11 21\\nEDGE_RANGE 0 L0 L1 2 1\\n")
+    >>> read_pyfg(file).ranges.distance
+    array([2.])
+    """
+    return to_graph(Path(path).name, read_words(Path(path)), GRAMMAR)
+
+
+def write_pyfg(graph: Graph, path: str | Path) -> None:
+    """Write a PyFG file that reads back bit by bit.
+
+    Raises:
+        InputError: a pose or measurement without a stamp, a vertex without a position, or fixed vertices, for which
+            PyFG has no record.
+    """
+    if len(graph.fixed):
+        raise InputError("fixed", f"{len(graph.fixed)} vertices", "PyFG has no record for fixed vertices",
+                         "Write dataclasses.replace(graph, fixed=()), or a pose prior.")  # fmt: skip
+    lines = to_lines(graph, GRAMMAR, lambda name: name)
+    Path(path).write_text("\n".join([*lines, ""]))

@@ -1,0 +1,192 @@
+"""Every wrong line of a PyFG, g2o, TUM or KITTI file is named with its place and the mend."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopoc.errors import InputError
+from coopoc.formats import read_graph, write_graph
+from coopoc.formats.edges import PointEdges, RangeEdges
+from coopoc.formats.graph import Graph
+from coopoc.formats.kitti import read_kitti, write_kitti
+from coopoc.formats.trajectory import Trajectory
+from coopoc.formats.tum import read_tum, write_tum
+
+PYFG = """VERTEX_SE2 0 A0 0 0 0
+VERTEX_SE2 1 A1 1 0 0.5
+VERTEX_XY L0 3 4
+EDGE_SE2 1 A0 A1 1 0 0.5 1 0 0 1 0 1
+EDGE_SE2_XY 1 A1 L0 2 4 1 0 1
+EDGE_RANGE 1 A0 L0 5 0.1
+VERTEX_SE2:PRIOR 0 A0 0 0 0 1 0 0 1 0 1
+"""
+BAD_PYFG = {
+    "unknown record": ("EDGE_RANGE", "EDGE_RNG", "line 6 = EDGE_RNG", "VERTEX_SE2, VERTEX_XY, VERTEX_SE2:PRIOR"),
+    "missing word": ("L0 5 0.1", "L0 5", "line 6 = EDGE_RANGE 1 A0 L0 5 (5 words)", "EDGE_RANGE stamp i j r variance"),
+    "no number": ("5 0.1", "five 0.1", "line 6", "all finite numbers"),
+    "not finite": ("5 0.1", "nan 0.1", "line 6", "all finite numbers"),
+    "infinite vertex": ("A1 1 0 0.5", "A1 inf 0 0.5", "line 2", "VERTEX_SE2 stamp i x y theta"),
+    "stamp": ("VERTEX_SE2 1 A1", "VERTEX_SE2 one A1", "line 2", "stamp"),
+    "negative variance": ("5 0.1", "5 -0.1", "line 6 = variance -0.1", ">= 0"),
+    "negative range": ("5 0.1", "-5 0.1", "line 6 = distance -5", ">= 0"),
+    "indefinite": ("0.5 1 0 0 1 0 1", "0.5 1 2 0 1 0 1", "line 4 = covariance", "positive semi-definite"),
+    "indefinite point": ("4 1 0 1", "4 1 0 -1", "line 5 = covariance", "positive semi-definite"),
+    "indefinite prior": ("0 0 0 1 0 0 1 0 1", "0 0 0 1 0 0 -1 0 1", "line 7 = covariance", "positive semi-definite"),
+    "repeated": ("VERTEX_SE2 1 A1", "VERTEX_SE2 1 A0", "line 2 = vertex A0", "is at a.pyfg: line 1"),
+    "repeated point": ("VERTEX_XY L0 3 4\n", "VERTEX_XY L0 3 4\nVERTEX_XY A1 3 4\n", "line 4 = vertex A1", "line 2"),
+    "unknown vertex": ("A0 L0 5", "A0 L9 5", "line 6 = vertex L9", "Add its VERTEX line"),
+    "wrong kind": ("1 A1 L0 2", "1 A1 A0 2", "line 5 = vertex A0", "must be a point"),
+    "itself": ("A0 L0 5", "A0 A0 5", "line 6 = A0 twice", "two vertices"),
+    "name": ("VERTEX_XY L0", "VERTEX_XY beacon", "line 3 = vertex beacon", "a letter and a number"),
+    "mixed": ("VERTEX_XY L0 3 4", "VERTEX_XYZ L0 3 4 5", "line 3 = VERTEX_XYZ", "must be 2-D as line 1, VERTEX_SE2"),
+    "empty": (PYFG, "# nothing\n", "a.pyfg = 0 vertices", "complete"),
+    "binary": ("EDGE_RANGE", "\udcff", "a.pyfg", "text"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_PYFG)
+def test_a_bad_pyfg_line_is_named(tmp_path: Path, case: str) -> None:
+    old, new, thing, mend = BAD_PYFG[case]
+    assert len(read_graph(_file(tmp_path / "good.pyfg", PYFG)).ranges) == 1
+    assert old in PYFG
+    _assert_refused(lambda: read_graph(_file(tmp_path / "a.pyfg", PYFG.replace(old, new, 1))), thing, mend)
+
+
+G2O = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
+VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1
+VERTEX_TRACKXYZ 2 3 4 5
+PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
+EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 4 0 0 0 0 0 4 0 0 0 0 4 0 0 0 9 0 0 9 0 9
+EDGE_SE3_TRACKXYZ 0 2 0 3 4 5 1 0 0 1 0 1
+EDGE_RANGE 0 2 7 4
+FIX 0 1
+"""
+BAD_G2O = {
+    "singular": ("3 4 5 1 0 0 1 0 1", "3 4 5 1 1 0 1 0 1", "line 6 = information", "singular"),
+    "no information": ("2 7 4", "2 7 0", "line 7 = information [0.0]", "positive definite"),
+    "quaternion": ("1 1 0 0 0 0 0 1\nVERTEX_T", "1 1 0 0 1 0 0 1\nVERTEX_T", "line 2 = quaternion", "length 1"),
+    "measured quaternion": ("0 1 1 0 0 0 0 0 1 4", "0 1 1 0 0 0 0 0 2 4", "line 5 = quaternion", "length 1"),
+    "offset not given": ("EDGE_SE3_TRACKXYZ 0 2 0", "EDGE_SE3_TRACKXYZ 0 2 3", "line 6 = offset 3", "PARAMS_SE3OFFSET"),
+    "offset": ("OFFSET 0 0 0", "OFFSET 0 0 1", "line 6 = offset 0", "identity"),
+    "offset's words": ("OFFSET 0 0 0", "OFFSET 0 0", "line 4", "PARAMS_SE3OFFSET id x y z"),
+    "fixed vertex": ("FIX 0 1", "FIX 0 9", "line 8 = vertex 9", "one of the vertices"),
+    "ambiguous": ("TRACKXYZ 2 3", "TRACKXYZ 0 3", "line 6 = vertex 2", "one of the vertices"),
+    "both": ("FIX", "VERTEX_TRACKXYZ 1 0 0 0\nEDGE_RANGE 0 1 2 4\nFIX", "line 9 = vertex 1", "both a pose and a point"),
+    "id": ("VERTEX_TRACKXYZ 2", "VERTEX_TRACKXYZ -2", "line 3 = vertex -2", "g2o: a number"),
+    "wrong kind": ("EDGE_SE3:QUAT 0 1", "EDGE_SE3:QUAT 0 2", "line 5 = vertex 2", "must be a pose"),
+    "unknown record": ("FIX", "EDGE2", "line 8 = EDGE2", "PARAMS_SE3OFFSET, FIX"),
+    "mixed": ("VERTEX_TRACKXYZ 2 3 4 5", "VERTEX_XY 2 3 4", "line 3 = VERTEX_XY", "3-D as line 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_G2O)
+def test_a_bad_g2o_line_is_named(tmp_path: Path, case: str) -> None:
+    old, new, thing, mend = BAD_G2O[case]
+    assert read_graph(_file(tmp_path / "good.g2o", G2O)).fixed.tolist() == [0, 1]
+    assert old in G2O
+    _assert_refused(lambda: read_graph(_file(tmp_path / "a.g2o", G2O.replace(old, new, 1))), thing, mend)
+
+
+GRAPH = Graph(
+    2,
+    ("A0", "L5", "A1", "B0", "L7", "B1"),
+    [True, False, True, True, False, True],
+    np.arange(12.0).reshape(6, 2),
+    np.zeros((6, 1)),
+    ranges=RangeEdges([[0, 2], [0, 1], [1, 4]], [1, 2, 3], [1, 1, 1]),
+    fixed=[1, 0],
+)
+
+
+def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
+    graph, out = GRAPH, tmp_path / "a.pyfg"
+    _assert_refused(lambda: write_graph(graph, out), "fixed = 2 vertices", "pose prior")
+    _assert_refused(lambda: write_graph(replace(graph, fixed=()), out), "stamp of pose of A0", "graph.stamped(t)")
+    _assert_refused(lambda: write_graph(graph.stamped(0.0), tmp_path / "a.g2o"), "stamp", "graph.stamped(np.nan)")
+    lost = replace(graph, position=np.full((6, 2), np.nan))
+    _assert_refused(lambda: write_graph(lost, tmp_path / "a.g2o"), "vertex A0", "must be known")
+    flat = replace(graph.ranges, variance=[1.0, 0.0, 1.0])
+    _assert_refused(lambda: write_graph(replace(graph, ranges=flat), tmp_path / "a.g2o"), "ranges[1]", "singular")
+    _assert_refused(lambda: write_graph(graph, tmp_path / "a.toro"), "path = a.toro", ".pyfg or .g2o")
+    _assert_refused(lambda: read_graph(tmp_path / "a"), "path = a", ".pyfg or .g2o")
+    _assert_refused(lambda: read_graph(tmp_path / "none.g2o"), "none.g2o", "must be a file")
+    assert not list(tmp_path.iterdir())
+
+
+GRAPH_RULES: dict[str, tuple[dict[str, Any], str]] = {
+    "dimension": ({"dimension": 4}, "dimension = 4"),
+    "shape": ({"position": np.zeros((6, 3))}, "position = shape (6, 3)"),
+    "infinite": ({"position": np.full((6, 2), np.inf)}, "names[0] = vertex A0"),
+    "stamp of a point": ({"stamps": np.arange(6.0)}, "names[1] = stamp 1.0 of L5"),
+    "names": ({"names": ("A0", "L5", "A1", "B0", "L7", "A0")}, "names[5] = vertex A0"),
+    "covariance's shape": ({"point_prior": PointEdges([[1]], [[0, 0]], [np.eye(3)])}, "point_prior.covariance"),
+    "asymmetric": ({"point_prior": PointEdges([[1]], [[0, 0]], [[[1, 0.5], [0, 1]]])}, "point_prior[0]"),
+    "prior of a pose": ({"point_prior": PointEdges([[0]], [[0, 0]], [np.eye(2)])}, "must be a point"),
+    "node": ({"ranges": RangeEdges([[0, 6]], [1.0], [1.0])}, "ranges[0] = vertices [0, 6]"),
+    "fixed": ({"fixed": [6]}, "fixed[0] = 6"),
+}
+
+
+@pytest.mark.parametrize("case", GRAPH_RULES)
+def test_a_bad_graph_is_named_by_its_row(case: str) -> None:
+    change, thing = GRAPH_RULES[case]
+    _assert_refused(lambda: replace(GRAPH, **change), thing)
+
+
+TUM = "# t x y z qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 0.999\n"
+KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "thing", "mend"),
+    [
+        (TUM + "0.2 1 2\n", "a.tum: line 4 = 0.2 1 2 (3 words)", "t x y z qx qy qz qw"),
+        (TUM + "0.2 x 0 0 0 0 0 1\n", "a.tum: line 4", "finite"),
+        (TUM + "0.2 0 0 0 0 0 0 0\n", "a.tum: line 4 = quaternion [0.0, 0.0, 0.0, 0.0]", "length 1"),
+        (TUM + "0.1 0 0 0 0 0 0 1\n", "a.tum: line 4, column t", "must increase"),
+        ("# t x y z\n", "a.tum = 0 lines", "complete"),
+    ],
+)
+def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str, mend: str) -> None:
+    assert len(read_tum(_file(tmp_path / "good.tum", TUM))) == 2
+    _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, mend)
+
+
+@pytest.mark.parametrize(
+    ("text", "thing", "mend"),
+    [
+        (KITTI + "1 0 0 5 0 1 0 6\n", "a.txt: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
+        (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.txt: line 3", "finite"),
+        (KITTI + "1 0 0 5 0 1.01 0 6 0 0 1 7\n", "a.txt: line 3 = rotation", "orthonormal"),
+        (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.txt: line 3 = rotation", "determinant 1"),
+    ],
+)
+def test_a_bad_kitti_line_is_named(tmp_path: Path, text: str, thing: str, mend: str) -> None:
+    assert len(read_kitti(_file(tmp_path / "good.txt", KITTI))) == 2
+    _assert_refused(lambda: read_kitti(_file(tmp_path / "a.txt", text)), thing, mend)
+
+
+def test_stamps_of_kitti_stand_in_a_file_of_their_own(tmp_path: Path) -> None:
+    poses = Trajectory([0.0, 1, 2], np.ones((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
+    _assert_refused(lambda: write_kitti(poses, tmp_path / "a.txt"), "times = None", "of their own")
+    _assert_refused(lambda: write_tum(replace(poses, stamps=None), tmp_path / "a.tum"), "stamps = None", "KITTI")
+    write_kitti(poses, tmp_path / "a.txt", tmp_path / "t.txt")
+    _file(tmp_path / "t.txt", "0\n1\n")
+    _assert_refused(lambda: read_kitti(tmp_path / "a.txt", tmp_path / "t.txt"), "times = 2 stamps", "must be 3")
+
+
+def _file(path: Path, text: str) -> Path:
+    path.write_text(text, errors="surrogateescape")
+    return path
+
+
+def _assert_refused(call: Any, *parts: str) -> None:
+    with pytest.raises(InputError) as error:
+        call()
+    for part in parts:
+        assert part in str(error.value)
