@@ -1,0 +1,241 @@
+"""CovarianceIntersection, Mds and QcqpSdr over a Recording: consistency, laws, and what they do with a real channel."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import coopoc as co
+from coopoc import V2X, Fleet, Gnss, InputError, Kalman, Knowledge, Sensors, observe
+from coopoc.evaluate.metrics import errors, nees, rt_le
+from coopoc.methods.catalogue import METHODS as METHODS_BY_NAME
+from coopoc.methods.covariance_intersection import CovarianceIntersection, Said
+from coopoc.methods.kalman import solo_filter
+from coopoc.methods.mds import Mds
+from coopoc.methods.qcqp_sdr import QcqpSdr
+from coopoc.world.inbox import inbox
+
+S2 = Sensors.paper_scenario2()
+SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
+SPLIT = CovarianceIntersection(split=True, name="split-ci")
+FILTERS = [CovarianceIntersection(), SPLIT, CovarianceIntersection(criterion="det"),
+           CovarianceIntersection("identity"), replace(SPLIT, knowledge="identity")]  # fmt: skip
+SNAPSHOTS = [Mds(), Mds("identity", ranges=0), Mds(iterations=30), Mds(ranges=0, missing="angles"), QcqpSdr(),
+             QcqpSdr("identity")]  # fmt: skip
+METHODS = [*FILTERS, *SNAPSHOTS]
+
+
+def label(method: object) -> str:
+    fields = ("name", "knowledge", "criterion", "iterations", "ranges", "missing")
+    return "-".join(str(getattr(method, f)) for f in fields if hasattr(method, f))
+
+
+def test_ci_is_not_over_confident_in_traffic() -> None:
+    """NEES on a crop of town10: mean at most 3 beyond its interval, far above for the naive sum of MSMV-R."""
+    fleet = co.load("town10").between(0, 250)
+    recording = observe(fleet, S2, V2X(max_neighbours=10), runs=8, seed=2, observers=[0, 12, 24])
+    found = {m.name: nees(m(recording, [0, 12, 24]), fleet).mean(axis=1) for m in (*FILTERS[:2], co.Msmv("nominal"))}
+    for name in ("ci", "split-ci"):
+        per_drive = found[name].ravel()
+        half = 2.58 * per_drive.std(ddof=1) / np.sqrt(len(per_drive))
+        assert per_drive.mean() - half < 3.0
+        assert per_drive.mean() > 0.5
+    assert found["msmv-r"].mean() > 6.0
+
+
+def test_what_is_said_late_is_no_surer_than_it_is() -> None:
+    """Monte Carlo: an estimate brought forward by half a second and more errs by no more than its variance says."""
+    fleet = co.load("town10").between(0, 200)
+    recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0), runs=20, observers=[0])
+    known = Knowledge.nominal(recording.sensors)
+    process = np.broadcast_to(known.process_variance(recording), recording.gnss.shape)
+    solo = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
+    said, box, links = Said(recording, known, *solo, process), inbox(recording, 0, SPLIT.message), recording.links
+    share = []
+    for t in range(20, 200):
+        span = slice(box.start[t], box.start[t + 1])
+        theirs, others, held = said.pseudo_fixes(box, t, fleet.position[None, t, 0])
+        late = held & (t - box.newest[:, span] >= 5)
+        gap = theirs - fleet.position[t, links.neighbour[box.link[span]]]
+        share.append(gap[late] ** 2 / np.diagonal(others.dependent[late], axis1=1, axis2=2))
+    assert 0.3 < np.concatenate(share)[:, :2].mean() < 1.1
+
+
+def test_all_ranges_place_the_ego_better_than_paths_through_it(crossing: Fleet) -> None:
+    everybody = observe(crossing, S2, V2X(max_neighbours=7, radius=200.0), runs=20)
+    alone = observe(crossing, S2, V2X(max_neighbours=7, radius=200.0), runs=20, observers=[0])
+    clique, star = Mds()(everybody, [0]), Mds()(alone, [0])
+    assert clique.notes == ("100 % of the distances between neighbours were measured",)
+    assert star.notes == ("0 % of the distances between neighbours were measured",)
+    assert rt_le(clique, crossing).mean() < rt_le(Gnss()(everybody, [0]), crossing).mean()
+    assert rt_le(clique, crossing).mean() < rt_le(star, crossing).mean()
+    assert star.covariance is None
+    with pytest.raises(InputError, match="claims none"):
+        nees(star, crossing)
+
+
+def test_a_platoon_has_no_lateral_shape() -> None:
+    """Rank one: across the lane all stand on one line through the fixes, the middle vehicle at their mean."""
+    t = np.arange(40) * 0.1
+    lane = np.stack([10 * t[:, None] + 12.0 * np.arange(5), np.zeros((40, 5)), np.zeros((40, 5))], axis=2)
+    velocity = np.broadcast_to([10.0, 0.0, 0.0], lane.shape)
+    fleet = Fleet(tuple("abcde"), t, lane, velocity)
+    sensors = replace(SILENT, gnss_std=(0.0, 1.0, 1.0), velocity_std_ratio=0.1)
+    recording = observe(fleet, sensors, V2X(max_neighbours=4, radius=100.0), runs=6, assumed=S2)
+    track = Mds()(recording, [2])
+    mean = recording.gnss[..., 1:].mean(axis=2)
+    assert track.x[:, :, 0, 1:] == pytest.approx(mean, abs=1e-6)
+
+
+def test_the_relaxation_finds_what_many_starts_find() -> None:
+    """Independent check: the best of forty random starts of scipy.optimize.least_squares, on who is heard."""
+    fleet = co.load("town10").between(0, 2)
+    recording = observe(fleet, S2, V2X(max_neighbours=5, loss=0.4), runs=4, observers=[12])
+    track = QcqpSdr()(recording, [12])
+    rng = np.random.default_rng(11)
+    first = np.flatnonzero(recording.links.step == 0)
+    assert {1, 2, 3, 4} & set((recording.arrival[:, first] == 0).sum(axis=1).tolist())
+    for run in range(4):
+        here = first[recording.arrival[run, first] == 0]
+        z, ranges = recording.gnss[run, 0, [12, *recording.links.neighbour[here]]], recording.relative[run, here, 0]
+
+        def residual(flat: np.ndarray, z: np.ndarray = z, ranges: np.ndarray = ranges) -> np.ndarray:
+            x = flat.reshape(-1, 3)
+            return np.concatenate([((x - z) / 3.5).ravel(), np.linalg.norm(x[1:] - x[0], axis=1) - ranges])
+
+        found = [least_squares(residual, (z + rng.normal(0, 15, z.shape)).ravel()) for _ in range(40)]
+        best = min(found, key=lambda f: f.cost)
+        assert track.x[run, 0, 0] == pytest.approx(best.x[:3], abs=1e-3)
+        assert track.neighbours[run, here] == pytest.approx(best.x[3:].reshape(-1, 3), abs=1e-3)
+        assert np.isnan(track.neighbours[run, np.setdiff1d(first, here)]).all()
+        cov = np.linalg.inv(best.jac.T @ best.jac)[:3, :3]
+        assert track.covariance[run, 0, 0] == pytest.approx(cov, abs=1e-3)
+    tight, of, total = track.notes[0].split()[:3]
+    assert of == "of"
+    assert int(total) - 1 <= int(tight) <= int(total) <= 8
+
+
+def brief(method: object, fleet: Fleet) -> Fleet:
+    """Semidefinite programmes take their time."""
+    return fleet.between(0, 12) if isinstance(method, QcqpSdr) else fleet
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_zero_noise_gives_zero_error(method, crossing: Fleet) -> None:
+    """Only where paths through the ego stand for distances is an error left."""
+    fleet = brief(method, crossing)
+    recording = observe(fleet, SILENT, V2X(max_neighbours=7, radius=200.0), assumed=S2)
+    worst = errors(method(recording, [0, 3]), fleet).max()
+    assert (worst < 1e-5) == (label(method) != "mds-identity-0-0-paths")
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_translating_the_world_translates_the_estimate(method, crossing: Fleet) -> None:
+    fleet, shift = brief(method, crossing), np.array([1000.0, -500.0, 30.0])
+    moved = replace(fleet, position=fleet.position + shift)
+    here = method(observe(fleet, S2, V2X(max_neighbours=4), runs=2), [0]).x
+    there = method(observe(moved, S2, V2X(max_neighbours=4), runs=2), [0]).x
+    assert there - shift == pytest.approx(here, abs=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_order_of_vehicles_changes_nothing(method, crossing: Fleet) -> None:
+    fleet = brief(method, crossing)
+    shuffled = fleet.select([fleet.ids[0], *reversed(fleet.ids[1:])])
+    here = method(observe(fleet, S2, V2X(max_neighbours=4), runs=2), ["c0"]).x
+    there = method(observe(shuffled, S2, V2X(max_neighbours=4), runs=2), ["c0"]).x
+    assert there == pytest.approx(here, abs=1e-5)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> None:
+    budget = V2X(max_neighbours=4, loss=0.2, latency=0.1)
+    fleet = brief(method, crossing)
+    many = method(observe(fleet, S2, budget, runs=3), [0]).x
+    assert method(observe(fleet, S2, budget, runs=1), [0]).x == pytest.approx(many[:1], abs=1e-7)
+    short = method(observe(fleet.between(0, 8), S2, budget, runs=3), [0]).x
+    assert short == pytest.approx(many[:, :8], abs=1e-7)
+
+
+@pytest.mark.parametrize("channel", [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0)], ids=["alone", "deaf"])
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_without_messages_it_is_the_solo_method(method, channel: V2X, crossing: Fleet) -> None:
+    """The filters equal the solo Kalman filter with its covariance, the snapshots the fix."""
+    recording = observe(crossing, S2, channel, runs=3)
+    track = method(recording, [0, 1])
+    if method in SNAPSHOTS:
+        assert track.x == pytest.approx(Gnss()(recording, [0, 1]).x, abs=1e-9)
+    else:
+        solo = Kalman(method.knowledge)(recording, [0, 1])
+        assert track.x == pytest.approx(solo.x, abs=1e-9)
+        assert track.covariance == pytest.approx(solo.covariance, abs=1e-9)
+    assert (track.received_bytes == 0).all()
+    assert (track.sent_bytes > 0).all() == (channel.max_neighbours > 0)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=label)
+def test_bytes_by_closed_form(method, crossing: Fleet) -> None:
+    """One message per link and step: 14 numbers for an estimate with its covariance, 8 + 2 K for fix and K ranges."""
+    fleet = brief(method, crossing)
+    recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=10), runs=1)
+    numbers = 14 if method in FILTERS else 8 + 2 * min(getattr(method, "ranges", 0), 3)
+    track = method(recording, [1])
+    assert (track.received_bytes == len(recording.links.of(1)) * (4 * numbers + 10)).all()
+    assert (track.sent_bytes == len(fleet.t) * (4 * numbers + 10)).all()
+
+
+@pytest.mark.parametrize("method", [*FILTERS[:2], Mds(), QcqpSdr()], ids=label)
+def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
+    """Poison: what the others measured at steps whose messages the inbox never yields changes nothing. An estimate
+    remembers all fixes before it: there, those after the last message that is used."""
+    recording = observe(crossing, S2, V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3), runs=1)
+    box = inbox(recording, 0, method.message)
+    who = recording.links.neighbour[box.link]
+    said = {(int(s), int(j)) for s, j in zip(box.newest[0], who, strict=True) if s >= 0}
+    secret = np.array([[j > 0 and (t, j) not in said for j in range(8)] for t in range(60)])
+    if method in FILTERS:
+        secret = np.logical_and.accumulate(secret[::-1])[::-1]
+    assert secret.sum() > 20
+    gnss, relative = recording.gnss.copy(), recording.relative.copy()
+    gnss[:, secret] += 500.0
+    links = recording.links
+    relative[:, (links.observer > 0) & secret[links.step, links.observer]] += 50.0
+    poisoned = replace(recording, gnss=gnss, relative=relative)
+    assert method(poisoned, [0]).x == pytest.approx(method(recording, [0]).x, abs=1e-7)
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_messages_help_as_they_come(split: bool, formation: Fleet) -> None:
+    fleet, score = formation.between(0, 200), []
+    method = CovarianceIntersection(split=split)
+    for channel in (V2X(max_neighbours=10), V2X(max_neighbours=10, rate=1.0, latency=0.3, loss=0.3),
+                    V2X(max_neighbours=0)):  # fmt: skip
+        recording = observe(fleet, S2, channel, runs=20, observers=[0])
+        track = method(recording, [0])
+        score.append(rt_le(track, fleet).mean())
+        assert nees(track, fleet).mean() < 3.3
+    assert score[0] < score[1] < score[2]
+
+
+def test_the_catalogue_has_them_by_name() -> None:
+    for name, kind in {"ci": CovarianceIntersection, "split-ci": CovarianceIntersection, "mds": Mds,
+                       "qcqp-sdr": QcqpSdr}.items():  # fmt: skip
+        method = METHODS_BY_NAME[name]("identity")
+        assert isinstance(method, kind)
+        assert isinstance(method, co.Method)
+        assert (method.name, method.knowledge, method.cooperative) == (name, "identity", True)
+    assert METHODS_BY_NAME["split-ci"]("nominal").split
+
+
+def test_bad_choices_are_named() -> None:
+    with pytest.raises(InputError, match="criterion = 'size'"):
+        CovarianceIntersection(criterion="size")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="iterations = -1"):
+        Mds(iterations=-1)
+    with pytest.raises(InputError, match="missing = 'guess'"):
+        Mds(missing="guess")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"ranges = 0\.5"):
+        Mds(ranges=0.5)  # type: ignore[arg-type]
