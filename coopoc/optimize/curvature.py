@@ -10,7 +10,7 @@ from ..arrays import Floats
 from .arrowhead import structure
 from .factor import Factor, unchecked
 from .linear import Linear, linearise, opposite
-from .normal import Pattern, assemble, squares
+from .normal import Pattern, assemble, normal_equations, squares
 from .problem import Problem
 
 STEP = 1e-4
@@ -30,16 +30,40 @@ def is_minimum(problem: Problem, x: Floats) -> bool:
     linear = problem.linearise(x[None])
     scheme, _ = structure(problem)
     flat = assemble(scheme, squares(linear, [f.nodes for f in problem.factors]))[0]
-    true = assemble(scheme, [part for factor in problem.factors for part in _hessian(problem, factor, x, linear)])[0]
+    true = true_blocks(problem, linear)
     own = scheme.pairs[:, 0] == scheme.pairs[:, 1]
     true[own] += SLACK * flat[own] * np.eye(problem.space.dof)
     return _positive(scheme, true)
 
 
-def _hessian(problem: Problem, factor: Factor, x: Floats, linear: Linear) -> list[Floats]:
-    """Second derivatives of what each measurement costs, as `squares` orders them: (1, M, dof, dof) each."""
-    k = next(i for i, f in enumerate(problem.factors) if f is factor)
-    slopes = linear.slope[k]
+def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
+    """dx (1, n, dof) of (H + diag(damping)) dx = -J^T r with the exact Hessian H of a single problem.
+
+    Raises:
+        numpy.linalg.LinAlgError: H + diag(damping) is not positive definite.
+    """
+    scheme, _ = structure(problem)
+    _, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
+    blocks = true_blocks(problem, linear)
+    own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
+    at = np.arange(problem.space.dof)
+    blocks[own[:, None], at, at] += damping[0, scheme.pairs[own, 0]]
+    factored = _pivots(scheme, blocks)
+    if factored is None:
+        raise np.linalg.LinAlgError("the cost curves downwards here")
+    return -np.asarray(factored.solve(gradient.ravel())).reshape(gradient.shape)
+
+
+def true_blocks(problem: Problem, linear: Linear) -> Floats:
+    """(P, dof, dof) blocks of the exact Hessian of a single problem, in the pattern's order."""
+    x = linear.x[0]
+    parts = [part for k in range(len(problem.factors)) for part in _hessian(problem, k, x, linear)]
+    return assemble(structure(problem)[0], parts)[0]
+
+
+def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats]:
+    """Second derivatives of what each measurement of a factor costs, as `squares` orders them: (1, M, dof, dof)."""
+    factor, slopes = problem.factors[k], linear.slope[k]
     if factor.measurement.linear and factor.loss is None:
         return squares(Linear(linear.x, (linear.residual[k],), (slopes,), linear.cost), [factor.nodes])
     pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.free)
@@ -52,7 +76,8 @@ def _hessian(problem: Problem, factor: Factor, x: Floats, linear: Linear) -> lis
         for c in range(dof):
             size = np.where(c < problem.dimension, reach, STEP)
             up, down = (_pulls(problem, factor, local, moved, c, sign * size) for sign in (1.0, -1.0))
-            columns[node][:, :, c] = (up - down) / (2.0 * size[:, None])
+            moves = 1.0 if problem.free is None else problem.free[factor.nodes[:, moved], c][:, None]
+            columns[node][:, :, c] = moves * (up - down) / (2.0 * size[:, None])
     whole = np.concatenate(columns, axis=2)
     whole = 0.5 * (whole + np.swapaxes(whole, 1, 2))
     if not pair or opposed:
@@ -82,18 +107,23 @@ def _pulls(problem: Problem, factor: Factor, local: Floats, node: int, coordinat
 
 
 def _positive(scheme: Pattern, blocks: Floats) -> bool:
-    """Whether the symmetric matrix of the blocks (P, dof, dof) is positive definite: all pivots of L D L^T are."""
+    """Whether the symmetric matrix of the blocks (P, dof, dof) is positive definite."""
+    return _pivots(scheme, blocks) is not None
+
+
+def _pivots(scheme: Pattern, blocks: Floats) -> Any:
+    """Factors of the matrix of the blocks if all pivots of its L D L^T are positive, else None."""
     from scipy.sparse.linalg import splu
 
     if not np.isfinite(blocks).all():
-        return False
+        return None
     try:
         factored = splu(_matrix(scheme, blocks), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                         options={"SymmetricMode": True})  # fmt: skip
     except RuntimeError:  # a pivot of exactly zero
-        return False
+        return None
     symmetric = np.array_equal(factored.perm_r, factored.perm_c)
-    return bool(symmetric and (factored.U.diagonal() > 0).all())
+    return factored if symmetric and (factored.U.diagonal() > 0).all() else None
 
 
 def _matrix(scheme: Pattern, blocks: Floats) -> Any:

@@ -9,12 +9,15 @@ import numpy as np
 from ...arrays import Floats
 from ..arrowhead import eliminate, structure
 from ..assess import factorise
+from ..curvature import newton_step
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, descend
 from ..linear import Linear
 from ..normal import normal_equations
 from ..problem import Problem, jacobian
 from .run import Ended, Run
 
+PATIENCE = 40
+"""Gauss-Newton steps before the exact Hessian takes over: with large residuals J^T J alone creeps or overshoots."""
 DENSE_POINTS = 60
 """Up to this many points a problem without a hub is solved densely."""
 
@@ -28,8 +31,11 @@ def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: flo
     step = linear_step(problem)
 
     def run(x: Floats) -> Ended:
-        end = descend(problem, step, x[None], max_iterations, tolerance)
-        return Ended(end.x[0], int(end.iterations[0]))
+        end = descend(problem, step, x[None], min(max_iterations, PATIENCE), tolerance)
+        if end.converged[0] or max_iterations <= PATIENCE:
+            return Ended(end.x[0], int(end.iterations[0]))
+        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - PATIENCE, tolerance)
+        return Ended(more.x[0], int(end.iterations[0] + more.iterations[0]), {"newton_steps": int(more.iterations[0])})
 
     return run
 
