@@ -13,25 +13,38 @@ if TYPE_CHECKING:
     from .errors import InputError as InputError
     from .errors import MissingLibraryError as MissingLibraryError
     from .evaluate.bounds import bound_rt_le as bound_rt_le
+    from .evaluate.bounds import fleet_bound as fleet_bound
     from .evaluate.bounds import posterior_bound as posterior_bound
     from .evaluate.metrics import max_error as max_error
     from .evaluate.metrics import nees as nees
     from .evaluate.metrics import rt_le as rt_le
     from .fleets import load as load
+    from .methods.admm import ConsensusADMM as ConsensusADMM
+    from .methods.batch_smoother import BatchSmoother as BatchSmoother
+    from .methods.central_filter import CentralFilter as CentralFilter
     from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
+    from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
+    from .methods.diffusion import Diffusion as Diffusion
+    from .methods.gbp import GaussianBeliefPropagation as GaussianBeliefPropagation
     from .methods.gnss import Gnss as Gnss
     from .methods.joint_filter import JointFilter as JointFilter
     from .methods.kalman import Kalman as Kalman
     from .methods.knowledge import Knowledge as Knowledge
     from .methods.lkf_sa import LaplacianKalman as LaplacianKalman
+    from .methods.mds import Mds as Mds
     from .methods.msmv import Msmv as Msmv
+    from .methods.qcqp_sdr import QcqpSdr as QcqpSdr
     from .methods.track import Method as Method
     from .methods.track import Track as Track
+    from .optimize.constraint import Constraint as Constraint
     from .optimize.factor import Factor as Factor
+    from .optimize.graphs import read as read
+    from .optimize.losses import Loss as Loss
     from .optimize.problem import Problem as Problem
     from .optimize.solution import Solution as Solution
     from .optimize.solve import backends as backends
     from .optimize.solve import solve as solve
+    from .optimize.space import pose as pose
     from .study.results import Results as Results
     from .study.run import run as run
     from .study.study import Study as Study
@@ -50,9 +63,13 @@ _HOME = {
     "Gnss": "methods.gnss", "Kalman": "methods.kalman", "Knowledge": "methods.knowledge",
     "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
     "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
-    "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds",
+    "CovarianceIntersection": "methods.covariance_intersection", "Mds": "methods.mds", "QcqpSdr": "methods.qcqp_sdr",
+    "GaussianBeliefPropagation": "methods.gbp", "ConsensusADMM": "methods.admm", "Diffusion": "methods.diffusion",
+    "CentralFilter": "methods.central_filter", "BatchSmoother": "methods.batch_smoother",
+    "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds", "fleet_bound": "evaluate.bounds",
     "CooperativeMAP": "methods.cooperative_map", "Factor": "optimize.factor", "Problem": "optimize.problem",
     "Solution": "optimize.solution", "backends": "optimize.solve", "solve": "optimize.solve",
+    "Constraint": "optimize.constraint", "Loss": "optimize.losses", "pose": "optimize.space", "read": "optimize.graphs",
     "Results": "study.results", "Study": "study.study", "run": "study.run",
     "load": "fleets", "Method": "methods.track", "Track": "methods.track",
 }  # fmt: skip

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from .admm import ConsensusADMM
+from .batch_smoother import BatchSmoother
+from .central_filter import CentralFilter
 from .cooperative_map import CooperativeMAP
+from .covariance_intersection import CovarianceIntersection
+from .diffusion import Diffusion
+from .gbp import GaussianBeliefPropagation
 from .gnss import Gnss
 from .joint_filter import JointFilter
 from .kalman import Kalman
 from .knowledge import Knowledge
 from .lkf_sa import LaplacianKalman
+from .mds import Mds
 from .msmv import Msmv
+from .qcqp_sdr import QcqpSdr
 from .track import Method
 
 Factory = Callable[[Knowledge | str], Method]
@@ -25,4 +33,14 @@ METHODS: Mapping[str, Factory] = {
     "joint": lambda knowledge: JointFilter(knowledge),
     "cooperative-map": lambda knowledge: CooperativeMAP(knowledge=knowledge),
     "cooperative-map-5": lambda knowledge: CooperativeMAP(knowledge=knowledge, window=5, name="cooperative-map-5"),
+    "ci": lambda knowledge: CovarianceIntersection(knowledge),
+    "split-ci": lambda knowledge: CovarianceIntersection(knowledge, split=True, name="split-ci"),
+    "mds": lambda knowledge: Mds(knowledge),
+    "qcqp-sdr": lambda knowledge: QcqpSdr(knowledge),
+    "gbp": lambda knowledge: GaussianBeliefPropagation(knowledge),
+    "admm": lambda knowledge: ConsensusADMM(knowledge),
+    "diffusion": lambda knowledge: Diffusion(knowledge),
+    "diffusion-anchored": lambda knowledge: Diffusion(knowledge, anchored=True, name="diffusion-anchored"),
+    "central-filter": lambda knowledge: CentralFilter(knowledge),
+    "batch-smoother": lambda knowledge: BatchSmoother(knowledge),
 }

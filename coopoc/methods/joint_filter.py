@@ -10,10 +10,11 @@ import numpy as np
 from ..arrays import Floats
 from ..world.inbox import Inbox
 from ..world.recording import Recording
-from ..world.spherical import spherical, to_vector, wrap
+from ..world.spherical import spherical
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
+from .network import whitened
 from .star import FORGOTTEN, StarStep, rows, star_steps
 from .track import Track
 
@@ -122,18 +123,5 @@ def add_edges(information: Floats, pull: Floats, weight: Floats, push: Floats) -
 
 def exact_edges(point: Floats, star: StarStep, known: Knowledge) -> tuple[Floats, Floats]:
     """Whitened Jacobian (R, k, 3, 3) by x_j - x_ego and residual (R, k, 3, 1) of range, azimuth and inclination."""
-    assert known.sensors is not None
-    vector = point[:, 1:] - point[:, :1]
-    dx, dy, dz = np.moveaxis(vector, -1, 0)
-    seen = np.stack(spherical(dx, dy, dz), axis=-1)
-    residual = star.relative - seen
-    residual[..., 1:] = wrap(residual[..., 1:])
-    unit = to_vector(np.concatenate([np.ones_like(seen[..., :1]), seen[..., 1:]], axis=-1))
-    d = np.maximum(seen[..., 0], known.sensors.min_range)
-    ground = np.maximum(np.hypot(dx, dy), 1e-3 * d)
-    zero = np.zeros_like(d)
-    by_azimuth = np.stack([-dy / ground**2, dx / ground**2, zero], axis=-1)
-    by_inclination = np.stack([dx * dz / (ground * d**2), dy * dz / (ground * d**2), -ground / d**2], axis=-1)
-    jacobian = np.stack([unit, by_azimuth, by_inclination], axis=-2)
-    std = known.sensors.relative_std
-    return jacobian / std[:, None], (residual / std)[..., None]
+    root, residual = whitened(point[:, 1:] - point[:, :1], star.relative, known)
+    return root, residual[..., None]

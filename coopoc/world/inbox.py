@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..errors import InputError
 from .recording import Recording
 from .v2x import Message
 
@@ -36,7 +37,10 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
 
     Args:
         recording: the links, the sending schedule and the arrivals. ego: column.
-        message: its size counts against `v2x.bytes_per_second`.
+        message: what its rounds take on air counts against `v2x.bytes_per_second`.
+
+    Raises:
+        InputError: a message to each neighbour or as long as the neighbourhood: `coopoc.world.exchange` counts those.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -44,11 +48,13 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     >>> inbox(observe(fleet, Sensors(), V2X()), 0, FIX_AND_VELOCITY).received_bytes
     array([64.])
     """
+    if message.unicast or message.per_neighbour:
+        raise InputError("message", message.name, "must be a broadcast of one size", "Use world.exchange.exchange.")
     steps = len(recording.t)
     link = recording.links.of(ego)
     at = recording.links.step[link]
-    size = message.payload + recording.v2x.overhead
-    arrival = _within_cap(recording.arrival[:, link], size, recording)
+    size = message.size(recording.v2x.overhead)
+    arrival = within_cap(recording.arrival[:, link], np.full(len(link), size), recording)
     newest = np.full(arrival.shape, -1, dtype=np.int64)
     fresh = np.zeros(arrival.shape, dtype=bool)
     for neighbour in np.unique(recording.links.neighbour[link]):
@@ -75,10 +81,15 @@ def _newest_held(arrival: Ints, sent: Ints, steps: int) -> Ints:
     return newest
 
 
-def _within_cap(arrival: Ints, size: int, recording: Recording) -> Ints:
-    """Arrivals with -1 for what a token bucket of one second's worth turns away; nearest neighbours come first."""
+def within_cap(arrival: Ints, size: Ints, recording: Recording) -> Ints:
+    """Arrivals (R, M) with -1 for what a token bucket of one second's worth turns away.
+
+    Args:
+        arrival: (R, M) steps at one receiver, in order of time and then of preference (nearest first).
+        size: (M,) bytes on air.
+    """
     cap = recording.v2x.bytes_per_second
-    if not np.isfinite(cap) or size == 0:
+    if not np.isfinite(cap) or not size.any():
         return arrival
     kept = arrival.copy()
     tokens, last = np.zeros(len(arrival)), 0
@@ -86,9 +97,9 @@ def _within_cap(arrival: Ints, size: int, recording: Recording) -> Ints:
         now = int(arrival[:, k].max())
         if now < 0:
             continue
-        tokens = np.minimum(tokens + cap * recording.dt * (now - last), max(cap, size))
+        tokens = np.minimum(tokens + cap * recording.dt * (now - last), max(cap, size[k]))
         last = now
-        taken = (arrival[:, k] >= 0) & (tokens >= size)
+        taken = (arrival[:, k] >= 0) & (tokens >= size[k])
         kept[~taken, k] = -1
-        tokens = tokens - size * taken
+        tokens = tokens - size[k] * taken
     return kept

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import AnyArray, Bools, Floats
 from ..errors import InputError
 
 
@@ -56,22 +57,48 @@ class V2X:
 
 @dataclass(frozen=True)
 class Message:
-    """What one broadcast carries: its payload is `numbers` float32, 4 bytes each.
+    """What a vehicle sends in one step: `rounds` messages of `numbers` float32, 4 bytes each.
+
+    Args:
+        numbers: in each round. rounds: messages a step; they share the fate of the step's message. 0 sends nothing.
+        opening: numbers that ride with the first round only, such as the measurements that all rounds work on.
+        per_neighbour: numbers more in each round for each neighbour of the sender: a list as long as its neighbourhood.
+        unicast: True for a message of its own to each neighbour; False for one broadcast that all neighbours receive.
 
     >>> Message("fix and velocity", 8).payload
     32
+    >>> Message("belief", 9, rounds=3, opening=5).size(overhead=100)
+    428
     """
 
     name: str
     numbers: int
+    rounds: int = 1
+    opening: int = 0
+    per_neighbour: int = 0
+    unicast: bool = False
+
+    def __post_init__(self) -> None:
+        for field in ("numbers", "rounds", "opening", "per_neighbour"):
+            value = getattr(self, field)
+            if value != int(value) or value < 0:
+                raise InputError(field, value, "must be a whole number >= 0", f"Give Message({field}=...).")
 
     @property
     def payload(self) -> int:
-        """Bytes."""
+        """Bytes of one round, without lists."""
         return 4 * self.numbers
 
+    def size(self, overhead: int = 0, neighbours: AnyArray | int = 0) -> Any:
+        """Bytes that one receiver takes from one sender in a step: rounds x (payload + overhead), and the opening.
 
-NO_MESSAGE = Message("none", 0)
+        Args:
+            overhead: bytes per message on air. neighbours: of the sender, a number or an array.
+        """
+        return 4 * self.opening + self.rounds * (self.payload + 4 * self.per_neighbour * neighbours + overhead)
+
+
+NO_MESSAGE = Message("none", 0, rounds=0)
 FIX_AND_VELOCITY = Message("fix and velocity", 8)
 """GNSS fix (3), velocity (3), id and time (2): LKF-SA's star and the joint filter (methods.md section 3.3)."""
 ESTIMATE = Message("estimate", 8)
