@@ -41,7 +41,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "o
             as if nothing were known of how the robots stand to each other; "file" takes the vertices as they are.
             Landmarks are put where the first pose that measures them sees them, or by the ranges to them.
 
-    >>> from coopoc.formats import RangeEdges
+    >>> from coopoc.formats.edges import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
     >>> from_graph(Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges))
     Problem(2 nodes in the plane; 1 range)

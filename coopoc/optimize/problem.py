@@ -71,6 +71,7 @@ class Problem:
             object.__setattr__(self, field, tuple(self.index(node) for node in getattr(self, field)))
         if len(set(self.hub)) < len(self.hub):
             raise InputError("hub", self.hub, "must not name a point twice", "Name each point of the hub once.")
+        Space(self.dimension)  # refuses any other than 2 and 3
         items: tuple[Factor | Constraint, ...] = (*self.factors, *self.constraints)
         for item in items:
             _check_item(self, item)

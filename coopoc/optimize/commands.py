@@ -1,0 +1,105 @@
+"""coopoc solve and coopoc check: the solvers from the command line."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from .graphs import Objective, Start, read
+from .problem import Problem
+from .solution import Solution, Status
+from .solve import BACKENDS, solve
+
+
+def solve_file(
+    file: Annotated[Positional[Path], arg(metavar="FILE")],
+    /,
+    backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
+    objective: Objective = "chordal",
+    start: Start = "odometry",
+    output: Annotated[Path | None, arg(metavar="FILE")] = None,
+) -> int:
+    """Solve the factor graph of a PyFG or g2o file.
+
+    Example: coopoc solve drive.pyfg --backend gtsam --output solution.json
+
+    Args:
+        file: .pyfg or .g2o.
+        backend: coopoc check shows them.
+        objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
+        start: odometry chained from each robot's first vertex, all robots at the origin (apart), or the file's vertices.
+        output: the solution as JSON; without it a summary goes to stdout.
+    """
+    problem = read(file, objective, start)
+    print(f"coopoc: {problem}", file=sys.stderr)
+    solution = solve(problem, backend, throw=False)
+    summary = described(solution)
+    if output is not None:
+        output.write_text(json.dumps(summary | nodes(solution)) + "\n")
+        print(f"coopoc: the solution is in {output}", file=sys.stderr)
+    print(json.dumps(summary, indent=1))
+    if solution.status is not Status.SOLVED:
+        print(f"coopoc: {solution.status.value}", file=sys.stderr)
+    return int(solution.status is not Status.SOLVED)
+
+
+def described(solution: Solution) -> dict[str, Any]:
+    """What a solution says of itself, without its nodes."""
+    return {
+        "status": solution.status.name, "sentence": solution.status.value, "backend": solution.backend,
+        "cost": solution.cost, "gradient": solution.gradient, "iterations": solution.iterations,
+        "build_seconds": solution.build_seconds, "solve_seconds": solution.solve_seconds,
+        "free": list(solution.free),
+    }  # fmt: skip
+
+
+def nodes(solution: Solution) -> dict[str, Any]:
+    """Positions m, rotation matrices and covariances (position m, then rotation rad) by name; NaN becomes null."""
+    at = zip(solution.names, solution.position, solution.rotation, solution.covariance, strict=True)
+    turning = solution.space.turning
+    return {"nodes": {
+        name: {"position": position.tolist(), **({"rotation": rotation.tolist()} if turning else {}),
+               "covariance": covariance.tolist() if np.isfinite(covariance).all() else None}
+        for name, position, rotation, covariance in at}}  # fmt: skip
+
+
+def tiny() -> Problem:
+    """Two vehicles in 3-D with a fix each and the range, azimuth and inclination between them."""
+    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
+    return problem.add("spherical", ("ego", "b"), [10.0, 0.05, 1.55], std=[0.5, 0.05, 0.05])
+
+
+def check() -> int:
+    """Solve one tiny problem with every backend and compare the answers.
+
+    Example: coopoc check
+    """
+    reference, failed = solve(tiny()), 0
+    print(f"{'backend':<14} {'holds constraints':<18} {'status':<10} {'cost':>12} {'off by [m]':>11} {'ms':>8}")
+    for name, known in BACKENDS.items():
+        if not known.installed:
+            print(f"{name:<14} {known.constraints:<18} not installed: pip install {known.library}")
+            continue
+        problem = tiny() if name != "cvxpy" else _ranges()
+        expected = reference if name != "cvxpy" else solve(_ranges())
+        began = time.perf_counter()
+        found = solve(problem, name, throw=False)
+        took = 1e3 * (time.perf_counter() - began)
+        off = float(np.abs(found.x - expected.x).max())
+        good = found.status is Status.SOLVED and off < 1e-6
+        failed += not good
+        print(f"{name:<14} {known.constraints:<18} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}")
+    print(f"coopoc: {len(BACKENDS)} backends, {failed} disagree with gauss-newton", file=sys.stderr)
+    return int(failed > 0)
+
+
+def _ranges() -> Problem:
+    """The same vehicles with the range alone: what a relaxation takes."""
+    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
+    return problem.add("range", ("ego", "b"), 10.0, std=0.5)

@@ -1,0 +1,182 @@
+"""Points and poses in one problem: derivatives against finite differences, minima against SciPy, files against bounds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import coopoc as co
+from coopoc.evaluate.alignment import absolute_error
+from coopoc.formats import read_graph
+from coopoc.formats.edges import RangeEdges
+from coopoc.formats.graph import Graph
+from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
+from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.space import Space, exp, log
+
+PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
+needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
+
+
+def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Problem, np.ndarray]:
+    """Two robots of four poses each and a landmark, with one factor of every kind that exists, and the truth."""
+    rng = np.random.default_rng(seed)
+    d, space = dimension, Space(dimension, turning=True)
+    names = tuple(f"{robot}{k}" for robot in "AB" for k in range(4)) + ("L0",)
+    position = np.concatenate([np.arange(4)[:, None] * 5.0 + row * 8.0 + np.zeros((4, d)) for row in (0, 1)])
+    position = np.concatenate([position, np.full((1, d), 12.0)]) + rng.normal(size=(9, d))
+    turn = 0.4 * rng.normal(size=(9, space.angles))
+    turn[-1] = 0.0
+    truth = space.join(position, exp(turn))
+    problem = Problem(names, x0=truth, dimension=d, poses=names[:-1])
+    pairs = {"A0": "A1", "A1": "A2", "A2": "A3", "B0": "B1", "B1": "B2", "B2": "B3", "A3": "B0", "B3": "L0"}
+    for kind, known in sorted(MEASUREMENTS.items()):
+        if d == 2 and known.plane is None:
+            continue
+        chosen = [[n] for n in names[:3]] if known.arity == 1 else [list(p) for p in pairs.items()]
+        if known.frame == "relative":
+            chosen = [c for c in chosen if "L0" not in c]
+        nodes = [[names.index(n) for n in c] for c in chosen]
+        size, constants = known.size(d), [0.5] * known.constants
+        if known.compares_poses:
+            z = np.array([_relative(space, truth, c) for c in nodes])
+            moved = space.retract(z, noise * rng.normal(size=(len(nodes), space.dof)))
+            problem = problem.add(kind, chosen, moved, std=np.full(size, 0.3))
+            continue
+        zero = problem.add(kind, chosen, np.full((len(nodes), size), 1.0), std=1.0, constants=constants or None)
+        h = zero.linearise(truth[None]).residual[-1][0] + 1.0
+        measured = h + noise * rng.normal(size=h.shape)
+        problem = problem.add(kind, chosen, measured, std=np.full(size, 0.3), constants=constants or None)
+    return problem, truth
+
+
+def _relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
+    p, R = space.position(truth), space.rotation(truth)
+    if len(nodes) == 1:
+        return truth[nodes[0]]
+    i, j = nodes
+    return space.join(R[i].T @ (p[j] - p[i]), R[i].T @ R[j])
+
+
+@pytest.mark.parametrize("held", [(), ("A0", "L0")])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_jacobian_equals_finite_differences(dimension: int, held: tuple[str, ...]) -> None:
+    problem, truth = everything(dimension)
+    problem = co.Problem(problem.names, problem.factors, truth, dimension=dimension, poses=problem.poses, held=held)
+    space, x = problem.space, problem.space.retract(truth, np.full((9, problem.space.dof), 0.02) * free(problem))
+    _, J = problem.whiten(x)
+    dense, count = J.toarray(), 9 * space.dof
+    for k in range(count):
+        step = 1e-6 * np.eye(count)[k].reshape(9, -1) * free(problem)
+        up, down = (problem.whiten(space.retract(x, sign * step))[0] for sign in (1.0, -1.0))
+        assert dense[:, k] == pytest.approx((up - down) / 2e-6, abs=1e-6)
+
+
+def free(problem: Problem) -> np.ndarray:
+    return np.ones((len(problem.names), problem.space.dof)) if problem.free is None else problem.free
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_scipy_finds_the_same_minimum_and_covariance(dimension: int, backend: str) -> None:
+    problem, truth = everything(dimension)
+    found = solve(problem, backend)
+    space, movable = problem.space, free(problem).ravel().astype(bool)
+
+    def residual(step: np.ndarray) -> np.ndarray:
+        whole = np.zeros(movable.size)
+        whole[movable] = step
+        return problem.whiten(space.retract(truth, whole.reshape(9, -1)))[0]
+
+    theirs = least_squares(residual, np.zeros(movable.sum()), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert found.status is Status.SOLVED
+    assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
+    step = np.zeros(movable.size)
+    step[movable] = theirs.x
+    assert found.x == pytest.approx(space.retract(truth, step.reshape(9, -1)), abs=1e-6)
+    J = problem.whiten(found.x)[1].toarray()[:, movable]
+    cov = np.zeros((movable.size, movable.size))
+    cov[np.ix_(movable, movable)] = np.linalg.inv(J.T @ J)
+    own = cov.reshape(9, space.dof, 9, space.dof)[np.arange(9), :, np.arange(9)]
+    assert found.covariance == pytest.approx(own, abs=1e-9)
+
+
+def test_a_turned_world_turns_the_estimate() -> None:
+    """What is measured between bodies does not depend on the world: only the held pose turns, and all with it."""
+    graph = small()
+    problem = from_graph(graph, start="file")
+    turn, shift, space = exp(np.array([0.7])), np.array([30.0, -4.0]), problem.space
+    moved = space.join(problem.x0[:, :2] @ turn.T + shift, turn @ space.rotation(problem.x0))
+    there = Problem(problem.names, problem.factors, moved, dimension=2, poses=problem.poses, held=problem.held)
+    a, b = solve(problem), solve(there)
+    assert b.cost == pytest.approx(a.cost, abs=1e-12)
+    assert b.position == pytest.approx(a.position @ turn.T + shift, abs=1e-6)
+
+
+def small() -> Graph:
+    if PYFG.is_dir():
+        return read_graph(PYFG / "factor_graph_small.pyfg")
+    ranges = RangeEdges([[0, 1]], [5.0], [0.01])
+    return Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges)
+
+
+def test_exp_and_log_are_scipys() -> None:
+    w = np.random.default_rng(0).normal(size=(40, 3))
+    w[0] = 0.0
+    assert exp(w) == pytest.approx(Rotation.from_rotvec(w).as_matrix(), abs=1e-12)
+    assert log(exp(w)) == pytest.approx(w, abs=1e-9)
+    assert log(exp(np.array([[0.3], [-3.0]]))) == pytest.approx(np.array([[0.3], [-3.0]]))
+
+
+def test_full_covariances_weigh_as_their_inverse() -> None:
+    cov = np.array([[4.0, 1.0, 0], [1.0, 2.0, 0.5], [0, 0.5, 3.0]])
+    problem = Problem(("a",)).add("position", "a", [1.0, 2, 3], cov=cov)
+    gap = np.array([1.0, -2.0, 0.5])
+    assert problem.cost(gap[None] + [1, 2, 3]) == pytest.approx(0.5 * gap @ np.linalg.solve(cov, gap))
+    assert solve(problem).covariance[0] == pytest.approx(cov)
+
+
+PLANE = Problem(("a", "b"), dimension=2, poses=("a",))
+WRONG = {
+    "no pose": (lambda: PLANE.add("bearing", ("b", "a"), 0.1, std=0.1), "must be a pose"),
+    "space in the plane": (lambda: PLANE.add("position", "a", [0, 0, 0], std=1.0), "must fit a problem of 2"),
+    "no such angle": (lambda: PLANE.add("inclination", ("a", "b"), 1.0, std=0.1), "must fit a problem of 2"),
+    "an angle of 270": (lambda: PLANE.add("bearing", ("a", "b"), 270.0, std=0.1), "looks like degrees"),
+    "not a rotation": (lambda: PLANE.add("pose", "a", [0, 0, 1, 1, 0, 1], std=0.1), "rotation matrices"),
+    "not positive": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [2, 1]]), "symmetric positive definite"),
+    "not symmetric": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [0, 9]]), "not symmetric"),
+    "no dt": (lambda: PLANE.add("speed", ("a", "b"), 10.0, std=0.1), "1 finite numbers for speed"),
+    "no start": (lambda: solve(PLANE.add("pose", "a", pose([0.0, 0], 0.1), std=1.0)), "where there are poses"),
+    "held nowhere": (lambda: Problem(("a",), held=("a",)), "needs an x0"),
+    "four dimensions": (lambda: Problem(("a",), dimension=4), "must be 2 or 3"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_input_says_what_to_do(case: str) -> None:
+    call, words = WRONG[case]
+    with pytest.raises(co.InputError, match=words):
+        call()
+
+
+@needs_files
+def test_mrclam5a_reaches_the_reference() -> None:
+    """An independent Levenberg-Marquardt reached 69.10 and 0.214 m; CORA's log has 75.28."""
+    graph = read_graph(PYFG / "mrclam5a.pyfg")
+    found = solve(from_graph(graph))
+    assert found.cost <= 69.2
+    error = absolute_error(found.position[graph.is_pose], graph.position[graph.is_pose])
+    assert float(error.rmse) <= 0.25
+
+
+@needs_files
+def test_a_graph_without_its_gauge_names_what_is_free() -> None:
+    problem = from_graph(read_graph(PYFG / "factor_graph_small.pyfg"))
+    loose = Problem(problem.names, problem.factors, problem.x0, dimension=2, poses=problem.poses)
+    found = solve(loose, throw=False)
+    assert found.status is Status.RANK_DEFICIENT
+    assert set(found.free) == set(problem.names)
