@@ -113,12 +113,13 @@ def _rows(
         columns["nees_inside"] = np.broadcast_to(nees_inside(track, drive), columns["nees"].shape)
     links = [len(recording.links.of(column)) / len(track.t) for column in track.egos]
     distance = errors(track, drive) if quantiles else None
+    served = len(drive.ids) if recording.observers == tuple(range(len(drive.ids))) else len(who)
     found = []
     for e, ego in enumerate(who):
         for r in range(len(track.x)):
             row: Row = {"run": r, "ego": ego, **extra, "neighbours_mean": links[e]}
             row |= {name: float(values[r, e]) for name, values in columns.items()}
-            row["seconds"] = track.seconds / len(track.x) / len(who)
+            row["seconds"] = track.seconds / len(track.x) / served
             if distance is not None:
                 row["error_quantiles_m"] = np.quantile(distance[r, :, e], np.linspace(0, 1, quantiles)).tolist()
             found.append(row)

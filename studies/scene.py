@@ -13,6 +13,7 @@ import numpy as np
 
 from coopoc.data.registry import load, recorder
 from coopoc.errors import InputError
+from coopoc.methods.catalogue import WHOLE_FLEET
 from coopoc.study.environment import revision
 from coopoc.study.study import Params
 from coopoc.world.fleet import Fleet
@@ -165,11 +166,14 @@ def _digests(data: str) -> Mapping[str, str]:
 def recording(p: Params) -> Recording:
     """What the vehicles of the cell see; the real measurements where there are any."""
     who = egos(p["data"], str(p["egos"]))
-    return _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), who)
+    observers = None if p.get("method") in WHOLE_FLEET else who
+    return _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
 
 
 @lru_cache(maxsize=2)
-def _recording(data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...]) -> Recording:
+def _recording(
+    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None
+) -> Recording:
     real = _recorder(data)
     if real is not None:
         return real(v2x, runs=runs, seed=seed)

@@ -44,3 +44,6 @@ METHODS: Mapping[str, Factory] = {
     "central-filter": lambda knowledge: CentralFilter(knowledge),
     "batch-smoother": lambda knowledge: BatchSmoother(knowledge),
 }
+
+WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"})
+"""Methods that need what every vehicle measured, not only the egos."""
