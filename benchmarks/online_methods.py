@@ -4,8 +4,8 @@ Run:  python benchmarks/online_methods.py                         (town10, K = 1
       python benchmarks/online_methods.py --runs 10 --neighbours 2 --steps 300
 
 White noise of the paper's second scenario, nominal knowledge, ideal channel. NEES of 3 is consistent; inside is the
-share of steps whose run-averaged NEES lies in its 99 % band. Milliseconds are per step, run and ego (whole-fleet methods: per
-step, run and vehicle), on whatever this machine was doing.
+share of steps whose run-averaged NEES lies in its 99 % band. Milliseconds are per step, run and ego (whole-fleet
+methods: per step, run and vehicle), on whatever this machine was doing.
 """
 
 from __future__ import annotations
