@@ -1,36 +1,95 @@
-"""gtsam: its native linear factors built once, the others as fresh JacobianFactors, its multifrontal elimination.
+"""gtsam: its multifrontal elimination in a loop of ours, or its own optimisers on a graph of its own factors.
 
-GTSAM has no factor for range, azimuth and inclination in the world frame with a std each: Pose3's bearing-range factor
-weights the bearing's tangent plane equally, which is another objective, and a Python CustomFactor inside an optimiser
-that C++ owns copies all Values at each callback. So the loop is owned here: the nonlinear factors are whitened and
-linearised vectorised in NumPy and handed over as JacobianFactors, in absolute coordinates, so that the native ones
-(PriorFactorPoint3, BetweenFactorPoint3) keep their linearisation over all steps.
+GTSAM has no factor for range, azimuth and inclination in the world frame with a std each, and a Python CustomFactor
+inside an optimiser that C++ owns copies all Values at each callback. So the loop that takes every problem is owned
+here: the nonlinear factors are whitened and linearised vectorised in NumPy and handed over as JacobianFactors, in
+absolute coordinates, so that the native ones (PriorFactorPoint3, BetweenFactorPoint3) keep their linearisation.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats
-from ..descend import MAX_ITERATIONS, TOLERANCE, descend
+from ...errors import InputError
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
 from ..factor import Factor
 from ..linear import Linear
 from ..problem import Problem
+from .gtsam_forms import form_of, forms
+from .gtsam_native import estimate, hold, native_graph, values, which_turn
+from .gtsam_optimizers import OPTIMIZERS, all_native, graduation, levenberg_marquardt
 from .run import Ended, Run
 
 
-def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Run:
+def build(
+    problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, optimizer: str = "elimination"
+) -> Run:
     """Solver of one problem.
 
     Args:
-        max_iterations: of linear solves. tolerance: m, largest move of a point in the last step.
+        max_iterations: of linear solves. tolerance: m or rad, largest move of a node in the last step.
+        optimizer: "elimination" is Levenberg-Marquardt of ours with GTSAM's elimination, for every problem. "lm",
+            "dogleg" and "isam2" are GTSAM's own, for problems of its own factors only; the last step is "lm"'s, since
+            GTSAM's dogleg ends at a trust region of 1e-5. So is "gnc", graduated non-convexity for losses "truncated"
+            or "geman-mcclure" of one scale: it needs no good start to tell who is wrong; what has no loss is believed,
+            and extras["weights"] has (M,) weights of each factor's measurements.
+
+    Raises:
+        InputError: an unknown optimizer, factors that it does not have (they are named).
     """
+    check_limits(max_iterations, tolerance)
+    if optimizer == "elimination":
+        step = elimination_step(problem)
+
+        def run(x: Floats) -> Ended:
+            end = descend(problem, step, x[None], max_iterations, tolerance)
+            return Ended(end.x[0], int(end.iterations[0]))
+
+        return run
+    if optimizer not in OPTIMIZERS:
+        known = ["elimination", *OPTIMIZERS]
+        raise InputError("optimizer", repr(optimizer), f"must be one of {known}", "Leave it out for elimination.")
+    return _optimising(problem, max_iterations, tolerance, optimizer)
+
+
+def _optimising(problem: Problem, max_iterations: int, tolerance: float, optimizer: str) -> Run:
+    said, posed, space = forms(problem), which_turn(problem), problem.space
+    all_native(problem, said, optimizer)
+    graph, keys = native_graph(problem, said).graph, range(len(problem.names))
+    hold(problem, graph)
+    graduate = graduation(problem, said) if optimizer == "gnc" else None
+
+    def run(x: Floats) -> Ended:
+        at, before, count = values(space, posed, x, keys), 0, 0
+        extras: dict[str, Any] = {}
+        advance = OPTIMIZERS[optimizer]
+        try:
+            if graduate is not None:
+                at, before, extras["weights"] = graduate(at, max_iterations)
+                x = estimate(space, posed, at, keys)
+            while count < max_iterations:
+                at, used = advance(graph, at, max_iterations - count)
+                last, x, count = x, estimate(space, posed, at, keys), count + used
+                if advance is levenberg_marquardt and np.abs(x - last).max(initial=0.0) <= tolerance:
+                    break
+                advance = levenberg_marquardt
+        except RuntimeError:  # a singular system: `solve` says which nodes are free
+            pass
+        return Ended(x, before + count, extras)
+
+    return run
+
+
+def elimination_step(problem: Problem) -> Step:
+    """GTSAM's multifrontal elimination, with an ordering (COLAMD) that is found once."""
     import gtsam
 
-    space = problem.space
-    fixed = native(problem).linearize(_zeros(problem))
+    space, own, n = problem.space, [_is_linear(problem, factor) for factor in problem.factors], len(problem.names)
+    fixed = _constant(problem, own)
     unit = {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 13)}
     ordering: list[Any] = []
     still = [] if problem.free is None else np.flatnonzero(~problem.free.all(axis=1)).tolist()
@@ -38,8 +97,8 @@ def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: flo
     def step(linear: Linear, damping: Floats) -> Floats:
         graph = gtsam.GaussianFactorGraph()
         graph.push_back(fixed)
-        at = linear.x[0] if not space.turning else np.zeros((len(problem.names), space.dof))
-        _add_linearised(graph, problem, linear, at, unit)
+        at = linear.x[0] if not space.turning else np.zeros((n, space.dof))
+        _add_linearised(graph, problem, linear, at, own, unit)
         for i in still:
             graph.add(i, np.diag(1.0 - problem.free[i]), np.zeros(space.dof), unit[space.dof])  # type: ignore[index]
         if damping.any():
@@ -56,57 +115,30 @@ def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: flo
             raise np.linalg.LinAlgError("gtsam: a point without measurements")
         return (there.reshape(at.shape) - at)[None]
 
-    def run(x: Floats) -> Ended:
-        end = descend(problem, step, x[None], max_iterations, tolerance)
-        return Ended(end.x[0], int(end.iterations[0]))
-
-    return run
+    return step
 
 
-def native(problem: Problem) -> Any:
-    """gtsam.NonlinearFactorGraph of the factors that GTSAM has with exactly our objective and that are linear."""
-    import gtsam
-
-    graph = gtsam.NonlinearFactorGraph()
-    if problem.space.turning:
-        return graph
-    plane = problem.dimension == 2
-    prior = gtsam.PriorFactorPoint2 if plane else gtsam.PriorFactorPoint3
-    between = gtsam.BetweenFactorPoint2 if plane else gtsam.BetweenFactorPoint3
-    for factor in problem.factors:
-        if not _is_native(problem, factor):
-            continue
-        for node, z, model in zip(factor.nodes.tolist(), factor.z, _models(factor), strict=True):
-            if model is not None and len(node) == 1:
-                graph.add(prior(node[0], z, model))
-            elif model is not None:
-                graph.add(between(node[0], node[1], z, model))
-    return graph
+def _constant(problem: Problem, own: Sequence[bool]) -> Any:
+    """gtsam.GaussianFactorGraph of GTSAM's own factors whose linearisation is the same everywhere."""
+    said = [form_of(problem, factor) if mine else "" for factor, mine in zip(problem.factors, own, strict=True)]
+    n = len(problem.names)
+    nowhere = values(problem.space, [False] * n, np.zeros((n, problem.dimension)), range(n))
+    return native_graph(problem, said).graph.linearize(nowhere)
 
 
-def _is_native(problem: Problem, factor: Factor) -> bool:
+def _is_linear(problem: Problem, factor: Factor) -> bool:
+    """Whether GTSAM's own factor may be linearised once and for all."""
     free = problem.free is None or bool(problem.free[factor.nodes].all())
     return factor.measurement.linear and factor.loss is None and free and not problem.space.turning
 
 
-def _models(factor: Factor) -> list[Any]:
-    """A noise model per measurement; None where it carries no information."""
-    import gtsam
-
-    if factor.std is not None and np.isfinite(factor.std).all():
-        wide = np.broadcast_to(factor.std, factor.z.shape)
-        distinct = {std: gtsam.noiseModel.Diagonal.Sigmas(np.array(std)) for std in set(map(tuple, wide))}
-        return [distinct[tuple(std)] for std in wide]
-    says = factor.informative
-    return [gtsam.noiseModel.Gaussian.SqrtInformation(root, False) if informative else None
-            for root, informative in zip(factor.root, says, strict=True)]  # fmt: skip
-
-
-def _add_linearised(graph: Any, problem: Problem, linear: Linear, at: Floats, unit: dict[int, Any]) -> None:
+def _add_linearised(
+    graph: Any, problem: Problem, linear: Linear, at: Floats, own: Sequence[bool], unit: dict[int, Any]
+) -> None:
     """The other factors as r + J dx with dx = x - `at`: GTSAM's unknowns are absolute where its own factors are."""
     derivatives = linear.by_node(problem.factors)
-    for factor, residual, slopes in zip(problem.factors, linear.residual, derivatives, strict=True):
-        if _is_native(problem, factor):
+    for factor, residual, slopes, mine in zip(problem.factors, linear.residual, derivatives, own, strict=True):
+        if mine:
             continue
         count, model = len(factor.nodes), unit[factor.size]
         parts = [np.broadcast_to(s[0], (count, *s.shape[2:])) for s in slopes]
@@ -119,12 +151,3 @@ def _add_linearised(graph: Any, problem: Problem, linear: Linear, at: Floats, un
         else:
             for (i, j), a, b, rhs in zip(factor.nodes.tolist(), *parts, goal, strict=True):
                 graph.add(i, a, j, b, rhs, model)
-
-
-def _zeros(problem: Problem) -> Any:
-    import gtsam
-
-    values = gtsam.Values()
-    for i in range(len(problem.names)):
-        values.insert(i, np.zeros(problem.dimension))
-    return values

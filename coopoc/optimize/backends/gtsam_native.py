@@ -1,0 +1,157 @@
+"""A problem as GTSAM's graph of its own factors, its nodes as GTSAM's values, and back: a point is a Point2/3, a pose a
+Pose2/3."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Floats
+from ..factor import Factor
+from ..linear import linearise
+from ..problem import Problem
+from ..space import Space
+from .gtsam_forms import Form, pose_of
+
+ESTIMATORS = {
+    "huber": "Huber", "cauchy": "Cauchy", "geman-mcclure": "GemanMcClure", "truncated": "TruncatedLeastSquares",
+}  # fmt: skip
+"""GTSAM's names of our losses; their values and weights are the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Native:
+    """A gtsam.NonlinearFactorGraph and, of each of its factors, which (factor, row) of the problem it says."""
+
+    graph: Any
+    place: tuple[tuple[int, int], ...]
+
+
+def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | None = None) -> Native:
+    """The graph of the factors that have parts.
+
+    Args:
+        said: of `forms`. keys: GTSAM's names of the nodes, default their indices.
+    """
+    import gtsam
+
+    graph, place = gtsam.NonlinearFactorGraph(), []
+    keys = range(len(problem.names)) if keys is None else keys
+    posed = which_turn(problem)
+    for f, (factor, parts) in enumerate(zip(problem.factors, said, strict=True)):
+        rows = np.flatnonzero(factor.informative).tolist()
+        for part in () if isinstance(parts, str) else parts:
+            models = _models(part.root, factor)
+            for k in rows:
+                nodes = factor.nodes[k].tolist()
+                name = part.names.get(tuple(posed[i] for i in nodes))
+                if name is None:  # a range from a point to a pose
+                    nodes = nodes[::-1]
+                    name = part.names[tuple(posed[i] for i in nodes)]
+                graph.add(getattr(gtsam, name)(*(keys[i] for i in nodes), *part.given(gtsam, k), models[k]))
+                place.append((f, k))
+    return Native(graph, tuple(place))
+
+
+def hold(problem: Problem, graph: Any) -> None:
+    """Add to a graph GTSAM's equalities of the nodes that are held."""
+    import gtsam
+
+    posed = which_turn(problem)
+    for i in problem.held:
+        assert problem.x0 is not None
+        name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
+        graph.add(getattr(gtsam, name)(i, _node(gtsam, problem.dimension, problem.x0[i], posed[i])))
+
+
+def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) -> Any:
+    """gtsam.Values of nodes x (n, width), which are points or `posed`, under their keys."""
+    import gtsam
+
+    found = gtsam.Values()
+    for node, turns, key in zip(x, posed, keys, strict=True):
+        found.insert(key, _node(gtsam, space.dimension, node, turns))
+    return found
+
+
+def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Iterable[int]) -> Floats:
+    """x (n, width) of the nodes in gtsam.Values."""
+    d, x = space.dimension, np.empty((len(posed), space.width))
+    for i, (turns, key) in enumerate(zip(posed, keys, strict=True)):
+        if turns:
+            pose = getattr(found, f"atPose{d}")(key)
+            x[i] = space.join(pose.translation(), pose.rotation().matrix())
+        else:
+            x[i] = space.join(getattr(found, f"atPoint{d}")(key))
+    return x
+
+
+def which_turn(problem: Problem) -> list[bool]:
+    """Of each node whether it is a pose."""
+    poses = set(problem.poses)
+    return [i in poses for i in range(len(problem.names))]
+
+
+def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
+    """Of each node of x (n, width) the (dof, own) matrix T with our step = T GTSAM's, which has `own` numbers.
+
+    GTSAM moves a pose in its body's directions, in space with the rotation first; we move its position in the world's.
+    A covariance of GTSAM's becomes T C T^T, a derivative by our step times T is one by GTSAM's.
+
+    >>> from coopoc.optimize import pose
+    >>> tangent(Space(2, turning=True), [True], pose([[5.0, 1.0]], np.pi / 2))[0].round(3) + 0.0
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
+    """
+    d, rotation, found = space.dimension, space.rotation(x), []
+    for i, turns in enumerate(posed):
+        if not turns:
+            found.append(np.eye(space.dof, d))
+            continue
+        matrix = np.eye(space.dof)
+        matrix[:d, :d] = rotation[i]
+        found.append(matrix if d == 2 else np.roll(matrix, space.angles, axis=1))
+    return found
+
+
+def linearised(problem: Problem, which: Sequence[int], x: Floats, keys: Sequence[int]) -> list[Any]:
+    """The factors `which` as gtsam.LinearContainerFactors, linear around x (n, width) for good."""
+    import gtsam
+
+    jacobian: Any = gtsam.JacobianFactor
+    factors, posed = [problem.factors[f] for f in which], which_turn(problem)
+    linear, found = linearise(problem.space, factors, None, x[None]), []
+    turn, at = tangent(problem.space, posed, x), values(problem.space, posed, x, keys)
+    for factor, residual, slopes in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+        unit = gtsam.noiseModel.Unit.Create(factor.size)
+        wide = [np.broadcast_to(slope[0], (len(factor.nodes), *slope.shape[2:])) for slope in slopes]
+        for k in np.flatnonzero(factor.informative).tolist():
+            blocks = [(keys[i], slope[k] @ turn[i]) for i, slope in zip(factor.nodes[k], wide, strict=True)]
+            found.append(gtsam.LinearContainerFactor(jacobian(*chain(*blocks), -residual[0, k], unit), at))
+    return found
+
+
+def _node(gtsam: Any, d: int, x: Floats, posed: bool) -> Any:
+    return pose_of(gtsam, d, x) if posed else x[:d]
+
+
+def _models(root: Floats, factor: Factor) -> list[Any]:
+    """A noise model per measurement, one object for equal ones."""
+    import gtsam
+
+    noise, made = gtsam.noiseModel, {}
+    for row in root:
+        key = row.tobytes()
+        if key not in made:
+            diagonal = not np.tril(row, -1).any()  # what GTSAM takes for diagonal may have entries below
+            model: Any = noise.Gaussian.SqrtInformation(row, diagonal)
+            if factor.loss is not None:
+                shape = getattr(noise.mEstimator, ESTIMATORS[factor.loss.name]).Create(factor.loss.scale)
+                model = noise.Robust.Create(shape, model)
+            made[key] = model
+    return [made[row.tobytes()] for row in root]

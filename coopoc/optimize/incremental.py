@@ -1,0 +1,205 @@
+"""FixedLag: a problem that grows piece by piece and forgets what is older than its lag, by GTSAM's ISAM2."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..errors import InputError
+from .backends.gauss_newton import linear_step
+from .backends.gtsam_forms import forms
+from .backends.gtsam_native import estimate, linearised, native_graph, tangent, values, which_turn
+from .descend import descend
+from .factor import Factor
+from .initial import initial_guess
+from .problem import Problem
+from .solve import usable
+from .space import Space
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Some nodes at one moment, each as a Solution has it.
+
+    Args:
+        names: of n nodes. x: (n, width), see Space. covariance: (n, dof, dof) m^2, rad^2 marginals.
+    """
+
+    names: tuple[str, ...]
+    x: Floats
+    covariance: Floats
+
+
+class FixedLag:
+    """The most probable nodes of the last `lag` seconds, given all that was ever measured.
+
+    `update` adds a piece of the problem: new nodes, and factors among them and those of the window. What GTSAM has with
+    exactly our objective (see backends/gtsam_forms.py) it linearises afresh where a node has moved by more than
+    `threshold`. All else, such as range and angles in the world frame, is linearised once, robust weights included, at
+    the most probable geometry given the piece and the marginals of the nodes before it: after the converted
+    measurement, which makes a poor prior harmless, one exact step (performance.md section 1.5). Nodes that fall out of
+    the lag are marginalised (Kaess et al., iSAM2, IJRR 2012; gtsam.IncrementalFixedLagSmoother); an infinite lag
+    forgets nothing.
+
+    Args:
+        lag: s; a node whose stamp is older than the newest one minus the lag leaves. Of steps of dt take (k + 1/2) dt,
+            so that rounding does not decide. threshold: m or rad, a move that asks for a fresh linearisation.
+        passes: Gauss-Newton steps per update; more only matter for GTSAM's own nonlinear factors.
+
+    Raises:
+        InputError: lag < 0, threshold <= 0, passes < 1. MissingLibraryError: no gtsam.
+
+    >>> smoother = FixedLag(lag=1.0)
+    >>> piece = Problem(("v0@0", "v0@1")).add("position", "v0@0", [0, 0, 0], std=1.0)
+    >>> piece = piece.add("displacement", ("v0@0", "v0@1"), [5, 0, 0], std=1.0)
+    >>> smoother.update(piece, {"v0@0": 0.0, "v0@1": 0.5}).x.round(6).tolist()
+    [[5.0, 0.0, 0.0]]
+    """
+
+    def __init__(self, lag: float, threshold: float = 0.01, passes: int = 1) -> None:
+        if not (lag >= 0 and threshold > 0 and passes >= 1):
+            given = f"lag {lag}, threshold {threshold}, passes {passes}"
+            raise InputError("FixedLag", given, "must be >= 0 s, > 0 m or rad, >= 1", "Such as FixedLag(lag=1.0).")
+        usable("gtsam")
+        import gtsam
+
+        params = gtsam.ISAM2Params()
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        params.setRelinearizeThreshold(threshold)
+        params.relinearizeSkip = 1
+        self.lag, self.passes = lag, passes
+        self._smoother: Any = gtsam.IncrementalFixedLagSmoother(lag, params)
+        self._keys: dict[str, int] = {}
+        self._shape: dict[str, tuple[int, bool]] = {}
+        self._count = count()
+
+    @property
+    def stamps(self) -> dict[str, float]:
+        """Moment of each node of the window, s."""
+        known = self._smoother.timestamps()
+        return {name: known[key] for name, key in self._keys.items() if key in known}
+
+    def update(self, piece: Problem, stamps: Mapping[str, float], wanted: Sequence[str] | None = None) -> Estimates:
+        """The nodes `wanted` after a piece was added.
+
+        Args:
+            piece: a single problem; a name that the window has is its node, any other is a new one. Poses need an x0;
+                that of nodes of the window is not looked at. hub is not looked at.
+            stamps: s, moment of each new node. One of a node of the window moves it there: a landmark that is seen
+                again stays.
+            wanted: names of the window, default those that have the newest stamp.
+
+        Raises:
+            InputError: what a piece cannot have (realisations, held nodes, constraints), a new node without a stamp or
+                older than the window, a node that changes its kind, nodes that the measurements leave free.
+        """
+        before = self.stamps
+        fresh = self._check(piece, stamps, before)
+        said = forms(piece)
+        rest = [f for f, form in enumerate(said) if isinstance(form, str)]
+        x = self._geometry(piece, np.setdiff1d(np.arange(len(piece.names)), fresh), rest)
+        posed = which_turn(piece)
+        for i in fresh:
+            self._keys[piece.names[i]] = next(self._count)
+            self._shape[piece.names[i]] = piece.dimension, posed[i]
+        keys = [self._keys[name] for name in piece.names]
+        graph = native_graph(piece, said, keys).graph
+        for factor in linearised(piece, rest, x, keys):
+            graph.add(factor)
+        entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
+        moments = {self._keys[name]: float(at) for name, at in stamps.items()}
+        self._advance(graph, entering, moments)
+        self._keys = {name: self._keys[name] for name in self.stamps}
+        self._shape = {name: self._shape[name] for name in self._keys}
+        return self.estimate(wanted)
+
+    def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
+        """The nodes `wanted` of the window, by name; default those that have the newest stamp."""
+        stamps = self.stamps
+        newest = max(stamps.values(), default=0.0)
+        names = tuple(wanted if wanted is not None else (name for name, at in stamps.items() if at == newest))
+        for name in names:
+            if name not in stamps:
+                raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", "See stamps.")
+        turning = any(self._shape[name][1] for name in names)
+        return self._read(names, Space(self._shape[names[0]][0] if names else 3, turning))
+
+    def _read(self, names: tuple[str, ...], space: Space) -> Estimates:
+        keys, posed = [self._keys[name] for name in names], [self._shape[name][1] for name in names]
+        x = estimate(space, posed, self._smoother.calculateEstimate(keys), keys)
+        turn = tangent(space, posed, x)
+        cov = [t @ self._smoother.marginalCovariance(key) @ t.T for t, key in zip(turn, keys, strict=True)]
+        return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
+
+    def _check(self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float]) -> list[int]:
+        """Indices of the new nodes; InputError as `update`."""
+        for field, given in (("batch", piece.batch), ("held", piece.held), ("constraints", piece.constraints)):
+            if given:
+                mend = "Pick one realisation; hold a node with a position or pose factor of small std."
+                raise InputError("piece", f"with {field} {given}", f"must have no {field}", mend)
+        dimensions = {shape[0] for shape in self._shape.values()} | {piece.dimension}
+        if len(dimensions) > 1:
+            mend = "Use one smoother per dimension."
+            raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", mend)
+        known = {*piece.names, *before}
+        newest = max([*before.values(), *stamps.values()], default=0.0)
+        for name, at in stamps.items():
+            if name not in known or not newest - self.lag <= at < np.inf:
+                mend = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
+                raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", mend)
+        for i, name in enumerate(piece.names):
+            if name not in before and name not in stamps:
+                mend = "Give a new node its moment; a node that has left the window cannot be measured any more."
+                raise InputError("stamps", f"none of {name!r}", "must have every new node", mend)
+            if name in before and self._shape[name] != (piece.dimension, i in piece.poses):
+                raise InputError("piece", repr(name), "must stay the point or pose that it was", "Name it in poses.")
+        return [i for i, name in enumerate(piece.names) if name not in before]
+
+    def _geometry(self, piece: Problem, old: Ints, rest: Sequence[int]) -> Floats:
+        """(n, width) where the piece is linearised: its most probable nodes given the marginals of the `old` ones.
+
+        Of converted measurements that is their linear solution; of others, the `rest`, one Gauss-Newton step from x0.
+        """
+        x0 = None if piece.x0 is None else np.array(piece.x0)
+        if x0 is not None and not rest:
+            return x0
+        prior = piece
+        if len(old):
+            was = self._read(tuple(piece.names[i] for i in old), piece.space)
+            if x0 is not None:
+                x0[old] = was.x
+            prior = replace(piece, x0=x0, factors=(*piece.factors, *priors(piece, old, was)))
+        x = initial_guess(prior)
+        if x0 is None and all(piece.factors[f].kind == "spherical" and piece.factors[f].loss is None for f in rest):
+            return np.asarray(x[0])
+        return np.asarray(descend(prior, linear_step(prior), x, max_iterations=1).x[0])
+
+    def _advance(self, graph: Any, entering: Any, moments: dict[int, float]) -> None:
+        try:
+            self._smoother.update(graph, entering, moments)
+            for _ in range(self.passes - 1):
+                self._smoother.update()
+        except RuntimeError as singular:
+            mend = "Add a position factor, or more measurements. The smoother cannot be used any more."
+            raise InputError("piece", str(singular)[:60], "must leave no node free", mend) from singular
+
+
+def priors(piece: Problem, old: Ints, was: Estimates) -> list[Factor]:
+    """What the window says of nodes of a piece, one by one."""
+    space, d = piece.space, piece.dimension
+    turns = np.isin(old, piece.poses)
+    found = []
+    if not turns.all():
+        points = ~turns
+        found.append(Factor("position", old[points, None], was.x[points, :d], cov=was.covariance[points, :d, :d]))
+    if turns.any():
+        body = np.broadcast_to(np.eye(space.dof), (int(turns.sum()), space.dof, space.dof)).copy()
+        body[:, :d, :d] = space.rotation(was.x[turns])
+        cov = np.swapaxes(body, -1, -2) @ was.covariance[turns] @ body
+        found.append(Factor("pose", old[turns, None], was.x[turns], cov=cov))
+    return found
