@@ -18,7 +18,9 @@ from coopoc.optimize.initial import initial_guess
 from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
-OTHERS = sorted(set(backends()) - {"gauss-newton"})
+LOCAL = sorted(set(backends()) - {"cvxpy"})
+"""Backends that go downhill from a start; cvxpy relaxes: see test_optimize_agreement.py."""
+OTHERS = [name for name in LOCAL if name != "gauss-newton"]
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +87,7 @@ def test_odometry_that_outweighs_gnss_by_half_a_million(dense: Recording, backen
     check(problem, backend)
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", LOCAL)
 def test_where_plain_gauss_newton_overshoots_for_ever(backend: str) -> None:
     """Flat range-only stars: the height's true curvature exceeds twice that of J^T J."""
     cycling = 0
@@ -124,7 +126,7 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
     return found.x.reshape(-1, 3), found.cost
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("case", ["snapshot", "window", "range", "azimuth"])
 def test_scipy_finds_the_same_minimum(crossing_recording: Recording, case: str, backend: str) -> None:
     for seed in range(2):
@@ -170,7 +172,7 @@ def custom(factor: Factor, node: list[int], z: np.ndarray):
     return error
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("length", [1, 5])
 def test_marginals_equal_gtsams(crossing_recording: Recording, length: int, backend: str) -> None:
     problem = Problem.from_window(crossing_recording, 20, 0, length)
@@ -188,7 +190,7 @@ def chain_of(points: int, hub: tuple[int, ...] = ()) -> Problem:
     return problem.add("position", seen, rng.normal(size=(len(seen), 3)) * 5, std=rng.uniform(1, 3, (len(seen), 3)))
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("points", [5, 40, 300])
 def test_a_linear_problem_equals_lstsq(points: int, backend: str) -> None:
     """Dense, sparse (300 points without a hub) and osqp's and gtsam's own elimination, against numpy.linalg.lstsq."""
@@ -243,7 +245,7 @@ def test_a_batch_does_not_claim_what_is_free() -> None:
     assert np.isnan(batch.covariance).all()
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("seed", range(5))
 def test_a_bad_start_is_survived(seed: int, backend: str) -> None:
     """From 100 m away plain Gauss-Newton steps raise the cost; the damped ones end where the gradient vanishes."""
@@ -255,7 +257,7 @@ def test_a_bad_start_is_survived(seed: int, backend: str) -> None:
     assert solution.gradient < 1e-5
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", LOCAL)
 def test_solution_says_what_happened(dense: Recording, backend: str) -> None:
     solution = solve(Problem.from_snapshot(dense, 10, 0), backend)
     number = r"-?[\d.e+-]+"

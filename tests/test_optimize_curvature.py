@@ -56,7 +56,7 @@ def between_two() -> Problem:
     return problem.add("range", [("ego", "a"), ("ego", "b")], [10.0, 10.0], std=0.5)
 
 
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", sorted(set(backends()) - {"cvxpy"}))
 def test_a_saddle_is_not_solved(backend: str) -> None:
     problem = between_two()
     stuck = solve(problem, backend, throw=False)

@@ -132,7 +132,7 @@ def test_a_decorated_function_is_all_it_takes() -> None:
     try:
         problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
         problem = problem.add("squared range", ("a", "b"), 100.0, std=1e-3)
-        for backend in backends():
+        for backend in sorted(set(backends()) - {"cvxpy"}):
             solution = solve(problem, backend)
             assert np.linalg.norm(solution["b"] - solution["a"]) == pytest.approx(10.0, abs=1e-5)
         with pytest.raises(InputError, match="registered already"):

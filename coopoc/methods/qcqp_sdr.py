@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..optimize.convex.relaxation import shor
 from ..optimize.problem import Problem
-from ..optimize.relaxation import shor
 from ..optimize.solve import solve
 from ..world.inbox import Inbox
 from ..world.recording import Recording

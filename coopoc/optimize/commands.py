@@ -33,7 +33,7 @@ def solve_file(
         file: .pyfg or .g2o.
         backend: coopoc check shows them.
         objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
-        start: odometry chained from each robot's first vertex, all robots at the origin (apart), or the file's vertices.
+        start: odometry chained from each robot's first vertex, from a ring (apart), or the file's vertices.
         output: the solution as JSON; without it a summary goes to stdout.
     """
     problem = read(file, objective, start)

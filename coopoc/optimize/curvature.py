@@ -51,7 +51,8 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     factored = _pivots(scheme, blocks)
     if factored is None:
         raise np.linalg.LinAlgError("the cost curves downwards here")
-    return -np.asarray(factored.solve(gradient.ravel())).reshape(gradient.shape)
+    dx: Floats = -np.asarray(factored.solve(gradient.ravel())).reshape(gradient.shape)
+    return dx
 
 
 def true_blocks(problem: Problem, linear: Linear) -> Floats:

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError
-from ..formats import Graph, read_graph
+from ..formats import read_graph
+from ..formats.graph import Graph
 from .factor import Factor
 from .problem import Problem
 from .space import Space
@@ -37,8 +38,9 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "o
 
     Args:
         graph: of `coopoc.formats.read_graph`.
-        start: "odometry" chains each robot's relative poses from its first vertex in the file; "apart" from the origin,
-            as if nothing were known of how the robots stand to each other; "file" takes the vertices as they are.
+        start: "odometry" chains each robot's relative poses from its first vertex in the file; "apart" from a ring as
+            wide as the mean range, all facing one way, as if nothing were known of how the robots stand to each other;
+            "file" takes the vertices as they are.
             Landmarks are put where the first pose that measures them sees them, or by the ranges to them.
 
     >>> from coopoc.formats.edges import RangeEdges
@@ -54,6 +56,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "o
     if not held and not len(graph.pose_prior) and not len(graph.point_prior):
         held = poses[:1]
     x0 = _file(graph) if start == "file" else _chained(graph, start == "apart")
+    x0 = x0 if poses else x0[:, : graph.dimension]
     return Problem(graph.names, _factors(graph, objective), x0, dimension=graph.dimension, poses=poses, held=held)
 
 
@@ -108,11 +111,15 @@ def _chained(graph: Graph, apart: bool) -> Floats:
     rotation = np.tile(np.eye(graph.dimension), (len(graph.names), 1, 1))
     known = np.zeros(len(graph.names), dtype=bool)
     robots = [places for places in graph.robots.values() if len(places)]
-    for places in robots:
+    around = float(graph.ranges.distance.mean()) if len(graph.ranges) else 1.0
+    for k, places in enumerate(robots):
         first = places[0]
         known[first] = True
         if not apart and np.isfinite(graph.position[first]).all():
             position[first], rotation[first] = graph.position[first], graph.rotation[first]
+        else:
+            angle = 2.0 * np.pi * k / len(robots)
+            position[first, :2] = around * np.cos(angle), around * np.sin(angle)
     _walk(graph, position, rotation, known)
     for (i, j), at in zip(graph.relative_point.nodes.tolist(), graph.relative_point.position, strict=True):
         if not known[j]:

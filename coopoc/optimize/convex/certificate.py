@@ -1,0 +1,102 @@
+"""certify: whether a solution is the best there is, by the dual certificate of its QCQP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...arrays import Floats
+from ..problem import Problem
+from ..solution import Solution
+from .qcqp import Multipliers, multipliers
+from .quadratic import quadratic
+from .schur import Reduced, reduce
+
+TOLERANCE = 1e-6
+"""Largest gap of a certified solution, as a share of its cost (at least of 1, the cost of two residuals of one std)."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What is known of a solution's cost against the smallest cost of any point.
+
+    Args:
+        certified: no point has a cost smaller by more than the tolerance. sentence: the verdict in words.
+        cost: of the solution. lower_bound: no point has a smaller cost. smallest_eigenvalue: of C - L.
+        surrogate: what was replaced; all the above then is about the surrogate and its own minimum.
+    """
+
+    certified: bool
+    sentence: str
+    cost: float
+    lower_bound: float
+    smallest_eigenvalue: float
+    surrogate: tuple[str, ...] = ()
+
+    @property
+    def gap(self) -> float:
+        """cost - lower_bound, at least 0."""
+        return max(self.cost - self.lower_bound, 0.0)
+
+    def __str__(self) -> str:
+        return self.sentence
+
+
+def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, surrogate: bool = False) -> Certificate:
+    """Certificate of a solution, at the price of one eigenvalue: no relaxation is solved.
+
+    With the multipliers L that belong to the solution's X in closed form, every point of the QCQP costs at least
+
+        1/2 tr L + 1/2 tr(X X^T) min(0, lambda_min(C - L)),       tr(X X^T) fixed by the constraints,
+
+    and 1/2 tr L is the solution's own cost (Lagrangian duality; CORA, arXiv 2302.11614, methods.md section 6.1). Where
+    lambda_min is negative the solution may be a local minimum, or the relaxation is not tight there: `shor` or
+    `staircase` then give a better bound.
+
+    Args:
+        problem: one that `quadratic` takes. solution: of it. tolerance: largest gap, as a share of max(cost, 1).
+        surrogate: replace what is not quadratic (`surrogate`), solve that from the solution and certify its minimum;
+            the sentence says what was replaced and how far the two points are apart.
+
+    Raises:
+        InputError: as `quadratic`, or as `surrogate`.
+
+    >>> from .solve import solve
+    >>> fixes = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+    >>> problem = fixes.add("range", ("a", "b"), 5.0, std=0.5)
+    >>> print(certify(problem, solve(problem)))
+    certified global optimum of Problem(2 points; 2 position, 1 range)
+    """
+    if surrogate:
+        return _by_surrogate(problem, solution, tolerance)
+    form = quadratic(problem)
+    x = solution.x
+    X = form.lift(problem.space.position(x), problem.space.rotation(x))[: form.bound]
+    reduced = reduce(form)
+    bound, smallest, _ = lower_bound(reduced, multipliers(form, X, reduced.times(X)))
+    certified = solution.cost - bound <= tolerance * max(solution.cost, 1.0)
+    sentence = f"certified global optimum of {problem!r}" if certified else (
+        f"not certified: cost {solution.cost:.6g}, no point of {problem!r} costs less than {max(bound, 0.0):.6g} "
+        f"(smallest eigenvalue {smallest:.1e}); a local minimum, or the relaxation is not tight"
+    )  # fmt: skip
+    return Certificate(certified, sentence, solution.cost, max(bound, 0.0), smallest)
+
+
+def _by_surrogate(problem: Problem, solution: Solution, tolerance: float) -> Certificate:
+    from ..solve import solve
+    from .surrogate import surrogate
+
+    other = surrogate(problem)
+    found = solve(replace(other.problem, x0=solution.x), throw=False)
+    verdict = certify(other.problem, found, tolerance)
+    space = problem.space
+    apart = np.linalg.norm(space.position(found.x) - space.position(solution.x), axis=1).max(initial=0.0)
+    said = f"; surrogate: {'; '.join(other.replaced) or 'nothing replaced'}; at most {apart:.3g} m from the solution"
+    return replace(verdict, sentence=verdict.sentence + said, surrogate=other.replaced)
+
+
+def lower_bound(reduced: Reduced, L: Multipliers) -> tuple[float, float, Floats]:
+    """A cost that no point beats, for any multipliers L; the smallest eigenvalue of C - L and its eigenvector."""
+    smallest, vector = reduced.smallest(L)
+    return 0.5 * (L.trace + L.problem.trace * min(smallest, 0.0)), smallest, vector

@@ -1,0 +1,93 @@
+"""staircase: Shor's relaxation of a large problem by low-rank factors, from any start (Burer and Monteiro)."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from ...arrays import Floats
+from ...errors import InputError
+from ..problem import Problem
+from .certificate import lower_bound
+from .manifold import Stationary, minimise, retract
+from .qcqp import Quadratic
+from .quadratic import quadratic
+from .relaxation import TIGHT, Relaxation, rounded
+from .schur import Reduced, reduce
+
+START = 2
+"""Columns beyond d at a random start: with none to spare the first steps end in local minima."""
+HEIGHT = 12
+"""Columns beyond d after which the staircase gives up; the bound then is what it has proved by that time."""
+STALL = 1e-9
+"""Share of the cost (at least of 1) that one more column must save to be followed by another."""
+
+
+def staircase(problem: Problem, refine: bool = True, seed: int = 0, height: int = HEIGHT) -> Relaxation:
+    """The semidefinite relaxation of `shor` with Z = Y Y^T, Y of a few columns, rounded and refined.
+
+    minimise 1/2 <C, Y Y^T> over Y with p columns; if C - L has a negative eigenvalue there, its eigenvector in a new
+    column p + 1 leads down, else the relaxation is solved: whatever the start, the bound is that of `shor` (CORA, arXiv
+    2302.11614, section 6.1 of methods.md). Poses need not be known even roughly: the start is random unless the problem
+    has an x0. A thousand poses take seconds.
+
+    Args:
+        problem: one that `quadratic` takes. refine: follow by `solve` from the rounded point.
+        seed: of the random start. height: columns beyond d at which to give up.
+
+    Raises:
+        InputError: as `quadratic`; height below 1.
+
+    >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+    >>> round(staircase(problem.add("range", ("a", "b"), 6.0, std=1.0)).lower_bound, 6)
+    0.666667
+    """
+    if not isinstance(height, int) or height < 1:
+        raise InputError("height", height, "must be a whole number >= 1", f"Leave it out for {HEIGHT}.")
+    began = time.perf_counter()
+    form = quadratic(problem)
+    reduced = reduce(form)
+    with tqdm(desc="staircase", unit=" steps", delay=2.0) as bar:
+        found, bound = _climb(form, reduced, _start(problem, form, seed), form.columns + height, bar)
+    _, values, rows = np.linalg.svd(found.X, full_matrices=False)
+    d = form.columns
+    gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
+    return rounded(problem, form, reduced, found.X @ rows[:d].T, bound, gap, began, refine)
+
+
+def _start(problem: Problem, form: Quadratic, seed: int) -> Floats:
+    if problem.x0 is None:
+        random = np.random.default_rng(seed).standard_normal((form.bound, form.columns + START))
+        return form.project(random)
+    where = problem.space
+    return form.lift(where.position(problem.x0), where.rotation(problem.x0))[: form.bound]
+
+
+def _climb(form: Quadratic, reduced: Reduced, Y: Floats, most: int, bar: Any) -> tuple[Stationary, float]:
+    """A stationary point and the best bound on the way; the two agree, unless `most` columns or rounding stop it."""
+    bound, before = -np.inf, np.inf
+    while True:
+        found = minimise(form, reduced, Y, tick=bar.update)
+        proved, smallest, vector = lower_bound(reduced, found.multipliers)
+        bound, size = max(bound, proved), max(found.cost, 1.0)
+        if found.cost - bound <= TIGHT * size or Y.shape[1] >= most or before - found.cost <= STALL * size:
+            return found, bound
+        bar.set_postfix(columns=Y.shape[1] + 1, cost=f"{found.cost:.6g}", bound=f"{max(bound, 0.0):.6g}")
+        Y, before = _escape(form, reduced, found, smallest, vector), found.cost
+
+
+def _escape(form: Quadratic, reduced: Reduced, found: Stationary, smallest: float, v: Floats) -> Floats:
+    """A lower point with one more column: along v the cost is cost + 1/2 smallest a^2 + O(a^3)."""
+    wide = np.column_stack([found.X, np.zeros(len(v))])
+    along = np.zeros_like(wide)
+    along[:, -1] = v
+    reach = np.sqrt(form.bound)
+    while True:
+        Y = retract(form, wide, reach * along)
+        cost = 0.5 * float(np.sum(Y * reduced.times(Y)))
+        if cost <= found.cost + 0.125 * smallest * reach * reach or reach < 1e-6:
+            return Y
+        reach *= 0.5

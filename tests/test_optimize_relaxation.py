@@ -1,0 +1,352 @@
+"""Relaxations: they bound every cost, agree with models written for CVXPY by hand, and are attained where tight."""
+
+from __future__ import annotations
+
+import importlib
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cvxpy as cp
+import numpy as np
+import pytest
+from scipy.io import mmread
+from scipy.optimize import least_squares
+
+from coopoc import InputError
+from coopoc.arrays import Floats
+from coopoc.optimize import Backend, Problem, Status, solve
+from coopoc.optimize.backends.cvxpy_ import build
+from coopoc.optimize.convex.cones import semidefinite
+from coopoc.optimize.convex.manifold import minimise, tangent
+from coopoc.optimize.convex.qcqp import Quadratic, multipliers
+from coopoc.optimize.convex.quadratic import quadratic
+from coopoc.optimize.convex.relaxation import ball, polished, shor
+from coopoc.optimize.convex.schur import Dense, Sparse
+from coopoc.optimize.convex.staircase import staircase
+
+PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
+UP = 0.6
+"""Vertical against horizontal std in anisotropic problems."""
+
+
+def swarm(seed: int, d: int = 3, vehicles: int = 4, gnss_std: float = 3.5, up: float = 1.0) -> Problem:
+    """Fixes and the ranges of all pairs; `up` stretches the last axis of the fixes' std."""
+    rng = np.random.default_rng(seed)
+    truth, std = rng.uniform(-20, 20, (vehicles, d)), gnss_std * np.array([*np.ones(d - 1), up])
+    names = [f"v{i}" for i in range(vehicles)]
+    pairs = [(i, j) for i in range(vehicles) for j in range(i + 1, vehicles)]
+    ranges = [np.linalg.norm(truth[i] - truth[j]) + rng.standard_normal() for i, j in pairs]
+    problem = Problem(tuple(names), dimension=d).add(
+        "position", names, truth + std * rng.standard_normal(truth.shape), std
+    )
+    return problem.add("range", pairs, np.abs(ranges)[:, None], 1.0)
+
+
+def two_robots(seed: int, d: int = 2, steps: int = 4, held: bool = False, noise: float = 1.0) -> Problem:
+    """Odometry of two robots as chordal relative poses and ranges between them; nothing in the world's frame."""
+    from scipy.spatial.transform import Rotation
+
+    rng = np.random.default_rng(seed)
+    turn = Rotation.random(2 * steps, rng=rng).as_matrix() if d == 3 else _turns(rng.uniform(-3, 3, 2 * steps))
+    at = rng.uniform(-5, 5, (2 * steps, d))
+    names = tuple(f"{robot}{k}" for robot in "AB" for k in range(steps))
+    x = np.concatenate([at, turn.reshape(len(at), -1)], axis=1)
+    problem = Problem(names, x0=x, dimension=d, poses=range(2 * steps), held=(0,) if held else ())  # type: ignore[arg-type]
+    pairs = [(k, k + 1) for k in range(2 * steps - 1) if k != steps - 1]
+    seen = [np.concatenate([turn[i].T @ (at[j] - at[i]), (turn[i].T @ turn[j]).ravel()]) for i, j in pairs]
+    z = np.array(seen)
+    z[:, :d] += 0.05 * noise * rng.standard_normal((len(z), d))
+    problem = problem.add("relative_pose_chordal", pairs, z, [0.05] * d + [0.02] * d * d)
+    across = [(i, j) for i in range(steps) for j in range(steps, 2 * steps)]
+    ranges = [np.linalg.norm(at[i] - at[j]) + 0.1 * noise * rng.standard_normal() for i, j in across]
+    return problem.add("range", across, np.abs(ranges)[:, None], 0.1)
+
+
+def _turns(angle: Floats) -> Floats:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def brute(problem: Problem, starts: int = 30, spread: float = 20.0) -> float:
+    """Smallest cost that scipy finds from random starts, over positions or, in the plane, positions and headings."""
+    rng, n, d = np.random.default_rng(0), len(problem.names), problem.dimension
+
+    def system(y: Floats) -> tuple[Floats, Any]:
+        rows = y.reshape(n, -1)
+        return problem.whiten(problem.space.join(rows[:, :d], _turns(rows[:, 2]) if problem.poses else None))
+
+    def found() -> float:
+        start = rng.uniform(-spread, spread, n * (d + bool(problem.poses)))
+        return least_squares(lambda y: system(y)[0], start, jac=lambda y: system(y)[1].toarray()).cost  # type: ignore[no-any-return]
+
+    return min(found() for _ in range(starts))
+
+
+def by_hand(problem: Problem) -> float:
+    """Shor's relaxation of [1; t; s], no position eliminated, every row of A written out: CVXPY's value."""
+    d, n, (fixes, ranges) = problem.dimension, len(problem.names), problem.factors
+    m = len(ranges.z)
+    size = 1 + d * (n + m)
+    rows = []
+    for i, z, w in zip(fixes.nodes[:, 0], fixes.z, fixes.root, strict=True):
+        row = np.zeros((d, size))
+        row[:, 0], row[:, 1 + d * i : 1 + d * i + d] = -w @ z, w
+        rows.append(row)
+    for e, ((i, j), r, w) in enumerate(zip(ranges.nodes, ranges.z[:, 0], ranges.root[:, 0, 0], strict=True)):
+        row = np.zeros((d, size))
+        for node, sign in ((i, -w), (j, w)):
+            row[:, 1 + d * node : 1 + d * node + d] = sign * np.eye(d)
+        row[:, 1 + d * (n + e) : 1 + d * (n + e) + d] = -w * r * np.eye(d)
+        rows.append(row)
+    A = np.concatenate(rows)
+    Y = cp.Variable((size, size), PSD=True)
+    first = 1 + d * (n + np.arange(m))
+    ones = [Y[0, 0] == 1, *(cp.trace(Y[k : k + d, k : k + d]) == 1 for k in first)]
+    programme = cp.Problem(cp.Minimize(0.5 * cp.trace(A.T @ A @ Y)), ones)
+    return float(programme.solve(solver=cp.CLARABEL, tol_gap_rel=1e-9, tol_feas=1e-9))
+
+
+def cora(name: str) -> tuple[Quadratic, Problem, Any]:
+    """One of CORA's unit cases: our QCQP of it and a reader of its expected matrices."""
+    folder = PYFG / "cora_unit" / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+    if name == "single_range":
+        problem = Problem(("L0", "L1"), x0=[[11, 19], [11, 21]], dimension=2).add("range", (0, 1), 2.0, 1.0)  # type: ignore[arg-type]
+    else:
+        from coopoc.optimize.graphs import read
+
+        problem = replace(read(folder / "factor_graph.pyfg", start="file"), held=())
+    return quadratic(problem), problem, lambda matrix: np.asarray(mmread(folder / f"{matrix}.mm").todense())
+
+
+@pytest.mark.parametrize("name", ["single_range", "single_rpm", "small_ra_slam_problem"])
+def test_matrices_are_coras(name: str) -> None:
+    """Data matrix, lifted truth, gradients, certificate matrix and Hessian product that CORA's own tests expect."""
+    form, problem, expected = cora(name)
+    Q = (form.rows.T @ form.rows).toarray()
+    assert pytest.approx(expected("DataMatrix"), abs=1e-7) == Q
+    assert problem.x0 is not None
+    x, c = problem.x0, form.bound
+    X = form.lift(problem.space.position(x), problem.space.rotation(x))
+    assert pytest.approx(expected("X_gt"), abs=1e-6) == X
+    assert problem.space.join(*form.drop(X)) == pytest.approx(x, abs=1e-12)
+    Y = expected("X_rand_dim2")
+    gradient = Q @ Y
+    assert gradient == pytest.approx(expected("expected_egrad"), abs=1e-7)
+    L = multipliers(form, Y[:c], gradient[:c])
+    S = Q.copy()
+    S[:c, :c] -= L.dense
+    assert pytest.approx(expected("S_rand"), abs=1e-6) == S
+    assert L.sparse.toarray() == pytest.approx(L.dense)
+    slope = np.concatenate([tangent(form, Y[:c], gradient[:c]), gradient[c:]])
+    assert slope == pytest.approx(expected("expected_rgrad"), abs=1e-7)
+    bent = S @ expected("rand_dX")
+    bent[:c] = tangent(form, Y[:c], bent[:c])
+    assert bent == pytest.approx(expected("hessProd"), rel=1e-7, abs=1e-6)
+
+
+@pytest.mark.parametrize("up", [1.0, UP])
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_bound_is_that_of_the_programme_written_out(d: int, up: float) -> None:
+    """Matrix form (d + m rows) and stacked form have the value of [1; t; s][1; t; s]^T, solved by CVXPY."""
+    for seed in range(3):
+        problem = swarm(seed, d, vehicles=3, up=up)
+        assert quadratic(problem).stacked == (up != 1.0)
+        assert shor(problem, refine=False).lower_bound == pytest.approx(by_hand(problem), rel=2e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize("make", [swarm, partial(swarm, d=2), partial(swarm, up=UP), partial(swarm, d=2, up=3.0),
+                                  two_robots, partial(two_robots, d=3), partial(two_robots, held=True)])  # fmt: skip
+@pytest.mark.parametrize("seed", range(3))
+def test_no_point_beats_the_bounds(make: Any, seed: int) -> None:
+    """Random points, minima from random starts and the solution all cost at least what each relaxation says."""
+    problem = make(seed)
+    relaxed = [shor(problem), staircase(problem)] + ([] if problem.poses else [ball(problem)])
+    best = relaxed[0].lower_bound
+    rng, space = np.random.default_rng(seed), problem.space
+    for _ in range(50):
+        turned = np.linalg.qr(rng.standard_normal((len(problem.names), problem.dimension, problem.dimension)))[0]
+        turned[:, :, 0] *= np.sign(np.linalg.det(turned))[:, None]
+        if problem.x0 is not None and problem.held:
+            turned[0] = space.rotation(problem.x0)[0]
+        point = space.join(rng.normal(0, 10, (len(problem.names), problem.dimension)), turned)
+        assert problem.cost(point) >= best
+    for relaxation in relaxed:
+        assert relaxation.solution is not None
+        assert relaxation.solution.status is Status.SOLVED or problem.poses
+        assert relaxation.lower_bound <= relaxation.solution.cost * (1 + 1e-9) + 1e-9
+        assert relaxation.solution.cost <= relaxation.cost * (1 + 1e-9) + 1e-12
+        assert relaxation.lower_bound <= best * (1 + 1e-5) + 1e-6
+
+
+@pytest.mark.parametrize("make", [swarm, partial(swarm, d=2), partial(swarm, up=UP), two_robots])
+@pytest.mark.parametrize("seed", range(2))
+def test_tight_relaxations_reach_what_brute_force_reaches(make: Any, seed: int) -> None:
+    """scipy.optimize.least_squares from random starts finds nothing better, and its best is our solution."""
+    problem = make(seed)
+    relaxed = shor(problem)
+    assert relaxed.solution is not None
+    found = brute(problem, starts=12, spread=6.0 if problem.poses else 20.0)
+    assert found >= relaxed.lower_bound * (1 - 1e-9) - 1e-9
+    assert relaxed.solution.cost <= found * (1 + 1e-6)
+    if relaxed.tight:
+        assert relaxed.lower_bound == pytest.approx(found, rel=1e-5)
+
+
+def test_some_of_them_are_tight() -> None:
+    tight = [shor(swarm(seed)).tight for seed in range(6)] + [
+        shor(two_robots(seed, noise=0.2)).tight for seed in range(3)
+    ]
+    assert sum(tight) >= 6
+
+
+def test_a_ball_relaxation_is_the_cone_programme_in_positions() -> None:
+    """CVXPY on the positions themselves, |t_j - t_i - r s| with |s| <= 1: the same bound, never above Shor's."""
+    for seed in range(3):
+        problem = swarm(seed, vehicles=4)
+        fixes, ranges = problem.factors
+        x, s = cp.Variable(fixes.z.shape), cp.Variable((len(ranges.z), 3))
+        i, j = ranges.nodes.T
+        cost = cp.sum_squares((x - fixes.z) / 3.5) + cp.sum_squares(x[j] - x[i] - cp.multiply(ranges.z, s))
+        value = cp.Problem(cp.Minimize(0.5 * cost), [cp.norm(s, axis=1) <= 1]).solve(solver=cp.CLARABEL)
+        found = ball(problem)
+        assert found.lower_bound == pytest.approx(float(value), rel=1e-4, abs=1e-5)
+        assert found.lower_bound <= shor(problem).lower_bound * (1 + 1e-7)
+
+
+@pytest.mark.parametrize("make", [two_robots, partial(two_robots, d=3), partial(two_robots, held=True), swarm,
+                                  partial(swarm, up=UP)])  # fmt: skip
+def test_sparse_elimination_is_the_dense_one(make: Any) -> None:
+    problem = make(0)
+    form = quadratic(problem)
+    relaxed = shor(problem, refine=False).x
+    x, turned = problem.space.position(relaxed), problem.space.rotation(relaxed)
+    dense, sparse = Dense(form), Sparse(form)
+    X = form.project(np.random.default_rng(0).standard_normal((form.bound, form.columns)))
+    assert sparse.times(X) == pytest.approx(dense.times(X), abs=1e-7 * np.abs(dense.matrix).max())
+    costs = [np.square(form.rows @ part.settle(X)).sum() for part in (dense, sparse)]
+    assert costs[0] == pytest.approx(costs[1], rel=1e-9)
+    L = multipliers(form, X, dense.times(X))
+    (a, v), (b, w) = dense.smallest(L), sparse.smallest(L)
+    assert a == pytest.approx(b, rel=1e-7)
+    assert abs(v @ w) == pytest.approx(1.0, abs=1e-5)
+    ends = [minimise(form, part, form.lift(x, turned)[: form.bound]).cost for part in (dense, sparse)]
+    assert ends[0] == pytest.approx(ends[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_staircase_climbs_to_shors_bound_from_anywhere(seed: int) -> None:
+    for problem in (swarm(seed), swarm(seed, up=UP), two_robots(seed, noise=3.0)):
+        goal = shor(problem, refine=False).lower_bound
+        nowhere = replace(problem, x0=None, held=())
+        for start in range(2):
+            assert staircase(nowhere, refine=False, seed=start).lower_bound == pytest.approx(goal, rel=1e-5, abs=1e-5)
+
+
+def test_robots_that_do_not_know_where_the_others_are() -> None:
+    """mrclam5a, every robot starting at the origin: better than the local minimum at 78.2 in the data's README."""
+    from coopoc.optimize.graphs import read
+
+    if not (PYFG / "mrclam5a.pyfg").exists():
+        pytest.skip(f"{PYFG} is absent")
+    problem = read(PYFG / "mrclam5a.pyfg", start="apart")
+    relaxed = staircase(problem, refine=False)
+    form = quadratic(problem)
+    x, _ = polished(problem, form, Sparse(form), relaxed.x)
+    assert 67.8 < relaxed.lower_bound < problem.cost(x) < 69.11
+    assert problem.cost(x) == pytest.approx(69.10, abs=0.01)  # an independent Levenberg-Marquardt from ground truth
+
+
+def test_a_programme_is_built_once_per_shape() -> None:
+    shor(swarm(0), refine=False)
+    before = semidefinite.cache_info()
+    shor(swarm(1), refine=False)
+    after = semidefinite.cache_info()
+    assert (after.hits, after.misses) == (before.hits + 1, before.misses)
+
+
+@pytest.mark.parametrize("relaxation", ["sdp", "socp"])
+@pytest.mark.parametrize("up", [1.0, UP])
+def test_cvxpys_primal_agrees_with_clarabels_dual(relaxation: str, up: float) -> None:
+    """Before any refinement: bounds to 1e-5; SDP costs to 1e-5 of the optimum, positions to a centimetre."""
+    problem = swarm(0, up=up)
+    ours = (shor if relaxation == "sdp" else ball)(problem)
+    ended = build(problem, relaxation=relaxation, refine=False)(np.zeros((4, 3)))
+    assert ended.extras["lower_bound"] == pytest.approx(ours.lower_bound, rel=1e-5)
+    assert ended.extras["rounded_cost"] == pytest.approx(problem.cost(ended.x), rel=1e-12)
+    assert ours.solution is not None
+    if relaxation == "sdp" and ours.tight:
+        assert ended.extras["rounded_cost"] == pytest.approx(ours.solution.cost, rel=1e-5)
+        assert ended.x == pytest.approx(ours.solution.x, abs=0.01)
+    refined = build(problem, relaxation=relaxation)(np.zeros((4, 3)))
+    assert problem.cost(refined.x) <= ended.extras["rounded_cost"]
+
+
+def test_cvxpys_quadratic_programme_is_lstsq() -> None:
+    """numpy.linalg.lstsq on the whitened system, with a held point too; nothing is refined."""
+    rng = np.random.default_rng(0)
+    names = [f"v{i}" for i in range(5)]
+    problem = Problem(tuple(names)).add("position", names, rng.normal(1e5, 20, (5, 3)), [3.5, 3.5, 6.0])
+    problem = problem.add("displacement", [(i, i + 1) for i in range(4)], rng.normal(0, 9, (4, 3)), 0.05)
+    for case in (problem, replace(problem, x0=rng.normal(1e5, 20, (5, 3)), held=(2,))):
+        x = np.full((5, 3), 1e5) if case.x0 is None else case.x0
+        r, J = case.whiten(x)
+        free = np.flatnonzero(np.ones(15) if case.free is None else case.free)
+        expected = x.copy()
+        expected.reshape(-1)[free] -= np.linalg.lstsq(J.toarray()[:, free], r, rcond=None)[0]
+        ended = build(case)(x)
+        assert ended.x == pytest.approx(expected, abs=1e-6)
+        assert ended.extras == {"relaxation": "qp", "refined": False}
+
+
+def test_the_backend_is_held_to_the_same_check_as_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`solve` recomputes cost, gradient and status: gauss-newton's answer, and the bound in the extras."""
+    registry = importlib.import_module("coopoc.optimize.solve").BACKENDS
+    monkeypatch.setitem(registry, "cvxpy", Backend("cvxpy", "cvxpy_", "convex relaxations", "cvxpy"))
+    for problem in (swarm(0), swarm(1, d=2), replace(swarm(2), factors=swarm(2).factors[:1])):
+        ours, theirs = solve(problem), solve(problem, "cvxpy")
+        assert theirs.status is Status.SOLVED
+        assert theirs.cost == pytest.approx(ours.cost, rel=1e-9, abs=1e-12)
+        assert theirs.x == pytest.approx(ours.x, abs=1e-6)
+        assert theirs.extras.get("lower_bound", 0.0) <= ours.cost * (1 + 1e-9)
+    with pytest.raises(InputError, match="is no option of cvxpy"):
+        solve(swarm(0), "cvxpy", max_iterations=3)
+
+
+def test_what_has_no_relaxation_is_refused() -> None:
+    problem = swarm(0)
+    with pytest.raises(InputError, match="not quadratic: it must be one of"):
+        shor(problem.add("azimuth", ("v0", "v1"), 0.1, 0.1))
+    with pytest.raises(InputError, match="constraints"):
+        shor(problem.constrain("position", "v0", lower=-1.0))
+    with pytest.raises(InputError, match="relaxation = 'lp'"):
+        build(problem, relaxation="lp")
+    with pytest.raises(InputError, match="needs points and only position and displacement"):
+        build(problem, relaxation="qp")
+    with pytest.raises(InputError, match="world's frame"):
+        ball(two_robots(0))
+    with pytest.raises(InputError, match="staircase"):
+        shor(swarm(0, vehicles=20))
+    poses = two_robots(0)
+    with pytest.raises(InputError, match="differs between axes"):
+        shor(poses.add("position", "A0", [0, 0], [1.0, 2.0]))
+    with pytest.raises(InputError, match="differs between axes"):
+        shor(poses.add("relative_position", ("A0", "B0"), [1, 0], [1.0, 2.0]))
+
+
+def test_priors_and_fixes_in_the_worlds_frame_place_poses() -> None:
+    """pose_chordal and held say the same where the prior is stiff; isotropic fixes among poses are exact."""
+    problem = two_robots(1, noise=0.3)
+    assert problem.x0 is not None
+    stiff = problem.add("pose_chordal", "A0", problem.x0[0], [1e-2] * 6)
+    free, held = shor(stiff), shor(replace(problem, held=(0,)))
+    assert free.lower_bound == pytest.approx(held.lower_bound, rel=1e-5)
+    assert free.solution is not None
+    assert held.solution is not None
+    assert free.solution.x == pytest.approx(held.solution.x, abs=1e-4)
+    assert free.solution.cost == pytest.approx(brute(stiff, starts=8, spread=6.0), rel=1e-5)
+    fixed = problem.add("position", [0, 2, 5], problem.x0[[0, 2, 5], :2], 0.5)
+    assert solve(replace(fixed, x0=shor(fixed).x)).cost == pytest.approx(brute(fixed, starts=8, spread=6.0), rel=1e-5)
