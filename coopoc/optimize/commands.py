@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from .graphs import Objective, Start, read
+from .graphs import Objective, read
 from .problem import Problem
 from .solution import Solution, Status
 from .solve import BACKENDS, solve
@@ -22,7 +23,7 @@ def solve_file(
     /,
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
-    start: Start = "odometry",
+    start: Literal["odometry", "apart", "file", "relaxed"] = "odometry",
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
     """Solve the factor graph of a PyFG or g2o file.
@@ -33,10 +34,15 @@ def solve_file(
         file: .pyfg or .g2o.
         backend: coopoc check shows them.
         objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
-        start: odometry chained from each robot's first vertex, from a ring (apart), or the file's vertices.
+        start: odometry chained from each robot's first vertex, from a ring (apart), the file's vertices, or the rounded
+            point of a convex relaxation that needs no start.
         output: the solution as JSON; without it a summary goes to stdout.
     """
-    problem = read(file, objective, start)
+    problem = read(file, objective, "apart" if start == "relaxed" else start)
+    if start == "relaxed":
+        from .convex import staircase
+
+        problem = replace(problem, x0=staircase(problem, refine=False).x)
     print(f"coopoc: {problem}", file=sys.stderr)
     solution = solve(problem, backend, throw=False)
     summary = described(solution)

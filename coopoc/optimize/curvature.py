@@ -51,8 +51,7 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     factored = _pivots(scheme, blocks)
     if factored is None:
         raise np.linalg.LinAlgError("the cost curves downwards here")
-    dx: Floats = -np.asarray(factored.solve(gradient.ravel())).reshape(gradient.shape)
-    return dx
+    return np.asarray(-factored.solve(gradient.ravel()).reshape(gradient.shape))
 
 
 def true_blocks(problem: Problem, linear: Linear) -> Floats:
