@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def test_first_steps_runs() -> None:
     script = ROOT / "examples" / "first_steps.py"
     out = subprocess.run([sys.executable, "-W", "error", script], capture_output=True, text=True, check=True).stdout
-    assert out.count("SOLVED") == 3
+    assert out.count("SOLVED") == 4
     assert "FedKalmanNet" in out
 
 

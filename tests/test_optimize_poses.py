@@ -1,4 +1,4 @@
-"""Points and poses in one problem: derivatives against finite differences, minima against SciPy, files against bounds."""
+"""Points and poses in one problem: derivatives against finite differences, minima against SciPy, files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Prob
     """Two robots of four poses each and a landmark, with one factor of every kind that exists, and the truth."""
     rng = np.random.default_rng(seed)
     d, space = dimension, Space(dimension, turning=True)
-    names = tuple(f"{robot}{k}" for robot in "AB" for k in range(4)) + ("L0",)
+    names = (*(f"{robot}{k}" for robot in "AB" for k in range(4)), "L0")
     position = np.concatenate([np.arange(4)[:, None] * 5.0 + row * 8.0 + np.zeros((4, d)) for row in (0, 1)])
     position = np.concatenate([position, np.full((1, d), 12.0)]) + rng.normal(size=(9, d))
     turn = 0.4 * rng.normal(size=(9, space.angles))

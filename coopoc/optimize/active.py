@@ -1,106 +1,199 @@
-"""Which constraints hold a point, how hard, and by how much any is violated."""
+"""Which constraints hold a point, how hard, which ways remain, and by how much any is violated."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
+from .constraint import Constraint, values
 from .local import chain, local
 from .problem import Problem
 
-NEAR = 1e-6
-"""m, rad or m/s: a constraint this close to its bound is active."""
+NEAR = 5e-7
+"""m or rad, a step this long reaches the bound: the constraint is active."""
+DEPENDENT = 1e-9
+"""Singular value, of rows of length 1, below which they say the same."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """All constraints of a problem at x, as rows of numbers.
+    """All numbers of a problem that are bounded, at x.
 
     Args:
-        value, lower, upper: (rows,). matrix: (rows, n dof) sparse derivative of the values.
+        value, lower, upper: (rows,). matrix: (rows, n dof) sparse derivative of the values by the steps.
+        place: (rows, 3) constraint, row of its nodes and component.
     """
 
     value: Floats
     lower: Floats
     upper: Floats
     matrix: Any
+    place: Ints
+
+    @property
+    def outside(self) -> Floats:
+        """(rows,) by how much each is violated."""
+        return np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """The constraints that hold at x.
+    """The constraints that hold at x: equalities, and the inequalities that push.
 
     Args:
-        matrix: (rows, n dof) sparse. gap: (rows,) value minus the bound it lies on. equality: (rows,).
-        pull: (n dof,) C^T multipliers. violation: the largest of any constraint.
+        multipliers: (rows,) of `Rows`, the gradient of the cost plus matrix^T multipliers vanishes at a minimum; at a
+            lower bound they are <= 0, at an upper one >= 0.
+        pull: (n dof,) matrix^T multipliers. onto: (n dof,) the least step onto what holds.
+        along: (n dof, k) sparse, orthonormal directions in which all that holds stays as it is.
+        exact: the same for the equalities alone. violation: the largest of any constraint. violated: which, in words.
     """
 
-    matrix: Any
-    gap: Floats
-    equality: Bools
+    multipliers: Floats
     pull: Floats
+    onto: Floats
+    along: Any
+    exact: Any
     violation: float
+    violated: str
+
+    @property
+    def holds(self) -> bool:
+        """True if any direction is taken away."""
+        return bool(self.along.shape[1] < self.along.shape[0])
+
+
+def bounded(constraint: Constraint) -> Bools:
+    """(M, size) True where a side is finite."""
+    return np.asarray(np.isfinite(constraint.lower) | np.isfinite(constraint.upper))
+
+
+def steerable(problem: Problem, constraint: Constraint) -> Bools:
+    """(M, size) True where a side is finite and a node can move: the rows that a solver gets."""
+    free = problem.free
+    if free is None:
+        return bounded(constraint)
+    moves = np.asarray(free[constraint.nodes].any(axis=(1, 2)))
+    return np.asarray(bounded(constraint) & moves[:, None])
 
 
 def constraint_rows(problem: Problem, x: Floats) -> Rows:
     """The constraints of a single problem at x (n, width)."""
-    from scipy.sparse import coo_array, vstack
+    from scipy.sparse import vstack
 
-    values, lowers, uppers, blocks = [], [], [], []
-    space, n = problem.space, len(problem.names)
-    for item in problem.constraints:
-        known = item.measurement
-        seen = local(space, known, x[None], item.nodes)
-        assert item.constants is not None
-        value, slope = known.differentiate(*seen, np.zeros(item.lower.shape), item.constants)
-        slope = np.broadcast_to(slope, (*value.shape, slope.shape[-1]))
-        slopes = chain(space, known, x[None], item.nodes, seen, slope)
-        pair = item.nodes.shape[1] == 2
-        slopes = (-slopes[0], slopes[0]) if pair and len(slopes) == 1 else slopes
-        count, size = item.lower.shape
-        row = np.arange(count * size).reshape(count, size, 1) + np.zeros(space.dof, np.int64)
-        entries = [(s[0] if problem.free is None else s[0] * problem.free[c][:, None, :], c)
-                   for s, c in zip(slopes, item.nodes.T, strict=True)]  # fmt: skip
-        matrix = sum(
-            coo_array((s.ravel(), (row.ravel(), (space.dof * c[:, None, None] + np.arange(space.dof)
-                                                 + np.zeros((size, 1), np.int64)).ravel())),
-                      shape=(count * size, n * space.dof)).tocsr() for s, c in entries)  # fmt: skip
-        values.append(value[0].ravel())
-        lowers.append(item.lower.ravel())
-        uppers.append(item.upper.ravel())
-        blocks.append(matrix)
-    stacked = vstack(blocks, format="csr")
-    return Rows(np.concatenate(values), np.concatenate(lowers), np.concatenate(uppers), stacked)
+    parts = [_rows_of(problem, x, k) for k in range(len(problem.constraints))]
+    value, lower, upper = (np.concatenate([p[0][side] for p in parts]) for side in range(3))
+    return Rows(value, lower, upper, vstack([p[1] for p in parts], format="csr"), np.concatenate([p[2] for p in parts]))
+
+
+def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats, Floats], Any, Ints]:
+    from scipy.sparse import csr_array
+
+    item, space = problem.constraints[k], problem.space
+    known, which = item.measurement, bounded(item)
+    seen = local(space, known, x[None], item.nodes)
+    value, slope = values(known, item, *seen)
+    slopes = chain(space, known, x[None], item.nodes, seen, np.broadcast_to(slope, (*value.shape, slope.shape[-1])))
+    if len(slopes) < known.arity:
+        slopes = (-slopes[0], slopes[0])
+    row, component = np.nonzero(which)
+    data = np.stack([s[0, row, component] for s in slopes], axis=1)
+    if problem.free is not None:
+        data = data * problem.free[item.nodes[row]]
+    columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
+    starts = np.arange(0, data.size + 1, known.arity * space.dof)
+    matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
+    place = np.stack([np.full(len(row), k), row, component], axis=1)
+    return (value[0][which], item.lower[which], item.upper[which]), matrix, place
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     """The constraints that hold at x (n, width), where the gradient of the cost is (n, dof).
 
-    Multipliers are the least-squares ones with the signs that a minimum needs; what does not push is not active.
+    Multipliers are the least-squares ones with the signs that a minimum needs; an inequality that does not push does
+    not hold. Constraints that share no direction are looked at apart from each other.
     """
+    rows = constraint_rows(problem, x)
+    length = np.sqrt(np.asarray(rows.matrix.multiply(rows.matrix).sum(axis=1)).ravel())
+    reach = NEAR * length
+    low, high = rows.value - rows.lower <= reach, rows.upper - rows.value <= reach
+    equal, touched = rows.lower == rows.upper, np.flatnonzero((low | high) & (length > 0))
+    multipliers, onto = np.zeros(len(length)), np.zeros(gradient.size)
+    along: list[tuple[Ints, Floats]] = []
+    exact: list[tuple[Ints, Floats]] = []
+    for members, columns, block in _apart(rows.matrix[touched]):
+        own = touched[members]
+        unit = block / length[own, None]
+        found = _multipliers(unit, gradient.ravel()[columns], low[own] | equal[own], high[own] | equal[own])
+        multipliers[own] = found / length[own]
+        pushes = equal[own] | (found != 0)
+        gap = (rows.value - np.where(multipliers < 0, rows.lower, rows.upper))[own] / length[own]
+        onto[columns], ways = _split(unit[pushes], gap[pushes])
+        along.append((columns, ways))
+        exact.append((columns, _split(unit[equal[own]], gap[equal[own]])[1]))
+    pull, worst = rows.matrix.T @ multipliers, int(rows.outside.argmax())
+    violation, violated = float(rows.outside[worst]), _words(problem, rows, worst)
+    ways, held = (_directions(gradient.size, blocks) for blocks in (along, exact))
+    return Active(multipliers, pull, onto, ways, held, violation, violated)
+
+
+def _apart(matrix: Any) -> Iterator[tuple[Ints, Ints, Floats]]:
+    """Rows that share no column with the others: their numbers, their columns and the dense block."""
+    from scipy.sparse.csgraph import connected_components
+
+    matrix.eliminate_zeros()
+    count, label = connected_components(abs(matrix) @ abs(matrix).T, directed=False)
+    for group in range(count):
+        members = np.flatnonzero(label == group)
+        part = matrix[members]
+        columns = np.unique(part.indices)
+        yield members, columns, part[:, columns].toarray()
+
+
+def _multipliers(unit: Floats, gradient: Floats, low: Bools, high: Bools) -> Floats:
+    """Least |gradient + unit^T m| with m <= 0 where only the lower bound is near and m >= 0 where only the upper is."""
     from scipy.optimize import lsq_linear
 
-    rows = constraint_rows(problem, x)
-    equal = rows.lower == rows.upper
-    low, high = np.abs(rows.value - rows.lower) <= NEAR, np.abs(rows.value - rows.upper) <= NEAR
-    outside = np.maximum(np.maximum(rows.lower - rows.value, rows.value - rows.upper), 0.0)
-    touched = np.flatnonzero(equal | low | high)
-    matrix = rows.matrix[touched]
-    multipliers = np.zeros(0)
-    if len(touched):
-        floor = np.where(equal[touched] | low[touched], -np.inf, 0.0)
-        roof = np.where(equal[touched] | high[touched], np.inf, 0.0)
-        scale = np.maximum(np.abs(gradient).max(), 1e-12)
-        tight = floor < roof
-        multipliers = np.zeros(len(touched))
-        found = lsq_linear(matrix[tight].T.toarray(), -gradient.ravel() / scale, (floor[tight], roof[tight]), tol=1e-14)
-        multipliers[tight] = scale * found.x
-    pushes = equal[touched] | (np.abs(multipliers) > 1e-9 * max(np.abs(multipliers).max(initial=0.0), 1e-300))
-    bound = np.where(low[touched], rows.lower[touched], rows.upper[touched])
-    return Active(
-        matrix[pushes], (rows.value[touched] - bound)[pushes], equal[touched][pushes], matrix.T @ multipliers,
-        float(outside.max(initial=0.0)),
-    )  # fmt: skip
+    scale = max(np.abs(gradient).max(), 1e-300)
+    bounds = (np.where(low, -np.inf, 0.0), np.where(high, np.inf, 0.0))
+    found = lsq_linear(unit.T, -gradient / scale, bounds, method="bvls", tol=1e-14)
+    return np.asarray(scale * found.x)
+
+
+def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:
+    """The least step that undoes the gaps of the rows, and orthonormal directions (columns) that no row sees."""
+    if not len(unit):
+        return np.zeros(unit.shape[1]), np.eye(unit.shape[1])
+    left, values, right = np.linalg.svd(unit)
+    rank = int((values > DEPENDENT).sum())
+    return -right[:rank].T @ ((left[:, :rank].T @ gap) / values[:rank]), right[rank:].T
+
+
+def _directions(size: int, blocks: list[tuple[Ints, Floats]]) -> Any:
+    """(size, k) sparse: the blocks' directions on their columns, and each coordinate that is in no block."""
+    from scipy.sparse import csc_array
+
+    kept: Ints = np.setdiff1d(np.arange(size), np.concatenate([np.empty(0, np.int64), *(c for c, _ in blocks)]))
+    rows, cols, top = [kept], [np.arange(len(kept))], len(kept)
+    data: list[Floats] = [np.ones(len(kept))]
+    for columns, block in blocks:
+        rows.append(np.repeat(columns, block.shape[1]))
+        cols.append(top + np.tile(np.arange(block.shape[1]), len(columns)))
+        data.append(block.ravel())
+        top += block.shape[1]
+    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))
+    return csc_array(entries, shape=(size, top))
+
+
+def _words(problem: Problem, rows: Rows, worst: int) -> str:
+    """Which constraint is violated most, of which nodes, and by how much."""
+    k, row, component = rows.place[worst].tolist()
+    item = problem.constraints[k]
+    nodes = " and ".join(problem.names[n] for n in item.nodes[row])
+    below = rows.value[worst] < rows.lower[worst]
+    side, bound = ("below its lower", rows.lower[worst]) if below else ("above its upper", rows.upper[worst])
+    which = f", component {component}," if item.lower.shape[1] > 1 else ""
+    return f"{item.kind} of {nodes}{which} is {rows.outside[worst]:.3g} {side} bound {bound:.6g}"

@@ -43,13 +43,16 @@ def solve_batch(problem: Problem, max_iterations: int = MAX_ITERATIONS, toleranc
         max_iterations: of Gauss-Newton steps. tolerance: m, largest move of a point in the last step.
 
     Raises:
-        InputError: no measurements.
+        InputError: no measurements, or constraints.
     >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
     >>> solve_batch(problem).x.shape
     (2, 1, 3)
     """
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    if problem.constraints:
+        mend = 'Use solve(problem.pick(run), "casadi").'
+        raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", mend)
     step = linear_step(problem)
     scheme, frame = structure(problem)
     count = problem.batch or 1

@@ -23,7 +23,7 @@ def is_minimum(problem: Problem, x: Floats) -> bool:
     """True unless the cost of a single problem curves downwards at x (n, width), where its gradient vanishes.
 
     The Hessian is J^T J + sum_k r_k d2 r_k / dx2. J^T J alone is positive definite at a saddle too, such as an ego on
-    the line between two others whose ranges are longer than the line. Where there are constraints it is not looked at.
+    the line between two others whose ranges are longer than the line. Where there are constraints see lagrangian.py.
     """
     if problem.linear or problem.constraints:
         return True
@@ -33,7 +33,7 @@ def is_minimum(problem: Problem, x: Floats) -> bool:
     true = true_blocks(problem, linear)
     own = scheme.pairs[:, 0] == scheme.pairs[:, 1]
     true[own] += SLACK * flat[own] * np.eye(problem.space.dof)
-    return _positive(scheme, true)
+    return pivots(matrix(scheme, true)) is not None
 
 
 def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
@@ -48,7 +48,7 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
     at = np.arange(problem.space.dof)
     blocks[own[:, None], at, at] += damping[0, scheme.pairs[own, 0]]
-    factored = _pivots(scheme, blocks)
+    factored = pivots(matrix(scheme, blocks))
     if factored is None:
         raise np.linalg.LinAlgError("the cost curves downwards here")
     return np.asarray(-factored.solve(gradient.ravel()).reshape(gradient.shape))
@@ -58,7 +58,8 @@ def true_blocks(problem: Problem, linear: Linear) -> Floats:
     """(P, dof, dof) blocks of the exact Hessian of a single problem, in the pattern's order."""
     x = linear.x[0]
     parts = [part for k in range(len(problem.factors)) for part in _hessian(problem, k, x, linear)]
-    return assemble(structure(problem)[0], parts)[0]
+    blocks: Floats = assemble(structure(problem)[0], parts)[0]
+    return blocks
 
 
 def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats]:
@@ -106,19 +107,14 @@ def _pulls(problem: Problem, factor: Factor, local: Floats, node: int, coordinat
     return np.concatenate([(np.swapaxes(s, -1, -2) @ residual[..., None])[0, :, :, 0] for s in slopes], axis=1)
 
 
-def _positive(scheme: Pattern, blocks: Floats) -> bool:
-    """Whether the symmetric matrix of the blocks (P, dof, dof) is positive definite."""
-    return _pivots(scheme, blocks) is not None
-
-
-def _pivots(scheme: Pattern, blocks: Floats) -> Any:
-    """Factors of the matrix of the blocks if all pivots of its L D L^T are positive, else None."""
+def pivots(matrix: Any) -> Any:
+    """Factors of a sparse symmetric matrix if all pivots of its L D L^T are positive, else None."""
     from scipy.sparse.linalg import splu
 
-    if not np.isfinite(blocks).all():
+    if not np.isfinite(matrix.data).all():
         return None
     try:
-        factored = splu(_matrix(scheme, blocks), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        factored = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                         options={"SymmetricMode": True})  # fmt: skip
     except RuntimeError:  # a pivot of exactly zero
         return None
@@ -126,7 +122,8 @@ def _pivots(scheme: Pattern, blocks: Floats) -> Any:
     return factored if symmetric and (factored.U.diagonal() > 0).all() else None
 
 
-def _matrix(scheme: Pattern, blocks: Floats) -> Any:
+def matrix(scheme: Pattern, blocks: Floats) -> Any:
+    """The sparse matrix (n dof, n dof) of symmetric blocks (P, dof, dof)."""
     from scipy.sparse import csc_array
 
     off = scheme.pairs[:, 0] != scheme.pairs[:, 1]

@@ -13,7 +13,7 @@ from .linear import Linear
 from .problem import Problem
 
 Step = Callable[[Linear, Floats], Floats]
-"""(linearisation, damping (B, n, dof)) -> dx (B, n, dof), (J^T J + diag(damping)) dx = -J^T r; LinAlgError: singular."""
+"""(linearisation, damping (B, n, dof)) -> dx (B, n, dof): (J^T J + diag(damping)) dx = -J^T r, else LinAlgError."""
 
 MAX_ITERATIONS = 500
 """About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
@@ -53,10 +53,7 @@ def descend(
     Raises:
         InputError: max_iterations that is no whole number >= 0, tolerance that is not > 0.
     """
-    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
-        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
-    if not isinstance(tolerance, float | int) or not tolerance > 0:
-        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
+    check_limits(max_iterations, tolerance)
     best, count = x.copy(), np.zeros(len(x), dtype=np.int64)
     done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
     active, now = np.arange(len(x)), problem
@@ -82,6 +79,14 @@ def descend(
             active = active[going]
             now = problem.pick(active) if problem.batch else problem
     return Descent(best, count, done)
+
+
+def check_limits(max_iterations: int, tolerance: float) -> None:
+    """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
+    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
+        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
+    if not isinstance(tolerance, float | int) or not tolerance > 0:
+        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
 
 
 def _promised(problem: Problem, linear: Linear, dx: Floats) -> Floats:

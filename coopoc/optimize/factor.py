@@ -22,7 +22,7 @@ class Factor:
     Args:
         kind: a registered measurement.
         nodes: (M, arity); of two, the first observes the second.
-        z: (M, k) or (B, M, k) for B noise realisations: m, rad; a kind that compares poses has k = d + d^2 (see `pose`).
+        z: (M, k) or (B, M, k) for B noise realisations: m, rad; kinds that compare poses have k = d + d^2 (see `pose`).
         std: size, (size,), (M, size) or (B, M, size) standard deviations, W = diag(1/std); infinite: no information
             (a measurement that this realisation lacks).
         sqrt_information: instead of std, (size, size), (M, size, size) or (B, M, size, size), W^T W = cov^-1.

@@ -106,7 +106,7 @@ def squares(linear: Linear, nodes: Sequence[Ints]) -> list[Floats]:
 
 
 def assemble(scheme: Pattern, parts: Sequence[Floats]) -> Floats:
-    """Blocks (B, P, dof, dof) in the pattern's order from the products of `squares`; 1 on the diagonal of what is still."""
+    """Blocks (B, P, dof, dof) in the pattern's order from the products of `squares`; 1 on what is still."""
     every = np.concatenate(parts, axis=1)
     dof = every.shape[-1]
     gathered = every.reshape(*every.shape[:2], dof * dof)[:, scheme.rows]

@@ -93,7 +93,8 @@ class SolveError(RuntimeError):
 
     def __init__(self, solution: Solution) -> None:
         self.solution = solution
-        super().__init__(f"{solution.backend}: {solution.status.value} ({solution})")
+        violated = f" Violated: {solution.extras['violated']}." if "violated" in solution.extras else ""
+        super().__init__(f"{solution.backend}: {solution.status.value}{violated} ({solution})")
 
     def __reduce__(self) -> tuple[type[SolveError], tuple[Solution]]:
         return type(self), (self.solution,)

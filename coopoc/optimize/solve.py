@@ -11,13 +11,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..errors import InputError, MissingLibraryError
+from .active import constraint_rows
 from .assess import Assessment, assess
 from .backends.run import Ended
 from .curvature import is_minimum
 from .descend import MAX_ITERATIONS
 from .initial import initial_guess
+from .lagrangian import is_constrained_minimum
 from .problem import Problem
 from .solution import Solution, SolveError, Status
 
@@ -51,7 +53,9 @@ BACKENDS = {
     b.name: b
     for b in (
         Backend("gauss-newton", "gauss_newton", "reference: Levenberg-Marquardt, batched over noise runs"),
-        Backend("gtsam", "gtsam_", "factor graph elimination by GTSAM", "gtsam"),
+        Backend("gtsam", "gtsam_", "elimination by GTSAM, or its own LM, dogleg, ISAM2, GNC (optimizer=)", "gtsam"),
+        Backend("casadi", "casadi_", "nonlinear programming by IPOPT or SQP, constraints of any kind", "casadi", "all"),
+        Backend("cvxpy", "cvxpy_", "convex relaxations: QP, Shor's SDP with a lower bound, SOCP", "cvxpy"),
         Backend("osqp", "osqp_", "sequential quadratic programming, persistent workspace", "osqp", "linear"),
     )
 }
@@ -100,12 +104,13 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     ended = run(start)
     solved = time.perf_counter()
     truth = assess(problem, ended.x)
+    violated = {"violated": truth.violated} if truth.violation > FEASIBLE or ended.infeasible else {}
     solution = Solution(
         x=ended.x, covariance=truth.covariance, cost=truth.cost, gradient=truth.gradient,
         status=_status(problem, ended, truth, options.get("max_iterations", MAX_ITERATIONS)),
         iterations=ended.iterations, build_seconds=built - began, solve_seconds=solved - built, backend=backend,
         names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, space=problem.space,
-        violation=truth.violation, extras=ended.extras,
+        violation=truth.violation, extras=ended.extras | violated,
     )  # fmt: skip
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
@@ -144,7 +149,7 @@ def _check_constraints(problem: Problem, known: Backend) -> None:
 
 
 def _check_start(problem: Problem, start: Floats) -> None:
-    """InputError if a measurement has no derivative at the start."""
+    """InputError if a measurement or a constraint has no derivative at the start."""
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])
     for factor, residual, slope in zip(problem.factors, linear.residual, linear.slope, strict=True):
@@ -152,11 +157,20 @@ def _check_start(problem: Problem, start: Floats) -> None:
         for by_node in slope:
             bad = bad | ~np.isfinite(by_node[0]).all(axis=(-2, -1))
         if bad.any():
-            pair = " and ".join(problem.names[n] for n in factor.nodes[np.flatnonzero(bad)[0]])
-            raise InputError(
-                "x0", f"{pair} coincide or stand above each other", f"leave {factor.kind} without a direction",
-                "Give an x0 that keeps them apart.",
-            )  # fmt: skip
+            raise _without_direction(problem, factor.kind, factor.nodes[np.flatnonzero(bad)[0]])
+    if problem.constraints:
+        with np.errstate(all="ignore"):
+            rows = constraint_rows(problem, start)
+        bad = ~np.isfinite(rows.value + rows.matrix.sum(axis=1))
+        if bad.any():
+            k, row, _ = rows.place[np.flatnonzero(bad)[0]]
+            raise _without_direction(problem, problem.constraints[k].kind, problem.constraints[k].nodes[row])
+
+
+def _without_direction(problem: Problem, kind: str, nodes: Ints) -> InputError:
+    pair = " and ".join(problem.names[n] for n in nodes)
+    return InputError("x0", f"{pair} coincide or stand above each other", f"leave {kind} without a direction",
+                      "Give an x0 that keeps them apart.")  # fmt: skip
 
 
 def _status(problem: Problem, ended: Ended, truth: Assessment, limit: int) -> Status:
@@ -165,7 +179,9 @@ def _status(problem: Problem, ended: Ended, truth: Assessment, limit: int) -> St
     if truth.free:
         return Status.RANK_DEFICIENT
     if truth.remaining <= POSITION_TOLERANCE:
-        return Status.SOLVED if is_minimum(problem, ended.x) else Status.SADDLE
+        held = truth.active
+        minimum = is_constrained_minimum(problem, ended.x, held) if held else is_minimum(problem, ended.x)
+        return Status.SOLVED if minimum else Status.SADDLE
     return Status.MAX_ITERATIONS if ended.iterations >= limit else Status.FAILED
 
 

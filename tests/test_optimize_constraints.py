@@ -1,0 +1,497 @@
+"""Constraints: closed forms, SciPy's constrained solvers, KKT written out here; sets that are empty; who refuses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.linalg import null_space
+from scipy.optimize import LinearConstraint, NonlinearConstraint, lsq_linear, minimize
+
+from coopoc import V2X, Fleet, InputError, Sensors, observe
+from coopoc.optimize import MEASUREMENTS, Problem, Solution, SolveError, Status, backends, measurement, pose, solve
+from coopoc.optimize.active import active_at
+from coopoc.world.recording import Recording
+
+INF = np.inf
+LINEAR = [("osqp", {}), ("casadi", {}), ("casadi", {"method": "sqp"})]
+ANY = LINEAR[1:]
+PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+RANGED = PAIR.add("range", ("a", "b"), 8.0, std=0.5)
+
+
+def road(x, y, m=np):
+    return 2.0 * m.sin(x / 15.0) + 0.05 * y
+
+
+@pytest.fixture(scope="module", autouse=True)
+def kinds():
+    """A road surface and a plane, as a user would register them."""
+
+    @measurement("height", arity=1, components=("coordinate",))
+    def height(x, y, z, m=np):
+        return (z - road(x, y, m),)
+
+    @measurement("plane", arity=1, components=("coordinate",), constants=3)
+    def plane(x, y, z, a, b, c, m=np):
+        return (a * x + b * y + c * z,)
+
+    yield
+    del MEASUREMENTS["height"], MEASUREMENTS["plane"]
+
+
+@pytest.fixture(scope="module")
+def dense(formation: Fleet) -> Recording:
+    return observe(formation.between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=2, observers=[0])
+
+
+def solved(problem: Problem, backend: str, options: dict[str, str]) -> Solution:
+    solution = solve(problem, backend, **options)
+    assert solution.status is Status.SOLVED
+    assert solution.violation < 1e-8
+    return solution
+
+
+def gradient(problem: Problem, x: np.ndarray) -> np.ndarray:
+    r, J = problem.whiten(x)
+    return J.T @ r
+
+
+@pytest.mark.parametrize(("backend", "options"), ANY)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fix_on_a_plane_is_projected(seed: int, backend: str, options: dict[str, str]) -> None:
+    """Closed form: x = p - S n (n.p - c) / (n.S n), covariance S - S n n^T S / (n.S n)."""
+    rng = np.random.default_rng(seed)
+    n, p, c, std = rng.normal(size=3), rng.normal(size=3) * 5, rng.normal(), rng.uniform(1, 4, 3)
+    S = np.diag(std**2)
+    problem = Problem(("a",)).add("position", "a", p, std=std).constrain("plane", "a", c, c, constants=n)
+    solution = solved(problem, backend, options)
+    assert solution.x[0] == pytest.approx(p - S @ n * (n @ p - c) / (n @ S @ n), abs=1e-9)
+    assert solution.covariance[0] == pytest.approx(S - np.outer(S @ n, S @ n) / (n @ S @ n), abs=1e-9)
+    assert solution.cost == pytest.approx(0.5 * (n @ p - c) ** 2 / (n @ S @ n), rel=1e-9)
+
+
+def chain(points: int, seed: int) -> Problem:
+    """A random walk with odometry 100 times as sure as the fixes: a linear problem."""
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal(size=(points, 3)), axis=0)
+    names = tuple(f"p{k}" for k in range(points))
+    problem = Problem(names).add("position", names, truth + rng.normal(0, 3, truth.shape), std=3.0)
+    return problem.add("displacement", list(pairwise(names)), np.diff(truth, axis=0), std=0.03)
+
+
+@pytest.mark.parametrize(("backend", "options"), LINEAR)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_linear_problem_in_a_box_is_scipys(seed: int, backend: str, options: dict[str, str]) -> None:
+    """scipy.optimize.lsq_linear (BVLS); with bounds alone x - clip(x - gradient) vanishes at the minimum."""
+    problem = chain(12, seed)
+    free = solve(problem).x
+    lower, upper = free - 0.2, free + np.random.default_rng(seed).uniform(-0.15, 0.5, free.shape)
+    r, J = problem.whiten(np.zeros_like(free))
+    found = lsq_linear(J.toarray(), -r, (lower.ravel(), upper.ravel()), method="bvls", tol=1e-15)
+    solution = solved(problem.constrain("position", problem.names, lower, upper), backend, options)
+    assert solution.x.ravel() == pytest.approx(found.x, abs=1e-6)
+    assert solution.cost == pytest.approx(found.cost, rel=1e-9)
+    pull = gradient(problem, solution.x).reshape(-1, 3) * 1e-3  # m per unit of cost
+    assert solution.x == pytest.approx(np.clip(solution.x - pull, lower, upper), abs=1e-6)
+    assert solution.covariance == pytest.approx(solve(problem).covariance, abs=1e-9)
+    if backend == "osqp":
+        assert solution.iterations == 1
+
+
+@pytest.mark.parametrize("length", [1, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_an_active_bound_is_the_same_in_all(dense: Recording, length: int, seed: int) -> None:
+    """osqp, ipopt and sqp against each other and KKT: the gradient vanishes where nothing pushes, else has its sign."""
+    rng = np.random.default_rng(seed)
+    problem = Problem.from_window(dense, 20, 0, length, seed % 2)
+    free = solve(problem).x
+    middle = free + rng.uniform(-0.8, 0.8, free.shape)
+    lower, upper = middle - 0.4, middle + 0.4
+    upper[0] = lower[0] = free[0] + 0.3  # an equality
+    bound = problem.constrain("position", problem.names, lower, upper)
+    first, *others = [solved(bound, *how) for how in LINEAR]
+    for other in others:
+        assert other.cost == pytest.approx(first.cost, rel=1e-9)
+        assert other.x == pytest.approx(first.x, abs=1e-6)
+        assert other.covariance == pytest.approx(first.covariance, abs=1e-6)
+    pull = gradient(problem, first.x).reshape(-1, 3)
+    low, high = first.x < lower + 1e-7, first.x > upper - 1e-7
+    assert low[1:].any()
+    assert high[1:].any()
+    assert pull[~low & ~high] == pytest.approx(0.0, abs=1e-5)
+    assert (pull[low & ~high] > -1e-5).all()
+    assert (pull[high & ~low] < 1e-5).all()
+    assert first.gradient < 1e-4
+
+
+@pytest.mark.parametrize(("backend", "options"), LINEAR)
+def test_odometry_that_outweighs_gnss_by_half_a_million(
+    dense: Recording, backend: str, options: dict[str, str]
+) -> None:
+    """SciPy's BVLS around the answer: one more step of the linearised problem in the box moves nothing."""
+    sure = Sensors(gnss_std=(3.5, 3.5, 3.5), velocity_std_ratio=0.0, velocity_floor=0.05)
+    problem = Problem.from_window(replace(dense, sensors=sure), 20, 0, 5)
+    free = solve(problem).x
+    upper = np.where(np.arange(len(free))[:, None] % 7 == 0, free - 0.5, INF)
+    solution = solved(problem.constrain("position", problem.names, -INF, upper), backend, options)
+    r, J = problem.whiten(solution.x)
+    step = lsq_linear(J.toarray(), -r, (-INF, (upper - solution.x).ravel() + 1e-12), method="bvls", tol=1e-15).x
+    assert step == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("backend", "options"), LINEAR)
+@pytest.mark.parametrize("length", [1, 5])
+def test_constraints_that_do_not_push_change_nothing(
+    dense: Recording, length: int, backend: str, options: dict[str, str]
+) -> None:
+    problem = Problem.from_window(dense, 20, 0, length)
+    free = solve(problem)
+    wide = problem.constrain("position", problem.names, free.x - 1.0, free.x + 0.1)
+    wide = wide.constrain("displacement", (0, 1), -1e3, 1e3)
+    solution = solved(wide, backend, options)
+    assert solution.cost == pytest.approx(free.cost, rel=1e-9)
+    assert solution.x == pytest.approx(free.x, abs=1e-6)
+    assert solution.covariance == pytest.approx(free.covariance, abs=1e-6)
+
+
+def drive(seed: int, vehicles: int = 2, steps: int = 4) -> Problem:
+    """Vehicles on the road, with fixes, odometry that runs ahead and ranging to the one in front."""
+    rng = np.random.default_rng(seed)
+    t = 0.5 * np.arange(steps)[:, None]
+    x, y = 14.0 * t - 20.0 * np.arange(vehicles), 0.0 * t + np.zeros(vehicles)
+    truth = np.stack([x, y, road(x, y)], axis=-1)
+    names = [[f"v{v}@{s}" for v in range(vehicles)] for s in range(steps)]
+    flat = tuple(n for row in names for n in row)
+    moved = [(a, b) for now, then in pairwise(names) for a, b in zip(now, then, strict=True)]
+    problem = Problem(flat).add("position", flat, truth.reshape(-1, 3) + rng.normal(0, 2, (len(flat), 3)), std=2.0)
+    gone = np.diff(truth, axis=0).reshape(-1, 3)
+    problem = problem.add("displacement", moved, 1.1 * gone + rng.normal(0, 0.3, (len(moved), 3)), std=0.3)
+    ahead = [(b, a) for row in names for a, b in pairwise(row)]
+    gap = (truth[:, :-1] - truth[:, 1:]).reshape(-1, 3)
+    seen = MEASUREMENTS["spherical"].predict(gap) + rng.normal(size=gap.shape) * [0.5, 0.03, 0.03]
+    problem = problem.add("spherical", ahead, seen, std=[0.5, 0.03, 0.03])
+    problem = problem.constrain("height", flat, 0.0, 0.0)
+    problem = problem.constrain("position", flat, [-INF, -0.8, -INF], [INF, 0.8, INF])
+    return problem.constrain("speed", moved, upper=14.0, constants=[0.5])
+
+
+def scipys(problem: Problem, method: str) -> tuple[np.ndarray, float]:
+    """SciPy on the same problem: its cost and gradient are ours, the constraints and their derivatives written here."""
+    n = len(problem.names)
+    moved = next(f.nodes for f in problem.factors if f.kind == "displacement")
+    ties = np.zeros((3 * len(moved), 3 * n))
+    for k, (i, j) in enumerate(moved):
+        for c in range(3):
+            ties[3 * k + c, [3 * i + c, 3 * j + c]] = -1.0, 1.0
+
+    def rise(flat: np.ndarray) -> np.ndarray:
+        x, y, z = flat.reshape(-1, 3).T
+        return z - road(x, y)
+
+    def rise_slope(flat: np.ndarray) -> np.ndarray:
+        slope = np.zeros((n, 3 * n))
+        k = np.arange(n)
+        slope[k, 3 * k], slope[k, 3 * k + 1], slope[k, 3 * k + 2] = -2.0 / 15.0 * np.cos(flat[::3] / 15.0), -0.05, 1.0
+        return slope
+
+    def speed(flat: np.ndarray) -> np.ndarray:
+        return np.linalg.norm((ties @ flat).reshape(-1, 3), axis=1) / 0.5
+
+    def speed_slope(flat: np.ndarray) -> np.ndarray:
+        gap = (ties @ flat).reshape(-1, 3)
+        unit = gap / np.linalg.norm(gap, axis=1, keepdims=True)
+        return np.einsum("kc,kcn->kn", unit, ties.reshape(-1, 3, 3 * n)) / 0.5
+
+    lane = np.eye(3 * n)[1::3]
+    constraints = [NonlinearConstraint(rise, 0, 0, rise_slope), LinearConstraint(lane, -0.8, 0.8),
+                   NonlinearConstraint(speed, -INF, 14.0, speed_slope)]  # fmt: skip
+    options = {
+        "SLSQP": {"ftol": 1e-15, "maxiter": 2000},
+        "trust-constr": {"gtol": 1e-10, "xtol": 1e-12, "maxiter": 3000},
+    }
+    found = minimize(
+        lambda flat: problem.cost(flat.reshape(-1, 3)), problem.factors[0].z.ravel(), method=method,
+        jac=lambda flat: gradient(problem, flat.reshape(-1, 3)), constraints=constraints, options=options[method],
+    )  # fmt: skip
+    return found.x.reshape(-1, 3), found.fun
+
+
+@pytest.mark.parametrize(("backend", "options"), ANY)
+@pytest.mark.parametrize("seed", range(4))
+def test_surface_lane_and_top_speed_are_scipys(seed: int, backend: str, options: dict[str, str]) -> None:
+    problem = drive(seed)
+    x, cost = scipys(problem, "SLSQP")
+    solution = solved(problem, backend, options)
+    assert solution.cost == pytest.approx(cost, rel=1e-8)
+    assert solution.x == pytest.approx(x, abs=1e-4)
+    gone = solution.x[2:] - solution.x[:-2]
+    assert np.linalg.norm(gone, axis=1).max() == pytest.approx(7.0, abs=1e-6)  # the limit is met, not passed
+    assert solution.x[:, 2] == pytest.approx(road(solution.x[:, 0], solution.x[:, 1]), abs=1e-9)
+    assert np.abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
+
+
+@pytest.mark.filterwarnings("ignore:delta_grad")  # SciPy's BFGS at the end of its convergence
+@pytest.mark.parametrize(("backend", "options"), ANY)
+def test_scipys_trust_region_agrees_too(backend: str, options: dict[str, str]) -> None:
+    problem = drive(7)
+    x, cost = scipys(problem, "trust-constr")
+    solution = solved(problem, backend, options)
+    assert solution.cost == pytest.approx(cost, rel=1e-6)
+    assert solution.x == pytest.approx(x, abs=1e-3)
+
+
+def test_the_covariance_holds_equalities_exactly() -> None:
+    """Against Z (Z^T J^T J Z)^-1 Z^T with SciPy's null space; the inequalities that push are left out."""
+    problem = drive(1)
+    solution = solve(problem, "casadi")
+    _, J = problem.whiten(solution.x)
+    rows = np.zeros((len(solution.x), J.shape[1]))
+    for k, (x, _, _) in enumerate(solution.x):
+        rows[k, 3 * k : 3 * k + 3] = -2.0 / 15.0 * np.cos(x / 15.0), -0.05, 1.0
+    Z = null_space(rows)
+    cov = Z @ np.linalg.inv(Z.T @ (J.T @ J).toarray() @ Z) @ Z.T
+    own = np.stack([cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(solution.x))])
+    assert solution.covariance == pytest.approx(own, abs=1e-9)
+
+
+def test_multipliers_are_those_of_ipopt() -> None:
+    """An NLP written in CasADi here: its multipliers have our signs and values."""
+    problem = drive(2)
+    solution = solve(problem, "casadi")
+    held = active_at(problem, solution.x, gradient(problem, solution.x).reshape(-1, 3))
+    x = ca.SX.sym("x", 3, len(problem.names))
+    moved = next(f.nodes for f in problem.factors if f.kind == "displacement").tolist()
+    r, J = problem.whiten(solution.x)
+    step = ca.vec(x) - ca.DM(solution.x.ravel())
+    model = 0.5 * ca.sumsqr(ca.DM(r) + ca.DM(J.toarray()) @ step)  # the same gradient at the solution
+    rise = ca.vertcat(*(x[2, k] - road(x[0, k], x[1, k], ca) for k in range(x.shape[1])))
+    speed = ca.vertcat(*(ca.norm_2(x[:, j] - x[:, i]) / 0.5 for i, j in moved))
+    g, n, m = ca.vertcat(rise, x[1, :].T, speed), x.shape[1], len(moved)
+    quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10, "mu_target": 1e-11}}
+    found = ca.nlpsol("s", "ipopt", {"x": ca.vec(x), "f": model, "g": g}, quiet)(
+        x0=solution.x.ravel(), lbg=[0.0] * n + [-0.8] * n + [-INF] * m, ubg=[0.0] * n + [0.8] * n + [14.0] * m
+    )  # fmt: skip
+    assert held.multipliers == pytest.approx(np.asarray(found["lam_g"]).ravel(), abs=1e-6)
+    assert np.abs(held.multipliers[n:]).max() > 0.01
+
+
+def test_poses_in_a_slab() -> None:
+    """osqp holds bounds on positions of poses; casadi agrees, and a step of SciPy's BVLS around it moves nothing."""
+    rng, n = np.random.default_rng(0), 6
+    at = np.stack([5.0 * np.arange(n), rng.normal(0, 1, n)], axis=1)
+    turn = rng.normal(0, 0.3, n)
+    c, s = np.cos(turn[:-1]), np.sin(turn[:-1])
+    gap = np.diff(at, axis=0)
+    seen = np.stack([c * gap[:, 0] + s * gap[:, 1], c * gap[:, 1] - s * gap[:, 0]], axis=1)
+    z = pose(seen + rng.normal(0, 0.1, seen.shape), np.diff(turn) + rng.normal(0, 0.05, n - 1))
+    names = tuple("abcdef")
+    problem = Problem(names, dimension=2, poses=range(n), x0=pose(at + 0.2, turn + 0.1))
+    problem = problem.add("pose", "a", pose(at[0], turn[0]), 0.1).add("relative_pose", list(pairwise(names)), z, 0.1)
+    bound = problem.constrain("position", names, [-INF, -0.5], [INF, 0.5])
+    first, *others = [solved(bound, *how) for how in LINEAR]
+    for other in others:
+        assert other.cost == pytest.approx(first.cost, rel=1e-9)
+        assert other.x == pytest.approx(first.x, abs=1e-6)
+        assert other.covariance == pytest.approx(first.covariance, abs=1e-6)
+    r, J = problem.whiten(first.x)
+    room = np.full((n, 3), INF)
+    room[:, 1] = 0.5
+    y = np.stack([0 * turn, first.x[:, 1], 0 * turn], axis=1)
+    bounds = (np.minimum(-room - y, -1e-12).ravel(), np.maximum(room - y, 1e-12).ravel())
+    assert lsq_linear(J.toarray(), -r, bounds, method="bvls", tol=1e-15).x == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(first.position[:, 1]).max() == pytest.approx(0.5, abs=1e-9)
+
+
+EMPTY = {
+    "what an equality allows": (
+        RANGED.constrain("displacement", ("a", "b"), [5, 0, 0], [5, 0, 0])
+        .constrain("position", "a", upper=[0, INF, INF]).constrain("position", "b", lower=[10, -INF, -INF]), LINEAR),
+    "two boxes": (
+        RANGED.constrain("position", "a", lower=[3, -INF, -INF])
+        .constrain("position", "a", upper=[2, INF, INF]), LINEAR),
+    "by a tenth of a millimetre": (
+        PAIR.constrain("position", "a", lower=[3, -INF, -INF])
+        .constrain("position", "a", upper=[2.9999, INF, INF]), LINEAR),
+    "two ranges": (RANGED.constrain("range", ("a", "b"), 5, 5).constrain("range", ("a", "b"), 7, 7), ANY),
+    "a range and two boxes": (
+        RANGED.constrain("range", ("a", "b"), upper=5.0).constrain("position", "a", upper=[-5, INF, INF])
+        .constrain("position", "b", lower=[15, -INF, -INF]), ANY),
+    "what is held": (
+        replace(RANGED, x0=[[0, 0, 0], [9, 0, 0]], held=(0,)).constrain("position", "a", [1, 0, 0], [1, 0, 0]), LINEAR),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", EMPTY)
+def test_an_empty_set_is_infeasible_and_names_the_worst(case: str) -> None:
+    problem, able = EMPTY[case]
+    for backend, options in able:
+        solution = solve(problem, backend, throw=False, **options)
+        assert solution.status is Status.INFEASIBLE
+        worst = solution.extras["violated"]
+        assert any(f"{c.kind} of a" in worst or f"{c.kind} of b" in worst for c in problem.constraints)
+        assert "bound" in worst
+        assert solution.violation > 4e-5
+        with pytest.raises(SolveError, match=r"satisfies the constraints.*extras\['violated'\]") as caught:
+            solve(problem, backend, **options)
+        assert caught.value.solution.extras["violated"]
+
+
+def test_the_words_name_component_nodes_and_bound() -> None:
+    solution = solve(EMPTY["what is held"][0], "osqp", throw=False)
+    assert solution.extras["violated"] == "position of a, component 0, is 1 below its lower bound 1"
+
+
+def test_osqp_ends_where_an_empty_set_is_violated_least() -> None:
+    """Two boxes 1 m apart: half a metre from both."""
+    solution = solve(EMPTY["two boxes"][0], "osqp", throw=False)
+    assert solution.x[0, 0] == pytest.approx(2.5, abs=1e-3)
+
+
+@pytest.mark.parametrize("backend", sorted(set(backends()) - {"casadi", "osqp"}))
+def test_who_cannot_hold_constraints_names_who_can(backend: str) -> None:
+    if backends()[backend].constraints != "none":
+        pytest.skip(f"{backend} holds constraints")
+    with pytest.raises(InputError, match=rf"cannot be held by {backend}.*casadi.*osqp"):
+        solve(PAIR.constrain("position", "a", upper=1.0), backend)
+    with pytest.raises(InputError, match=rf"cannot be held by {backend}.*casadi"):
+        solve(PAIR.constrain("range", ("a", "b"), upper=1.0), backend)
+
+
+def test_osqp_refuses_what_is_not_linear() -> None:
+    with pytest.raises(InputError, match=r"'range'.*cannot be held by osqp, only by \['casadi'\]"):
+        solve(PAIR.constrain("range", ("a", "b"), upper=1.0), "osqp")
+
+
+@pytest.mark.parametrize(("backend", "options"), ANY)
+def test_the_far_side_of_a_range_is_a_maximum(backend: str, options: dict[str, str]) -> None:
+    """b must be 8 m from a, and is seen at 9 m to the right: the point 8 m to the left is stationary too."""
+    problem = Problem(("a", "b"), x0=[[0, 0, 0], [-8, 0, 0]]).add("position", "a", [0, 0, 0], std=0.1)
+    problem = problem.add("position", "b", [9, 0, 0], std=3.0).constrain("range", ("a", "b"), 8.0, 8.0)
+    stuck = solve(problem, backend, throw=False, **options)
+    assert stuck.x[1, 0] == pytest.approx(-8.0, abs=0.1)
+    assert stuck.gradient < 1e-6
+    assert stuck.status is Status.SADDLE
+    aside = solved(replace(problem, x0=[[0, 0, 0], [-8, 0.1, 0]]), backend, options)
+    gap = 1.0 / (0.01 + 9.0)  # the metre is shared by the variances
+    assert aside.x[:, 0] == pytest.approx([0.01 * gap, 9.0 - 9.0 * gap], abs=1e-6)
+
+
+@pytest.mark.parametrize(("backend", "options"), LINEAR)
+def test_a_bound_is_no_measurement(backend: str, options: dict[str, str]) -> None:
+    """What only inequalities see is free; what an equality ties down is not."""
+    hanging = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0).add("displacement", ("a", "b"), [5, 0, 0],
+                                                                              std=[1.0, 1.0, INF])  # fmt: skip
+    boxed = solve(hanging.constrain("position", "b", -20.0, 20.0), backend, throw=False, **options)
+    assert boxed.status is Status.RANK_DEFICIENT
+    assert boxed.free == ("b",)
+    tied = hanging.constrain("displacement", ("a", "b"), [-INF, -INF, 1.0], [INF, INF, 1.0])
+    solution = solved(tied, backend, options)
+    assert solution.x[1] == pytest.approx([5.0, 0.0, 1.0], abs=1e-6)
+    assert solution.covariance[1] == pytest.approx(np.diag([2.0, 2.0, 1.0]), abs=1e-9)
+
+
+@pytest.mark.parametrize(("backend", "options"), LINEAR)
+def test_constraints_that_say_the_same_twice(dense: Recording, backend: str, options: dict[str, str]) -> None:
+    problem = Problem.from_snapshot(dense, 10, 0)
+    free = solve(problem).x
+    there, gap = free[0] + [1.0, 0, 0], np.array([*(free[2, :2] - free[1, :2] + 0.5), INF])
+    once = problem.constrain("position", 0, there, there).constrain("displacement", (1, 2), gap * [1, 1, -1], gap)
+    twice = once.constrain("position", 0, there, INF).constrain("displacement", (2, 1), -gap, gap * [-1, -1, 1])
+    first, again = solved(once, backend, options), solved(twice, backend, options)
+    assert again.x == pytest.approx(first.x, abs=1e-6)
+    assert again.covariance == pytest.approx(first.covariance, abs=1e-9)
+    assert again.x[0] == pytest.approx(there, abs=1e-9)
+    assert again.covariance[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
+    """min 1/2 x^2 + q x in [-1, 1]: by hand."""
+    from scipy.sparse import eye
+
+    from coopoc.optimize.backends.osqp_ import _Programme
+
+    def holds(q: float, x: float, y: float) -> bool:
+        one = eye(1, format="csc")
+        sides = np.array([[-1.0], [1.0]])
+        return _Programme(one, 1e-9)._holds(one, np.array([q]), *sides, np.array([x]), np.array([y]))
+
+    assert holds(-2.0, 1.0, 1.0)  # pushed by the upper bound
+    assert holds(2.0, -1.0, -1.0)
+    assert holds(0.5, -0.5, 0.0)
+    assert not holds(-2.0, 2.0, 0.0)  # outside
+    assert not holds(-0.5, 0.0, 0.5)  # pushed by a bound that is not met
+    assert not holds(0.5, 1.0, -1.5)  # pushed the wrong way
+    assert not holds(-0.5, 0.0, 0.0)  # not stationary
+
+
+def test_more_equalities_than_numbers_are_refused_by_casadi() -> None:
+    fixed = PAIR.constrain("position", ["a", "b"], [[1, 0, 0], [6, 0, 0]], [[1, 0, 0], [6, 0, 0]])
+    assert solve(fixed, "casadi").x == pytest.approx(np.array([[1, 0, 0], [6, 0, 0]]), abs=1e-9)
+    more = fixed.constrain("displacement", ("a", "b"), [5, 0, 0], [5, 0, 0])
+    assert solve(more, "osqp").x == pytest.approx(np.array([[1, 0, 0], [6, 0, 0]]), abs=1e-9)
+    with pytest.raises(InputError, match=r"9 equalities.*6 numbers that can move"):
+        solve(more, "casadi")
+
+
+@pytest.mark.parametrize(("backend", "options"), LINEAR)
+def test_a_constraint_on_what_is_held_is_checked_and_not_moved(backend: str, options: dict[str, str]) -> None:
+    held = replace(RANGED, x0=[[0, 0, 0], [9, 0, 0]], held=(0,))
+    kept = solved(
+        held.constrain("position", ["a", "b"], [[0, 0, 0], [-INF] * 3], [[0, 0, 0], [8, INF, INF]]), backend, options
+    )
+    assert kept.x == pytest.approx(np.array([[0, 0, 0], [8, 0, 0]]), abs=1e-6)
+
+
+def test_a_start_without_direction_is_refused() -> None:
+    apart = replace(PAIR, x0=np.zeros((2, 3))).constrain("speed", ("a", "b"), upper=3.0, constants=[1.0])
+    with pytest.raises(InputError, match=r"a and b coincide.*leave speed without a direction"):
+        solve(apart, "casadi")
+
+
+@pytest.mark.parametrize(
+    ("claim", "status"),
+    [([[5, 0, 0], [9, 0, 0]], Status.FAILED),  # on the bound, but the cost falls inside
+     ([[0, 0, 0], [8, 0, 0]], Status.FAILED),  # the constraint holds with slack, the gradient does not vanish
+     ([[6, 0, 0], [9, 0, 0]], Status.INFEASIBLE)],
+)  # fmt: skip
+def test_no_backend_can_flatter_itself(
+    monkeypatch: pytest.MonkeyPatch, claim: list[list[float]], status: Status
+) -> None:
+    from coopoc.optimize.backends import osqp_
+    from coopoc.optimize.backends.run import Ended
+
+    monkeypatch.setattr(osqp_, "build", lambda problem: lambda x: Ended(np.array(claim, dtype=float), 1))
+    problem = PAIR.constrain("position", "a", upper=[5, INF, INF])
+    assert solve(problem, "osqp", throw=False).status is status
+
+
+def test_osqp_is_silent(dense: Recording, capfd: pytest.CaptureFixture[str]) -> None:
+    """OSQP's polishing prints where no constraint is active, whatever `verbose` says."""
+    problem = Problem.from_snapshot(dense, 10, 0)
+    free = solve(problem).x
+    for gap in (-1.0, 0.0, 1e-6, 1.0):
+        solve(
+            problem.constrain("position", problem.names, free - 1.0, free - gap + (gap > 0.5) * 0.5),
+            "osqp",
+            throw=False,
+        )
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_platoon_example() -> None:
+    """Each thing that is known lowers the error, and osqp and casadi agree on the lane."""
+    script = Path(__file__).resolve().parents[1] / "examples" / "platoon.py"
+    out = subprocess.run([sys.executable, "-W", "error", script], capture_output=True, text=True, check=True).stdout
+    rows = [line for line in out.splitlines()[1:] if line]
+    total = [float(row.split()[-1]) for row in rows]
+    assert len(rows) == 5
+    assert rows[1].split()[2:] == rows[2].split()[2:]
+    assert sorted(total, reverse=True) == total
+    assert total[-1] < 0.7 * total[0]
