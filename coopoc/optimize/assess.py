@@ -14,7 +14,7 @@ from .active import Active, active_at
 from .arrowhead import eliminate, marginals, structure
 from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
-from .problem import Problem, jacobian
+from .problem import Problem
 
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
@@ -58,13 +58,13 @@ def assess(problem: Problem, x: Floats) -> Assessment:
         size = float(np.linalg.norm(gradient[0].ravel() + active.pull))
     try:
         if active is not None and active.holds:
-            cov, dx, sound = _restricted(jacobian(problem, linear), gradient[0], scheme.still, active)
+            cov, dx, sound = _restricted(problem.jacobian(linear), gradient[0], scheme.still, active)
         else:
             if problem.hub or len(x) <= SMALL:
                 cov = marginals(frame, blocks)[0]
                 dx = eliminate(frame, blocks, gradient, np.zeros_like(gradient))[0]
             else:
-                cov, dx = _sparse(jacobian(problem, linear), gradient[0], scheme.still)
+                cov, dx = _sparse(problem.jacobian(linear), gradient[0], scheme.still)
             sound = bool(bounded(scheme, blocks, cov[None]).all())
         if sound and np.isfinite(dx).all() and np.isfinite(cov).all():
             if scheme.still is not None:
@@ -74,7 +74,7 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     except np.linalg.LinAlgError:
         pass
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
-    free = _free(problem, jacobian(problem, linear), active)
+    free = _free(problem, problem.jacobian(linear), active)
     return Assessment(cost, size, unknown, np.nan, free, violation, violated, active)
 
 

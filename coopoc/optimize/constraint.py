@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
-from .factor import check_constants, check_nodes, fitting, numbers
+from .inputs import check_constants, check_nodes, fitting, numbers
 from .measurements import Measurement, lookup
 
 

@@ -13,7 +13,7 @@ from .arrowhead import structure
 from .constraint import Constraint, values
 from .curvature import SLACK, STEP, is_minimum, matrix, pivots, true_blocks
 from .local import chain, local
-from .problem import Problem, jacobian
+from .problem import Problem
 from .space import Space
 
 
@@ -30,7 +30,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
         return True
     if not active.holds:
         return is_minimum(replace(problem, constraints=()), x)
-    J = jacobian(problem, linear := problem.linearise(x[None]))
+    J = problem.jacobian(linear := problem.linearise(x[None]))
     cost = matrix(structure(problem)[0], true_blocks(problem, linear))
     curved = cost + _bend(problem, x, active.multipliers)
     curved = curved + SLACK * diags_array(np.asarray(J.multiply(J).sum(axis=0)).ravel())

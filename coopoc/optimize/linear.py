@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -82,3 +83,23 @@ def _masked(factor: Factor, slope: tuple[Floats, ...], free: Bools) -> tuple[Flo
     if len(slope) < len(nodes):
         slope = (-slope[0], slope[0])
     return tuple(s * free[column][:, None, :] for s, column in zip(slope, nodes, strict=True))
+
+
+def jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], which: int) -> Any:
+    """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
+    from scipy.sparse import csr_array
+
+    n, dof = shape
+    data, rows, cols, top = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
+    for factor, slopes in zip(factors, linear.by_node(factors), strict=True):
+        for column, slope in zip(factor.nodes.T, slopes, strict=True):
+            block = slope[which if len(slope) > 1 else 0]
+            block = np.broadcast_to(block, (len(factor.nodes), *block.shape[1:]))
+            count, size = block.shape[:2]
+            row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
+            data.append(block.ravel())
+            rows.append(row.ravel())
+            cols.append((dof * column[:, None, None] + np.arange(dof) + np.zeros((size, 1), np.int64)).ravel())
+        top += len(factor.nodes) * factor.size
+    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))
+    return csr_array(entries, shape=(top, dof * n))

@@ -13,8 +13,9 @@ import numpy.typing as npt
 from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
 from .constraint import Constraint
-from .factor import Factor, numbers
-from .linear import Linear, linearise
+from .factor import Factor
+from .inputs import numbers
+from .linear import Linear, jacobian, linearise
 from .measurements import lookup
 from .space import Space
 
@@ -192,7 +193,11 @@ class Problem:
         A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
         """
         linear = self.linearise(points(self, "x", x, (2,))[None])
-        return np.concatenate([r.ravel() for r in linear.residual]), jacobian(self, linear)
+        return np.concatenate([r.ravel() for r in linear.residual]), self.jacobian(linear)
+
+    def jacobian(self, linear: Linear, which: int = 0) -> Any:
+        """Sparse Jacobian (rows, n dof) of one of the realisations of `linearise`, CSR."""
+        return jacobian(linear, self.factors, (len(self.names), self.space.dof), which)
 
     def cost(self, x: npt.ArrayLike) -> float:
         """1/2 sum of rho of a single problem at x (n, width)."""
@@ -237,26 +242,6 @@ class Problem:
         plane = " in the plane" if self.dimension == 2 else ""
         bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
         return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
-
-
-def jacobian(problem: Problem, linear: Linear, which: int = 0) -> Any:
-    """Sparse Jacobian (rows, n dof) of one realisation, CSR."""
-    from scipy.sparse import csr_array
-
-    dof = problem.space.dof
-    data, rows, cols, top = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
-    for factor, slopes in zip(problem.factors, linear.by_node(problem.factors), strict=True):
-        for column, slope in zip(factor.nodes.T, slopes, strict=True):
-            block = slope[which if len(slope) > 1 else 0]
-            block = np.broadcast_to(block, (len(factor.nodes), *block.shape[1:]))
-            count, size = block.shape[:2]
-            row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
-            data.append(block.ravel())
-            rows.append(row.ravel())
-            cols.append((dof * column[:, None, None] + np.arange(dof) + np.zeros((size, 1), np.int64)).ravel())
-        top += len(factor.nodes) * factor.size
-    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))
-    return csr_array(entries, shape=(top, dof * len(problem.names)))
 
 
 def _indices(problem: Problem, kind: str, nodes: Any) -> Ints:

@@ -22,7 +22,7 @@ from ..convex.qcqp import Multipliers, Quadratic
 from ..convex.quadratic import quadratic
 from ..convex.relaxation import first_vectors, framed, in_balls, polished, rounded, small
 from ..convex.schur import Dense
-from ..problem import Problem, jacobian
+from ..problem import Problem
 from .gauss_newton import build as gauss_newton
 from .run import Ended, Run
 
@@ -85,7 +85,7 @@ def _linear(problem: Problem) -> Run:
         moved = x.copy()
         moved.reshape(-1)[free] = np.broadcast_to(x.mean(axis=0), x.shape).reshape(-1)[free]
         linear = problem.linearise(moved[None])  # away from the start, which may be the answer
-        J = jacobian(problem, linear)[:, free].tocoo()
+        J = problem.jacobian(linear)[:, free].tocoo()
         J.sum_duplicates()
         step, count = _qp(rows, len(free), J.row.astype(np.int64).tobytes(), J.col.astype(np.int64).tobytes())(
             J.data, np.concatenate([r.ravel() for r in linear.residual])

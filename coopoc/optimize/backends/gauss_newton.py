@@ -13,7 +13,7 @@ from ..curvature import newton_step
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, descend
 from ..linear import Linear
 from ..normal import normal_equations
-from ..problem import Problem, jacobian
+from ..problem import Problem
 from .run import Ended, Run
 
 PATIENCE = 40
@@ -55,7 +55,7 @@ def _sparse_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     out = np.empty_like(damping)
     still = None if problem.free is None else ~problem.free
     for b, residual in enumerate(zip(*linear.residual, strict=True)):
-        J = jacobian(problem, linear, b)
+        J = problem.jacobian(linear, b)
         factored = factorise(J.T @ J + diags_array(damping[b].ravel()), still)
         out[b] = -factored.solve(J.T @ np.concatenate([r.ravel() for r in residual])).reshape(out[b].shape)
     return out

@@ -62,7 +62,7 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
     Raises:
         InputError: as `quadratic`, or as `surrogate`.
 
-    >>> from .solve import solve
+    >>> from coopoc.optimize import solve
     >>> fixes = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> problem = fixes.add("range", ("a", "b"), 5.0, std=0.5)
     >>> print(certify(problem, solve(problem)))
