@@ -6,6 +6,7 @@ hold against SciPy, GTSAM's marginals and numpy.linalg.lstsq; under an active bo
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from functools import cache
 
@@ -62,7 +63,7 @@ def linear() -> Problem:
     root = rng.normal(size=(7, 3, 3))
     problem = Problem(names).add("position", names, 5.0 * rng.normal(size=(8, 3)), std=[3.0, 3.0, 5.0])
     cov = root @ np.swapaxes(root, 1, 2) + 0.1 * np.eye(3)
-    return problem.add("displacement", list(zip(names, names[1:], strict=False)), rng.normal(size=(7, 3)), cov=cov)
+    return problem.add("displacement", list(itertools.pairwise(names)), rng.normal(size=(7, 3)), cov=cov)
 
 
 def bounded() -> Problem:
@@ -140,3 +141,21 @@ def test_the_active_bound_is_scipys() -> None:
     assert (found.position[:, 2] <= bound + 1e-6).any()
     assert found.cost == pytest.approx(theirs.fun, rel=1e-8)
     assert found.x.ravel() == pytest.approx(theirs.x, abs=1e-3)
+
+
+NO_FIX = Problem(("a", "b", "c")).add("range", [("a", "b"), ("b", "c")], [[5.0], [6.0]], std=1.0)
+APART = Problem(("a", "b", "c", "d")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+ISLAND = APART.add("displacement", [("a", "b"), ("c", "d")], [[4, 0, 0], [1, 0, 0]], std=1.0)
+ONE_PLACE = Problem(("a", "b"), x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
+
+
+@pytest.mark.parametrize("backend", backends())
+def test_what_cannot_be_solved_is_said_by_every_backend(backend: str) -> None:
+    for problem, free in ((NO_FIX, {"a", "b", "c"}), (ISLAND, {"c", "d"})):
+        found = solve(problem, backend, throw=False)
+        assert found.status is Status.RANK_DEFICIENT
+        assert set(found.free) == free
+        with pytest.raises(InputError, match=r"must be observable.*Add a position factor"):
+            solve(problem, backend)
+    with pytest.raises(InputError, match=r"a and b coincide.*keeps them apart"):
+        solve(ONE_PLACE.add("range", ("a", "b"), 4.0, std=1.0), backend)

@@ -45,12 +45,26 @@ def initial_guess(problem: Problem) -> Floats:
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
     linear = converted(problem)
-    x = np.zeros((batch, len(problem.names), problem.dimension))
-    if not linear.factors:
-        return x
-    scheme, frame = structure(linear)
-    blocks, gradient = normal_equations(scheme, linear.linearise(x), [f.nodes for f in linear.factors])
-    return eliminate(frame, blocks, gradient, np.full_like(x, RIDGE))
+    x: Floats = np.zeros((batch, len(problem.names), problem.dimension))
+    if linear.factors:
+        scheme, frame = structure(linear)
+        blocks, gradient = normal_equations(scheme, linear.linearise(x), [f.nodes for f in linear.factors])
+        x = eliminate(frame, blocks, gradient, np.full_like(x, RIDGE))
+    return _apart(problem, linear, x)
+
+
+def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:
+    """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
+    touched = np.unique(np.concatenate([np.empty(0, np.int64), *(f.nodes.ravel() for f in linear.factors)]))
+    lost = np.setdiff1d(np.arange(len(problem.names)), touched)
+    if len(lost):
+        ranges = [f.z[..., 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
+        turn, radius = 2.4 * np.arange(len(lost)), np.sqrt(1.0 + np.arange(len(lost)))
+        spiral = np.zeros((len(lost), problem.dimension))
+        spiral[:, 0], spiral[:, 1] = radius * np.cos(turn), radius * np.sin(turn)
+        middle = x[:, touched].mean(axis=1, keepdims=True) if len(touched) else 0.0
+        x[:, lost] = middle + (ranges[0] if ranges else 1.0) * spiral
+    return x
 
 
 def _vector(factor: Factor) -> Factor:

@@ -93,7 +93,8 @@ def first_vectors(Z: Floats, d: int) -> tuple[Floats, float]:
     """X (bound, d), the nearest of rank d to Z = X X^T, and eigenvalue d + 1 over eigenvalue d."""
     values, vectors = np.linalg.eigh(Z)
     gap = float(max(values[-d - 1], 0.0) / max(values[-d], 1e-300)) if len(values) > d else 0.0
-    return vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0)), gap
+    top = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
+    return np.pad(top, ((0, 0), (0, d - top.shape[1]))), gap
 
 
 def rounded(
