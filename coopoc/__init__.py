@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
     from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
     from .methods.diffusion import Diffusion as Diffusion
+    from .methods.fixed_lag import FixedLagSmoother as FixedLagSmoother
     from .methods.gbp import GaussianBeliefPropagation as GaussianBeliefPropagation
     from .methods.gnss import Gnss as Gnss
     from .methods.joint_filter import JointFilter as JointFilter
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from .methods.knowledge import Knowledge as Knowledge
     from .methods.lkf_sa import LaplacianKalman as LaplacianKalman
     from .methods.mds import Mds as Mds
+    from .methods.moving_horizon import MovingHorizon as MovingHorizon
     from .methods.msmv import Msmv as Msmv
     from .methods.qcqp_sdr import QcqpSdr as QcqpSdr
     from .methods.track import Method as Method
@@ -64,6 +66,7 @@ _HOME = {
     "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
     "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
     "CovarianceIntersection": "methods.covariance_intersection", "Mds": "methods.mds", "QcqpSdr": "methods.qcqp_sdr",
+    "FixedLagSmoother": "methods.fixed_lag", "MovingHorizon": "methods.moving_horizon",
     "GaussianBeliefPropagation": "methods.gbp", "ConsensusADMM": "methods.admm", "Diffusion": "methods.diffusion",
     "CentralFilter": "methods.central_filter", "BatchSmoother": "methods.batch_smoother",
     "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds", "fleet_bound": "evaluate.bounds",

@@ -10,6 +10,7 @@ from .central_filter import CentralFilter
 from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
 from .diffusion import Diffusion
+from .fixed_lag import FixedLagSmoother
 from .gbp import GaussianBeliefPropagation
 from .gnss import Gnss
 from .joint_filter import JointFilter
@@ -17,6 +18,7 @@ from .kalman import Kalman
 from .knowledge import Knowledge
 from .lkf_sa import LaplacianKalman
 from .mds import Mds
+from .moving_horizon import MovingHorizon
 from .msmv import Msmv
 from .qcqp_sdr import QcqpSdr
 from .track import Method
@@ -43,6 +45,8 @@ METHODS: Mapping[str, Factory] = {
     "diffusion-anchored": lambda knowledge: Diffusion(knowledge, anchored=True, name="diffusion-anchored"),
     "central-filter": lambda knowledge: CentralFilter(knowledge),
     "batch-smoother": lambda knowledge: BatchSmoother(knowledge),
+    "fixed-lag": lambda knowledge: FixedLagSmoother(knowledge=knowledge),
+    "mhe": lambda knowledge: MovingHorizon(knowledge=knowledge),
 }
 
 WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"})

@@ -63,7 +63,7 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
         sent = np.concatenate([own, box.newest[:, span]], axis=1)
         again = (kept >= 0) & (np.append(before_sent, own * 0 - 2, axis=1)[:, kept] == sent)
         uses = np.where(again, np.append(uses, own, axis=1)[:, kept] + 1, 1)
-        motion = _prompt if (sent == t).all() else _late
+        motion = _prompt if (sent == t).all() else held_motion
         moved, process, fix, fix_variance = motion(recording, variance, members, sent, uses, t)
         relative = recording.relative[:, links]
         heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1)
@@ -84,7 +84,7 @@ def _prompt(
     return moved, process, recording.gnss[:, t, members], np.zeros((1, len(members), 1))
 
 
-def _late(
+def held_motion(
     recording: Recording, variance: Floats, members: Ints, sent: Ints, uses: Ints, t: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """The same four from the newest message of each run and member, as old as it may be."""
