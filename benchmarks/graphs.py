@@ -26,6 +26,8 @@ from coopoc.optimize import Problem, solve
 from coopoc.optimize.convex import staircase
 from coopoc.optimize.graphs import from_graph
 
+RELAXED = ("mrclam5a", "mrclam6")
+"""The staircase of tiers and plaza1 takes more than five minutes."""
 UNMEASURED = 1e6
 """Standard deviation of a rotation that a landmark does not have."""
 
@@ -81,6 +83,8 @@ def rows(path: Path) -> Iterator[list[object]]:
     yield [path.stem, size, "coopoc", ours.status.name, ours.cost, None, error(graph, ours.position), seconds]
     x, seconds = plain_gtsam(problem)
     yield [path.stem, size, "GTSAM LM", "-", problem.cost(x), None, error(graph, x[:, :2]), seconds]
+    if path.stem not in RELAXED:
+        return
     found = staircase(from_graph(graph, start="apart"))
     assert found.solution is not None
     yield [path.stem, size, "coopoc staircase, robots apart", found.solution.status.name, found.solution.cost,

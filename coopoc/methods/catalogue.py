@@ -35,6 +35,9 @@ METHODS: Mapping[str, Factory] = {
     "joint": lambda knowledge: JointFilter(knowledge),
     "cooperative-map": lambda knowledge: CooperativeMAP(knowledge=knowledge),
     "cooperative-map-5": lambda knowledge: CooperativeMAP(knowledge=knowledge, window=5, name="cooperative-map-5"),
+    "cooperative-map-gnc": lambda knowledge: CooperativeMAP(
+        knowledge=knowledge, window=5, robust="truncated", name="cooperative-map-gnc"
+    ),
     "ci": lambda knowledge: CovarianceIntersection(knowledge),
     "split-ci": lambda knowledge: CovarianceIntersection(knowledge, split=True, name="split-ci"),
     "mds": lambda knowledge: Mds(knowledge),

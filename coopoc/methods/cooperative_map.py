@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..optimize.batch import solve_batch
+from ..optimize.gnc import graduate, graduate_batch, surrogate_of
 from ..optimize.initial import converted
 from ..optimize.problem import Problem
 from ..optimize.sights import Sight, chain
 from ..optimize.solution import Status
 from ..optimize.solve import solve, usable
+from ..optimize.suspects import Suspects, mark, reweigh
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -43,15 +46,26 @@ class CooperativeMAP:
     is left out. Where the minimum puts two vehicles in one place, which a short noisy range can do and where angles
     have no derivative, the converted (linear) problem answers instead, and the notes count it.
 
+    Robust against neighbours that report false fixes: graduated non-convexity (`coopoc.optimize.graduate`) gives the
+    fixes of each neighbour in the window one weight. What the ego measures itself, its own fixes, its odometry and its
+    relative measurements, is believed, and so are the velocities it is sent.
+
     Args:
         backend: of `coopoc.optimize.backends()`. Only gauss-newton batches over the runs; the others loop, and their
             tracks say so.
         window: steps. knowledge: "identity", "nominal" or a Knowledge.
+        robust: "truncated" or "geman-mcclure"; None believes everyone.
+        threshold: probability that the fixes of an honest neighbour in a window pass (of a robust loss).
+        suspect_ego: doubt the ego's own fixes and its odometry, too, each as one group. Where all fixes are doubted
+            nothing says where the window is: it is then solved as if all were honest, and the notes count it.
     """
 
     backend: str = "gauss-newton"
     window: int = 1
     knowledge: Knowledge | str = "nominal"
+    robust: str | None = None
+    threshold: float = 0.99
+    suspect_ego: bool = False
     name: str = "cooperative-map"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
@@ -60,27 +74,31 @@ class CooperativeMAP:
         if self.window != int(self.window) or self.window < 1:
             raise InputError("window", self.window, "must be a whole number >= 1", "Use 1 for a snapshot.")
         usable(self.backend)
+        if self.robust is not None:
+            surrogate_of(self.robust, self.threshold)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.knowledge, recording)
-        replaced: list[int] = []
+        replaced: list[tuple[int, int]] = []
 
         def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
             for windows in alike(_windows(recording, ego, box, known, self.window)):
-                points, spread, met = self._solve(windows, known)
-                replaced.append(met)
+                points, spread, counts = self._solve(windows, known)
+                replaced.append(counts)
                 for k, window in enumerate(windows):
                     star, held = window[-1].star, window[-1].held
-                    theirs = np.where(held[:, 1:, None], points[k, :, 1:], np.nan)
+                    rank = np.argsort(np.argsort(vehicles(window)[-1]))
+                    theirs = np.where(held[:, 1:, None], points[k][:, rank[1:]], np.nan)
                     yield Estimate(star.step, points[k, :, 0], spread[k], star.links, theirs)
 
         track = follow_egos(self, recording, egos, follow)
-        return replace(track, notes=self._notes(sum(replaced)))
+        return replace(track, notes=self._notes(*np.sum(replaced, axis=0)))
 
-    def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, int]:
-        """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were replaced."""
-        problem = stack(windows, known)
+    def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, tuple[int, int]]:
+        """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were solved
+        converted and how many in spite of doubts."""
+        problem, blind = self._doubted(stack(windows, known), windows[0])
         ego, last = problem.hub[-1], len(windows[0][-1].members)
         if self.backend == "gauss-newton":
             answer = solve_batch(problem, tolerance=TOLERANCE)
@@ -94,11 +112,30 @@ class CooperativeMAP:
             linear = solve_batch(converted(problem.pick(met)))
             x[met], spread[met] = linear.x, linear.covariance[:, ego]
         shape = (len(windows), len(x) // len(windows))
-        return x[:, -last:].reshape(*shape, last, 3), spread.reshape(*shape, 3, 3), len(met)
+        return x[:, -last:].reshape(*shape, last, 3), spread.reshape(*shape, 3, 3), (len(met), blind)
 
-    def _notes(self, replaced: int) -> tuple[str, ...]:
+    def _doubted(self, problem: Problem, window: Window) -> tuple[Problem, int]:
+        """The problem with the weights of `robust`, and in how many realisations all fixes were doubted."""
+        suspects, groups = suspected(window, self.suspect_ego)
+        if self.robust is None or not len(groups):
+            return problem, 0
+        if self.backend == "gauss-newton":
+            batch = graduate_batch(problem, suspects, self.robust, self.threshold, groups, tolerance=TOLERANCE)
+            x, weights, spread = batch.x, batch.weights, batch.covariance
+        else:
+            each = [graduate(problem.pick(b), suspects, self.robust, self.threshold, groups, self.backend, throw=False)
+                    for b in range(problem.batch or 1)]  # fmt: skip
+            x, spread = np.stack([s.x for s in each]), np.stack([s.covariance for s in each])
+            weights = np.stack([s.extras["weights"] for s in each])
+        blind = np.isnan(spread).any(axis=(1, 2, 3))
+        weights[blind] = 1.0
+        return reweigh(problem, mark(problem, suspects), weights, x), int(blind.sum())
+
+    def _notes(self, replaced: int, blind: int) -> tuple[str, ...]:
         loop = () if self.backend == "gauss-newton" else (f"{self.backend} loops over the runs",)
-        return (*loop, f"{replaced} problems where vehicles met were solved converted") if replaced else loop
+        counted = {f"{replaced} problems where vehicles met were solved converted": replaced,
+                   f"{blind} problems where all fixes were doubted were solved as if honest": blind}  # fmt: skip
+        return (*loop, *(note for note, count in counted.items() if count))
 
 
 def _meeting(problem: Problem, x: Floats) -> Bools:
@@ -138,35 +175,63 @@ def alike(windows: Iterator[Window]) -> Iterator[list[Window]]:
     """Windows of the same structure together, for one batch to solve: a drive of snapshots has K + 1 structures."""
     waiting: dict[tuple[bytes, ...], list[Window]] = defaultdict(list)
     for window in windows:
-        first, *later = window
-        key = (len(first.members).to_bytes(4, "little"), *(seen.star.kept.tobytes() for seen in later))
+        key = tuple(np.sort(numbers).tobytes() for numbers in vehicles(window))
         waiting[key].append(window)
         if len(waiting[key]) == STACKED:
             yield waiting.pop(key)
     yield from waiting.values()
 
 
+def vehicles(window: Window) -> list[Ints]:
+    """Numbers of the members at each step, in the order in which the window meets the vehicles: the ego is 0.
+
+    A problem has its points in the order of these numbers, so that the order of the neighbours' distances, which
+    changes from step to step, makes no structure of its own.
+    """
+    members = np.concatenate([seen.members for seen in window])
+    _, first, inverse = np.unique(members, return_index=True, return_inverse=True)
+    numbers = np.argsort(np.argsort(first))[inverse]
+    return np.split(numbers, np.cumsum([len(seen.members) for seen in window[:-1]]))
+
+
+def suspected(window: Window, ego_too: bool) -> tuple[Suspects, Ints]:
+    """The suspects of a window's problem and their groups: the fixes of each neighbour; if `ego_too` those of the ego,
+    and its odometry."""
+    steps = vehicles(window)
+    vehicle = np.concatenate([np.sort(numbers) for numbers in steps])
+    rows = np.flatnonzero(vehicle + ego_too)
+    if not ego_too or len(window) == 1:
+        return [(0, rows.tolist())], vehicle[rows]
+    stays = [len(np.intersect1d(*pair)) for pair in pairwise(steps)]
+    moves = np.concatenate([[0], np.cumsum(stays[:-1])]).astype(np.int64)  # at each step the ego's is the first
+    return [(0, rows.tolist()), (1, moves.tolist())], np.concatenate([vehicle[rows], np.full(len(moves), -1)])
+
+
 def stack(windows: Sequence[Window], known: Knowledge) -> Problem:
-    """The problem of S windows of one structure as a batch of S R realisations."""
+    """The problem of S windows of one structure as a batch of S R realisations; points in the order of `vehicles`."""
     columns: list[list[Sight]] = [[] for _ in windows[0]]
     for window in windows:
-        met: set[int] = set()
-        for sights, seen in zip(columns, window, strict=True):
-            first = np.array([m not in met for m in seen.members])
-            met.update(seen.members.tolist())
-            sights.append(_sight(seen, first, opening=seen is window[0]))
+        before, most = np.empty(0, dtype=np.int64), -1
+        for sights, seen, numbers in zip(columns, window, vehicles(window), strict=True):
+            sights.append(_sight(seen, numbers, before, most))
+            before, most = np.sort(numbers), max(most, numbers.max())
     merged = [_merge(sights) for sights in columns]
     return chain(merged, known.sensors)
 
 
-def _sight(seen: Seen, first: Bools, opening: bool) -> Sight:
-    """A fix is used where its message is fresh, or held when the window meets the vehicle: never twice in a window."""
-    star = seen.star
-    heard = np.where(first, seen.held, star.heard)
+def _sight(seen: Seen, numbers: Ints, before: Ints, most: int) -> Sight:
+    """The step in the order of its vehicles' numbers, those of the step before being `before` and the largest `most`.
+
+    A fix is used where its message is fresh, or held when the window meets the vehicle: never twice in a window.
+    """
+    star, order = seen.star, np.argsort(numbers)
+    heard = np.where(numbers > most, seen.held, star.heard)
     std = np.where(heard[..., None], np.sqrt(star.fix_variance), np.inf)
-    kept = np.full_like(star.kept, -1) if opening else star.kept
     moved_std = np.broadcast_to(np.sqrt(star.process), star.moved.shape)
-    return Sight(kept, star.fix, std, star.moved, moved_std, star.relative)
+    place = np.searchsorted(before, numbers[order])
+    kept = np.where(np.isin(numbers[order], before), place, -1)
+    return Sight(kept, star.fix[:, order], std[:, order], star.moved[:, order], moved_std[:, order],
+                 star.relative[:, order[1:] - 1])  # fmt: skip
 
 
 def _merge(sights: Sequence[Sight]) -> Sight:

@@ -69,23 +69,37 @@ def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats
         return squares(Linear(linear.x, (linear.residual[k],), (slopes,), linear.cost), [factor.nodes])
     pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.free)
     count, dof = len(factor.nodes), problem.space.dof
-    local = x[factor.nodes]
+    local, bare = x[factor.nodes], unchecked(factor, loss=None)
     reach = STEP * np.maximum(np.linalg.norm(problem.space.position(local[:, -1] - local[:, 0] * pair), axis=-1), 1e-3)
     columns = [np.empty((count, len(slopes) * dof, dof)) for _ in slopes]
     for node in range(len(slopes)):
         moved = factor.nodes.shape[1] - len(slopes) + node
         for c in range(dof):
             size = np.where(c < problem.dimension, reach, STEP)
-            up, down = (_pulls(problem, factor, local, moved, c, sign * size) for sign in (1.0, -1.0))
+            up, down = (_pulls(problem, bare, local, moved, c, sign * size) for sign in (1.0, -1.0))
             moves = 1.0 if problem.free is None else problem.free[factor.nodes[:, moved], c][:, None]
             columns[node][:, :, c] = moves * (up - down) / (2.0 * size[:, None])
-    whole = np.concatenate(columns, axis=2)
+    whole: Floats = np.concatenate(columns, axis=2)
     whole = 0.5 * (whole + np.swapaxes(whole, 1, 2))
+    if factor.loss is not None:
+        whole = _bent(problem, factor, whole, x, _pulls(problem, bare, local, 0, 0, np.zeros(count)))
     if not pair or opposed:
         return [whole[None]]
     first, second, between = whole[:, :dof, :dof], whole[:, dof:, dof:], whole[:, :dof, dof:]
     swapped = (factor.nodes[:, 0] > factor.nodes[:, 1])[:, None, None]
     return [first[None], second[None], np.where(swapped, np.swapaxes(between, 1, 2), between)[None]]
+
+
+def _bent(problem: Problem, factor: Factor, whole: Floats, x: Floats, pull: Floats) -> Floats:
+    """rho' H + 2 rho'' g g^T of H `whole` and g `pull` of the measurements without their loss.
+
+    A difference of the robust gradient itself would need steps far below a standard deviation.
+    """
+    assert factor.loss is not None
+    bare = linearise(problem.space, [unchecked(factor, loss=None)], problem.free, x[None])
+    square = np.square(bare.residual[0][0]).sum(axis=-1)
+    outer = pull[:, :, None] * pull[:, None, :]
+    return factor.loss.weight(square)[:, None, None] * whole + 2.0 * factor.loss.bend(square)[:, None, None] * outer
 
 
 def _pulls(problem: Problem, factor: Factor, local: Floats, node: int, coordinate: int, size: Floats) -> Floats:

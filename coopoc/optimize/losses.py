@@ -10,16 +10,31 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 
-Shape = tuple[Callable[[Floats, float], Floats], Callable[[Floats, float], Floats]]
+Curve = Callable[[Floats, float], Floats]
+Shape = tuple[Curve, Curve, Curve]
+"""rho, rho' and rho'' of the squared residual."""
 
 LOSSES: dict[str, Shape] = {
     "huber": (
         lambda s, c: np.where(s <= c * c, s, 2.0 * c * np.sqrt(np.maximum(s, c * c)) - c * c),
         lambda s, c: c / np.sqrt(np.maximum(s, c * c)),
+        lambda s, c: np.where(s <= c * c, 0.0, -0.5 * c * np.maximum(s, c * c) ** -1.5),
     ),
-    "cauchy": (lambda s, c: c * c * np.log1p(s / (c * c)), lambda s, c: 1.0 / (1.0 + s / (c * c))),
-    "geman-mcclure": (lambda s, c: s / (1.0 + s / (c * c)), lambda s, c: (1.0 + s / (c * c)) ** -2.0),
-    "truncated": (lambda s, c: np.minimum(s, c * c), lambda s, c: (s <= c * c).astype(np.float64)),
+    "cauchy": (
+        lambda s, c: c * c * np.log1p(s / (c * c)),
+        lambda s, c: 1.0 / (1.0 + s / (c * c)),
+        lambda s, c: -((1.0 + s / (c * c)) ** -2.0) / (c * c),
+    ),
+    "geman-mcclure": (
+        lambda s, c: s / (1.0 + s / (c * c)),
+        lambda s, c: (1.0 + s / (c * c)) ** -2.0,
+        lambda s, c: -2.0 * (1.0 + s / (c * c)) ** -3.0 / (c * c),
+    ),
+    "truncated": (
+        lambda s, c: np.minimum(s, c * c),
+        lambda s, c: (s <= c * c).astype(np.float64),
+        lambda s, c: np.zeros_like(s),
+    ),
 }
 
 
@@ -54,3 +69,7 @@ class Loss:
     def weight(self, square: Floats) -> Floats:
         """rho'(s), in [0, 1]."""
         return LOSSES[self.name][1](square, self.scale)
+
+    def bend(self, square: Floats) -> Floats:
+        """rho''(s), at most 0; 0 at the kink of a truncated loss."""
+        return LOSSES[self.name][2](square, self.scale)

@@ -1,0 +1,156 @@
+"""Graduated non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
+
+from coopoc import CooperativeMAP, InputError
+from coopoc.optimize import Loss, Problem, SolveError, Status, graduate, pose
+from coopoc.optimize.gnc import SURROGATES
+
+
+def paper_rho(loss: str, r: float, mu: float, c: float = 1.0) -> float:
+    """Surrogates as Yang et al. print them, equations 4 and 6."""
+    if loss == "geman-mcclure":
+        return mu * c**2 * r**2 / (mu * c**2 + r**2)
+    if r**2 <= mu / (mu + 1) * c**2:
+        return r**2
+    return c**2 if r**2 >= (mu + 1) / mu * c**2 else 2 * c * r * np.sqrt(mu * (mu + 1)) - mu * (c**2 + r**2)
+
+
+@pytest.mark.parametrize("loss", SURROGATES)
+@pytest.mark.parametrize("mu", [0.05, 1.0, 7.0, 300.0])
+def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
+    """w = d rho_mu / d r^2, and the minimiser of w r^2 + Phi_mu(w), whose minimum is rho_mu (Black and Rangarajan)."""
+    penalties = {
+        "truncated": lambda w: mu * (1 - w) / (mu + w),
+        "geman-mcclure": lambda w: mu * (np.sqrt(w) - 1) ** 2,
+    }
+    for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
+        weight = float(SURROGATES[loss].weight(np.array(r**2), np.array(mu)))
+        slope = (paper_rho(loss, np.sqrt(r**2 + 1e-7), mu) - paper_rho(loss, np.sqrt(r**2 - 1e-7), mu)) / 2e-7
+        assert weight == pytest.approx(slope, abs=1e-6)
+        dual = minimize_scalar(lambda w, r=r: w * r**2 + penalties[loss](w), bounds=(0, 1), options={"xatol": 1e-12})
+        assert dual.fun == pytest.approx(paper_rho(loss, r, mu), abs=1e-5)
+        assert weight == pytest.approx(dual.x, abs=2e-3)
+
+
+def test_schedules_end_at_the_losses() -> None:
+    """At first no suspect is given up; at last the weights are those of the loss (Remark 5)."""
+    s = np.array([[0.1, 0.9, 1.1, 30.0]])
+    for loss, last in (("truncated", 1e9), ("geman-mcclure", 1.0)):
+        first = SURROGATES[loss].first(s.max(axis=1))
+        expected = 1 / (2 * 30 - 1) if loss == "truncated" else 60.0
+        assert first == pytest.approx(expected)
+        assert (SURROGATES[loss].weight(s, first) > 0).all()
+        assert SURROGATES[loss].weight(s, np.array([last])) == pytest.approx(Loss(loss, 1.0).weight(s), abs=1e-6)
+    assert SURROGATES["truncated"].later(np.array([2.0])) == pytest.approx(2.8)
+    assert SURROGATES["geman-mcclure"].later(np.array([2.8])) == pytest.approx(2.0)
+
+
+def test_of_all_subsets_it_finds_the_best() -> None:
+    """Truncated least squares of one point is a choice among 2^9 subsets; each is a weighted mean."""
+    found = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        z = rng.normal(size=(9, 3))
+        z[: seed % 5] += rng.uniform(-40, 40, (seed % 5, 3))
+        problem = Problem(("a",)).add("position", ["a"], [[0, 0, 0]], std=3.0).add("position", ["a"] * 9, z, std=1.0)
+        bound = chi2.ppf(0.99, 3)
+        chosen = np.array(list(itertools.product([0.0, 1.0], repeat=9)))
+        x = chosen @ z / (chosen.sum(axis=1, keepdims=True) + 1 / 9)
+        square = np.minimum(((z - x[:, None]) ** 2).sum(axis=2), bound).sum(axis=1) + (x**2).sum(axis=1) / 9
+        best = 0.5 * square.min()
+        ours = graduate(problem, suspects=[1])
+        truncated = ours.cost + 0.5 * bound * (ours.extras["weights"] == 0).sum()
+        assert truncated >= best - 1e-9
+        assert np.array_equal(ours.extras["weights"] == 1, ((z - ours.x) ** 2).sum(axis=1) <= bound)
+        found += truncated <= best + 1e-9
+    assert found >= 19
+
+
+def test_a_group_is_one_hypothesis() -> None:
+    """Five fixes 3 std off: 9 is within the 11.3 of one, 45 is not within the 30.6 of five (chi-square, 99 %)."""
+    z = np.outer(np.arange(14) >= 9, [3.0, 0, 0])
+    problem = Problem(("a",)).add("position", ["a"] * 4, z[:4], std=0.05).add("position", ["a"] * 10, z[4:], std=1.0)
+    alone = graduate(problem, [1])
+    assert (alone.extras["weights"] == 1).all()
+    together = graduate(problem, [1], groups=["honest"] * 5 + ["spoofed"] * 5)
+    assert together.extras["weights"].tolist() == [1.0] * 5 + [0.0] * 5
+    assert together.x[0] == pytest.approx([0, 0, 0], abs=1e-9)
+
+
+def test_wrong_loop_closures_are_those_that_gtsam_finds() -> None:
+    """Poses in the plane, against BetweenFactorPose2 under GncLMOptimizer."""
+    rng = np.random.default_rng(4)
+    turn, std = np.repeat([0, 0, 0, np.pi / 2], 1).tolist() * 5, np.array([0.1, 0.1, 0.02])
+    poses = [gtsam.Pose2(0, 0, 0)]
+    for angle in turn:
+        poses.append(poses[-1].compose(gtsam.Pose2(2.0, 0, angle)))
+    noisy = lambda p: p.compose(gtsam.Pose2(*rng.normal(0, std)))  # noqa: E731
+    edges = [(k, k + 1) for k in range(20)] + [(0, 16), (1, 17), (2, 18), (4, 20), (3, 12), (5, 14), (7, 19)]
+    measured = [noisy(poses[i].between(poses[j])) for i, j in edges]
+    measured[-3:] = [noisy(gtsam.Pose2(1, 0, 0.3)) for _ in range(3)]
+    start, graph, guess = [poses[0]], gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for step in measured[:20]:
+        start.append(start[-1].compose(step))
+    written = lambda p: pose([p.x(), p.y()], p.theta())  # noqa: E731
+    model = gtsam.noiseModel.Diagonal.Sigmas(std)
+    graph.add(gtsam.PriorFactorPose2(0, poses[0], model))
+    for (i, j), between in zip(edges, measured, strict=True):
+        graph.add(gtsam.BetweenFactorPose2(i, j, between, model))
+    for k, p in enumerate(start):
+        guess.insert(k, p)
+    params = gtsam.GncLMParams()
+    params.setKnownInliers(list(range(21)))
+    params.setRelativeCostTol(0.0)
+    optimiser = gtsam.GncLMOptimizer(graph, guess, params)
+    theirs = optimiser.optimize()
+    problem = Problem(tuple(map(str, range(21))), x0=np.stack([written(p) for p in start]), dimension=2,
+                      poses=tuple(range(21)))  # fmt: skip
+    problem = problem.add("pose", 0, written(poses[0]), std=std)
+    problem = problem.add("relative_pose", edges, np.stack([written(p) for p in measured]), std=std)
+    ours = graduate(problem, [(1, range(20, 27))])
+    assert np.array_equal(ours.extras["weights"], optimiser.getWeights()[-7:])
+    assert np.array_equal(ours.extras["weights"], [1, 1, 1, 1, 0, 0, 0])
+    assert ours.position == pytest.approx(np.array([theirs.atPose2(k).translation() for k in range(21)]), abs=1e-4)
+
+
+PAIR = Problem("ab").add("position", ["a", "b"], np.zeros((2, 3)), std=1.0)
+LOST = PAIR.add("range", ("a", "b"), 1.0, std=1.0, loss=Loss("huber", 1.0))
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: graduate(PAIR, [1]), "suspects"),
+        (lambda: graduate(PAIR, [(0, [2])]), "suspects"),
+        (lambda: graduate(PAIR, [0, (0, [1])]), "suspects"),
+        (lambda: graduate(PAIR, []), "suspects"),
+        (lambda: graduate(LOST, [1]), "suspects"),
+        (lambda: graduate(PAIR, [0], groups=[0]), "groups"),
+        (lambda: graduate(PAIR, [0], loss="huber"), "loss"),
+        (lambda: graduate(PAIR, [0], threshold=11.3), "threshold"),
+        (lambda: graduate(replace(PAIR, x0=np.zeros((2, 2, 3))), [0]), "problem"),
+        (lambda: CooperativeMAP(robust="tukey"), "loss"),
+        (lambda: CooperativeMAP(robust="truncated", threshold=1.0), "threshold"),
+    ],
+)
+def test_wrong_input_says_what_to_do(make, field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        make()
+
+
+def test_doubts_that_leave_nothing_are_told() -> None:
+    """Two fixes of one point 80 m apart, both suspects: believing neither is cheapest, and then the point is free."""
+    torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0)
+    assert graduate(torn, [0], throw=False).status is Status.RANK_DEFICIENT
+    with pytest.raises((InputError, SolveError)):
+        graduate(torn, [0])

@@ -1,0 +1,246 @@
+"""Robust losses and graduated non-convexity against GTSAM's, SciPy's robust minima and CasADi's curvature."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import casadi as ca
+import gtsam
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime, least_squares
+from scipy.stats import chi2
+
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, graduate, graduate_batch, solve
+from coopoc.optimize.curvature import is_minimum
+from coopoc.optimize.gnc import SURROGATES
+
+M = gtsam.noiseModel.mEstimator
+GTSAMS = {"huber": M.Huber, "cauchy": M.Cauchy, "geman-mcclure": M.GemanMcClure, "truncated": M.TruncatedLeastSquares}
+SMOOTH = ["huber", "cauchy", "geman-mcclure"]
+
+
+@pytest.mark.parametrize("name", GTSAMS)
+@pytest.mark.parametrize("scale", [0.4, 1.3])
+def test_losses_and_weights_are_gtsams(name: str, scale: float) -> None:
+    r = np.array([0.0, 0.1, 0.39, 0.41, 1.29, 1.31, 3.0, 50.0])
+    ours, theirs = Loss(name, scale), GTSAMS[name].Create(scale)
+    assert ours.cost(r**2) == pytest.approx([2 * theirs.loss(v) for v in r], rel=1e-12)
+    assert ours.weight(r**2) == pytest.approx([theirs.weight(v) for v in r], rel=1e-12)
+    slope = (ours.cost(r[1:] ** 2 + 1e-6) - ours.cost(r[1:] ** 2 - 1e-6)) / 2e-6
+    assert ours.weight(r[1:] ** 2) == pytest.approx(slope, rel=1e-4, abs=1e-8)
+
+
+def native(seed: int, wrong: int = 0, loss: Loss | None = None) -> Problem:
+    """Twelve points that GTSAM has factors for: a walk with odometry, three ranges to its start, two fixes of each
+    point, of which the first `wrong` second ones are tens of metres off."""
+    rng = np.random.default_rng(seed)
+    truth = np.cumsum(rng.normal(0, 4, (12, 3)), axis=0)
+    fixes = truth + rng.normal(size=(2, 12, 3))
+    fixes[1, :wrong] += rng.uniform(15, 40, (wrong, 3)) * rng.choice([-1, 1], (wrong, 3))
+    problem = Problem(tuple(f"p{k}" for k in range(12)), x0=truth).add("position", list(range(12)), fixes[0], std=1.0)
+    pairs = [(k, k + 1) for k in range(11)]
+    moved = np.diff(truth, axis=0) + rng.normal(0, 0.3, (11, 3))
+    problem = problem.add("displacement", pairs, moved, std=0.3, loss=loss)
+    far = [(0, 5), (0, 8), (0, 11)]
+    ranges = [[np.linalg.norm(truth[j] - truth[i]) + rng.normal(0, 0.5)] for i, j in far]
+    problem = problem.add("range", far, ranges, std=0.5, loss=loss)
+    return problem.add("position", list(range(12)), fixes[1], std=1.0, loss=loss)
+
+
+def gtsams(problem: Problem) -> gtsam.NonlinearFactorGraph:
+    """The same problem of GTSAM's own factors and robust noise models."""
+    prior, between, distance = gtsam.PriorFactorPoint3, gtsam.BetweenFactorPoint3, gtsam.RangeFactor3
+    kinds = {"position": prior, "displacement": between, "range": distance}
+    graph = gtsam.NonlinearFactorGraph()
+    for factor in problem.factors:
+        std = np.broadcast_to(factor.std, (len(factor.nodes), factor.size))
+        for nodes, z, sigmas in zip(factor.nodes.tolist(), factor.z, std, strict=True):
+            model = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            if factor.loss is not None:
+                model = gtsam.noiseModel.Robust.Create(GTSAMS[factor.loss.name].Create(factor.loss.scale), model)
+            graph.add(kinds[factor.kind](*nodes, float(z[0]) if factor.kind == "range" else z, model))
+    return graph
+
+
+def values(x: np.ndarray) -> gtsam.Values:
+    found = gtsam.Values()
+    for k, point in enumerate(x):
+        found.insert(k, point)
+    return found
+
+
+@pytest.mark.parametrize("name", GTSAMS)
+def test_a_robust_problem_costs_what_it_costs_in_gtsam(name: str) -> None:
+    """The cost, and J^T r as its gradient (SciPy's differences)."""
+    problem = native(0, wrong=4, loss=Loss(name, 1.5))
+    x = problem.x0 + np.random.default_rng(1).normal(0, 0.5, (12, 3))
+    assert problem.cost(x) == pytest.approx(gtsams(problem).error(values(x)), rel=1e-12)
+    r, J = problem.whiten(x)
+    slope = approx_fprime(x.ravel(), lambda flat: problem.cost(flat.reshape(-1, 3)), 1e-6)
+    assert J.T @ r == pytest.approx(slope, abs=2e-3 * np.abs(slope).max())
+
+
+def sighted(name: str, seed: int) -> Problem:
+    """Two points among four that are held, by robust measurements of one number each, a third of them wrong."""
+    rng = np.random.default_rng(seed)
+    anchors = np.array([[0, 0, 0], [30, 0, 2], [0, 30, 4], [30, 30, 9.0]])
+    truth = rng.uniform(8, 22, (2, 3)) * [1, 1, 0.5]
+    x0 = np.concatenate([anchors, truth + rng.normal(0, 0.5, (2, 3))])
+    problem = Problem(("a", "b", "c", "d", "p", "q"), x0=x0, held=("a", "b", "c", "d"))
+    pairs = [(a, 4 + p) for a in range(4) for p in range(2)] + [(4, 5)]
+    vector = np.array([[*anchors, *truth][j] - [*anchors, *truth][i] for i, j in pairs])
+    for kind, std in (("range", 0.3), ("azimuth", 0.03), ("inclination", 0.03)):
+        z = MEASUREMENTS[kind].predict(vector) + std * rng.normal(size=(len(pairs), 1))
+        z[rng.choice(len(pairs), 3, replace=False)] += 8 * std
+        problem = problem.add(kind, pairs, z, std=std, loss=Loss(name, 1.2))
+    return problem
+
+
+def geman_mcclure(s: np.ndarray) -> np.ndarray:
+    return np.stack([s / (1 + s), (1 + s) ** -2.0, -2 * (1 + s) ** -3.0])
+
+
+@pytest.mark.parametrize("name", SMOOTH)
+@pytest.mark.parametrize("seed", range(3))
+def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
+    """SciPy's own huber and cauchy (elementwise, rho of (r / C)^2 times C^2), its solver and differences."""
+    problem = sighted(name, seed)
+    plain = replace(problem, factors=tuple(replace(f, loss=None) for f in problem.factors))
+
+    def residual(free: np.ndarray) -> np.ndarray:
+        return plain.whiten(np.concatenate([problem.x0[:4], free.reshape(2, 3)]))[0]
+
+    loss, ours = geman_mcclure if name == "geman-mcclure" else name, solve(problem)
+    near = ours.x[4:] + np.random.default_rng(seed).normal(0, 0.1, (2, 3))
+    exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-12}
+    tries = [least_squares(residual, start.ravel(), "3-point", loss=loss, f_scale=1.2, **exact)
+             for start in (problem.x0[4:], near)]  # fmt: skip
+    best = min(tries, key=lambda found: found.cost)
+    assert ours.cost == pytest.approx(best.cost, rel=1e-9)
+    assert ours.x[4:].ravel() == pytest.approx(best.x, abs=1e-5)
+
+
+def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:
+    v, cost = ca.SX.sym("x", 3, len(problem.names)), 0
+    rho = {
+        "huber": lambda s, c: ca.if_else(s <= c**2, s, 2 * c * ca.sqrt(s) - c**2),
+        "cauchy": lambda s, c: c**2 * ca.log(1 + s / c**2),
+        "geman-mcclure": lambda s, c: s / (1 + s / c**2),
+    }
+    for factor in problem.factors:
+        for k, nodes in enumerate(factor.nodes.tolist()):
+            gap = v[:, nodes[-1]] - (v[:, nodes[0]] if len(nodes) == 2 else 0)
+            h = ca.vertcat(*MEASUREMENTS[factor.kind].formula(gap[0], gap[1], gap[2], ca)) - factor.z[k]
+            square = ca.sumsqr(ca.DM(factor.root[k]) @ h)
+            cost += 0.5 * (rho[factor.loss.name](square, factor.loss.scale) if factor.loss else square)
+    return np.asarray(ca.Function("H", [v], [ca.hessian(cost, ca.vec(v))[0]])(x.T))
+
+
+def test_the_robust_curvature_is_casadis() -> None:
+    """At random points, minima of the cost or not: is_minimum says whether CasADi's Hessian is positive."""
+    signs = []
+    for seed, name in itertools.product(range(8), SMOOTH):
+        problem = native(seed, wrong=2, loss=Loss(name, 2.5))
+        x = problem.x0 + np.random.default_rng(seed).normal(0, 0.25 + 0.05 * seed, problem.x0.shape)
+        lowest = np.linalg.eigvalsh(casadis_hessian(problem, x)).min()
+        assert abs(lowest) > 1e-4
+        assert is_minimum(problem, x) == (lowest > 0)
+        signs.append(lowest > 0)
+    assert 3 < sum(signs) < len(signs) - 3
+
+
+def test_between_two_fixes_there_is_a_saddle() -> None:
+    """Two robust fixes 6 m apart disagree: half-way the cost is stationary and curves downwards along their line."""
+    apart = Problem(("a",), x0=[[3.0, 0, 0]])
+    apart = apart.add("position", ["a", "a"], [[0, 0, 0], [6, 0, 0]], std=1.0, loss=Loss("cauchy", 1.0))
+    stuck = solve(apart, throw=False)
+    assert stuck.status is Status.SADDLE
+    assert np.linalg.eigvalsh(casadis_hessian(apart, stuck.x))[0] == pytest.approx(-0.16, abs=1e-6)  # 2 (1 - 9) / 10^2
+    aside = solve(replace(apart, x0=[[2.0, 0, 0]]))
+    assert aside.x[0, 0] == pytest.approx(3 - np.sqrt(8), abs=1e-6)  # roots of u^2 = 8, u from the middle
+    assert is_minimum(apart, aside.x)
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 5, 9])
+def test_gtsam_doubts_the_same_measurements(wrong: int) -> None:
+    """GncLMOptimizer at the same probability, all but the second fixes known inliers."""
+    for seed in range(3):
+        problem = native(seed, wrong)
+        graph, start = gtsams(problem), solve(problem).x
+        params = gtsam.GncLMParams()
+        params.setLossType(gtsam.GncLossType.TLS)
+        params.setKnownInliers(list(range(graph.size() - 12)))
+        params.setRelativeCostTol(0.0)
+        theirs = gtsam.GncLMOptimizer(graph, values(start), params)
+        result = theirs.optimize()
+        ours = graduate(problem, suspects=[3])
+        assert np.array_equal(ours.extras["weights"], theirs.getWeights()[-12:])
+        assert np.array_equal(ours.extras["weights"][:wrong], np.zeros(wrong))
+        assert ours.x == pytest.approx(np.stack([result.atPoint3(k) for k in range(12)]), abs=1e-3)
+        kept = [graph.at(k) for k in range(graph.size() - 12)]
+        kept += [graph.at(graph.size() - 12 + k) for k in np.flatnonzero(ours.extras["weights"])]
+        assert ours.cost == pytest.approx(sum(f.error(result) for f in kept), rel=1e-6)
+
+
+def test_geman_mcclure_ends_where_its_loss_is_least() -> None:
+    """solve with Loss("geman-mcclure", c) started at the result has nowhere to go, and its cost is GTSAM's GNC's."""
+    for seed in range(3):
+        problem = native(seed, 5)
+        ours = graduate(problem, [3], loss="geman-mcclure")
+        loss = Loss("geman-mcclure", np.sqrt(chi2.ppf(0.99, 3)))
+        stated = replace(problem, factors=(*problem.factors[:3], replace(problem.factors[3], loss=loss)), x0=ours.x)
+        least = solve(stated)
+        assert least.x == pytest.approx(ours.x, abs=1e-4)
+        graph, params = gtsams(problem), gtsam.GncLMParams()
+        params.setLossType(gtsam.GncLossType.GM)
+        params.setKnownInliers(list(range(graph.size() - 12)))
+        params.setRelativeCostTol(0.0)
+        theirs = gtsam.GncLMOptimizer(graph, values(solve(problem).x), params).optimize()
+        assert least.cost == pytest.approx(gtsams(stated).error(theirs), rel=1e-3)
+
+
+@pytest.mark.parametrize("backend", ["gtsam", "osqp"])
+def test_any_backend_and_any_weighting_may_solve_the_rounds(backend: str) -> None:
+    problem = native(1, 4)
+    ours, theirs = graduate(problem, [3]), graduate(problem, [3], backend=backend)
+    assert theirs.backend == backend
+    assert theirs.x == pytest.approx(ours.x, abs=1e-6)
+    assert np.array_equal(theirs.extras["weights"], ours.extras["weights"])
+    root = replace(problem.factors[3], std=None, sqrt_information=np.eye(3))
+    by_root = graduate(replace(problem, factors=(*problem.factors[:3], root)), [(3, range(12))], backend=backend)
+    assert by_root.x == pytest.approx(ours.x, abs=1e-6)
+    inside = Problem(problem.names, problem.factors[:3], problem.x0)
+    kept = np.flatnonzero(ours.extras["weights"]).tolist()
+    inside = inside.add("position", kept, problem.factors[3].z[kept], std=1.0)
+    assert solve(inside, backend).covariance == pytest.approx(ours.covariance, abs=1e-9)
+
+
+def test_a_batch_is_each_of_its_realisations() -> None:
+    """With realisations that lack measurements, and one that needs no round at all."""
+    each = [native(seed, wrong) for seed, wrong in ((0, 0), (1, 3), (2, 7))]
+    factors = []
+    for parts in zip(*(p.factors for p in each), strict=True):
+        std = np.stack([np.broadcast_to(f.std, (len(f.nodes), f.size)) for f in parts])
+        std[1, 1] = np.inf
+        factors.append(replace(parts[0], z=np.stack([f.z for f in parts]), std=std))
+    batch = replace(each[0], factors=tuple(factors), x0=np.stack([p.x0 for p in each]))
+    groups = np.repeat(np.arange(6), 2)
+    for loss in SURROGATES:
+        found = graduate_batch(batch, [3], loss=loss, groups=groups)
+        assert found.converged.all()
+        for b in range(3):
+            alone = graduate(batch.pick(b), [3], loss=loss, groups=groups)
+            assert found.x[b] == pytest.approx(alone.x, abs=1e-6)
+            assert found.weights[b] == pytest.approx(alone.extras["weights"], abs=1e-6)
+            assert found.covariance[b] == pytest.approx(alone.covariance, abs=1e-6)
+            assert found.rounds[b] == alone.extras["rounds"]
+
+
+def test_a_saddle_far_from_the_origin_is_one() -> None:
+    """Two fixes that disagree by three standard deviations under a tight loss: halfway between them is no minimum."""
+    z = np.array([[0, 0, 0], [0.15, 0, 0]]) + 1e5
+    problem = Problem(("a",), x0=[[1e5 + 0.075, 1e5, 1e5]])
+    problem = problem.add("position", ["a", "a"], z, std=0.05, loss=Loss("cauchy", 0.8))
+    assert solve(problem, throw=False).status is Status.SADDLE
