@@ -1,0 +1,81 @@
+"""coopoc solve and coopoc check, as a user types them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopoc.cli import main
+from coopoc.formats import write_graph
+from coopoc.formats.edges import PoseEdges, RangeEdges
+from coopoc.formats.graph import Graph
+from coopoc.optimize import backends
+
+ROOT = Path(__file__).resolve().parents[1]
+PYFG = ROOT / "../shared/data/pyfg"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    """Three poses in a row and a landmark ranged by all, measured without error: cost zero at the truth."""
+    position = np.array([[0.0, 0.0], [4.0, 0.0], [8.0, 1.0], [3.0, 6.0]])
+    angle = np.array([[0.0], [0.2], [0.1], [0.0]])
+    turn = np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
+    moved = [position[1] - position[0], turn @ (position[2] - position[1])]
+    odometry = PoseEdges([[0, 1], [1, 2]], moved, [[0.2], [-0.1]], [np.diag([0.01, 0.01, 1e-4])] * 2, [0.1, 0.2])
+    distance = np.linalg.norm(position[:3] - position[3], axis=1)
+    ranges = RangeEdges([[0, 3], [1, 3], [2, 3]], distance, [0.01] * 3, [0.0, 0.1, 0.2])
+    graph = Graph(2, ("A0", "A1", "A2", "L0"), [True] * 3 + [False], position, angle, [0.0, 0.1, 0.2, np.nan],
+                  relative_pose=odometry, ranges=ranges)  # fmt: skip
+    path = tmp_path / "drive.pyfg"
+    write_graph(graph, path)
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    with pytest.raises(SystemExit) as end:
+        main(list(words))
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])
+def test_solve_writes_the_solution(file: Path, capsys: pytest.CaptureFixture[str], backend: str) -> None:
+    target = file.with_suffix(".json")
+    status, out, err = run(capsys, "solve", str(file), "--backend", backend, "--output", str(target))
+    assert (status, json.loads(out)["status"]) == (0, "SOLVED")
+    assert str(target) in err
+    found = json.loads(target.read_text())
+    assert found["nodes"]["A2"]["position"] == pytest.approx([8.0, 1.0], abs=1e-4)
+    assert np.shape(found["nodes"]["A2"]["covariance"]) == (3, 3)
+
+
+def test_a_wrong_line_and_an_unknown_backend_are_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, _, err = run(capsys, "solve", str(file), "--backend", "ceres")
+    assert (status, "gauss-newton" in err) == (2, True)
+    file.write_text(file.read_text() + "EDGE_RANGE 0.1 A0 L9 5.0 0.01\n")
+    status, _, err = run(capsys, "solve", str(file))
+    assert status == 2
+    assert f"{file.name}:{len(file.read_text().splitlines())}" in err
+    assert "L9" in err
+
+
+def test_check_solves_one_problem_with_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, "check")
+    assert (status, out.count("SOLVED")) == (0, len(backends()))
+    assert "0 disagree" in err
+
+
+@pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
+def test_the_example_draws_a_graph_file(tmp_path: Path) -> None:
+    picture, script = tmp_path / "drive.png", ROOT / "examples" / "graph_file.py"
+    command = [sys.executable, "-W", "error", script, PYFG / "mrclam5a.pyfg", picture]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "-> 69.10 in" in out
+    assert "-> 0.214 m" in out
+    assert picture.stat().st_size > 10_000
