@@ -89,12 +89,14 @@ def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Ce
     """Cells in an order in which those that share a recording follow each other within one of `jobs` lanes.
 
     Groups are dealt to the lanes in turn and the lanes are interleaved, so that each worker mostly meets one group
-    at a time. A worker that drifts into another lane computes that recording once more, nothing else changes.
+    at a time. A worker that drifts into another lane computes that recording once more, nothing else changes. The last
+    groups come first: grids mostly grow towards their end, and a long cell at the end would leave other workers idle.
     """
     groups: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in cells:
         groups.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
-    lanes = [list(itertools.chain.from_iterable(list(groups.values())[lane::jobs])) for lane in range(jobs)]
+    ordered = list(groups.values())[::-1]
+    lanes = [list(itertools.chain.from_iterable(ordered[lane::jobs])) for lane in range(jobs)]
     return [cell for step in itertools.zip_longest(*lanes) for cell in step if cell is not None]
 
 
