@@ -181,12 +181,12 @@ def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path: Path) -> None:
     assert reasons[2].startswith("Arrow")
 
 
-def test_cells_of_one_recording_follow_each_other_in_a_lane() -> None:
+def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first() -> None:
     cells = [Cell({}, {"k": k, "m": m}, f"{k}{m}") for m in "ab" for k in range(4)]
-    assert [c.name for c in schedule(cells, ("k",), 1)] == ["0a", "0b", "1a", "1b", "2a", "2b", "3a", "3b"]
+    assert [c.name for c in schedule(cells, ("k",), 1)] == ["3a", "3b", "2a", "2b", "1a", "1b", "0a", "0b"]
     two = [c.name for c in schedule(cells, ("k",), 2)]
-    assert two[0::2] == ["0a", "0b", "2a", "2b"]
-    assert two[1::2] == ["1a", "1b", "3a", "3b"]
+    assert two[0::2] == ["3a", "3b", "1a", "1b"]
+    assert two[1::2] == ["2a", "2b", "0a", "0b"]
     assert sorted(c.name for c in schedule(cells[:5], ("k",), 3)) == sorted(c.name for c in cells[:5])
 
 
