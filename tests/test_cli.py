@@ -132,7 +132,8 @@ def test_failed_cells_set_the_status(tmp_path: Path) -> None:
 def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> None:
     words = ["run", "small", "--jobs", jobs, "--set", "runs=2", "pause=0.4"]
     process = subprocess.Popen([*COMMAND, *words], cwd=tmp_path, env=ENV, stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
+                               stderr=subprocess.PIPE, text=True, start_new_session=True,
+                               preexec_fn=_listen)  # fmt: skip
     cells = tmp_path / "runs/small/cells"
     for _ in range(1000):
         if cells.is_dir() and len(list(cells.glob("*.parquet"))) >= 3:  # both workers are at work
@@ -145,6 +146,11 @@ def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> No
     assert "Traceback" not in stderr
     plan = json.loads(coopoc(*words, "--dry-run", cwd=tmp_path).stdout)
     assert 3 <= plan["finished"] < 9
+
+
+def _listen() -> None:
+    """Hear Ctrl-C even where the tests run in the background of a shell, which makes its jobs ignore it."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def test_a_worker_that_is_killed_is_one_readable_line(tmp_path: Path) -> None:

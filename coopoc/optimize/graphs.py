@@ -157,7 +157,7 @@ def _by_ranges(graph: Graph, position: Floats, known: Bools) -> None:
         others = nodes[rows][nodes[rows] != j]
         seen = known[others]
         p, d = position[others[seen]], r[rows[seen]]
-        if len(p) > graph.dimension + 1:
+        if len(p) > graph.dimension:
             matrix = np.concatenate([2.0 * p, np.ones((len(p), 1))], axis=1)
             found = np.linalg.lstsq(matrix, np.square(p).sum(axis=1) - d * d, rcond=None)[0]
             position[j] = found[: graph.dimension]
