@@ -27,12 +27,12 @@ $(READY): pyproject.toml constraints.txt
 		{ rm -rf $(VENV); echo "No venv module: apt-get install python3-venv, then repeat."; exit 1; }
 	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
 	$(PIP) setuptools wheel torch
-	$(PIP) --no-build-isolation --editable .
+	$(PIP) --no-build-isolation --editable '.[fast]'
 	@touch $(READY)
 
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
-	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel]'
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,fast,flower,privacy,export]'
 	@touch $@
 
 clean:

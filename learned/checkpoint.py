@@ -21,7 +21,7 @@ from coopoc.errors import InputError
 
 from .net import GainNet
 from .okf import OptimisedKF
-from .rollout import unflatten
+from .stack import unflatten
 
 _HISTORY = "history"
 _NOISE = ("process_std", "velocity_ratio", "gnss_std")

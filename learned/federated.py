@@ -16,10 +16,10 @@ from coopoc.world.noise import stream
 
 from .aggregate import Aggregate, rule
 from .clients import Client, Pieces
+from .gain import Gain
 from .machine import one_core, watched
-from .net import GainNet
-from .rollout import flatten, unflatten
 from .schedule import Epoch, Schedule, cosine, generator
+from .stack import flatten, unflatten
 from .train import Judge, descend, pooled
 
 
@@ -44,7 +44,7 @@ class Round:
 class Federation:
     """A federated net: the global weights that validated best, every round, the shape of the net, seconds."""
 
-    model: GainNet
+    model: Gain
     history: tuple[Round, ...]
     sizes: tuple[int, ...]
     seconds: float
@@ -59,7 +59,7 @@ class Federation:
         total = sum(n * loss for n, loss in zip(self.sizes, row.validation_loss, strict=True)) / sum(self.sizes)
         return total if math.isfinite(total) else math.inf
 
-    def after(self, number: int) -> GainNet:
+    def after(self, number: int) -> Gain:
         """The global net after round `number`, 0 being the start."""
         if not 0 <= number < len(self.history):
             raise InputError("round", number, f"must be in 0..{len(self.history) - 1}", "See history.")
@@ -67,7 +67,7 @@ class Federation:
 
 
 def federate(
-    model: GainNet,
+    model: Gain,
     clients: Sequence[Client],
     rounds: int = 20,
     aggregate: str | Aggregate = "mean",
@@ -91,7 +91,7 @@ def federate(
 
     Source: arXiv 2411.05847, algorithm 1; McMahan et al., AISTATS 2017, for E.
 
-    >>> from coopoc.learned.clients import clients
+    >>> from coopoc.learned import GainNet, clients
     >>> from coopoc.world.fleet import Fleet
     >>> t = torch.arange(33) / 10
     >>> line = Fleet(("a",), t, torch.zeros(33, 1, 3), torch.zeros(33, 1, 3))
@@ -103,7 +103,7 @@ def federate(
 
 @one_core()
 def federate_many(
-    models: Sequence[GainNet],
+    models: Sequence[Gain],
     groups: Sequence[Sequence[Client]],
     seeds: Sequence[int],
     rounds: int = 20,
@@ -140,7 +140,7 @@ def federate_many(
 
 def adapt(
     theta: Tensor,
-    like: GainNet,
+    like: Gain,
     pool: Pieces,
     members: Sequence[Ints],
     keys: Sequence[tuple[int, str]],
@@ -187,7 +187,7 @@ def _rows(
     return rows
 
 
-def _chosen(history: Sequence[Round], sizes: Tensor, like: GainNet, seconds: float) -> Federation:
+def _chosen(history: Sequence[Round], sizes: Tensor, like: Gain, seconds: float) -> Federation:
     """The federation with the weights of its best round."""
     federation = Federation(like, tuple(history), tuple(sizes.tolist()), seconds)
     return replace(federation, model=federation.after(federation.best.number))

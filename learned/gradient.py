@@ -9,7 +9,8 @@ from torch import Tensor
 
 from .clients import Batch
 from .net import CELLS, SIZE, GainNet
-from .rollout import Gru, Layers, Step, layers, steps
+from .rollout import Gru, Step, steps
+from .stack import Layers, layers
 
 Taps = defaultdict[str, list[Tensor]]
 """Of each layer, its inputs (S, B, in) or the gradients of its outputs (S, B, out), last step first."""

@@ -18,10 +18,9 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 
 from .clients import Pieces, clients
-from .gradient import loss_and_gradient
 from .machine import one_core
 from .net import GainNet
-from .rollout import flatten
+from .stack import flatten
 from .train import Judge
 
 OPTIMISERS = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
@@ -75,7 +74,7 @@ def literal(
     untrained, best = float(judge(theta.detach())), math.inf
     for done in range(steps):
         batch = training.batch(torch.from_numpy(draw.integers(len(training), size=(1, 1))))
-        found, gradient = loss_and_gradient(theta.detach(), like, batch)
+        found, gradient = like.loss_and_gradient(theta.detach(), batch)
         if not (found.isfinite().all() and gradient.isfinite().all()):
             return Outcome(optimiser, learning_rate, clipped, _named(start_gain), seed, done, best, untrained)
         theta.grad = gradient

@@ -18,7 +18,8 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .machine import one_core
 from .net import SIZE, GainNet
-from .rollout import Step, flatten, layers, steps
+from .rollout import Step, steps
+from .stack import flatten, layers
 
 
 @dataclass(frozen=True, eq=False)

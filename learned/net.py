@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
+
+from coopoc.arrays import Floats
+from coopoc.methods.track import Method
+
+from .clients import Batch
+from .gain import Gain
 
 SIZE = 3
 """Components of state and measurement, m = n = 3."""
@@ -27,7 +34,7 @@ class Memory(NamedTuple):
     gnss_before: Tensor
 
 
-class GainNet(nn.Module):
+class GainNet(Gain):
     """Kalman gain from three GRUs that stand for process noise, prior covariance and innovation covariance.
 
     x_prior = x + dt u;  K = net(features);  x <- x_prior + K (z - x_prior).
@@ -70,6 +77,30 @@ class GainNet(nn.Module):
             with torch.no_grad():
                 self.gain.weight.mul_(0.1)
                 self.gain.bias.copy_(start_gain * torch.eye(SIZE).flatten())
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Widths."""
+        return {"in_mult": self.in_mult, "out_mult": self.out_mult}
+
+    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
+        """(S, B) squared error of each piece, mean over time, sum over components, m^2 (equation 7)."""
+        from .gradient import loss
+        from .stack import layers
+
+        return loss(layers(theta, self), batch)
+
+    def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Loss (S,) m^2 and gradient (S, P)."""
+        from .gradient import loss_and_gradient
+
+        return loss_and_gradient(theta, self, batch)
+
+    def method(self, name: str, start: Floats | None = None) -> Method:
+        """`LearnedGain` with this net."""
+        from .method import LearnedGain
+
+        return LearnedGain(self, name, start)
 
     def start(self, x0: Tensor) -> Memory:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""

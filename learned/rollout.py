@@ -2,65 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from .net import CELLS, SIZE, GainNet
+from .net import CELLS, SIZE
+from .stack import Layers
 
 EPS = 1e-12
 """Least norm that a feature is divided by, as in `torch.nn.functional.normalize`."""
-
-
-def flatten(models: Sequence[GainNet]) -> Tensor:
-    """(S, P) weights of S models of one shape, in the order of `parameters()`.
-
-    >>> flatten([GainNet(seed=0), GainNet(seed=1)]).shape
-    torch.Size([2, 19938])
-    """
-    return torch.stack([torch.nn.utils.parameters_to_vector(m.parameters()).detach() for m in models])
-
-
-def unflatten(theta: Tensor, like: GainNet) -> list[GainNet]:
-    """New models shaped as `like` with the weights theta (S, P)."""
-    models = []
-    for row in theta:
-        model = GainNet(like.in_mult, like.out_mult)
-        torch.nn.utils.vector_to_parameters(row.clone(), model.parameters())
-        models.append(model)
-    return models
-
-
-class Layer(NamedTuple):
-    """A stacked linear layer, or one of the two of a GRU: weight (S, out, in), bias (S, 1, out), weight^T as a view."""
-
-    weight: Tensor
-    bias: Tensor
-    transposed: Tensor
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Output (S, B, out) of an input (S, B, in)."""
-        return torch.baddbmm(self.bias, x, self.transposed)
-
-
-Layers = dict[str, Layer]
-
-
-def layers(theta: Tensor, like: GainNet) -> Layers:
-    """Views into flat weights, or gradients, (S, P) of models shaped as `like`: "update", ..., "process_ih", ...
-
-    >>> net = GainNet()
-    >>> layers(flatten([net]), net)["process_ih"].weight.shape
-    torch.Size([1, 27, 120])
-    """
-    named, at = {}, 0
-    for name, parameter in like.named_parameters():
-        named[name] = theta[:, at : at + parameter.numel()].view(len(theta), *parameter.shape)
-        at += parameter.numel()
-    return {name.replace(".weight", ""): Layer(weight, named[name.replace("weight", "bias")].unsqueeze(1), weight.mT)
-            for name, weight in named.items() if "weight" in name}  # fmt: skip
 
 
 class Gru(NamedTuple):

@@ -16,18 +16,17 @@ from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
 from .clients import Batch, Pieces, mirrored
-from .gradient import loss, loss_and_gradient
+from .gain import Gain
 from .machine import one_core, watched
-from .net import GainNet
-from .rollout import flatten, layers, unflatten
 from .schedule import Schedule, adamw, clip, cosine, generator
+from .stack import flatten, unflatten
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
     """One net to train: its start, its pieces, and the key of its batches: a seed and the name of the data."""
 
-    model: GainNet
+    model: Gain
     training: Pieces
     validation: Pieces
     seed: int = 0
@@ -50,7 +49,7 @@ class Progress:
 class Fit:
     """A trained net: the weights that validated best, how it went, why it stopped early (None: it did not), seconds."""
 
-    model: GainNet
+    model: Gain
     history: tuple[Progress, ...]
     stopped: str | None
     seconds: float
@@ -62,7 +61,7 @@ class Fit:
 
 
 def fit(
-    model: GainNet,
+    model: Gain,
     training: Pieces,
     validation: Pieces,
     schedule: Schedule | None = None,
@@ -80,7 +79,7 @@ def fit(
     Source: arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
 
     >>> from coopoc.world.fleet import Fleet
-    >>> from coopoc.learned.clients import clients
+    >>> from coopoc.learned import GainNet, clients
     >>> line = Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3)))
     >>> (only,) = clients(line, piece=10)
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step
@@ -132,7 +131,7 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
 
 def descend(
     theta: Tensor,
-    like: GainNet,
+    like: Gain,
     pool: Pieces,
     plans: Sequence[Ints],
     rates: Sequence[Floats],
@@ -154,7 +153,7 @@ def descend(
             batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), dice)
             batch = mirrored(batch, dice) if schedule.mirror else batch
             mine, m, v = theta[rows], first[rows], second[rows]
-            losses[rows], gradient = loss_and_gradient(mine, like, batch)
+            losses[rows], gradient = like.loss_and_gradient(mine, batch)
             finite = losses[rows].isfinite() & gradient.isfinite().all(1)
             stopped |= {r: f"loss or gradient not finite at step {step + 1}"
                         for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
@@ -173,13 +172,13 @@ class Judge:
     the better for its start being over, so they decide only against weights that drift away. Fresh noise is drawn once.
     """
 
-    def __init__(self, kinds: Sequence[Sequence[Pieces]], like: GainNet) -> None:
+    def __init__(self, kinds: Sequence[Sequence[Pieces]], like: Gain) -> None:
         self.like = like
         self.batches = [_padded(parts) for parts in kinds]
 
     def __call__(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
-            means = [(loss(layers(theta, self.like), batch) * share).sum(1) for batch, share in self.batches]
+            means = [(self.like.losses(theta, batch) * share).sum(1) for batch, share in self.batches]
         return torch.stack(means).nan_to_num(math.inf, math.inf).amax(0)
 
 

@@ -15,7 +15,8 @@ from coopoc.learned.clients import Batch
 from coopoc.learned.gradient import loss_and_gradient
 from coopoc.learned.machine import one_core
 from coopoc.learned.method import DIVERGED
-from coopoc.learned.rollout import flatten, layers, steps
+from coopoc.learned.rollout import steps
+from coopoc.learned.stack import flatten, layers
 from coopoc.methods.track import Method
 
 

@@ -16,7 +16,7 @@ from coopoc import load as load_fleet
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import Checkpoint, GainNet, LearnedGain, OptimisedKF, Schedule, load, load_method, save, train_all
 from coopoc.learned.checkpoint import read_card
-from coopoc.learned.rollout import flatten
+from coopoc.learned.stack import flatten
 
 
 def drives() -> Fleet:

@@ -13,8 +13,8 @@ from coopoc import Fleet, InputError, Sensors
 from coopoc.learned import GainNet, Pieces, Schedule, clients, federate, fit
 from coopoc.learned.aggregate import mean, uniform
 from coopoc.learned.clients import mirrored
-from coopoc.learned.rollout import flatten
 from coopoc.learned.schedule import adamw, clip, cosine
+from coopoc.learned.stack import flatten
 from coopoc.learned.train import Task, fit_many
 
 QUICK = Schedule(epochs=6, batch=2, checks=3)

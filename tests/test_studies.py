@@ -21,7 +21,7 @@ from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain
 from coopoc.learned.net import GainNet
 from coopoc.learned.recipes import Setting, jobs_of, load_method
-from coopoc.learned.rollout import flatten
+from coopoc.learned.stack import flatten
 from coopoc.plugins import find
 from coopoc.studies import claims, convergence, error_cdf, neighbours, paper, scene, weights
 from coopoc.study.publish import views as published

@@ -1,0 +1,44 @@
+"""Gain: what training, federation and checkpoints need of a net that filters."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from coopoc.arrays import Floats
+from coopoc.methods.track import Method
+
+from .clients import Batch
+
+
+class Gain(nn.Module, ABC):
+    """A net that filters fixes and velocities; many of one shape are trained together as rows of theta (S, P).
+
+    Whoever writes another net gives its losses as a differentiable function of flat weights and has `fit`, `federate`,
+    every aggregation rule, checkpoints and studies at once.
+    """
+
+    @property
+    @abstractmethod
+    def settings(self) -> Mapping[str, Any]:
+        """Arguments that make a net of this shape again."""
+
+    @abstractmethod
+    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
+        """Training loss (S, B) of every piece for S nets with weights theta (S, P), differentiable in theta."""
+
+    @abstractmethod
+    def method(self, name: str, start: Floats | None = None) -> Method:
+        """This net as a method, Recording -> Track, from the first fix or a known start (R, E, 3) or (E, 3) m."""
+
+    def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
+        with torch.enable_grad():
+            given = theta.detach().requires_grad_()
+            means = self.losses(given, batch).mean(1)
+            (gradient,) = torch.autograd.grad(means.sum(), given)
+        return means.detach(), gradient
