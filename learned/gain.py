@@ -32,7 +32,7 @@ class Gain(nn.Module, ABC):
         """Training loss (S, B) of every piece for S nets with weights theta (S, P), differentiable in theta."""
 
     @abstractmethod
-    def method(self, name: str, start: Floats | None = None) -> Method:
+    def method(self, name: str, x0: Floats | None = None) -> Method:
         """This net as a method, Recording -> Track, from the first fix or a known start (R, E, 3) or (E, 3) m."""
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:

@@ -46,7 +46,7 @@ class LearnedGain:
     start, so that float32 costs no accuracy far from the origin.
 
     Args:
-        model: trained net. name: in tables. start: (R, E, 3) or (E, 3) m, a known start as in KalmanNet's
+        model: trained net. name: in tables. x0: (R, E, 3) or (E, 3) m, a known start as in KalmanNet's
             published loop; None starts at the first fix.
 
     Source: arXiv 2411.05847, equations 4-6 and section II.B.
@@ -57,7 +57,7 @@ class LearnedGain:
 
     model: GainNet
     name: str = "fedkalmannet"
-    start: Floats | None = None
+    x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
 
@@ -88,12 +88,12 @@ class LearnedGain:
     def _x0(self, recording: Recording, columns: list[int]) -> Floats:
         """(R, E, 3) m, where the filter starts."""
         fixes: Floats = recording.gnss[:, 0, columns]
-        if self.start is None:
+        if self.x0 is None:
             return fixes
-        if np.shape(self.start) not in (fixes.shape, fixes.shape[1:]):
+        if np.shape(self.x0) not in (fixes.shape, fixes.shape[1:]):
             allowed = f"must be (R, E, 3) = {fixes.shape} or (E, 3)"
-            raise InputError("start", f"shape {np.shape(self.start)}", allowed, "Give one position per ego.")
-        return np.broadcast_to(self.start, fixes.shape)
+            raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
+        return np.broadcast_to(self.x0, fixes.shape)
 
     @one_core()
     def _scan(self, recording: Recording, columns: list[int], pick: Callable[[Step], Tensor]) -> AnyArray:

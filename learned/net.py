@@ -96,11 +96,11 @@ class GainNet(Gain):
 
         return loss_and_gradient(theta, self, batch)
 
-    def method(self, name: str, start: Floats | None = None) -> Method:
+    def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
         from .method import LearnedGain
 
-        return LearnedGain(self, name, start)
+        return LearnedGain(self, name, x0)
 
     def start(self, x0: Tensor) -> Memory:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states I, 0, I."""

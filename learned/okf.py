@@ -31,7 +31,7 @@ class OptimisedKF:
 
     Args:
         process_std: a, m per step. velocity_ratio: b, share of the measured velocity. gnss_std: r, m.
-        start: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
 
     Source: Greenberg, Yannay, Mannor, Optimization or Architecture: How to Hack Kalman Filtering, NeurIPS 2023.
 
@@ -42,7 +42,7 @@ class OptimisedKF:
     process_std: Three
     velocity_ratio: Three
     gnss_std: Three
-    start: Floats | None = None
+    x0: Floats | None = None
     name: str = "okf"
     cooperative: bool = False
     message: Message = NO_MESSAGE
@@ -61,7 +61,7 @@ class OptimisedKF:
         velocity = recording.velocity[:, :, columns]
         moved = np.array(self.velocity_ratio) * recording.dt * velocity
         x, spread = solo_filter(recording.gnss[:, :, columns], velocity, np.square(self.process_std) + moved**2,
-                                np.square(self.gnss_std), recording.dt, self.start)  # fmt: skip
+                                np.square(self.gnss_std), recording.dt, self.x0)  # fmt: skip
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         return Track(recording.t, tuple(columns), x, spread[..., None] * np.eye(3), silent, silent, seconds)

@@ -39,7 +39,7 @@ def cell(p: Params) -> list[Row]:
 
     @lru_cache
     def score(row: int) -> Floats:
-        return rt_le(LearnedGain(checkpoint.after(row), start=start)(recording, who), drive)
+        return rt_le(LearnedGain(checkpoint.after(row), x0=start)(recording, who), drive)
 
     found: list[Row] = []
     for number in (rounds,) if alone else range(rounds + 1):

@@ -60,7 +60,7 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
         return [(seed, _learned(name, p, seed, known)) for seed in weights.seeds(p)]
     method: Method = find("coopoc.methods", name)(knowledge(p))
     if isinstance(method, Kalman):
-        method = replace(method, start=known)
+        method = replace(method, x0=known)
     if isinstance(method, CooperativeMAP):
         method = replace(method, backend=p.get("backend", method.backend))
     return [(None, method)]
@@ -80,8 +80,8 @@ def _learned(name: str, p: Params, seed: int, known: Floats | None) -> Method:
 
     model = weights.checkpoint(name, p, seed).model
     if isinstance(model, GainNet):
-        return LearnedGain(model, name=name, start=known)
-    return replace(model, start=known)
+        return LearnedGain(model, name=name, x0=known)
+    return replace(model, x0=known)
 
 
 def rows(p: Params, *, quantiles: int = 0) -> list[Row]:

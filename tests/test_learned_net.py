@@ -172,10 +172,10 @@ def test_translating_the_world_translates_the_estimate() -> None:
 def test_a_given_start_is_used_and_its_shape_checked() -> None:
     fleet = drive()
     rec = observe(fleet, Sensors(), runs=2)
-    track = LearnedGain(GainNet(), start=fleet.position[0])(rec)
+    track = LearnedGain(GainNet(), x0=fleet.position[0])(rec)
     np.testing.assert_array_equal(track.x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3)))
-    with pytest.raises(InputError, match="start"):
-        LearnedGain(GainNet(), start=np.zeros((5, 3)))(rec)
+    with pytest.raises(InputError, match="x0"):
+        LearnedGain(GainNet(), x0=np.zeros((5, 3)))(rec)
 
 
 def test_divergence_is_reported_and_nan_is_refused() -> None:

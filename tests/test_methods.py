@@ -195,7 +195,7 @@ def test_a_known_start_has_no_nees(formation: Fleet) -> None:
     """At the known start error and covariance are zero: NaN there, and the gate looks at the other steps."""
     fleet, everywhere = formation.between(0, 100), replace(S2, velocity_reading="speed")
     recording = observe(fleet, everywhere, V2X(max_neighbours=0), runs=30, observers=[0])
-    track = Kalman("nominal", start=fleet.position[0, :1])(recording, [0])
+    track = Kalman("nominal", x0=fleet.position[0, :1])(recording, [0])
     found = nees(track, fleet)
     assert np.isnan(found[:, 0]).all()
     assert np.isfinite(found[:, 1:]).all()
@@ -217,8 +217,8 @@ def test_bad_knowledge_is_named(crossing: Fleet) -> None:
         Knowledge("mine", S2, process_std=(0.1, 0.1, 0.0))
     with pytest.raises(InputError, match="membership = 'rest'"):
         LaplacianKalman(membership="rest")  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="start"):
-        Kalman("nominal", start=np.zeros((2, 3)))(recording, [0])
+    with pytest.raises(InputError, match="x0"):
+        Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 
 
 def test_absent_neighbour_is_left_out_and_absent_ego_refused(crossing: Fleet) -> None:

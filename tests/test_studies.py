@@ -205,7 +205,7 @@ def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_pat
         assert [row["round"] for row in found] == [0, 0, 1, 1, 2, 2]
         seen = co.observe(town10, scene.sensors(p), co.V2X(max_neighbours=0), runs=2, observers=["town10-00"])
         begin = town10.position[0, :1] if start == "true" else None
-        alone = LearnedGain(net.after(2), start=begin)(seen, ["town10-00"])
+        alone = LearnedGain(net.after(2), x0=begin)(seen, ["town10-00"])
         assert [row["rt_le_m"] for row in found[-2:]] == pytest.approx(rt_le(alone, town10)[:, 0])
 
 

@@ -22,7 +22,7 @@ class Kalman:
 
     Args:
         knowledge: "identity", "nominal" or a Knowledge.
-        start: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -31,24 +31,24 @@ class Kalman:
     """
 
     knowledge: Knowledge | str = "nominal"
-    start: Floats | None = None
+    x0: Floats | None = None
     name: str = "kalman"
     cooperative: bool = False
     message: Message = NO_MESSAGE
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
-        """Track of the egos; InputError if one is unknown or absent, or the start has another shape."""
+        """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
         columns = recording.columns(egos)
         known = resolve(self.knowledge, recording)
         variance = known.process_variance(recording)
         variance = variance[:, :, columns] if variance.shape[2] > 1 else variance
-        start = self.start
-        if start is not None and start.shape[-2:] != (len(columns), 3):
-            raise InputError("start", start.shape, f"must end in (E, 3) = ({len(columns)}, 3)", "One start per ego.")
+        x0 = self.x0
+        if x0 is not None and x0.shape[-2:] != (len(columns), 3):
+            raise InputError("x0", x0.shape, f"must end in (E, 3) = ({len(columns)}, 3)", "One start per ego.")
         x, p = solo_filter(
             recording.gnss[:, :, columns], recording.velocity[:, :, columns], variance, known.gnss_variance,
-            recording.dt, start,
+            recording.dt, x0,
         )  # fmt: skip
         free = np.zeros((recording.runs, len(columns)))
         return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), free, free, time.perf_counter() - began)
@@ -56,7 +56,7 @@ class Kalman:
 
 def solo_filter(
     gnss: Floats, velocity: Floats, process_variance: Floats, gnss_variance: Floats, dt: float,
-    start: Floats | None = None,
+    x0: Floats | None = None,
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Kalman filter per axis: all covariances are diagonal, so the three axes do not couple.
 
@@ -65,15 +65,15 @@ def solo_filter(
     Args:
         gnss, velocity: (R, T, N, 3), NaN where a vehicle is absent; it starts anew at its first fix.
         process_variance: broadcastable to (R, T, N, 3) m^2. gnss_variance: (3,) m^2. dt: s.
-        start: (..., N, 3) m exact position at step 0, or None for the first fix.
+        x0: (..., N, 3) m exact position at step 0, or None for the first fix.
 
     Returns:
         x and p of shape (R, T, N, 3): m and m^2.
     """
     q = np.broadcast_to(process_variance, gnss.shape)
     x, p = np.empty_like(gnss), np.empty_like(gnss)
-    x[:, 0] = gnss[:, 0] if start is None else start
-    p[:, 0] = gnss_variance if start is None else 0.0
+    x[:, 0] = gnss[:, 0] if x0 is None else x0
+    p[:, 0] = gnss_variance if x0 is None else 0.0
     for t in range(1, gnss.shape[1]):
         prior = x[:, t - 1] + dt * velocity[:, t]
         spread = p[:, t - 1] + q[:, t]
