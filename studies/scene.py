@@ -72,14 +72,12 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
 
 
 def sensors(p: Params) -> Sensors:
-    """What acts in scenario 1 or 2 of the paper, with the velocity noise of the cell."""
+    """What acts in scenario 1 or 2 of the paper, or in its training (0), with the velocity noise of the cell."""
     ratio, reading = float(p["velocity_ratio"]), p["velocity_reading"]
-    if p["scenario"] == 1:
-        found = Sensors.paper_scenario1()
-    elif p["scenario"] == 2:
-        found = Sensors.paper_scenario2()
-    else:
-        raise InputError("scenario", p["scenario"], "must be 1 or 2", "See section IV.B of the paper.")
+    presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
+    if p["scenario"] not in presets:
+        raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
+    found = presets[p["scenario"]]()
     return replace(found, velocity_std_ratio=ratio, velocity_reading=reading)
 
 

@@ -1,0 +1,55 @@
+"""Methods against a reference: how many times its error each has, one panel per case, one dot per training seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.ticker import FixedLocator, NullFormatter, StrMethodFormatter
+
+from ..errors import InputError
+from .plot import Plot, canvas
+from .style import NEUTRAL, look
+
+TICKS = (0.9, 1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)
+
+
+def multiples(
+    found: Mapping[tuple[str, str], Mapping[str, Sequence[float]]],
+    caption: str,
+    target: Mapping[str, float] | None = None,
+) -> Plot:
+    """Dots at value / reference of each method in each case; a line marks 1, a band reaches up to the case's target.
+
+    Args:
+        found: (method, knowledge) -> case -> multiples, one per training seed. target: case -> upper end of the band.
+
+    Raises:
+        InputError: nothing to draw.
+    """
+    cases = list(dict.fromkeys(name for each in found.values() for name in each))
+    if not cases:
+        raise InputError("found", "no multiples", "must hold at least one", "Run the study, or a case of it.")
+    height = 0.9 + 0.21 * len(found)
+    with canvas(1, len(cases), width=1.9 + 1.75 * len(cases), height=height, sharey=True, squeeze=False) as (
+        figure, axes,
+    ):  # fmt: skip
+        for panel, case in zip(axes[0], cases, strict=True):
+            panel.axvspan(1.0, (target or {}).get(case, 1.0), color=NEUTRAL, alpha=0.35, linewidth=0)
+            panel.axvline(1.0, color="black", linewidth=0.9)
+            for row, ((method, _), each) in enumerate(found.items()):
+                values = np.array(each.get(case, ()), dtype=float)
+                shown = look(method)
+                panel.plot(values, np.full(len(values), row), linestyle="none", marker=shown.marker, color=shown.color,
+                           markersize=4, alpha=0.8, markeredgewidth=0.6)  # fmt: skip
+            panel.set(title=case, xscale="log", xlabel="× reference")
+            panel.xaxis.set_major_locator(FixedLocator(TICKS))
+            panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            panel.xaxis.set_minor_formatter(NullFormatter())
+        labels = [f"{look(method).label}{_of(knowledge)}" for method, knowledge in found]
+        axes[0, 0].set(yticks=range(len(found)), yticklabels=labels, ylim=(len(found) - 0.4, -0.6))
+    return Plot(figure, caption)
+
+
+def _of(knowledge: str) -> str:
+    return "" if knowledge in ("trained", "none") else f", {knowledge}"
