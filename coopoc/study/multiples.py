@@ -11,7 +11,8 @@ from ..errors import InputError
 from .plot import Plot, canvas
 from .style import NEUTRAL, look
 
-TICKS = (0.9, 1.0, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0)
+NEAR, FAR = (0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 2.0), (0.5, 1.0, 2.0, 5.0, 10.0)
+"""Ticks where nothing is beyond 2, and where something is."""
 
 
 def multiples(
@@ -43,7 +44,7 @@ def multiples(
                 panel.plot(values, np.full(len(values), row), linestyle="none", marker=shown.marker, color=shown.color,
                            markersize=4, alpha=0.8, markeredgewidth=0.6)  # fmt: skip
             panel.set(title=case, xscale="log", xlabel="× reference")
-            panel.xaxis.set_major_locator(FixedLocator(TICKS))
+            panel.xaxis.set_major_locator(FixedLocator(NEAR if panel.get_xlim()[1] < 2.1 else FAR))
             panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             panel.xaxis.set_minor_formatter(NullFormatter())
         labels = [f"{look(method).label}{_of(knowledge)}" for method, knowledge in found]
