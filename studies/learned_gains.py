@@ -120,8 +120,8 @@ def _figure(results: Results) -> Plot | None:
     if not rows:
         return None
     text = (
-        "rms RT-LE as a multiple of the bound (scenario 1: of the oracle filter); a dot per training seed, a band up to "
-        "the target. GNSS and the filter with identity covariances lie far beyond and are in the tables only."
+        "rms RT-LE as a multiple of the bound (scenario 1: of the oracle filter); a dot per training seed, a band up "
+        "to the target. GNSS and the filter with identity covariances lie far beyond and are in the tables only."
     )
     targets = {name: 1 + NEAR[scenario] for name, (scenario, _) in CASES.items() if scenario in NEAR}
     return multiples(rows, f"{text} {results.settings['runs']} runs.", targets)
