@@ -31,8 +31,8 @@ def multiples(
     cases = list(dict.fromkeys(name for each in found.values() for name in each))
     if not cases:
         raise InputError("found", "no multiples", "must hold at least one", "Run the study, or a case of it.")
-    height = 0.9 + 0.21 * len(found)
-    with canvas(1, len(cases), width=1.9 + 1.75 * len(cases), height=height, sharex=True, sharey=True, squeeze=False) as (
+    width, height = 1.9 + 1.75 * len(cases), 0.9 + 0.21 * len(found)
+    with canvas(1, len(cases), width=width, height=height, sharex=True, sharey=True, squeeze=False) as (
         figure, axes,
     ):  # fmt: skip
         for panel, case in zip(axes[0], cases, strict=True):
