@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import AnyArray, Floats
+from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
@@ -18,8 +19,6 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .machine import one_core
 from .net import SIZE, GainNet
-from .rollout import Step, steps
-from .stack import flatten, layers
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +27,7 @@ class Diagnostics:
 
     A GRU state is a running mix of tanh values and so stays in [-1, 1] whatever the noise; it need not be symmetric or
     positive. `posterior` is K times the assumed GNSS covariance, which equals the posterior covariance only if K is the
-    optimal gain. All (R, T, E, 3, 3), the first step NaN.
+    optimal gain. All (R, T, E, 3, 3), the first step NaN; where a fix is missing the gain is zero and the states stay.
     """
 
     gain: Floats
@@ -64,10 +63,11 @@ class LearnedGain:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` name the runs that left the fixes behind."""
         began, columns = time.perf_counter(), recording.columns(egos)
-        x = self._scan(recording, columns, lambda step: step.x)
-        origin = recording.gnss[:, :1, columns]
-        x[:, 0] = self._x0(recording, columns)
-        estimates = np.concatenate([x[:, :1], x[:, 1:] + origin], axis=1)
+        x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
+        with one_core(), torch.inference_mode():
+            moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)
+        moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, SIZE), 2, 1)
+        estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         notes = tuple(_divergence(estimates, recording, columns))
@@ -76,14 +76,30 @@ class LearnedGain:
     def diagnostics(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Diagnostics:
         """Gain, GRU states and K times the GNSS covariance at every step, with the caveat of `Diagnostics`."""
         columns = recording.columns(egos)
+        gnss, velocity, x0 = self._lanes(recording, columns)
+        states = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
+        with one_core(), torch.inference_mode(), _heard(self.model) as heard:
+            memory = self.model.start(x0)
+            for fix, speed in zip(gnss.unbind(1), velocity.unbind(1), strict=True):
+                memory, gain = self.model.step(memory, fix, speed, recording.dt)
+                missing = fix.isnan().all(1, keepdim=True)
+                kept = [torch.where(missing, old, new) for old, new in zip(states[-1][1:], heard, strict=True)]
+                states.append((gain.flatten(1), *kept))
+        found = torch.stack([torch.stack(step) for step in states]).double().numpy()
+        found = found.reshape(len(states), 4, recording.runs, len(columns), SIZE, SIZE).transpose(1, 2, 0, 3, 4, 5)
+        posterior = found[0] * np.square(np.array(recording.sensors.gnss_std))
+        return Diagnostics(*found, posterior)
 
-        def picture(step: Step) -> Tensor:
-            return torch.stack([step.gain, step.process.after, step.prior.after, step.innovation.after], dim=2)
+    def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""
+        origin = recording.gnss[:, :1, columns]
 
-        found = self._scan(recording, columns, picture)
-        gain, process, prior, innovation = np.moveaxis(found.reshape(*found.shape[:-1], SIZE, SIZE), 3, 0)
-        posterior = gain * np.square(np.array(recording.sensors.gnss_std))
-        return Diagnostics(gain, process, prior, innovation, posterior)
+        def lanes(array: Floats) -> Tensor:
+            flat = np.moveaxis(array, 1, 2).reshape(-1, array.shape[1], SIZE)
+            return torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32))
+
+        gnss, velocity = recording.gnss[:, 1:, columns] - origin, recording.velocity[:, 1:, columns]
+        return lanes(gnss), lanes(velocity), lanes(self._x0(recording, columns)[:, None] - origin)[:, 0]
 
     def _x0(self, recording: Recording, columns: list[int]) -> Floats:
         """(R, E, 3) m, where the filter starts."""
@@ -95,23 +111,18 @@ class LearnedGain:
             raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
         return np.broadcast_to(self.x0, fixes.shape)
 
-    @one_core()
-    def _scan(self, recording: Recording, columns: list[int], pick: Callable[[Step], Tensor]) -> AnyArray:
-        """(R, T, E, ...) of what `pick` takes from each step, relative to the first fix; step 0 is NaN."""
-        origin = recording.gnss[:, :1, columns]
 
-        def lanes(array: Floats) -> Tensor:
-            flat = np.moveaxis(array, 1, 0).reshape(len(array[0]), 1, -1, SIZE)
-            return torch.from_numpy(np.ascontiguousarray(flat, dtype=np.float32))
-
-        gnss = lanes(recording.gnss[:, 1:, columns] - origin)
-        velocity = lanes(recording.velocity[:, 1:, columns])
-        x0 = lanes(self._x0(recording, columns)[:, None] - origin)[0]
-        net = layers(flatten([self.model]), self.model)
-        with torch.inference_mode():
-            picked = [pick(s)[0].numpy() for s in steps(net, gnss, velocity, x0, recording.dt)]
-        rows = np.stack([np.full_like(picked[0], np.nan), *picked]).astype(np.float64)
-        return np.moveaxis(rows.reshape(len(rows), recording.runs, len(columns), *rows.shape[2:]), 0, 1)
+@contextmanager
+def _heard(model: GainNet) -> Iterator[list[Tensor]]:
+    """What the GRUs of process, prior and innovation gave at the last step, kept up to date inside."""
+    heard = [torch.empty(0)] * 3
+    hooks = [cell.register_forward_hook(lambda _, __, state, at=at: heard.__setitem__(at, state))
+             for at, cell in enumerate((model.process, model.prior, model.innovation))]  # fmt: skip
+    try:
+        yield heard
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 DIVERGED = 10.0

@@ -1,4 +1,4 @@
-"""GainNet and its stacked rollout, against an independent wiring of the published architecture."""
+"""GainNet and its method, against an independent wiring of the published architecture and filters by hand."""
 
 from __future__ import annotations
 
@@ -12,11 +12,8 @@ from torch import nn
 from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.learned.clients import Batch
-from coopoc.learned.gradient import loss_and_gradient
 from coopoc.learned.machine import one_core
 from coopoc.learned.method import DIVERGED
-from coopoc.learned.rollout import steps
-from coopoc.learned.stack import flatten, layers
 from coopoc.methods.track import Method
 
 
@@ -95,42 +92,8 @@ def test_wiring_and_features_as_published() -> None:
     net, data = GainNet(start_gain=None, seed=3).double(), batch(1, 4, 12)
     gnss, velocity = data.gnss[:, 0].transpose(0, 1), data.velocity[:, 0].transpose(0, 1)
     expected = Published(net)(gnss, velocity, data.x0[0], 0.1)
-    torch.testing.assert_close(net(gnss, velocity, data.x0[0], 0.1), expected, rtol=1e-10, atol=1e-10)
-
-
-def test_stacked_rollout_is_the_reference_step() -> None:
-    nets, data = [GainNet(seed=s) for s in range(3)], batch(3, 5, 100, torch.float32)
-    stack = layers(flatten(nets), nets[0])
-    with torch.no_grad():
-        fast = torch.stack([s.x for s in steps(stack, data.gnss, data.velocity, data.x0, 0.1)])
-        for s, net in enumerate(nets):
-            slow = net(data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], 0.1)
-            torch.testing.assert_close(fast[:, s].transpose(0, 1), slow, rtol=1e-5, atol=1e-5 * slow.abs().max().item())
-
-
-def test_gradient_is_autograd_of_the_reference() -> None:
-    nets, data = [GainNet(seed=s).double() for s in range(2)], batch(2, 3, 15)
-    losses, gradient = loss_and_gradient(flatten(nets), nets[0], data)
-    for s, net in enumerate(nets):
-        x = net(data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], 0.1)
-        loss = ((x - data.truth[:, s].transpose(0, 1)) ** 2).sum(-1).mean()
-        loss.backward()
-        expected = torch.cat([p.grad.flatten() for p in net.parameters()])
-        torch.testing.assert_close(losses[s], loss.detach(), rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(gradient[s], expected, rtol=1e-9, atol=1e-12)
-
-
-def test_gradient_is_the_finite_difference() -> None:
-    net, data = GainNet(in_mult=2, out_mult=1).double(), batch(1, 2, 6)
-    theta = flatten([net])
-    _, gradient = loss_and_gradient(theta, net, data)
-    torch.manual_seed(0)
-    for _ in range(5):
-        direction = torch.randn_like(theta)
-        up, _ = loss_and_gradient(theta + 1e-6 * direction, net, data)
-        down, _ = loss_and_gradient(theta - 1e-6 * direction, net, data)
-        slope = float((up - down) / 2e-6)
-        assert slope == pytest.approx(float((gradient * direction).sum()), rel=1e-5, abs=1e-7)
+    for found in (net(gnss, velocity, data.x0[0], 0.1), net.reference(gnss, velocity, data.x0[0], 0.1)):
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 def constant(gain: np.ndarray) -> GainNet:
@@ -194,6 +157,7 @@ def test_diagnostics_are_the_gain_and_the_gru_states() -> None:
     found, track = method.diagnostics(rec), method(rec)
     assert found.gain.shape == found.process.shape == found.prior.shape == found.innovation.shape == (2, 60, 1, 3, 3)
     assert np.nanmax(np.abs(found.process[:, 1:])) <= 1.0
+    assert np.isnan(found.gain[:, 0]).all()
     np.testing.assert_allclose(found.posterior[:, 1:], 1.5**2 * found.gain[:, 1:])
     prior = track.x[:, :-1] + 0.1 * rec.velocity[:, 1:]
     moved = np.einsum("rteij,rtej->rtei", found.gain[:, 1:], rec.gnss[:, 1:] - prior)

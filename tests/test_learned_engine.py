@@ -1,0 +1,219 @@
+"""The compiled engine against plain torch: values, gradients, missing fixes, rows that do not know of each other."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from coopoc import InputError
+from coopoc.learned import GainNet, engine
+from coopoc.learned import net as net_module
+from coopoc.learned.arithmetic import compiled, sigmoid, tanh
+from coopoc.learned.clients import Batch
+from coopoc.learned.machine import one_core, row_threads
+from coopoc.learned.stack import flatten
+
+
+@pytest.fixture(autouse=True)
+def _one_core() -> Iterator[None]:
+    with one_core():
+        yield
+
+
+def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float64, gaps: float = 0.0) -> Batch:
+    """Drives at constant speed; a share `gaps` of the fixes is missing."""
+    torch.manual_seed(1)
+    velocity = 5 * torch.randn(1, models, lanes, 3, dtype=dtype).expand(steps, -1, -1, -1)
+    truth = torch.cumsum(0.1 * velocity, 0)
+    noise = torch.randn(2, steps, models, lanes, 3, dtype=dtype)
+    gnss = torch.where(torch.rand(steps, models, lanes, 1) < gaps, torch.nan, truth + noise[0])
+    return Batch(gnss, velocity + noise[1], truth, 0.5 * noise[0, 0], 0.1)
+
+
+def plain(nets: list[GainNet], data: Batch, dt: float | Tensor) -> Tensor:
+    """(T, S, B, 3) of the reference, a net after the other."""
+    rows = [net.reference(data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], dt)
+            for s, net in enumerate(nets)]  # fmt: skip
+    return torch.stack([row.transpose(0, 1) for row in rows], 1)
+
+
+def gradients(nets: list[GainNet], data: Batch, dt: float | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Estimates and gradients of the squared error, of the engine and by torch's autograd through the reference."""
+    theta = flatten(nets).requires_grad_()
+    found = engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, dt)
+    (found - data.truth).square().sum(-1).mean((0, 2)).sum().backward()
+    expected = plain(nets, data, dt)
+    (expected - data.truth).square().sum(-1).mean((0, 2)).sum().backward()
+    by_torch = torch.stack([torch.cat([grad(p).flatten() for p in net.parameters()]) for net in nets])
+    return found.detach(), grad(theta), expected.detach(), by_torch
+
+
+def grad(leaf: Tensor) -> Tensor:
+    assert leaf.grad is not None
+    return leaf.grad
+
+
+def test_tanh_and_sigmoid_against_numpy() -> None:
+    @compiled
+    def both(x: np.ndarray, out: np.ndarray) -> None:
+        for i in range(len(x)):
+            out[0, i], out[1, i] = tanh(x[i], x.dtype.type), sigmoid(x[i], x.dtype.type)
+
+    wide = np.concatenate([np.linspace(-30, 30, 20_001), np.logspace(-9, 2, 2_001), [np.inf, -np.inf]])
+    for dtype, tolerance in ((np.float32, 4e-7), (np.float64, 3e-13)):
+        x = wide.astype(dtype)
+        out = np.empty((2, len(x)), dtype)
+        both(x, out)
+        exact = x.astype(np.float64)
+        np.testing.assert_allclose(out[0], np.tanh(exact), rtol=tolerance)
+        np.testing.assert_allclose(out[1], 0.5 + 0.5 * np.tanh(0.5 * exact), atol=tolerance)
+    nothing = np.full(1, np.nan)
+    both(nothing, out := np.empty((2, 1)))
+    assert np.isnan(out).all()
+
+
+@pytest.mark.parametrize("magnitudes", [False, True])
+@pytest.mark.parametrize(("models", "lanes"), [(1, 1), (2, 2), (1, 7), (2, 5)])
+def test_gradcheck(models: int, lanes: int, magnitudes: bool) -> None:
+    """torch.autograd.gradcheck: finite differences in float64, with missing fixes and variable dt."""
+    nets = [GainNet(2, 1, seed=s, magnitudes=magnitudes).double() for s in range(models)]
+    data, dt = batch(models, lanes, 6, gaps=0.3), torch.linspace(0.05, 0.2, 6)
+
+    def run(theta: Tensor) -> Tensor:
+        return engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, dt)
+
+    theta = flatten(nets)
+    torch.manual_seed(2)
+    weights, direction = theta + 0.05 * torch.randn_like(theta), torch.randn(3, theta.shape[1], dtype=torch.float64)
+
+    def along(step: Tensor) -> Tensor:
+        return run(weights + step @ direction)
+
+    assert torch.autograd.gradcheck(along, torch.zeros(models, 3, dtype=torch.float64, requires_grad=True), eps=1e-7)
+
+
+@pytest.mark.parametrize("magnitudes", [False, True])
+@pytest.mark.parametrize(("models", "lanes", "steps"), [(3, 1, 100), (1, 2, 900), (2, 7, 100), (1, 72, 100)])
+def test_float32_agrees_with_the_reference(models: int, lanes: int, steps: int, magnitudes: bool) -> None:
+    """Values to 1e-5. Gradients are about as near to float64's as torch's own float32 ones: rounding turns the direction
+    of a short vector, so that torch itself is up to 1e-4 off."""
+    nets = [GainNet(seed=s, magnitudes=magnitudes) for s in range(models)]
+    data = batch(models, lanes, steps, torch.float32, 0.1)
+    found, mine, expected, theirs = gradients(nets, data, 0.1)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5 * expected.abs().max().item())
+    wide = Batch(data.gnss.double(), data.velocity.double(), data.truth.double(), data.x0.double(), 0.1)
+    exact = gradients([copy.deepcopy(net).double() for net in nets], wide, 0.1)[3]
+    far, near = (mine - exact).norm(dim=1), (theirs - exact).norm(dim=1)
+    assert (far < 2 * near + 3e-5 * exact.norm(dim=1)).all()
+
+
+@pytest.mark.parametrize("magnitudes", [False, True])
+def test_float64_agrees_with_the_reference_with_gaps_and_variable_dt(magnitudes: bool) -> None:
+    nets = [GainNet(4, 2, seed=s, magnitudes=magnitudes).double() for s in range(2)]
+    dt = torch.linspace(0.05, 0.3, 60, dtype=torch.float64)
+    found, mine, expected, theirs = gradients(nets, batch(2, 9, 60, gaps=0.4), dt)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
+
+
+def test_losses_are_those_of_the_reference() -> None:
+    nets, data = [GainNet(2, 1, seed=s).double() for s in range(2)], batch(2, 3, 20)
+    theta, expected = flatten(nets), (plain(nets, data, 0.1) - data.truth).square().sum(-1).mean(0)
+    torch.testing.assert_close(nets[0].losses(theta, data), expected.detach(), rtol=1e-10, atol=1e-12)
+    mean, gradient = nets[0].loss_and_gradient(theta, data)
+    expected.mean(1).sum().backward()
+    torch.testing.assert_close(mean, expected.mean(1).detach(), rtol=1e-10, atol=1e-12)
+    by_torch = torch.stack([torch.cat([grad(p).flatten() for p in net.parameters()]) for net in nets])
+    torch.testing.assert_close(gradient, by_torch, rtol=1e-8, atol=1e-12)
+
+
+def test_a_net_is_an_ordinary_module() -> None:
+    """Two steps of torch.optim.Adam through forward end where they end through the reference."""
+    data, ends = batch(1, 3, 20), []
+    gnss, velocity, truth = (a[:, 0].transpose(0, 1) for a in data[:3])
+    for way in ("forward", "reference"):
+        net = GainNet(2, 1).double()
+        adam = torch.optim.Adam(net.parameters(), lr=1e-2)
+        for _ in range(2):
+            adam.zero_grad()
+            (getattr(net, way)(gnss, velocity, data.x0[0], 0.1) - truth).square().mean().backward()
+            adam.step()
+        ends.append(flatten([net]))
+    torch.testing.assert_close(ends[0], ends[1], rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize("lanes", [1, 2, 20])
+def test_a_model_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> None:
+    """Bit for bit: alone, in a stack, in a stack on two threads."""
+    nets, data = [GainNet(seed=s) for s in range(5)], batch(5, lanes, 30, torch.float32)
+
+    def run(rows: slice, count: int) -> tuple[Tensor, Tensor]:
+        theta = flatten(nets[rows]).requires_grad_()
+        with row_threads(count):
+            x = engine.rollout(theta, nets[0], data.gnss[:, rows], data.velocity[:, rows], data.x0[rows], 0.1)
+            (gradient,) = torch.autograd.grad((x - data.truth[:, rows]).square().sum(), theta)
+        return x.detach(), gradient
+
+    stacked, shared, alone = run(slice(0, 5), 1), run(slice(0, 5), 2), run(slice(3, 4), 1)
+    assert torch.equal(stacked[0], shared[0])
+    assert torch.equal(stacked[1], shared[1])
+    assert torch.equal(stacked[0][:, 3:4], alone[0])
+    assert torch.equal(stacked[1][3:4], alone[1])
+
+
+def test_without_gradients_the_answer_is_the_same() -> None:
+    nets, data = [GainNet(seed=s) for s in range(2)], batch(2, 3, 40, torch.float32)
+    theta = flatten(nets)
+    silent = engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, 0.1)
+    assert torch.equal(silent, engine.rollout(theta.requires_grad_(), nets[0], data.gnss, data.velocity, data.x0, 0.1))
+
+
+def test_gradients_of_inputs_go_through_the_reference() -> None:
+    data, net = batch(1, 2, 5), GainNet(2, 1).double()
+    gnss = data.gnss[:, 0].transpose(0, 1).clone().requires_grad_()
+    net(gnss, data.velocity[:, 0].transpose(0, 1), data.x0[0], 0.1).sum().backward()
+    assert gnss.grad is not None
+    assert float(gnss.grad.abs().sum()) > 0
+
+
+def test_what_does_not_fit_is_named() -> None:
+    data, net = batch(1, 2, 5), GainNet(2, 1)
+    theta = flatten([net])
+    with pytest.raises(InputError, match="theta"):
+        engine.rollout(theta[:, :-1], net, data.gnss, data.velocity, data.x0, 0.1)
+    with pytest.raises(InputError, match="theta"):
+        engine.rollout(theta.half(), net, data.gnss, data.velocity, data.x0, 0.1)
+    with pytest.raises(InputError, match="velocity"):
+        engine.rollout(theta, net, data.gnss, data.velocity[1:], data.x0, 0.1)
+    with pytest.raises(InputError, match="dt"):
+        engine.rollout(theta, net, data.gnss, data.velocity, data.x0, torch.ones(4))
+
+
+def test_without_numba_plain_torch_serves_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    nets, data = [GainNet(2, 1, seed=s).double() for s in range(2)], batch(2, 2, 8, gaps=0.2)
+    theta = flatten(nets)
+    expected = nets[0].loss_and_gradient(theta, data)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    net_module._engine.cache_clear()
+    try:
+        with pytest.warns(UserWarning, match=r"pip install 'coopoc\[fast\]'"):
+            found = nets[0].loss_and_gradient(theta, data)
+        again = nets[0].loss_and_gradient(theta, data)
+    finally:
+        net_module._engine.cache_clear()
+    for one, two, three in zip(expected, found, again, strict=True):
+        torch.testing.assert_close(one, two, rtol=1e-8, atol=1e-12)
+        assert torch.equal(two, three)
+
+
+def test_importing_the_package_imports_no_numba() -> None:
+    code = "import sys, coopoc, coopoc.learned; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
