@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, fields, replace
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -18,20 +18,24 @@ from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
-Noise = Literal["static", "fresh"]
+Noise = Literal["static", "fresh", "wide"]
 Start = Literal["gnss", "true"]
 LONG = 9
 """Training pieces that a long piece is as long as: 900 steps, the paper's test drive."""
+WIDE = ((2 / 3, 1 / 2), (8 / 3, 2.0))
+"""Least and greatest factors of the GNSS and the velocity std under wide noise: 1.5 m, 10 % become 1 to 4 m, 5 to 20 %."""
 
 
 class Batch(NamedTuple):
-    """What S models see at once, each B pieces: gnss, velocity, truth (T, S, B, 3); x0 (S, B, 3); dt s."""
+    """What S models see at once, each B pieces: gnss, velocity, truth (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is
+    the truth (S, B), None if it never is."""
 
     gnss: Tensor
     velocity: Tensor
     truth: Tensor
     x0: Tensor
     dt: float
+    known: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +44,10 @@ class Pieces:
 
     Args:
         gnss, velocity, truth, true_velocity: (n, T + 1, 3) m and m/s; sample 0 only starts the filter.
-        gnss_std, velocity_std: (n, T + 1, 3) m and m/s of the noise, for fresh draws.
+        gnss_std, velocity_std: (n, T + 1, 3) m and m/s of the noise, for new draws.
         true_start: (n,) whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
-        dt: s. fresh: draw new noise at every use instead of the noise drawn once.
+        dt: s. noise: "static" was drawn once; "fresh" is drawn anew at every use; "wide" too, and then every use of a
+            piece also draws how large its noise is, log-uniformly between the factors `WIDE`.
     """
 
     gnss: Tensor
@@ -53,22 +58,26 @@ class Pieces:
     velocity_std: Tensor
     true_start: Tensor
     dt: float
-    fresh: bool = False
+    noise: Noise = "static"
 
     def __len__(self) -> int:
         return len(self.truth)
 
     def batch(self, index: Tensor, draws: Sequence[torch.Generator] = ()) -> Batch:
-        """Pieces `index` (S, B); fresh noise comes from the S generators `draws`."""
+        """Pieces `index` (S, B); new noise comes from the S generators `draws`."""
         gnss, velocity, truth = self.gnss[index], self.velocity[index], self.truth[index]
-        if self.fresh:
+        if self.noise != "static":
             shape = (2, *truth.shape[1:])
             normals = torch.stack([torch.randn(shape, generator=draw) for draw in draws], dim=1)
-            gnss = truth + self.gnss_std[index] * normals[0]
-            velocity = self.true_velocity[index] + self.velocity_std[index] * normals[1]
-        x0 = torch.where(self.true_start[index][..., None], truth[..., 0, :], gnss[..., 0, :])
+            gnss_std, velocity_std = self.gnss_std[index], self.velocity_std[index]
+            if self.noise == "wide":
+                gnss_std, velocity_std = _widened(gnss_std, velocity_std, draws)
+            gnss = truth + gnss_std * normals[0]
+            velocity = self.true_velocity[index] + velocity_std * normals[1]
+        known = self.true_start[index]
+        x0 = torch.where(known[..., None], truth[..., 0, :], gnss[..., 0, :])
         gnss, velocity, truth = (a[..., 1:, :].permute(2, 0, 1, 3).contiguous() for a in (gnss, velocity, truth))
-        return Batch(gnss, velocity, truth, x0, self.dt)
+        return Batch(gnss, velocity, truth, x0, self.dt, known if known.any() else None)
 
     def take(self, index: Sequence[int]) -> Pieces:
         """The pieces `index`."""
@@ -77,15 +86,26 @@ class Pieces:
     @classmethod
     def join(cls, parts: Sequence[Pieces]) -> Pieces:
         """All pieces of several parts in their order; the parts agree in length, dt and kind of noise."""
-        if len({(p.truth.shape[1], p.dt, p.fresh) for p in parts}) != 1:
-            found = [(p.truth.shape[1], p.dt, p.fresh) for p in parts]
+        if len({(p.truth.shape[1], p.dt, p.noise) for p in parts}) != 1:
+            found = [(p.truth.shape[1], p.dt, p.noise) for p in parts]
             raise InputError("pieces", found, "must agree in length, dt and noise", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
     def _each(self, made: Callable[[str], Tensor]) -> Pieces:
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
         tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
-        return Pieces(**tensors, dt=self.dt, fresh=self.fresh)
+        return Pieces(**tensors, dt=self.dt, noise=self.noise)
+
+
+def _widened(gnss_std: Tensor, velocity_std: Tensor, draws: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
+    """Stds (S, B, T + 1, 3) of pieces times factors log-uniform between `WIDE`, one per piece and kind; every other use
+    reads "10 % of the velocity" as of the speed: then each axis has the norm of all three."""
+    dice = torch.stack([torch.rand((3, gnss_std.shape[1]), generator=draw) for draw in draws], dim=1)
+    low, high = torch.tensor(WIDE).log().unbind()
+    factors = torch.lerp(low[:, None, None], high[:, None, None], dice[:2]).exp()[..., None, None]
+    of_speed = torch.linalg.vector_norm(velocity_std, dim=-1, keepdim=True)
+    velocity_std = torch.where(dice[2, ..., None, None] < 0.5, velocity_std, of_speed)
+    return factors[0] * gnss_std, factors[1] * velocity_std
 
 
 def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
@@ -104,7 +124,7 @@ def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
     def turn(vectors: Tensor) -> Tensor:
         return torch.where(swap, vectors[..., [1, 0, 2]], vectors) * signs
 
-    return Batch(turn(batch.gnss), turn(batch.velocity), turn(batch.truth), turn(batch.x0), batch.dt)
+    return Batch(turn(batch.gnss), turn(batch.velocity), turn(batch.truth), turn(batch.x0), batch.dt, batch.known)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +157,8 @@ def clients(
 
     Args:
         fleet: drives (T, N); a vehicle may leave early. sensors: default `Sensors.paper_training()`.
-        seed: of noise and split. noise: "static" or "fresh" (new at every use). start: "gnss" (first fix) or "true".
+        seed: of noise and split. noise: "static", "fresh" (new at every use) or "wide" (new,
+            and of a size that differs from use to use). start: "gnss" (first fix) or "true".
 
     Raises:
         InputError: a choice that does not exist, or a vehicle with fewer than two pieces.
@@ -149,14 +170,14 @@ def clients(
     >>> [(len(c.training), len(c.validation)) for c in clients(line)]
     [(2, 1)]
     """
-    for name, value, allowed in (("noise", noise, ("static", "fresh")), ("start", start, ("gnss", "true"))):
+    for name, value, allowed in (("noise", noise, get_args(Noise)), ("start", start, get_args(Start))):
         if value not in allowed:
             raise InputError(name, repr(value), f"must be one of {allowed}", "Pick one.")
     if piece < 2 or not 0 < split < 1:
         raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
     sensors = sensors or Sensors.paper_training()
-    if noise == "fresh" and sensors.gnss_bias[1] > 0:
-        raise InputError("gnss_bias", sensors.gnss_bias, "must be (0, 0) with fresh noise", "Train without a bias.")
+    if noise != "static" and sensors.gnss_bias[1] > 0:
+        raise InputError("gnss_bias", sensors.gnss_bias, f"must be (0, 0) with {noise} noise", "Train without a bias.")
     seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
     found, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
@@ -181,12 +202,13 @@ def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise
     count = len(drive[0]) // (piece + 1)
     gnss, velocity, truth, true_velocity = (d[: count * (piece + 1)].reshape(count, piece + 1, 3) for d in drive)
     origin = truth[:, :1]
-    stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), sensors.velocity_std(true_velocity)
+    acting = replace(sensors, velocity_reading="axis") if noise == "wide" else sensors
+    stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), acting.velocity_std(true_velocity)
 
     def tensor(numbers: Floats) -> Tensor:
         return torch.tensor(numbers, dtype=torch.float32)
 
     return Pieces(
         tensor(gnss - origin), tensor(velocity), tensor(truth - origin), tensor(true_velocity), tensor(stds[0]),
-        tensor(stds[1]), torch.full((count,), start == "true"), dt, noise == "fresh",
+        tensor(stds[1]), torch.full((count,), start == "true"), dt, noise,
     )  # fmt: skip

@@ -31,6 +31,8 @@ class Schedule:
     """Decoupled from the gradient (AdamW), the paper's number."""
     l2: float = 0.0
     """gamma of the paper's gamma ||theta||^2 in the loss; weaker than the decoupled decay under static noise."""
+    proximal: float = 0.0
+    """mu of FedProx's mu / 2 ||theta - theta_start||^2 in the loss: how far training may leave where it started."""
     clip: float = 1.0
     """Largest norm of a model's gradient."""
     mirror: bool = True
@@ -42,8 +44,9 @@ class Schedule:
         for field in ("epochs", "batch", "learning_rate", "clip", "checks"):
             if not getattr(self, field) > 0:
                 raise InputError(field, getattr(self, field), "must be > 0", f"Give Schedule({field}=...).")
-        if self.weight_decay < 0 or self.l2 < 0:
-            raise InputError("weight_decay, l2", (self.weight_decay, self.l2), "must be >= 0", "Use 0 for none.")
+        for field in ("weight_decay", "l2", "proximal"):
+            if not getattr(self, field) >= 0:
+                raise InputError(field, getattr(self, field), "must be >= 0", "Use 0 for none.")
         if self.epoch not in ("step", "pass"):
             raise InputError("epoch", repr(self.epoch), 'must be "step" or "pass"', "Pick one.")
 

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import torch
@@ -144,7 +145,7 @@ def descend(
     A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
     models with shorter plans wait for the longest. Their loss is NaN.
     """
-    first, second = torch.zeros_like(theta), torch.zeros_like(theta)
+    first, second, began = torch.zeros_like(theta), torch.zeros_like(theta), theta.clone()
     for step in range(max(map(len, plans))):
         rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
         losses = torch.full((len(plans),), math.nan)
@@ -158,8 +159,8 @@ def descend(
             stopped |= {r: f"loss or gradient not finite at step {step + 1}"
                         for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
             rate = torch.tensor([[rates[r][step]] for r in rows], dtype=theta.dtype)
-            adamw(mine, clip(gradient + 2 * schedule.l2 * mine, schedule.clip), m, v, step + 1, rate,
-                  schedule.weight_decay)  # fmt: skip
+            gradient = gradient + 2 * schedule.l2 * mine + schedule.proximal * (mine - began[rows])
+            adamw(mine, clip(gradient, schedule.clip), m, v, step + 1, rate, schedule.weight_decay)
             good = torch.tensor(rows)[finite]
             theta[good], first[good], second[good] = mine[finite], m[finite], v[finite]
         yield step + 1, losses
@@ -170,6 +171,7 @@ class Judge:
 
     The kinds are the validation pieces and, where there are any, the long ones: over a long drive a stable filter is
     the better for its start being over, so they decide only against weights that drift away. Fresh noise is drawn once.
+    A model's pieces are added in their order, so that its score does not depend on who is judged beside it.
     """
 
     def __init__(self, kinds: Sequence[Sequence[Pieces]], like: Gain) -> None:
@@ -178,7 +180,8 @@ class Judge:
 
     def __call__(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
-            means = [(self.like.losses(theta, batch) * share).sum(1) for batch, share in self.batches]
+            parts = [(self.like.losses(theta, batch) * share).unbind(1) for batch, share in self.batches]
+        means = [reduce(torch.add, each) for each in parts]
         return torch.stack(means).nan_to_num(math.inf, math.inf).amax(0)
 
 
