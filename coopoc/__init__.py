@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .evaluate.metrics import nees as nees
     from .evaluate.metrics import rt_le as rt_le
     from .fleets import load as load
+    from .methods.adaptive import AdaptiveKalman as AdaptiveKalman
     from .methods.admm import ConsensusADMM as ConsensusADMM
     from .methods.batch_smoother import BatchSmoother as BatchSmoother
     from .methods.central_filter import CentralFilter as CentralFilter
@@ -36,8 +37,10 @@ if TYPE_CHECKING:
     from .methods.moving_horizon import MovingHorizon as MovingHorizon
     from .methods.msmv import Msmv as Msmv
     from .methods.qcqp_sdr import QcqpSdr as QcqpSdr
+    from .methods.star_stream import Sighting as Sighting
     from .methods.track import Method as Method
     from .methods.track import Track as Track
+    from .methods.variational import VariationalKalman as VariationalKalman
     from .optimize.constraint import Constraint as Constraint
     from .optimize.factor import Factor as Factor
     from .optimize.graphs import read as read
@@ -63,6 +66,8 @@ _HOME = {
     "Fleet": "world.fleet", "Links": "world.recording", "Recording": "world.recording", "observe": "world.sensing",
     "Sensors": "world.sensors", "V2X": "world.v2x", "Message": "world.v2x",
     "Gnss": "methods.gnss", "Kalman": "methods.kalman", "Knowledge": "methods.knowledge",
+    "AdaptiveKalman": "methods.adaptive", "VariationalKalman": "methods.variational",
+    "Sighting": "methods.star_stream",
     "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
     "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
     "CovarianceIntersection": "methods.covariance_intersection", "Mds": "methods.mds", "QcqpSdr": "methods.qcqp_sdr",

@@ -8,17 +8,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .machine import one_core
 from .net import SIZE, GainNet
+from .stream import Driven, gain_stream
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +62,10 @@ class LearnedGain:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[Driven]:
+        """The net that is fed step by step (docs/streaming.md)."""
+        return gain_stream(self.model, x0, history)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` name the runs that left the fixes behind."""

@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.methods.kalman import solo_filter
+from coopoc.methods.kalman import Gaussian, solo_filter
+from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
 from coopoc.world.noise import stream
 from coopoc.world.recording import Recording
@@ -21,6 +23,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 from .clients import Batch, Pieces
 from .machine import one_core, watched
 from .schedule import generator
+from .stream import okf_stream
 
 Three = tuple[float, float, float]
 
@@ -54,6 +57,12 @@ class OptimisedKF:
                 raise InputError(field, getattr(self, field), "must be three numbers >= 0", "Train it with fit_okf.")
         if min(self.gnss_std) == 0:
             raise InputError("gnss_std", self.gnss_std, "must be > 0", "Assumed noise may not be zero.")
+
+    def start(
+        self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0
+    ) -> Stream[Gaussian]:
+        """The filter that is fed step by step (docs/streaming.md); interval: s, of the training."""
+        return okf_stream(self, x0, interval, history)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos."""

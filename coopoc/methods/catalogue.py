@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from .adaptive import AdaptiveKalman
 from .admm import ConsensusADMM
 from .batch_smoother import BatchSmoother
 from .central_filter import CentralFilter
@@ -22,6 +23,7 @@ from .moving_horizon import MovingHorizon
 from .msmv import Msmv
 from .qcqp_sdr import QcqpSdr
 from .track import Method
+from .variational import VariationalKalman
 
 Factory = Callable[[Knowledge | str], Method]
 """What a method assumes about noise -> the method. A third party's entry point in `coopoc.methods` is one, too."""
@@ -29,6 +31,8 @@ Factory = Callable[[Knowledge | str], Method]
 METHODS: Mapping[str, Factory] = {
     "gnss": lambda knowledge: Gnss(),
     "kalman": lambda knowledge: Kalman(knowledge),
+    "kalman-adaptive": lambda knowledge: AdaptiveKalman(),
+    "kalman-variational": lambda knowledge: VariationalKalman(),
     "lkf-sa": lambda knowledge: LaplacianKalman(knowledge),
     "lkf-sa-edge": lambda knowledge: JointFilter(knowledge, exact=False, name="lkf-sa-edge"),
     "msmv-r": lambda knowledge: Msmv(knowledge),

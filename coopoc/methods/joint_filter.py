@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from ..arrays import Floats
 from ..world.inbox import Inbox
@@ -16,6 +17,8 @@ from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .network import whitened
 from .star import FORGOTTEN, StarStep, rows, star_steps
+from .star_stream import Advance, StarStream
+from .stream import alone
 from .track import Track
 
 
@@ -46,10 +49,35 @@ class JointFilter:
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
         state: Floats = np.empty((recording.runs, 0, 3))
         spread: Floats = np.empty((recording.runs, 0, 0))
+        advance = self._advance(known)
         for star in star_steps(recording, ego, box, known):
-            state, spread = predict(state, spread, star)
-            state, spread = update(state, spread, star, known, self.exact and known.exact_relative)
+            state, spread = advance(state, spread, star)
             yield Estimate(star.step, state[:, 0], spread[:, :3, :3], star.links, state[:, 1:])
+
+    def start(
+        self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0, max_age: float = 1.0
+    ) -> StarStream:
+        """The filter that is fed step by step: `step(gnss, velocity, dt, fix_age, neighbours=[Sighting(...)])`.
+
+        Args:
+            x0, interval, history: as in `Kalman.start`. max_age: s, older messages of neighbours are forgotten.
+
+        >>> from coopoc.methods.star_stream import Sighting
+        >>> ego = JointFilter("identity").start()
+        >>> seen = Sighting("b", [9.0, 0.0, np.pi / 2], gnss=[10.0, 0.0, 0.0], velocity=[9.0, 0.0, 0.0])
+        >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
+        >>> float(x[0].round(3)), float(ego.neighbours["b"][0].round(3))  # the fixes say 10 m, the sighting 9 m
+        (0.333, 9.667)
+        """
+        known = alone(self.knowledge)
+        return StarStream(self._advance(known), known, x0, interval, history, max_age)
+
+    def _advance(self, known: Knowledge) -> Advance:
+        def advance(state: Floats, spread: Floats, star: StarStep) -> tuple[Floats, Floats]:
+            state, spread = predict(state, spread, star)
+            return update(state, spread, star, known, self.exact and known.exact_relative)
+
+        return advance
 
 
 def predict(state: Floats, spread: Floats, star: StarStep) -> tuple[Floats, Floats]:

@@ -5,15 +5,45 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
 from ..world.recording import Recording
 from ..world.v2x import NO_MESSAGE, Message
 from .knowledge import Knowledge, resolve
+from .stream import Stream, Variance, alone, assumed_motion
 from .track import Track
+
+
+class Gaussian(NamedTuple):
+    """Position x (..., 3) m and its variance per axis (..., 3) m^2."""
+
+    x: Floats
+    variance: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SoloKalman:
+    """The Kalman filter as a `Solo`: variance of the motion, and of a fix, (3,) m^2."""
+
+    process: Variance
+    gnss_variance: Floats
+
+    def begin(self, x: Floats, late: Floats | None) -> Gaussian:
+        """Exact, or as uncertain as a fix."""
+        return Gaussian(x, np.broadcast_to(0.0 if late is None else self.gnss_variance + late, x.shape))
+
+    def advance(self, state: Gaussian, moved: Floats, process: Floats, fix: Floats, late: Floats) -> Gaussian:
+        """Predict, and correct where there is a fix."""
+        return correct(state.x + moved, state.variance + process, fix, self.gnss_variance + late)
+
+    def read(self, state: Gaussian) -> tuple[Floats, Floats]:
+        """Position and diagonal covariance."""
+        return state.x, state.variance[..., None] * np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +83,38 @@ class Kalman:
         free = np.zeros((recording.runs, len(columns)))
         return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), free, free, time.perf_counter() - began)
 
+    def start(
+        self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0
+    ) -> Stream[Gaussian]:
+        """The filter that is fed step by step; a stream has no recording, so "nominal" is Knowledge.nominal(sensors).
+
+        Args:
+            x0: (3,) m, known before the first step; None starts at the first fix.
+            interval: s, dt of the recordings that the assumed process noise belongs to.
+            history: s, how old a delayed fix may be.
+
+        >>> x, covariance = Kalman("identity").start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+        >>> x.tolist(), covariance.trace()
+        ([1.0, 2.0, 0.0], np.float64(3.0))
+        """
+        known = alone(self.knowledge)
+        return Stream(SoloKalman(assumed_motion(known, interval), known.gnss_variance), x0, history)
+
+
+def correct(prior: Floats, spread: Floats, fix: Floats, noise: Floats) -> Gaussian:
+    """Kalman update per axis, gain k = p / (p + r), x += k (z - x), p = (1 - k)^2 p + k^2 r (Joseph); none for NaN.
+
+    Args:
+        prior: (..., 3) m. spread: (..., 3) m^2 its variance. fix: (..., 3) m. noise: (..., 3) m^2 its variance.
+
+    >>> correct(np.zeros(3), np.ones(3), np.array([2.0, 2.0, np.nan]), np.ones(3)).x
+    array([1., 1., 0.])
+    """
+    missing = np.isnan(fix)
+    gain = np.where(missing, 0.0, spread / (spread + noise))
+    x = np.where(missing, prior, prior + gain * (fix - prior))
+    return Gaussian(x, (1 - gain) ** 2 * spread + gain**2 * noise)
+
 
 def solo_filter(
     gnss: Floats, velocity: Floats, process_variance: Floats, gnss_variance: Floats, dt: float,
@@ -60,10 +122,10 @@ def solo_filter(
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Kalman filter per axis: all covariances are diagonal, so the three axes do not couple.
 
-    predict x += dt u, p += q; gain k = p / (p + r); x += k (z - x); p = (1 - k)^2 p + k^2 r (Joseph).
+    predict x += dt u, p += q, and `correct`. A fix of NaN is missing: prediction only.
 
     Args:
-        gnss, velocity: (R, T, N, 3), NaN where a vehicle is absent; it starts anew at its first fix.
+        gnss, velocity: (R, T, N, 3), both NaN where a vehicle is absent; it starts anew at its first fix.
         process_variance: broadcastable to (R, T, N, 3) m^2. gnss_variance: (3,) m^2. dt: s.
         x0: (..., N, 3) m exact position at step 0, or None for the first fix.
 
@@ -76,9 +138,8 @@ def solo_filter(
     p[:, 0] = gnss_variance if x0 is None else 0.0
     for t in range(1, gnss.shape[1]):
         prior = x[:, t - 1] + dt * velocity[:, t]
-        spread = p[:, t - 1] + q[:, t]
-        gain = spread / (spread + gnss_variance)
+        found = correct(prior, p[:, t - 1] + q[:, t], gnss[:, t], gnss_variance)
         joining = np.isnan(prior)
-        x[:, t] = np.where(joining, gnss[:, t], prior + gain * (gnss[:, t] - prior))
-        p[:, t] = np.where(joining, gnss_variance, (1 - gain) ** 2 * spread + gain**2 * gnss_variance)
+        x[:, t] = np.where(joining, gnss[:, t], found.x)
+        p[:, t] = np.where(joining, gnss_variance, found.variance)
     return x, p

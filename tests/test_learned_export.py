@@ -1,0 +1,177 @@
+"""Exported steps: ONNX by onnxruntime and TorchScript by torch's own loader, against the net."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from coopoc import V2X, InputError, Sensors, load, observe
+from coopoc.arrays import AnyArray, Floats
+from coopoc.errors import MissingLibraryError
+from coopoc.learned import GainNet, OptimisedKF, checkpoint
+from coopoc.learned.export import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx, to_torchscript
+from coopoc.learned.recipes import WEIGHTS
+from coopoc.learned.stream import gain_stream
+
+pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # of torch.jit.load
+onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+ROOT = Path(__file__).resolve().parents[1]
+Step = Callable[[Sequence[AnyArray]], Sequence[AnyArray]]
+
+
+@pytest.fixture(scope="module")
+def shipped() -> checkpoint.Checkpoint:
+    return checkpoint.load(WEIGHTS / "fedkalmannet.safetensors")
+
+
+@pytest.fixture(scope="module")
+def file(shipped: checkpoint.Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return to_onnx(shipped, tmp_path_factory.mktemp("export") / "step.onnx")
+
+
+@pytest.fixture(scope="module")
+def script(shipped: checkpoint.Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return to_torchscript(shipped, tmp_path_factory.mktemp("export") / "step.pt")
+
+
+def steps(file: Path) -> Step:
+    """The step of an exported file."""
+    if file.suffix == ".onnx":
+        session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+        return lambda arrays: session.run(list(OUTPUTS), dict(zip(INPUTS, arrays, strict=True)))
+    module = torch.jit.load(file)
+    return lambda arrays: [a.detach().numpy() for a in module(*(torch.from_numpy(a) for a in arrays))]
+
+
+def rolled(step: Step, net: GainNet, gnss: Floats, velocity: Floats, dt: float) -> Floats:
+    """(T, B, 3) estimates from the first fix of lanes (T, B, 3)."""
+    inputs = first_inputs(net, gnss[0].tolist())
+    found = [gnss[0]]
+    for fix, speed in zip(gnss[1:], velocity[1:], strict=True):
+        given = [a.astype(np.float32) for a in (fix, speed, np.array(dt))]
+        inputs = [*list(step([*inputs[:-3], *given]))[:-1], *given]
+        found.append(inputs[3].astype(float))
+    return np.stack(found)
+
+
+@pytest.mark.parametrize("kind", ["file", "script"])
+def test_a_whole_drive_has_the_error_of_the_net(
+    kind: str, shipped: checkpoint.Checkpoint, request: pytest.FixtureRequest
+) -> None:
+    """900 steps of four vehicles and two runs as eight lanes at once: RT-LE within 1e-4 m of torch's own steps."""
+    fleet = load("town10").select([0, 12, 24, 36])
+    seen = observe(fleet, Sensors.paper_scenario2(), V2X(max_neighbours=0), runs=2)
+    net, origin = shipped.model, np.tile(fleet.position[0], (2, 1))
+    assert isinstance(net, GainNet)
+    gnss, velocity = (np.moveaxis(a, 1, 0).reshape(900, 8, 3) for a in (seen.gnss, seen.velocity))
+    found = rolled(steps(request.getfixturevalue(kind)), net, gnss - origin, velocity, seen.dt) + origin
+    near, speed = (torch.tensor(a, dtype=torch.float32).transpose(0, 1) for a in (gnss - origin, velocity))
+    with torch.no_grad():
+        own = net.reference(near[:, 1:], speed[:, 1:], near[:, 0], seen.dt).transpose(0, 1).double().numpy() + origin
+    truth = np.concatenate([fleet.position, fleet.position], axis=1)
+    score = [np.sqrt(np.mean(((x - truth[1:]) ** 2).sum(-1), axis=0)) for x in (found[1:], own)]
+    np.testing.assert_allclose(score[0], score[1], atol=1e-4)
+    stream, alone = gain_stream(net), []
+    for t in range(900):
+        alone.append(stream.step(seen.gnss[1, t, 2], seen.velocity[1, t, 2], seen.dt)[0])
+    assert np.sqrt(np.mean(((np.array(alone)[1:] - truth[1:, 6]) ** 2).sum(-1))) == pytest.approx(score[0][6], abs=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["file", "script"])
+@pytest.mark.parametrize("lanes", [1, 7])
+def test_any_number_of_lanes_with_missing_fixes(
+    lanes: int, kind: str, shipped: checkpoint.Checkpoint, request: pytest.FixtureRequest
+) -> None:
+    net, step, draw = shipped.model, steps(request.getfixturevalue(kind)), np.random.default_rng(3)
+    assert isinstance(net, GainNet)
+    inputs = first_inputs(net, draw.normal(0, 2, (lanes, 3)).tolist())
+    inputs[7] = np.where(np.arange(lanes)[:, None] % 2 == 0, np.nan, inputs[7] + 1).astype(np.float32)
+    memory, gain = net.step(net.start(torch.from_numpy(inputs[3])), *(torch.from_numpy(a) for a in inputs[-3:]))
+    for ours, theirs in zip(step(inputs), (*memory, gain), strict=True):
+        np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=1e-5)
+
+
+def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step that is off by 2e-5 m in one number after twenty steps is refused, and no file appears."""
+    net, calls = GainNet(2, 1), iter(range(10 * STEPS))
+    one = to_torchscript(net, tmp_path / "good.pt")
+    good = steps(one)
+    assert agree(net, good) <= AGREE
+
+    def off(arrays: Sequence[AnyArray]) -> Sequence[AnyArray]:
+        found = [np.array(a) for a in good(arrays)]
+        found[3][0, 0] += 2e-5 * (next(calls) == 20)
+        return found
+
+    with pytest.raises(InputError, match=r"export = differs by .* at step 21"):
+        agree(net, off)
+    with pytest.raises(InputError, match="export = differs by nan"):
+        agree(net, lambda arrays: [np.full_like(a, np.nan) for a in good(arrays)])
+    other = steps(to_torchscript(GainNet(2, 1, seed=1), tmp_path / "other.pt"))
+    monkeypatch.setattr(torch.jit, "load", lambda part: lambda *given: [torch.from_numpy(a) for a in other(
+        [a.numpy() for a in given])])  # fmt: skip
+    with pytest.raises(InputError, match="export"):
+        to_torchscript(net, tmp_path / "bad.pt")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["good.pt", "other.pt"]
+
+
+def test_the_card_travels_along(file: Path, script: Path, shipped: checkpoint.Checkpoint, tmp_path: Path) -> None:
+    extra = {"card": ""}
+    torch.jit.load(script, _extra_files=extra)
+    props = {p.key: p.value for p in onnx.load(file).metadata_props}
+    for text in (props["card"], extra["card"]):
+        assert json.loads(text) == dict(shipped.card)
+    bare = {"card": ""}
+    torch.jit.load(to_torchscript(GainNet(2, 1), tmp_path / "a.pt"), _extra_files=bare)
+    assert not bare["card"]
+
+
+def test_the_file_names_its_arrays_and_no_machine(file: Path) -> None:
+    graph = onnx.load(file).graph
+    onnx.checker.check_model(onnx.load(file), full_check=True)
+    assert [i.name for i in graph.input] == list(INPUTS)
+    assert [o.name for o in graph.output] == list(OUTPUTS)
+    shapes = [[d.dim_param or d.dim_value for d in i.type.tensor_type.shape.dim] for i in graph.input]
+    lanes = shapes[0][0]
+    assert isinstance(lanes, str)
+    assert shapes == [*[[lanes, 9]] * 3, *[[lanes, 3]] * 6, []]
+    for place in (ROOT, Path(torch.__file__).parent, Path.cwd()):
+        assert os.fsencode(place) not in file.read_bytes()
+
+
+def test_other_models_and_a_missing_library_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    okf = OptimisedKF((0.1,) * 3, (0.1,) * 3, (1.5,) * 3)
+    with pytest.raises(InputError, match="model = OptimisedKF"):
+        to_onnx(okf, tmp_path / "a.onnx")  # type: ignore[arg-type]
+    find = builtins.__import__
+    for name in ("onnx", "onnxruntime", "onnxscript"):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, name, None)
+            with pytest.raises(MissingLibraryError, match=rf"needs {name}.*pip install 'coopoc\[export\]'"):
+                to_onnx(GainNet(2, 1), tmp_path / "a.onnx")
+    assert builtins.__import__ is find
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_documented_program_needs_onnxruntime_and_numpy_only(file: Path, tmp_path: Path) -> None:
+    """The last block of docs/streaming.md, as it stands, in a Python that cannot import coopoc, torch or onnx."""
+    text = (ROOT / "docs" / "streaming.md").read_text()
+    (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL) if "onnxruntime" in b]
+    (tmp_path / "fedkalmannet.onnx").write_bytes(file.read_bytes())
+    ban = "import sys\nfor name in ('torch', 'coopoc', 'onnx'):\n    sys.modules[name] = None\n"
+    (tmp_path / "run.py").write_text(ban + block)
+    out = subprocess.run([sys.executable, "-W", "error", "run.py"], cwd=tmp_path, capture_output=True, text=True,
+                         check=True).stdout  # fmt: skip
+    x = np.array([float(word) for word in re.findall(r"-?\d+\.\d+", out)])
+    assert x.shape == (3,)
+    assert np.linalg.norm(x - [1090.0, 2000.0, 0.0]) < 3.0, "it drove 10 s at 9 m/s"

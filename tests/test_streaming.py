@@ -1,0 +1,378 @@
+"""Streaming: the laws that every filter obeys when it is fed step by step, and independent answers."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Knowledge, Sensors, observe
+from coopoc.arrays import Floats
+from coopoc.learned import GainNet, LearnedGain, OptimisedKF
+from coopoc.learned.stream import gain_stream, okf_stream
+from coopoc.methods.adaptive import AdaptiveKalman
+from coopoc.methods.star_stream import Sighting, StarStream
+from coopoc.methods.variational import VariationalKalman
+from coopoc.world.inbox import Inbox, inbox
+from coopoc.world.recording import Links, Recording
+
+ROOT = Path(__file__).resolve().parents[1]
+S2 = Sensors.paper_scenario2()
+FITTED = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+OKF = OptimisedKF((0.05, 0.04, 0.01), (0.1, 0.12, 0.05), (1.5, 1.6, 1.7))
+NET = GainNet(2, 1)
+SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
+    "identity": (Kalman("identity"), Kalman("identity").start),
+    "nominal": (Kalman("nominal"), Kalman(Knowledge.nominal(S2)).start),
+    "fitted": (Kalman(FITTED), Kalman(FITTED).start),
+    "adaptive": (AdaptiveKalman(), AdaptiveKalman().start),
+    "variational": (VariationalKalman(), VariationalKalman().start),
+    "okf": (OKF, lambda x0=None: okf_stream(OKF, x0)),
+}
+STARTS: dict[str, Callable[..., Any]] = {
+    **{name: start for name, (_, start) in SOLO.items()},
+    "net": lambda x0=None: gain_stream(NET, x0),
+    "joint": JointFilter(Knowledge.nominal(S2)).start,
+    "edge": JointFilter(FITTED, exact=False).start,
+}
+U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
+
+
+def play(stream: Any, recording: Recording, ego: int, run: int, first: int = 0) -> tuple[Floats, Floats]:
+    """(T, 3) and (T, 3, 3) of a solo stream that is fed a run from step `first` on."""
+    fixes, speeds = recording.gnss[run, first:, ego], recording.velocity[run, first:, ego]
+    found = [stream.step(z, u, recording.dt) for z, u in zip(fixes, speeds, strict=True)]
+    return np.stack([x for x, _ in found]), np.stack([cov for _, cov in found])
+
+
+@pytest.mark.parametrize("name", SOLO)
+def test_step_by_step_is_the_track(name: str, crossing: Fleet) -> None:
+    method, start = SOLO[name]
+    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
+    track = method(recording, [3])
+    x, cov = play(start(), recording, 3, run=1)
+    np.testing.assert_allclose(x, track.x[1, :, 0], atol=1e-12)
+    np.testing.assert_allclose(cov, track.covariance[1, :, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SOLO)
+def test_a_known_start_is_the_track_from_there(name: str, crossing: Fleet) -> None:
+    method, start = SOLO[name]
+    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0)), crossing.position[0, 3]
+    track = replace(method, x0=x0[None])(recording, [3])
+    x, cov = play(start(x0), recording, 3, run=0, first=1)
+    np.testing.assert_allclose(x, track.x[0, 1:, 0], atol=1e-12)
+    np.testing.assert_allclose(cov, track.covariance[0, 1:, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_net_step_by_step_is_its_track(known: bool, crossing: Fleet) -> None:
+    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0)), crossing.position[0, 3]
+    track = LearnedGain(NET, x0=x0[None] if known else None)(recording, [3])
+    stream = gain_stream(NET, x0 if known else None)
+    for t in range(known, len(recording.t)):
+        x, cov = stream.step(recording.gnss[0, t, 3], recording.velocity[0, t, 3], recording.dt)
+        assert cov is None
+        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-5)
+
+
+def sightings(recording: Recording, box: Inbox, run: int, t: int) -> list[Sighting]:
+    """What an ego sees at step t, with the messages that are new to it, as a `Recording` and an `Inbox` tell it."""
+    seen = []
+    for k in range(box.start[t], box.start[t + 1]):
+        link = box.link[k]
+        j, sent = recording.links.neighbour[link], box.newest[run, k]
+        said: dict[str, Any] = {}
+        if box.fresh[run, k]:
+            said = {"gnss": recording.gnss[run, sent, j], "velocity": recording.velocity[run, sent, j],
+                    "age": (t - sent) * recording.dt}  # fmt: skip
+        seen.append(Sighting(recording.ids[j], recording.relative[run, link], **said))
+    return seen
+
+
+def blinking(recording: Recording) -> Recording:
+    """The recording with a fifth of its sightings left out."""
+    kept = np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2
+    links = Links(*(part[kept] for part in (recording.links.step, recording.links.observer, recording.links.neighbour)))
+    return replace(recording, links=links, relative=recording.relative[:, kept], arrival=recording.arrival[:, kept])
+
+
+CHANNELS = {
+    "ideal": V2X(max_neighbours=4, radius=25.0),
+    "lossy": V2X(max_neighbours=4, radius=25.0, loss=0.5),
+    "late": V2X(max_neighbours=4, radius=25.0, latency=0.3, rate=2.0, loss=0.3, max_age=0.6),
+    "silent": V2X(max_neighbours=4, radius=25.0, loss=1.0),
+}
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: Fleet) -> None:
+    """Neighbours come and go, a fifth of the sightings fails, and some are seen without a message; the track comes from
+    the recording's inbox."""
+    recording = blinking(observe(crossing, S2, CHANNELS[channel], runs=2))
+    assert len(set(recording.neighbours(0).tolist())) > 2
+    method = JointFilter("nominal", exact=exact)
+    track, box = method(recording, [0]), inbox(recording, 0, method.message)
+    stream = JointFilter(Knowledge.nominal(recording.sensors), exact).start(max_age=recording.v2x.max_age)
+    for t in range(len(recording.t)):
+        seen = sightings(recording, box, 1, t)
+        x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
+        np.testing.assert_allclose(x, track.x[1, t, 0], atol=1e-12)
+        np.testing.assert_allclose(cov, track.covariance[1, t, 0], atol=1e-12)
+        assert list(stream.neighbours) == [s.id for s in seen]
+        for k, s in enumerate(seen, start=int(box.start[t])):
+            np.testing.assert_allclose(stream.neighbours[s.id], track.neighbours[1, box.link[k]], atol=1e-9)
+
+
+def peer(x: Floats, known: Knowledge) -> Any:
+    """filterpy's filter of a position with a velocity as input."""
+    found = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    found.x, found.P = x.copy(), np.diag(known.gnss_variance)
+    found.H = np.eye(3)
+    return found
+
+
+@pytest.mark.parametrize(("method", "near"), [(Kalman(FITTED), 1e-9), (JointFilter(FITTED), 1e-4)])
+def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(method: Any, near: float) -> None:
+    """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The
+    star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
+    draw, stream = np.random.default_rng(0), method.start()
+    stream.step(Z, U, 0.1)
+    theirs, t, path = peer(Z, FITTED), [0.0, 0.1], [0 * U, 0.1 * U]
+    for k in range(200):
+        dt, u, z = draw.uniform(0.02, 0.5), draw.normal(0, 9, 3), Z + draw.normal(0, 3, 3)
+        t, path = [*t, t[-1] + dt], [*path, path[-1] + dt * u]
+        theirs.predict(u=u, B=dt * np.eye(3), Q=dt / 0.1 * np.diag(np.square(FITTED.process_std)))
+        there, age = draw.uniform() > 0.3, draw.uniform(0, 0.6) * (k > 30)
+        if there:
+            moved = path[-1] - [np.interp(t[-1] - age, t, column) for column in np.array(path).T]
+            theirs.update(z + moved, R=np.diag(FITTED.gnss_variance + age / 0.1 * np.square(FITTED.process_std)))
+        x, cov = stream.step(z if there else None, u, dt, fix_age=age)
+        np.testing.assert_allclose(x, theirs.x, atol=near)
+        np.testing.assert_allclose(cov, theirs.P, atol=near)
+
+
+@pytest.mark.parametrize("name", ["identity", "nominal", "fitted", "okf", "joint", "edge"])
+def test_a_missing_fix_has_infinite_variance(name: str) -> None:
+    """Against filterpy's update with a variance of 1e18 m^2, whatever the fix says."""
+    stream = STARTS[name]()
+    _, before = stream.step(Z, U, 0.1)
+    x, cov = stream.step([np.nan] * 3, U, 0.1)
+    theirs = peer(Z, FITTED)
+    theirs.P = before
+    theirs.predict(u=U, B=0.1 * np.eye(3), Q=cov - before)
+    theirs.update(Z + 1000.0, R=1e18 * np.eye(3))
+    np.testing.assert_allclose(x, theirs.x, atol=1e-9)
+    np.testing.assert_allclose(cov, theirs.P, atol=1e-9)
+    assert (np.diag(cov) > np.diag(before)).all()
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_a_long_step_is_two_short_ones(name: str) -> None:
+    once, twice = STARTS[name](), STARTS[name]()
+    for stream in (once, twice):
+        stream.step(Z, U, 0.1)
+        stream.step(Z + 1.0, U, 0.1)
+    twice.step(None, U, 0.1)
+    (x, cov), (same_x, same_cov) = once.step(None, U, 0.2), twice.step(None, U, 0.1)
+    near = 1e-6 if name == "net" else 1e-12
+    np.testing.assert_allclose(x, same_x, atol=near)
+    if cov is not None:
+        np.testing.assert_allclose(cov, same_cov, atol=1e-12)
+        np.testing.assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", STARTS)
+def test_a_late_fix_of_a_noise_free_drive_is_no_error(name: str) -> None:
+    """Fixes of any age up to 0.5 s, also of the middle of a step, one in three missing, dt between 0.05 and 0.3 s."""
+    draw, stream, t, where = np.random.default_rng(1), STARTS[name](), [0.0], [Z]
+    stream.step(Z, U, 0.1)
+    for _ in range(60):
+        dt, u = draw.uniform(0.05, 0.3), draw.normal(0, 9, 3)
+        t.append(t[-1] + dt)
+        where.append(where[-1] + dt * u)
+        age = min(draw.uniform(0, 0.5), t[-1])
+        then = np.array([np.interp(t[-1] - age, t, column) for column in np.array(where).T])
+        x, _ = stream.step(None if draw.uniform() < 0.3 else then, u, dt, fix_age=age)
+        np.testing.assert_allclose(x, where[-1], atol=2e-5 if name == "net" else 1e-9)
+
+
+@pytest.mark.parametrize("name", ["nominal", "adaptive", "joint", "net"])
+def test_nothing_is_known_before_the_first_fix(name: str) -> None:
+    stream = STARTS[name]()
+    for _ in range(3):
+        x, cov = stream.step(None, U, 0.1, fix_age=9.0)
+        assert np.isnan(x).all()
+        assert cov is None
+    x, cov = stream.step(Z, U, 0.1, fix_age=0.3)
+    np.testing.assert_allclose(x, Z + 0.3 * U, atol=1e-5)
+    if name == "nominal":
+        variance = np.square(S2.gnss_std) + 3 * (0.1 * S2.assumed_velocity_std(U)) ** 2
+        np.testing.assert_allclose(np.diag(cov), variance)
+
+
+def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float) -> tuple[float, float, float, float]:
+    """Errors in m of a drive's end on one axis: the stream, the optimum, the stream without late fixes, and the
+    optimum's own std. Odd steps bring the fix of `late` steps ago, even ones a prompt fix.
+
+    The optimum is numpy's least squares over all positions of the window, each fix at its true time.
+    """
+    truth = np.cumsum(draw.normal(0, q, steps + 1))
+    at = [t - late if t % 2 and t >= late else t for t in range(steps + 1)]
+    fixes = truth[at] + draw.normal(0, r, steps + 1)
+    known = Knowledge("constant", process_std=(q, q, q), gnss_std=(r, r, r))
+    full, prompt = Kalman(known).start(), Kalman(known).start()
+    for t in range(steps + 1):
+        stale = at[t] < t
+        x, _ = full.step([fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1, fix_age=0.1 * (t - at[t]))
+        without, _ = prompt.step(None if stale else [fixes[t], 0.0, 0.0], [0.0, 0.0, 0.0], 0.1)
+    rows = np.vstack([np.eye(steps + 1)[at] / r, np.diff(np.eye(steps + 1), axis=0) / q])
+    best = np.linalg.lstsq(rows, np.concatenate([fixes / r, np.zeros(steps)]), rcond=None)[0][-1]
+    std = np.sqrt(np.linalg.inv(rows.T @ rows)[-1, -1])
+    return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], std
+
+
+def test_a_late_fix_is_nearly_used_up() -> None:
+    """0.3 s late at the noise of scenario 2 at 10 m/s: within 2 % of the least squares over the whole window, which
+    is itself as good as it says; without the late fixes a filter is clearly worse."""
+    draw = np.random.default_rng(5)
+    errors = np.array([window(draw, 60, 3, q=0.1, r=3.5) for _ in range(150)])
+    ours, best, without, _ = np.sqrt(np.mean(errors**2, axis=0))
+    assert best == pytest.approx(errors[0, 3], rel=0.2)
+    assert ours < 1.02 * best
+    assert without > 1.1 * best
+
+
+def test_a_net_is_as_good_far_from_the_origin() -> None:
+    """float32 resolves 1 m at 1e7 m; the origin moves along."""
+    draw, far = np.random.default_rng(2), np.array([1e7, -2e7, 0.0])
+    here, there = gain_stream(NET), gain_stream(NET)
+    for k in range(50):
+        z = Z + 0.9 * k + draw.normal(0, 2, 3)
+        np.testing.assert_allclose(there.step(z + far, U, 0.1)[0] - far, here.step(z, U, 0.1)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("field", "given"),
+    [
+        ("gnss", {"gnss": [1.0, 2.0]}),
+        ("gnss", {"gnss": [1.0, np.nan, 2.0]}),
+        ("gnss", {"gnss": [1.0, np.inf, 2.0]}),
+        ("velocity", {"velocity": [1.0, 2.0]}),
+        ("velocity", {"velocity": [1.0, np.nan, 0.0]}),
+        ("dt", {"dt": 0.0}),
+        ("dt", {"dt": -0.1}),
+        ("dt", {"dt": np.nan}),
+        ("fix_age", {"fix_age": -0.1}),
+        ("fix_age", {"fix_age": np.nan}),
+        ("fix_age", {"fix_age": 0.7}),
+    ],
+)
+@pytest.mark.parametrize("name", ["nominal", "joint", "net"])
+def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str, Any]) -> None:
+    one, other = STARTS[name](), STARTS[name]()
+    for stream in (one, other):
+        stream.step(Z, U, 0.1)
+    with pytest.raises(InputError, match=f"^{field} = "):
+        one.step(**{"gnss": Z, "velocity": U, "dt": 0.1} | given)
+    np.testing.assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
+    assert one.past.seen == other.past.seen
+
+
+def test_history_is_as_long_as_asked_for() -> None:
+    stream = Kalman(FITTED).start(history=0.5)
+    for _ in range(100):
+        stream.step(Z, U, 0.1)
+    stream.step(Z, U, 0.1, fix_age=0.5)
+    assert len(stream.past.steps) == 5
+    with pytest.raises(InputError, match=r"fix_age = 0.61 s: must be in 0..0.5 s"):
+        stream.step(Z, U, 0.1, fix_age=0.61)
+
+
+def test_bad_starts_are_named() -> None:
+    for field, make in {
+        "x0": lambda: Kalman("identity").start([0.0, 0.0]),
+        "interval": lambda: Kalman("identity").start(interval=0.0),
+        "history": lambda: Kalman("identity").start(history=-1.0),
+        "max_age": lambda: JointFilter("identity").start(max_age=np.nan),
+        "knowledge": lambda: JointFilter("nominal").start(),
+    }.items():
+        with pytest.raises(InputError, match=f"^{field} = "):
+            make()
+    oracle = Kalman(Knowledge.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
+    with pytest.raises(InputError, match=r"knowledge = 'oracle'.*Knowledge.nominal"):
+        oracle.start()
+
+
+def test_bad_sightings_are_named() -> None:
+    for field, wrong in {
+        "relative": {"relative": [1.0, 2.0]},
+        "sighting": {"relative": [-1.0, 0.0, 1.5]},
+        "velocity": {"gnss": Z},
+        "neighbour's gnss": {"gnss": [1.0, np.nan, 0.0], "velocity": U},
+        "neighbour's velocity": {"velocity": [np.inf, 0.0, 0.0]},
+        "age": {"velocity": U, "age": -1.0},
+    }.items():
+        with pytest.raises(InputError, match=f"^{field} = "):
+            Sighting("b", **{"relative": [9.0, 0.0, 1.5]} | wrong)
+    seen = Sighting("b", [9.0, 0.0, 1.5])
+    with pytest.raises(InputError, match="neighbours"):
+        JointFilter("identity").start().step(Z, U, 0.1, neighbours=[seen, seen])
+
+
+def test_neighbours_help_while_the_fix_is_missing() -> None:
+    """A tunnel for the ego only: a sighting of a vehicle with fixes keeps its covariance bounded, alone it grows."""
+    known = Knowledge.nominal(Sensors())
+    helped, alone = (JointFilter(known).start() for _ in range(2))
+    assert isinstance(helped, StarStream)
+    for k in range(100):
+        z = 0.1 * k * U
+        fix = z if k < 10 else None
+        seen = Sighting("b", [10.0, 0.0, np.pi / 2], gnss=z + np.array([10.0, 0.0, 0.0]), velocity=U)
+        x, cov = helped.step(fix, U, 0.1, neighbours=[seen])
+        _, lonely = alone.step(fix, U, 0.1)
+    np.testing.assert_allclose(x, z, atol=1e-6)
+    assert np.trace(cov) < 0.5 * np.trace(lonely)
+
+
+def test_learned_methods_start_their_streams() -> None:
+    for method, stream in ((LearnedGain(NET), gain_stream(NET, Z)), (OKF, okf_stream(OKF, Z))):
+        filter = method.start(Z)
+        for _ in range(3):
+            np.testing.assert_array_equal(filter.step(Z + 1.0, U, 0.1)[0], stream.step(Z + 1.0, U, 0.1)[0])
+
+
+@pytest.mark.parametrize("log", ["bundled", "KITTI 00"])
+def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
+    arguments = []
+    if log != "bundled":
+        folder = request.getfixturevalue("shared") / "evo_oracle"
+        arguments = [folder / f"KITTI_00_{part}.txt" for part in ("ORB", "gt_times", "gt")]
+    command = [sys.executable, "-W", "error", ROOT / "examples" / "replay_log.py", *arguments, "--steps", "150"]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert ("No log given" in out) == (log == "bundled")
+    rows = [line.split("  ") for line in out.splitlines() if line.startswith(("Kal", "adap", "vari", "OKF", "Fed"))]
+    numbers = np.array([[float(word) for word in row[1:] if word.strip()] for row in rows])
+    assert numbers.shape == (7, 6)
+    assert (numbers[:, :5] < 2.5 * np.sqrt(3)).all(), "better than the fixes, however bad the log is"
+    assert (numbers[:, 5] > 50).all(), "steps per second"
+
+
+def test_documented_code_runs() -> None:
+    """The blocks of docs/streaming.md on filters; those on files are run by the tests of the export."""
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "streaming.md").read_text(), flags=re.DOTALL)
+    about_filters = [block for block in blocks if "onnx" not in block]
+    assert len(about_filters) == 2
+    for block in about_filters:
+        found: dict[str, Any] = {}
+        exec(block, found)
+        assert np.isfinite(found["x"]).all()
