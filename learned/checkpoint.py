@@ -13,18 +13,16 @@ from typing import Any
 
 import numpy as np
 import safetensors
-import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
 from coopoc.errors import InputError
+from coopoc.plugins import find, points
 
-from .net import GainNet
-from .okf import OptimisedKF
+from .gain import Gain
 from .stack import unflatten
 
 _HISTORY = "history"
-_NOISE = ("process_std", "velocity_ratio", "gnss_std")
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,13 +32,13 @@ class Checkpoint:
     `history` is (k, P), the weights at the k rows of `card["history"]`, or None.
     """
 
-    model: GainNet | OptimisedKF
+    model: Gain
     card: Mapping[str, Any]
     history: Tensor | None = None
 
-    def after(self, row: int) -> GainNet:
+    def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""
-        if not isinstance(self.model, GainNet) or self.history is None or not 0 <= row < len(self.history):
+        if self.history is None or not 0 <= row < len(self.history):
             held = 0 if self.history is None else len(self.history)
             raise InputError("row", row, f"must be in 0..{held - 1}", "This checkpoint holds no more weights.")
         return unflatten(self.history[row][None], self.model)[0]
@@ -57,16 +55,15 @@ class Checkpoint:
 
 
 def save(path: Path | str, checkpoint: Checkpoint) -> Path:
-    """Write weights, history and card to one safetensors file; a reader sees the old file or the new one whole."""
+    """Write weights, history and card to one safetensors file; a reader sees the old file or the new one whole.
+
+    Raises:
+        InputError: a net of a class that is no entry point in `coopoc.nets`: nobody could read it again.
+    """
     path, model = Path(path), checkpoint.model
-    card = dict(checkpoint.card) | {"environment": environment()}
-    if isinstance(model, GainNet):
-        card |= {"kind": "gain_net", "in_mult": model.in_mult, "out_mult": model.out_mult,
-                 "parameters": sum(p.numel() for p in model.parameters())}  # fmt: skip
-        tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
-    else:
-        card |= {"kind": "okf", "parameters": 9}
-        tensors = {name: torch.tensor(getattr(model, name), dtype=torch.float64) for name in _NOISE}
+    card = dict(checkpoint.card) | {"environment": environment(), "kind": kind(model), "net": dict(model.settings),
+                                    "parameters": sum(p.numel() for p in model.parameters())}  # fmt: skip
+    tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
     if checkpoint.history is not None:
         tensors[_HISTORY] = checkpoint.history
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -76,22 +73,30 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     return path
 
 
+def kind(model: Gain) -> str:
+    """Name of a net's class among the entry points `coopoc.nets`; InputError if it has none."""
+    value = f"{type(model).__module__}:{type(model).__qualname__}"
+    for name, point in points("coopoc.nets").items():
+        if point.value == value:
+            return name
+    mend = "Name it in [project.entry-points.\"coopoc.nets\"] of your package."
+    raise InputError("net", value, "must be an entry point in coopoc.nets", mend)
+
+
 def load(path: Path | str) -> Checkpoint:
     """Read a checkpoint and check every tensor's shape against what its card promises.
 
     Raises:
-        InputError: no such file, no card or one of another kind, or tensors of another shape than its model has.
+        InputError: no such file, no card, a kind of net that is not installed, or tensors of another shape than its
+            net has.
     """
     tensors, card = _read(Path(path))
     history = tensors.pop(_HISTORY, None)
-    kind = card.get("kind")
-    if kind not in ("gain_net", "okf"):
-        raise InputError(f"checkpoint {path}: kind", repr(kind), 'must be "gain_net" or "okf"', "Write it with save.")
-    if kind == "okf":
-        _match(path, dict.fromkeys(_NOISE, (3,)), tensors)
-        process, ratio, gnss = (tuple(tensors[name].tolist()) for name in _NOISE)
-        return Checkpoint(OptimisedKF(process, ratio, gnss), card, history)
-    model = GainNet(card["in_mult"], card["out_mult"])
+    if not isinstance(card.get("kind"), str) or not isinstance(card.get("net"), dict):
+        given = {name: card.get(name) for name in ("kind", "net")}
+        allowed = "must name a kind of net and its settings"
+        raise InputError(f"checkpoint {path}: card", given, allowed, "Write it with save.")
+    model: Gain = find("coopoc.nets", card["kind"])(**card["net"])
     load_into(model, tensors, path)
     if history is not None:
         count = sum(p.numel() for p in model.parameters())
@@ -99,7 +104,7 @@ def load(path: Path | str) -> Checkpoint:
     return Checkpoint(model, card, history)
 
 
-def load_into(model: GainNet, tensors: Mapping[str, Tensor], path: Path | str = "checkpoint") -> None:
+def load_into(model: Gain, tensors: Mapping[str, Tensor], path: Path | str = "checkpoint") -> None:
     """Put named tensors into a net; InputError naming the expected and the found shape if they do not fit."""
     _match(path, {name: tuple(p.shape) for name, p in model.named_parameters()}, tensors)
     model.load_state_dict(dict(tensors))
@@ -144,5 +149,5 @@ def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], found: Map
         if expected.get(name) != shapes.get(name):
             raise InputError(
                 f"checkpoint {path}", f"{name} of shape {shapes.get(name, 'missing')}",
-                f"expected {expected.get(name, 'no such tensor')}", "Use a net of its card's in_mult and out_mult.",
+                f"expected {expected.get(name, 'no such tensor')}", "Use a net of its card's settings.",
             )  # fmt: skip

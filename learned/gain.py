@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
-from .clients import Batch
+from .clients import Batch, Pieces
 
 
 class Gain(nn.Module, ABC):
@@ -34,6 +34,10 @@ class Gain(nn.Module, ABC):
     @abstractmethod
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """This net as a method, Recording -> Track, from the first fix or a known start (R, E, 3) or (E, 3) m."""
+
+    def finished(self, parts: Sequence[Pieces]) -> Gain:
+        """The net after its training, with what the loss could not see set from the training pieces of each client."""
+        return self
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.kalman import Gaussian, solo_filter
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
-from coopoc.world.noise import stream
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .clients import Batch, Pieces
-from .machine import one_core, watched
-from .schedule import generator
+from .gain import Gain
+from .machine import one_core
 from .stream import okf_stream
 
 Three = tuple[float, float, float]
@@ -76,87 +76,70 @@ class OptimisedKF:
         return Track(recording.t, tuple(columns), x, spread[..., None] * np.eye(3), silent, silent, seconds)
 
 
-@dataclass(frozen=True, eq=False)
-class OkfFit:
-    """A trained filter, its validation loss per check, m^2, and the training seconds."""
+class NoiseNumbers(Gain):
+    """The nine numbers of an OptimisedKF as a net: what a federation of Kalman filters exchanges is 36 bytes.
 
-    method: OptimisedKF
-    validation_loss: tuple[float, ...]
-    seconds: float
-
-
-def fit_okf(training: Pieces, validation: Pieces, steps: int = 300, velocity_part: bool = True) -> OkfFit:
-    """Train the noise numbers by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
-
-    The estimates depend on ratios of variances only, so the loss cannot see a common factor per axis; that factor is
-    set afterwards so that the training innovations have the variance that the filter claims for them.
+    p = s + a^2 + (b dt u)^2;  k = p / (p + r^2);  x <- x + dt u + k (z - x - dt u);  s = (1 - k) p, with log a, log b,
+    log r per axis as weights. The squared error sees ratios of variances only; `finished` sets their common scale.
 
     Args:
-        training, validation: pieces. steps: of Adam on all training pieces. velocity_part: train b too, else b = 0.
+        velocity_part: use b, else b = 0. seed: every net takes one; this one starts at the same numbers for each.
 
-    >>> from coopoc.learned.clients import clients
-    >>> from coopoc.world.fleet import Fleet
-    >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
-    >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
-    (0.0, 0.0, 0.0)
+    Source: Greenberg, Yannay, Mannor, Optimization or Architecture: How to Hack Kalman Filtering, NeurIPS 2023.
+
+    >>> NoiseNumbers().method("okf").gnss_std
+    (1.0, 1.0, 1.0)
     """
-    return fit_okf_many([(training, validation)], steps, velocity_part)[0]
+
+    def __init__(self, velocity_part: bool = True, seed: int = 0) -> None:
+        super().__init__()
+        self.velocity_part = velocity_part
+        self.logs = nn.Parameter(torch.tensor([0.1, 0.1, 1.0]).log()[:, None].repeat(1, 3))
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Whether the measured velocity has a part in the process noise."""
+        return {"velocity_part": self.velocity_part}
+
+    def numbers(self, theta: Tensor) -> Tensor:
+        """a m, b, r m per axis (S, 3, 3) of weights (S, 9)."""
+        used = torch.tensor([[1.0], [float(self.velocity_part)], [1.0]], dtype=theta.dtype)
+        return theta.view(-1, 3, 3).exp() * used
+
+    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
+        """(S, B) squared error of each piece, mean over time, sum over components, m^2."""
+        x, _ = scan(self.numbers(theta), batch)
+        return (x - batch.truth).square().sum(-1).mean(0)
+
+    def method(self, name: str, x0: Floats | None = None) -> OptimisedKF:
+        """`OptimisedKF` with these numbers."""
+        process, ratio, gnss = self.numbers(nn.utils.parameters_to_vector(self.parameters()).detach()[None])[0].double()
+        return OptimisedKF(_three(process), _three(ratio), _three(gnss), x0, name)
+
+    @one_core()
+    def finished(self, parts: Sequence[Pieces]) -> NoiseNumbers:
+        """The same filter with the scale that gives the normalised innovations of all training pieces unit variance.
+
+        Of each client's pieces it needs the mean square per axis only: three numbers a client.
+        """
+        numbers = self.numbers(nn.utils.parameters_to_vector(self.parameters()).detach()[None])
+        squares = torch.zeros(3)
+        for pieces in parts:
+            drawn = [torch.Generator().manual_seed(0)]
+            seen = scan(numbers, pieces.batch(torch.arange(len(pieces))[None], drawn))[1]
+            squares += seen.square().mean(0).sum((0, 1))
+        scale = (squares / sum(map(len, parts))).sqrt()
+        made = NoiseNumbers(self.velocity_part)
+        with torch.no_grad():
+            made.logs.copy_(self.logs + scale.log())
+        return made
 
 
-@one_core()
-def fit_okf_many(
-    tasks: Sequence[tuple[Pieces, Pieces]], steps: int = 300, velocity_part: bool = True, progress: str | None = None
-) -> list[OkfFit]:
-    """`fit_okf` for many settings, stacked; `progress` names the stage of a progress bar on stderr."""
-    began = time.perf_counter()
-    data, judge = (_stacked([task[i] for task in tasks], kind) for i, kind in enumerate(("training", "validation")))
-    logs = torch.log(torch.tensor([0.1, 0.1 if velocity_part else 1e-30, 1.0], dtype=torch.float64))
-    logs = logs[None, :, None].repeat(len(tasks), 1, 3).requires_grad_()
-    adam = torch.optim.Adam([logs], lr=0.1)
-    fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
-    lowest, best, history = torch.full((len(tasks),), torch.inf, dtype=torch.float64), logs.detach().clone(), []
-    for step in watched(range(steps), progress, "step"):
-        if step % 25 == 0 or step == steps - 1:
-            with torch.no_grad():
-                found = _loss(logs, *judge)
-            better = found < lowest
-            best[better], lowest[better] = logs.detach()[better], found[better]
-            history.append(found.tolist())
-        adam.zero_grad()
-        _loss(logs, *data).sum().backward()
-        adam.step()
-        fall.step()
-    with torch.no_grad():
-        numbers = torch.exp(best) * _calibration(best, *data)[:, None]
-    if not velocity_part:
-        numbers[:, 1] = 0.0
-    seconds = (time.perf_counter() - began) / len(tasks)
-    return [
-        OkfFit(OptimisedKF(_three(row[0]), _three(row[1]), _three(row[2])), tuple(h), seconds)
-        for row, h in zip(numbers, zip(*history, strict=True), strict=True)
-    ]
-
-
-def _stacked(parts: Sequence[Pieces], kind: str) -> tuple[Batch, Tensor]:
-    """All pieces of S settings in float64; (2, S, B): weight in the mean, 0 for padding, and uncertain start.
-
-    Fresh noise is drawn once, the same for every setting and another for training than for validation.
-    """
-    pool, most = Pieces.join(parts), max(map(len, parts))
-    ends = np.cumsum([len(p) for p in parts])
-    rows = [np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)]
-    index = torch.from_numpy(np.stack(rows))
-    batch = pool.batch(index, [generator(stream(0, kind, 0, "")) for _ in parts])
-    weight = torch.tensor([[float(i < len(p)) / len(p) for i in range(most)] for p in parts], dtype=torch.float64)
-    gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
-    uncertain = 1.0 - pool.true_start[index].double()
-    return Batch(gnss, velocity, truth, x0, pool.dt), torch.stack([weight, uncertain])
-
-
-def _scan(logs: Tensor, batch: Batch, uncertain: Tensor) -> tuple[Tensor, Tensor]:
-    """Estimates and normalised innovations (T, S, B, 3) of the filters exp(logs) (S, 3 kinds, 3 axes)."""
-    process, ratio, gnss_std = torch.exp(logs).unsqueeze(2).unbind(1)
-    noise, x, spread = gnss_std.square(), batch.x0, gnss_std.square() * uncertain[..., None]
+def scan(numbers: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Estimates m and normalised innovations (T, S, B, 3) of filters with a, b, r (S, 3 kinds, 3 axes)."""
+    process, ratio, gnss_std = numbers.unsqueeze(2).unbind(1)
+    noise, x = gnss_std.square(), batch.x0
+    spread = noise if batch.known is None else noise * (~batch.known)[..., None]
     estimates, normalised = [], []
     moves = process.square() + (ratio * batch.dt * batch.velocity).square()
     for fix, speed, move in zip(batch.gnss.unbind(), batch.velocity.unbind(), moves.unbind(), strict=True):
@@ -168,18 +151,6 @@ def _scan(logs: Tensor, batch: Batch, uncertain: Tensor) -> tuple[Tensor, Tensor
         spread = (1.0 - gain) * spread
         estimates.append(x)
     return torch.stack(estimates), torch.stack(normalised)
-
-
-def _loss(logs: Tensor, batch: Batch, weights: Tensor) -> Tensor:
-    """(S,) mean over pieces and time of the squared error, m^2."""
-    error = _scan(logs, batch, weights[1])[0] - batch.truth
-    return (error.square().sum(-1).mean(0) * weights[0]).sum(1)
-
-
-def _calibration(logs: Tensor, batch: Batch, weights: Tensor) -> Tensor:
-    """(S, 3) factor per axis that gives the normalised innovations unit variance."""
-    normalised = _scan(logs, batch, weights[1])[1]
-    return (normalised.square().mean(0) * weights[0][..., None]).sum(1).sqrt()
 
 
 def _three(values: Tensor) -> Three:

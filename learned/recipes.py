@@ -15,6 +15,8 @@ from typing import Any
 import torch
 
 from coopoc.errors import InputError
+from coopoc.methods.track import Method
+from coopoc.plugins import find
 from coopoc.workers import leave_with
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, VelocityReading
@@ -22,14 +24,13 @@ from coopoc.world.sensors import Sensors, VelocityReading
 from .checkpoint import Checkpoint, load, read_card, save
 from .clients import Client, Noise, Pieces, Start, clients
 from .federated import federate_many
+from .gain import Gain
 from .machine import reporting_on
-from .method import LearnedGain
-from .net import GainNet
-from .okf import OptimisedKF, fit_okf_many
+from .okf_fit import fit_okf_many
 from .schedule import Epoch, Schedule
 from .train import Fit, Task, fit_many
 
-REVISION = 2
+REVISION = 3
 """Raised whenever the training code changes what it makes of the same recipe."""
 WEIGHTS = Path(__file__).parent / "weights"
 
@@ -39,7 +40,8 @@ class Recipe:
     """One way to train, with the paper's schedule (section IV.A): 20 rounds; 1500 or 500 steps; pieces of 100, 80/20.
 
     Args:
-        kind: "federated", "centralised", "individual" (one net per client) or "okf".
+        kind: "federated", "centralised", "individual" (one net per client) or "okf" (all pieces at once, no batches).
+        net, options: what is trained, an entry point in `coopoc.nets`, and the named arguments that it is made with.
         schedule: optimiser, the same for all nets. rounds, local_epochs, local_epoch, aggregate: of a federation.
     """
 
@@ -52,16 +54,17 @@ class Recipe:
     noise: Noise = "static"
     piece: int = 100
     split: float = 0.8
-    in_mult: int = 40
-    out_mult: int = 5
-    start_gain: float | None = 0.1
+    net: str = "gain_net"
+    options: tuple[tuple[str, Any], ...] = ()
 
 
 RECIPES: dict[str, Recipe] = {
     "fedkalmannet": Recipe("federated"),
     "centralised": Recipe("centralised", Schedule(epochs=1500)),
     "individual": Recipe("individual", Schedule(epochs=500)),
-    "okf": Recipe("okf", Schedule(epochs=300)),
+    "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
+    "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
+    "magnitude": Recipe("federated", noise="wide", options=(("magnitudes", True),)),
 }
 
 
@@ -177,7 +180,7 @@ def _in_worker(group: Sequence[Job], fleet: Fleet, out: Path, line: int | None, 
         _train(group, fleet, out, line is not None)
 
 
-def load_method(name_or_path: Path | str) -> LearnedGain | OptimisedKF:
+def load_method(name_or_path: Path | str) -> Method:
     """The method of a checkpoint file, or of weights that come with the package by their name.
 
     Raises:
@@ -189,9 +192,7 @@ def load_method(name_or_path: Path | str) -> LearnedGain | OptimisedKF:
         allowed = f"must be a checkpoint file or one of {sorted(shipped)}"
         raise InputError("learned method", str(name_or_path), allowed, "Train one: coopoc train fedkalmannet.")
     checkpoint = load(path)
-    if isinstance(checkpoint.model, OptimisedKF):
-        return checkpoint.model
-    return LearnedGain(checkpoint.model, name=str(checkpoint.card.get("recipe", path.stem)))
+    return checkpoint.model.method(str(checkpoint.card.get("recipe", path.stem)))
 
 
 Data = dict[Setting, tuple[Client, ...]]
@@ -216,8 +217,10 @@ def _card(job: Job, fleet: Fleet, data: Sequence[Client]) -> dict[str, Any]:
             "validation_pieces": [len(c.validation) for c in used]}  # fmt: skip
 
 
-def _net(job: Job) -> GainNet:
-    return GainNet(job.recipe.in_mult, job.recipe.out_mult, job.recipe.start_gain, seed=job.setting.seed)
+def untrained(job: Job) -> Gain:
+    """The net of a job before its training."""
+    made: Gain = find("coopoc.nets", job.recipe.net)(**dict(job.recipe.options), seed=job.setting.seed)
+    return made
 
 
 def _joined(data: Sequence[Client], client: int | None, part: str) -> Pieces:
@@ -226,23 +229,24 @@ def _joined(data: Sequence[Client], client: int | None, part: str) -> Pieces:
 
 def _task(job: Job, data: Sequence[Client]) -> Task:
     training, validation, long = (_joined(data, job.client, part) for part in ("training", "validation", "long"))
-    return Task(_net(job), training, validation, job.setting.seed, str(job.client or ""), long)
+    return Task(untrained(job), training, validation, job.setting.seed, str(job.client or ""), long)
 
 
 def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    recipe, nets = todo[0].recipe, [_net(job) for job in todo]
+    recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
     done = federate_many(
         nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], recipe.rounds, recipe.aggregate,
         recipe.local_epochs, recipe.schedule, stage, recipe.local_epoch,
     )  # fmt: skip
     found = []
-    for federation in done:
+    for job, federation in zip(todo, done, strict=True):
         rows = [{"round": r.number, "training_loss": r.training_loss, "validation_loss": r.validation_loss,
-                 "sent_bytes": r.sent_bytes, "received_bytes": r.received_bytes, "rejected": r.rejected}
+                 "sent_bytes": r.sent_bytes, "received_bytes": r.received_bytes, "rejected": dict(r.rejected)}
                 for r in federation.history]  # fmt: skip
         weights = torch.stack([r.weights for r in federation.history])
         card = {"history": rows, "best": federation.best.number, "seconds": federation.seconds}
-        found.append(Checkpoint(federation.model, card, weights))
+        model = federation.model.finished([client.training for client in data[job.setting]])
+        found.append(Checkpoint(model, card, weights))
     return found
 
 
@@ -261,7 +265,7 @@ def _of_fit(fit: Fit) -> Checkpoint:
 def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     tasks = [(_joined(data[j.setting], None, "training"), _joined(data[j.setting], None, "validation")) for j in todo]
     fits = fit_okf_many(tasks, todo[0].recipe.schedule.epochs, progress=stage)
-    return [Checkpoint(f.method, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
+    return [Checkpoint(f.model, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
 
 
 TRAINERS: dict[str, Trainer] = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

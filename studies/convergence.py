@@ -30,8 +30,6 @@ def cell(p: Params) -> list[Row]:
     `raw_rt_le_m` of the weights as they are after the round. The centralised net's schedule is cut into as many equal
     parts as there are rounds.
     """
-    from coopoc.learned.method import LearnedGain
-
     checkpoint = weights.checkpoint(p["method"], p, p["train_seed"])
     rounds, last = (len(c.card["history"]) - 1 for c in (_federated(p), checkpoint))
     recording, who, drive = scene.recording(p), scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"])
@@ -39,7 +37,7 @@ def cell(p: Params) -> list[Row]:
 
     @lru_cache
     def score(row: int) -> Floats:
-        return rt_le(LearnedGain(checkpoint.after(row), x0=start)(recording, who), drive)
+        return rt_le(checkpoint.after(row).method(p["method"], start)(recording, who), drive)
 
     found: list[Row] = []
     for number in (rounds,) if alone else range(rounds + 1):

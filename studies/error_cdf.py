@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
 CLASSIC = (("gnss", "none"), ("kalman", "identity"), ("kalman", "fitted"), ("kalman", "nominal"), ("kalman", "oracle"))
-LINEUP = (*CLASSIC, *((name, "trained") for name in weights.LEARNED))
+LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER))
 HEADER = ("Method", "Knowledge", "RT-LE [m]", "Seed std [m]", "Maximum [m]", "Reduction [m]",
           "Reduction / fitted KF's", "Worse than GNSS [%]")  # fmt: skip
 

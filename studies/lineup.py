@@ -75,13 +75,7 @@ def start(p: Params) -> Floats | None:
 
 
 def _learned(name: str, p: Params, seed: int, known: Floats | None) -> Method:
-    from coopoc.learned.method import LearnedGain
-    from coopoc.learned.net import GainNet
-
-    model = weights.checkpoint(name, p, seed).model
-    if isinstance(model, GainNet):
-        return LearnedGain(model, name=name, x0=known)
-    return replace(model, x0=known)
+    return weights.checkpoint(name, p, seed).model.method(name, known)
 
 
 def rows(p: Params, *, quantiles: int = 0) -> list[Row]:

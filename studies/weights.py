@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, of as many as there are, at most six."""
-LEARNED = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
+PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
+"""What the paper trains, and the fair floor."""
+LEARNED = (*PAPER, "fedokf", "magnitude")
 """Methods that are trained."""
 
 
@@ -128,7 +130,7 @@ def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
     for name in names:
         card = checkpoint(name, p, 0).card
         found[name] = upload + 4.0 * card["parameters"]
-        if name == "fedkalmannet":
+        if card["settings"]["kind"] == "federated":
             moved = sum(row["sent_bytes"] + row["received_bytes"] for row in card["history"][1:])
             found[name] = moved / len(card["clients"])
     return found
@@ -137,12 +139,12 @@ def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
 def described(results: Results) -> Mapping[str, str]:
     """What the report says about the training of the methods that were run, from the cards of the first seed."""
     cards = {name: checkpoint(name, results.settings, 0).card for name in trained(results)}
-    nets = [card for name, card in cards.items() if name != "okf"]
+    nets = [card for card in cards.values() if card["kind"] == "gain_net"]
     told = {"nets": _nets(nets[0], len(seeds(results.settings)))} if nets else {}
     for name, card in cards.items():
         plan = card["settings"]
         text = f"{plan['schedule']['epochs']} optimiser steps"
-        if name == "fedkalmannet":
+        if plan["kind"] == "federated":
             text = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
         seconds, clients = f"{card['seconds']:.0f} s per net", ", ".join(card["clients"])
         told[name] = f"{text}; clients {clients}; {seconds}; key {card['key'][:12]}"

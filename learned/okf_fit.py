@@ -1,0 +1,113 @@
+"""fit_okf: train the nine numbers of an OptimisedKF on all pieces at once, in double precision."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from coopoc.world.noise import stream
+
+from .clients import Batch, Pieces
+from .machine import one_core, watched
+from .okf import NoiseNumbers, OptimisedKF, scan
+from .schedule import generator
+
+
+@dataclass(frozen=True, eq=False)
+class OkfFit:
+    """A trained filter, its validation loss per check, m^2, and the training seconds."""
+
+    model: NoiseNumbers
+    validation_loss: tuple[float, ...]
+    seconds: float
+
+    @property
+    def method(self) -> OptimisedKF:
+        """The filter."""
+        return self.model.method("okf")
+
+
+def fit_okf(training: Pieces, validation: Pieces, steps: int = 300, velocity_part: bool = True) -> OkfFit:
+    """Train the noise numbers by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
+
+    The estimates depend on ratios of variances only, so the loss cannot see a common factor per axis; that factor is
+    set afterwards so that the training innovations have the variance that the filter claims for them.
+
+    Args:
+        training, validation: pieces. steps: of Adam on all training pieces. velocity_part: train b too, else b = 0.
+
+    >>> from coopoc.learned.clients import clients
+    >>> from coopoc.world.fleet import Fleet
+    >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
+    >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
+    (0.0, 0.0, 0.0)
+    """
+    return fit_okf_many([(training, validation)], steps, velocity_part)[0]
+
+
+@one_core()
+def fit_okf_many(
+    tasks: Sequence[tuple[Pieces, Pieces]], steps: int = 300, velocity_part: bool = True, progress: str | None = None
+) -> list[OkfFit]:
+    """`fit_okf` for many settings, stacked; `progress` names the stage of a progress bar on stderr."""
+    began, like = time.perf_counter(), NoiseNumbers(velocity_part)
+    data, judge = (_stacked([task[i] for task in tasks], kind) for i, kind in enumerate(("training", "validation")))
+    logs = like.logs.detach().double().flatten().repeat(len(tasks), 1).requires_grad_()
+    adam = torch.optim.Adam([logs], lr=0.1)
+    fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
+    lowest, best, history = torch.full((len(tasks),), torch.inf, dtype=torch.float64), logs.detach().clone(), []
+    for step in watched(range(steps), progress, "step"):
+        if step % 25 == 0 or step == steps - 1:
+            with torch.no_grad():
+                found = _loss(like.numbers(logs), *judge)
+            better = found < lowest
+            best[better], lowest[better] = logs.detach()[better], found[better]
+            history.append(found.tolist())
+        adam.zero_grad()
+        _loss(like.numbers(logs), *data).sum().backward()
+        adam.step()
+        fall.step()
+    with torch.no_grad():
+        best = best.view(-1, 3, 3) + _calibration(like.numbers(best), *data)[:, None].log()
+    seconds = (time.perf_counter() - began) / len(tasks)
+    return [OkfFit(_of(row, velocity_part), tuple(h), seconds)
+            for row, h in zip(best, zip(*history, strict=True), strict=True)]  # fmt: skip
+
+
+def _of(logs: Tensor, velocity_part: bool) -> NoiseNumbers:
+    made = NoiseNumbers(velocity_part)
+    with torch.no_grad():
+        made.logs.copy_(logs)
+    return made
+
+
+def _stacked(parts: Sequence[Pieces], kind: str) -> tuple[Batch, Tensor]:
+    """All pieces of S settings in float64, and their weight (S, B) in the mean, 0 for padding.
+
+    New noise is drawn once, the same for every setting and another for training than for validation.
+    """
+    pool, most = Pieces.join(parts), max(map(len, parts))
+    ends = np.cumsum([len(p) for p in parts])
+    rows = [np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)]
+    index = torch.from_numpy(np.stack(rows))
+    batch = pool.batch(index, [generator(stream(0, kind, 0, "")) for _ in parts])
+    weight = torch.tensor([[float(i < len(p)) / len(p) for i in range(most)] for p in parts], dtype=torch.float64)
+    gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
+    return Batch(gnss, velocity, truth, x0, batch.dt, batch.known), weight
+
+
+def _loss(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
+    """(S,) mean over pieces and time of the squared error, m^2."""
+    error = scan(numbers, batch)[0] - batch.truth
+    return (error.square().sum(-1).mean(0) * weight).sum(1)
+
+
+def _calibration(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
+    """(S, 3) factor per axis that gives the normalised innovations unit variance."""
+    normalised = scan(numbers, batch)[1]
+    return (normalised.square().mean(0) * weight[..., None]).sum(1).sqrt()
