@@ -18,8 +18,8 @@ def screen(
     """Why answers are rejected: another shape, weights that are not finite, or a change that is far too large.
 
     With d_i = ||theta_i - theta||, client i is rejected if d_i > limit median_j d_j over the answers of the round. Two
-    answers or one have no median that a liar could not make: then the median of the round before is taken, and before
-    any round the change must not be longer than the weights, d_i > max(||theta||, 1).
+    answers or one have no median that a liar could not make (nor have those that mostly changed nothing): then the
+    median of the round before is taken, and in the first round no change may be longer than max(||theta||, 1).
 
     Args:
         theta: (P,) weights that the clients received. answers: what each sent. usual: median d of the round before.
@@ -40,9 +40,9 @@ def screen(
             reasons[name] = f"{int((~sent.isfinite()).sum())} of {sent.numel()} weights are not finite"
         else:
             far[name] = float(torch.linalg.vector_norm(sent.double() - theta.double()))
-    if len(far) >= 3:
+    if len(far) >= 3 and median(far.values()) > 0:
         most = limit * median(far.values())
-    elif usual is not None:
+    elif usual:
         most = limit * usual
     else:
         most = max(float(torch.linalg.vector_norm(theta)), 1.0)

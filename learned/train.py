@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 
 import numpy as np
@@ -170,8 +170,8 @@ class Judge:
     """Score (S,) m^2 of S models: the larger of the mean losses on each kind of their pieces, infinite if not finite.
 
     The kinds are the validation pieces and, where there are any, the long ones: over a long drive a stable filter is
-    the better for its start being over, so they decide only against weights that drift away. Fresh noise is drawn once.
-    A model's pieces are added in their order, so that its score does not depend on who is judged beside it.
+    the better for its start being over, so they decide only against weights that drift away. New noise is drawn once.
+    A score does not depend on who is judged beside it: a model's pieces have dice of their own and are added in order.
     """
 
     def __init__(self, kinds: Sequence[Sequence[Pieces]], like: Gain) -> None:
@@ -187,11 +187,21 @@ class Judge:
 
 def _padded(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:
     """All pieces of S models as one batch, and the share (S, B) of each in its model's mean, 0 for padding."""
-    pool, members = pooled(parts)
+    pool, members = pooled([_drawn(part) for part in parts])
     most = max(map(len, members))
     index = torch.from_numpy(np.stack([np.resize(m, most) for m in members]))
     share = torch.tensor([[(i < len(m)) / len(m) for i in range(most)] for m in members])
-    return pool.batch(index, [generator(stream(0, "validation", 0, "")) for _ in members]), share
+    return pool.batch(index), share
+
+
+def _drawn(part: Pieces) -> Pieces:
+    """The same pieces with noise that is drawn once, where it would be new at every use."""
+    if part.noise == "static":
+        return part
+    seen = part.batch(torch.arange(len(part))[None], [generator(stream(0, "validation", 0, ""))])
+    gnss = torch.cat([seen.x0, seen.gnss[:, 0]]).transpose(0, 1)
+    velocity = torch.cat([part.true_velocity[None, :, 0], seen.velocity[:, 0]]).transpose(0, 1)
+    return replace(part, gnss=gnss, velocity=velocity, noise="static")
 
 
 def pooled(parts: Sequence[Pieces]) -> tuple[Pieces, list[Ints]]:

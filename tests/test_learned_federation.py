@@ -16,7 +16,7 @@ from coopoc import Fleet, InputError, Sensors, load
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.aggregate import FedProx, MultiKrum, Rule
-from coopoc.learned.clients import Batch
+from coopoc.learned.clients import Batch, Noise
 from coopoc.learned.compression import Compression, Float16, Quantised, TopK
 from coopoc.learned.federated import Federation, adapt, federate_many, ledger, local_fit
 from coopoc.learned.gain import Gain
@@ -478,6 +478,22 @@ def test_a_net_is_federated_the_same_way(aggregate: str) -> None:
     assert path.isfinite().all()
     assert path.diff(dim=0).norm() > 0
     assert torch.equal(path, torch.stack([row.weights for row in again.history]))
+
+
+@pytest.mark.parametrize("noise", ["static", "fresh", "wide"])
+def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
+    """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses on one draw."""
+    group = unlike(drives(3), [Sensors()] * 3, [1.0, 0.5, 0.2], piece=10, noise=noise)
+    kinds, theta = [[c.training for c in group], [c.long for c in group]], torch.tensor([[0.2], [0.4], [0.6]])
+    theta = theta.repeat(1, 3)
+    together = Judge(kinds, Steady())(theta)
+    for row in range(3):
+        alone = Judge([[kind[row]] for kind in kinds], Steady())
+        assert torch.equal(alone(theta[row : row + 1])[0], together[row])
+        by_hand = [Steady().losses(theta[row : row + 1], batch).mean() for batch, _ in alone.batches]
+        torch.testing.assert_close(together[row], torch.stack(by_hand).max())
+        off = torch.cat([(batch.gnss - batch.truth).flatten() for batch, _ in alone.batches])
+        assert noise == "wide" or float(off.std()) == pytest.approx(1.5, rel=0.2)
 
 
 def test_a_net_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:

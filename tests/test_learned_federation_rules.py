@@ -344,3 +344,9 @@ def test_the_guard_remembers_what_is_usual() -> None:
     assert screen(theta, {"a": honest, "b": wrong})[0] == {}
     assert set(screen(theta, {"a": honest, "b": wrong}, usual=10.0)[0]) == {"b"}
     assert screen(theta, {}, usual=10.0) == ({}, 10.0)
+
+
+def test_the_guard_lets_a_change_in_where_most_changed_nothing() -> None:
+    theta = torch.ones(3)
+    assert screen(theta, {"a": theta, "b": theta, "c": theta + 0.1})[0] == {}
+    assert set(screen(theta, {"a": theta, "b": theta, "c": theta + 1e3})[0]) == {"c"}

@@ -1,0 +1,149 @@
+"""The federations that the aggregation study trains: clients that are alike, differ, lie or stay away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from coopoc.errors import InputError
+from coopoc.methods.knowledge import Knowledge
+from coopoc.study.study import Params
+from coopoc.world.fleet import Fleet
+from coopoc.world.sensing import observe
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
+
+from . import scene
+
+if TYPE_CHECKING:
+    from coopoc.learned.clients import Client
+    from coopoc.learned.participation import Participation
+
+RULES = ("mean", "uniform", "fedprox", "fedavgm", "fedadam", "uncertainty", "median", "trimmed_mean", "krum",
+         "multi_krum", "geometric_median")  # fmt: skip
+WIRES = ("float16", "top-k", "8 bits", "4 bits")
+GRAPHS = ("ring", "v2x")
+CONDITIONS = {
+    "iid": "equal sensors, equal amounts of data",
+    "heterogeneous": "GNSS 1, 1.5, 2.5, 4 m times velocity 5, 10, 20 %, all, two thirds or one third of the pieces",
+    "poisoned update": "one client sends its update times a negative factor",
+    "poisoned data": "one client's reference drive lies beside the true one",
+    "half absent": "half of the clients are asked, drawn anew in every round",
+}
+GNSS_STD, VELOCITY_RATIO, SHARES = (1.0, 1.5, 2.5, 4.0), (0.05, 0.10, 0.20), (1.0, 2 / 3, 1 / 3)
+
+
+def members(p: Params) -> Fleet:
+    """The vehicles that train: so many of the fleet of clients, evenly spaced."""
+    fleet, count = scene.fleet(p["clients"]), int(p["members"])
+    if not 2 <= count <= len(fleet.ids):
+        raise InputError("members", count, f"must be 2..{len(fleet.ids)}, the vehicles of the fleet", "Take fewer.")
+    return fleet.select([int(k) for k in np.arange(count) * len(fleet.ids) // count])
+
+
+def noise(p: Params) -> list[Sensors]:
+    """What acts on each client: the paper's training noise, or one pair of sensors after the other."""
+    paper = replace(Sensors.paper_training(), velocity_reading=p["velocity_reading"])
+    count = int(p["members"])
+    if p["condition"] != "heterogeneous":
+        return [paper] * count
+    kinds = [(gnss, ratio) for ratio in VELOCITY_RATIO for gnss in GNSS_STD]
+    return [replace(paper, gnss_std=(kinds[i % 12][0],) * 3, velocity_std_ratio=kinds[i % 12][1]) for i in range(count)]
+
+
+def clients(p: Params, seed: int) -> tuple[Client, ...]:
+    """The clients of a condition for one training seed; the one in the middle is the bad one."""
+    from coopoc.learned.participation import moved, unlike
+
+    count = int(p["members"])
+    amounts = [SHARES[i % 3] if p["condition"] == "heterogeneous" else 1.0 for i in range(count)]
+    found = list(unlike(members(p), noise(p), amounts, seed=seed, piece=int(p["piece"])))
+    if p["condition"] == "poisoned data":
+        found[count // 2] = moved(found[count // 2], float(p["offset_m"]))
+    return tuple(found)
+
+
+def participation(p: Params) -> Participation:
+    """Who takes part under a condition, and who lies."""
+    from coopoc.learned.participation import Participation, Poison
+
+    if p["condition"] == "poisoned update":
+        return Poison(who=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
+    return Participation(share=0.5 if p["condition"] == "half absent" else 1.0)
+
+
+def fitted(p: Params) -> Knowledge:
+    """The noise that all clients together have seen with training seed 0, as the Kalman filter takes it."""
+    fleet, acting = members(p), noise(p)
+    seen = {one: observe(fleet, one, V2X(0), seed=0) for one in dict.fromkeys(acting)}
+    gnss, velocity = (np.stack([getattr(seen[one], name)[:, :, i] for i, one in enumerate(acting)], axis=2)
+                      for name in ("gnss", "velocity"))  # fmt: skip
+    return Knowledge.fitted(replace(seen[acting[0]], gnss=gnss, velocity=velocity), fleet)
+
+
+class Trained(NamedTuple):
+    """A net of one training seed: what was kept and what came last, mean bytes of a client, answers rejected, rounds
+    that changed nothing, seconds."""
+
+    kept: Any
+    last: Any
+    sent: float
+    received: float
+    rejected: int
+    idle: int
+    seconds: float
+
+
+@lru_cache(maxsize=2)
+def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Trained, ...]:
+    """All training seeds of a method under a condition, in one rollout."""
+    from coopoc.learned import GainNet
+
+    p = {**dict(given), "condition": condition, "method": method}
+    seeds = range(int(p["train_seeds"]))
+    nets = [GainNet(int(p["in_mult"]), int(p["out_mult"]), seed=seed) for seed in seeds]
+    groups = [clients(p, seed) for seed in seeds]
+    return _pooled(p, nets, groups) if method == "centralised" else _federated(p, nets, groups)
+
+
+def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
+    from coopoc.learned.compression import Float16, Quantised, TopK
+    from coopoc.learned.federated import federate_many, ledger
+    from coopoc.learned.topology import Ring, V2XGraph
+
+    name = p["method"]
+    wires = dict(zip(WIRES, (Float16(), TopK(0.1), Quantised(8), Quantised(4)), strict=True))
+    graph = {"ring": Ring(), "v2x": V2XGraph(members(p), float(p["radius_m"]))}.get(name)
+    done = federate_many(
+        nets, groups, range(len(nets)), int(p["rounds"]), name if name in RULES else "mean", int(p["local_epochs"]),
+        participation=participation(p), compression=wires.get(name), topology=graph,
+    )  # fmt: skip
+    found = []
+    for fed in done:
+        sent, received = np.mean(list(ledger(fed).values()), axis=0)
+        rejected, idle = sum(len(row.rejected) for row in fed.history), sum(row.note != "" for row in fed.history)
+        last = fed.after(len(fed.history) - 1)
+        found.append(Trained(fed.model, last, float(sent), float(received), rejected, idle, fed.seconds))
+    return tuple(found)
+
+
+def _pooled(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
+    """Nets trained on all pieces in one place; the clients send their drives, six float32 a step, and get the net."""
+    from coopoc.learned.clients import Pieces
+    from coopoc.learned.schedule import Schedule
+    from coopoc.learned.stack import flatten, unflatten
+    from coopoc.learned.train import Task, fit_many
+
+    def all_(group: Sequence[Client], part: str) -> Pieces:
+        return Pieces.join([getattr(client, part) for client in group])
+
+    tasks = [Task(net, all_(g, "training"), all_(g, "validation"), seed, long=all_(g, "long"))
+             for seed, (net, g) in enumerate(zip(nets, groups, strict=True))]  # fmt: skip
+    sent, received = 4.0 * 6 * float(members(p).present.sum(axis=0).mean()), 4.0 * flatten(nets[:1]).numel()
+    found = fit_many(tasks, Schedule(epochs=int(p["steps"])))
+    last = [unflatten(fit.history[-1].weights[None], fit.model)[0] for fit in found]
+    return tuple(Trained(f.model, net, sent, received, 0, 0, f.seconds) for f, net in zip(found, last, strict=True))

@@ -1,0 +1,124 @@
+"""The aggregation study at a size that a test can afford: its conditions are what they say, its cells repeat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+import coopoc as co
+from coopoc.evaluate.metrics import rt_le
+from coopoc.learned import GainNet
+from coopoc.learned.federated import federate
+from coopoc.studies import aggregation, federations
+from coopoc.study.publish import views as published
+from coopoc.study.results import Results
+from coopoc.study.run import run
+
+TINY = {"members": 6, "runs": 2, "egos": "2", "train_seeds": 2, "rounds": 2, "local_epochs": 1, "steps": 4,
+        "in_mult": 2, "out_mult": 1}  # fmt: skip
+PARAMETERS = 390 * 2 + 504 * 1 + 1818
+
+
+def given(**more: Any) -> dict[str, Any]:
+    """Parameters of a tiny cell."""
+    return {**aggregation.STUDY.settings, **TINY, "condition": "iid", "method": "mean", "scenario": 1, **more}
+
+
+def test_every_condition_is_what_it_says() -> None:
+    """Noise of each client against its sensors, amounts, the liar, the moved truth, who is asked."""
+    plain, unlike = (federations.clients(given(condition=c, members=12), 0) for c in ("iid", "heterogeneous"))
+    noise = federations.noise(given(condition="heterogeneous", members=12))
+    assert len({(s.gnss_std, s.velocity_std_ratio) for s in noise}) == 12
+    for client, sensors in zip(unlike, noise, strict=True):
+        off = torch.cat([part.gnss - part.truth for part in (client.training, client.validation)])
+        assert float(off.std()) == pytest.approx(sensors.gnss_std[0], rel=0.1)
+    assert [len(c.training) for c in plain] == [6] * 12
+    assert [len(c.training) for c in unlike] == [6, 4, 2] * 4
+    misled = federations.clients(given(condition="poisoned data", members=12), 0)
+    shift = [float((a.training.truth - b.training.truth).mean()) for a, b in zip(misled, plain, strict=True)]
+    assert shift == pytest.approx([0.0] * 6 + [10.0] + [0.0] * 5, abs=1e-4)
+    liar = federations.participation(given(condition="poisoned update", members=12))
+    theta, weights = torch.zeros(2), torch.ones(2)
+    assert [float(liar.answer(c.name, 1, theta, weights)[0]) for c in plain] == [1.0] * 6 + [-20.0] + [1.0] * 5
+    assert federations.participation(given(condition="half absent")).count(12) == 6
+
+
+def test_no_cell_for_a_rule_without_enough_clients() -> None:
+    cells = aggregation.STUDY.override({"members": "6"}).cells()
+    there = {(c.given["condition"], c.given["method"]) for c in cells}
+    assert ("iid", "krum") in there
+    assert ("half absent", "krum") not in there
+    assert ("half absent", "median") in there
+    with pytest.raises(co.InputError, match="members = 61"):
+        aggregation.STUDY.override({"members": "61"}).cells()
+
+
+def test_a_cell_is_the_federation_of_its_seed() -> None:
+    """Its rows are the RT-LE of `federate` by hand, on the noise that all methods share; bytes are the ledger's."""
+    p = given(scenario=2)
+    rows = aggregation.cell(p)
+    assert rows[0]["sent_kb"] == pytest.approx(2 * 4 * (PARAMETERS + 1) / 1e3)
+    assert rows[0]["received_kb"] == pytest.approx(2 * 4 * PARAMETERS / 1e3)
+    fed = federate(GainNet(2, 1, seed=1), federations.clients(p, 1), 2, "mean", 1, seed=1)
+    fleet = co.load("town10")
+    seen = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(0), runs=2, observers=["town10-00", "town10-30"])
+    by_hand = rt_le(fed.model.method("x")(seen, ["town10-00", "town10-30"]), fleet)
+    federations.trained.cache_clear()
+    assert [row["rt_le_m"] for row in aggregation.cell(p)] == [row["rt_le_m"] for row in rows]
+    mine = [row["rt_le_m"] for row in rows if row["train_seed"] == 1]
+    assert mine == pytest.approx(by_hand.T.ravel().tolist(), rel=1e-6)
+
+
+def test_the_kalman_filter_is_fitted_to_what_the_clients_saw() -> None:
+    """Root mean square over all clients' own noise, taken by hand from their keyed recordings."""
+    p = given(condition="heterogeneous")
+    fleet, square = federations.members(p), []
+    for column, sensors in enumerate(federations.noise(p)):
+        seen = co.observe(fleet, sensors, co.V2X(0), seed=0)
+        square.append((seen.gnss[0, :, column] - fleet.position[:, column]) ** 2)
+    found = federations.fitted(p)
+    np.testing.assert_allclose(found.gnss_std, np.sqrt(np.mean(square, axis=(0, 1))), rtol=1e-9)
+
+
+def test_pooled_data_costs_the_drive_and_the_net() -> None:
+    (row, *_) = aggregation.cell(given(method="centralised", train_seeds=1, runs=1, egos="1"))
+    assert row["sent_kb"] == pytest.approx(900 * 6 * 4 / 1e3)
+    assert row["received_kb"] == pytest.approx(4 * PARAMETERS / 1e3)
+
+
+def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
+    wanted = {**TINY, "runs": 1, "method": "mean,8 bits,v2x,kalman,bound", "condition": "iid,poisoned update"}
+    study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
+    results = run(study, out=tmp_path, progress=False)
+    assert results.failed == 0
+    shown = published(tmp_path / "aggregation")
+    assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]
+    assert "equal sensors, equal amounts of data" in shown["tables"][0]["caption"]
+    assert any(said.startswith("Scenario 2, poisoned update: mean") for said in shown["findings"])
+    sent = {name: results.select(method=name, condition="iid")["sent_kb"].iloc[0] for name in ("mean", "8 bits", "v2x")}
+    assert sent["8 bits"] == pytest.approx(2 * (PARAMETERS + 8) / 1e3)
+    degree = sent["v2x"] / (2 * 4 * PARAMETERS / 1e3)
+    assert 1 <= degree <= 5
+
+
+@pytest.mark.parametrize(
+    ("gaps", "words"),
+    [((-0.1, -0.11, -0.12), "Better than the mean over training seeds (95 %): median -0.110 m; worse: no rule."),
+     ((0.1, 0.11, 0.12), "Better than the mean over training seeds (95 %): no rule; worse: median +0.110 m."),
+     ((-0.1, 0.12, 0.05), "Better than the mean over training seeds (95 %): no rule; worse: no rule.")],
+)  # fmt: skip
+def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps: tuple[float, ...], words: str) -> None:
+    at = {"condition": "iid", "scenario": 1}
+    places: list[dict[str, Any]] = [{"train_seed": s, "ego": e, "run": r}
+                                    for s in range(3) for e in range(2) for r in range(3)]  # fmt: skip
+    rows = [{**at, **place, "method": "mean", "rt_le_m": 1.0 + 0.1 * place["ego"]} for place in places]
+    rows += [{**row, "method": "median", "rt_le_m": row["rt_le_m"] + gaps[row["train_seed"]]} for row in rows]
+    axes, settings = ("condition", "method", "scenario"), dict(aggregation.STUDY.settings)
+    results = Results("aggregation", "", axes, settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
+    (said,) = aggregation.STUDY.findings(results)  # type: ignore[misc]
+    assert words in said
