@@ -12,7 +12,7 @@ from torch import Tensor
 
 from coopoc.errors import InputError
 
-from .aggregate import Combine, Rule, rule
+from .aggregate import rule
 from .clients import Client
 from .compression import Compression
 from .gain import Gain
@@ -20,6 +20,7 @@ from .history import Federation, Round, ledger
 from .local import Work, adapt, everyone, local_fit
 from .machine import one_core, watched
 from .participation import Participation, Turn
+from .rule import Combine, Rule
 from .schedule import Epoch, Schedule
 from .server import SERVER, Answer, Exchange, Group, Protection, Server, Standing, combine
 from .stack import flatten

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from coopoc.world.noise import stream
 
-from .aggregate import Rule, State
 from .compression import Compression
 from .guard import screen
 from .participation import Participation, Turn
+from .rule import Rule, State
 
 SERVER = "server"
 """The server's name in the traffic of a round."""
@@ -62,7 +62,7 @@ def combine(
         rule: how, and its state. theta: (P,) weights that the clients received. answers: by name, in any order.
         usual: what the last round gave; None at first.
 
-    >>> from .aggregate import RULES
+    >>> from coopoc.learned.aggregate import RULES
     >>> two = {"b": Answer(torch.tensor([3.0]), 1, 1.0), "a": Answer(torch.tensor([torch.nan]), 3, 1.0)}
     >>> done = combine(RULES["mean"], (), torch.tensor([2.0]), two)
     >>> done.theta.tolist(), done.rejected

@@ -15,12 +15,14 @@ from torch import Tensor, nn
 from coopoc import Fleet, InputError, Sensors, load
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
-from coopoc.learned.aggregate import FedProx, MultiKrum, Rule
 from coopoc.learned.clients import Batch, Noise
 from coopoc.learned.compression import Compression, Float16, Quantised, TopK
 from coopoc.learned.federated import Federation, adapt, federate_many, ledger, local_fit
 from coopoc.learned.gain import Gain
+from coopoc.learned.means import FedProx
 from coopoc.learned.participation import Participation, Poison, moved, unlike
+from coopoc.learned.robust_rules import MultiKrum
+from coopoc.learned.rule import Rule
 from coopoc.learned.server import SERVER, Group, Standing
 from coopoc.learned.stack import flatten
 from coopoc.learned.topology import Complete, Mesh, Pairs, Ring, Topology, V2XGraph, connected, disagreement, metropolis

@@ -14,25 +14,14 @@ from torch import Tensor
 
 from coopoc import InputError
 from coopoc.learned import Schedule
-from coopoc.learned.aggregate import (
-    RULES,
-    FedAdam,
-    FedAvgM,
-    FedProx,
-    GeometricMedian,
-    Krum,
-    Moments,
-    MultiKrum,
-    Rule,
-    TrimmedMean,
-    inverse_variance,
-    mean,
-    rule,
-    uniform,
-)
+from coopoc.learned.aggregate import RULES, rule
 from coopoc.learned.compression import Compression, Float16, Quantised, TopK
 from coopoc.learned.guard import screen
+from coopoc.learned.means import FedProx, inverse_variance, mean, uniform
 from coopoc.learned.robust import geometric_median, krum_scores
+from coopoc.learned.robust_rules import GeometricMedian, Krum, MultiKrum, TrimmedMean
+from coopoc.learned.rule import Rule
+from coopoc.learned.server_rules import FedAdam, FedAvgM, Moments
 
 SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])
 

@@ -11,8 +11,8 @@ import torch
 import coopoc.learned.train as train
 from coopoc import Fleet, InputError, Sensors
 from coopoc.learned import GainNet, Pieces, Schedule, clients, federate, fit
-from coopoc.learned.aggregate import mean, uniform
 from coopoc.learned.clients import mirrored
+from coopoc.learned.means import mean, uniform
 from coopoc.learned.schedule import adamw, clip, cosine
 from coopoc.learned.stack import flatten
 from coopoc.learned.train import Task, fit_many
