@@ -196,8 +196,9 @@ def clients(
         order = stream(seed, "split", 0, name).permutation(len(pieces)).tolist()
         count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
         long = _cut(drive, sensors, longest, fleet.dt, noise, start)
-        judged = sorted(order[count:]) * (DRAWS if noise == "wide" else 1)
-        found.append(Client(name, pieces.take(sorted(order[:count])), pieces.take(judged), long))
+        uses = DRAWS if noise == "wide" else 1
+        training, validation = pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]) * uses)
+        found.append(Client(name, training, validation, long.take([*range(len(long))] * uses)))
     return tuple(found)
 
 

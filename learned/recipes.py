@@ -30,7 +30,7 @@ from .okf_fit import fit_okf_many
 from .schedule import Epoch, Schedule
 from .train import Fit, Task, fit_many
 
-REVISION = 3
+REVISION = 4
 """Raised whenever the training code changes what it makes of the same recipe."""
 WEIGHTS = Path(__file__).parent / "weights"
 
@@ -65,6 +65,9 @@ RECIPES: dict[str, Recipe] = {
     "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
     "magnitude": Recipe("federated", noise="wide", options=(("magnitudes", True),)),
+    "recursive": Recipe("federated", Schedule(batch=24, mirror=False), 10, 10, noise="wide", piece=300, net="recursive"),
+    "split": Recipe("federated", Schedule(batch=8, learning_rate=3e-3, weight_decay=0.1), local_epochs=10, noise="wide",
+                    piece=300, net="split"),
 }
 
 
@@ -167,11 +170,16 @@ def train_all(
 
 def _train(group: Sequence[Job], fleet: Fleet, out: Path, progress: bool) -> None:
     """Train and save the checkpoints of one recipe."""
+    for job, checkpoint in zip(group, trained(group, fleet, progress), strict=True):
+        save(out / f"{job.label}.safetensors", checkpoint)
+
+
+def trained(group: Sequence[Job], fleet: Fleet, progress: bool = True) -> list[Checkpoint]:
+    """Checkpoints of jobs of one recipe, trained together now."""
     data = {job.setting: _data(fleet, job) for job in group}
-    trained = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
-    for job, made in zip(group, trained, strict=True):
-        card = _card(job, fleet, data[job.setting]) | dict(made.card)
-        save(out / f"{job.label}.safetensors", Checkpoint(made.model, card, made.history))
+    found = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
+    return [replace(made, card=_card(job, fleet, data[job.setting]) | dict(made.card))
+            for job, made in zip(group, found, strict=True)]  # fmt: skip
 
 
 def _in_worker(group: Sequence[Job], fleet: Fleet, out: Path, line: int | None, parent: int) -> None:

@@ -85,6 +85,10 @@ class Knowledge:
         variance: Floats = (recording.dt * self.sensors.velocity_std(velocity, floor)) ** 2
         return variance
 
+    def fix_variance(self, recording: Recording) -> Floats:
+        """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
+        return self.gnss_variance[None, None, None]
+
     @property
     def gnss_variance(self) -> Floats:
         """(3,) m^2."""

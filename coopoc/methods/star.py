@@ -51,7 +51,7 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
     n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this
     step adds (2n - 1) times the variance of one. Nothing is assumed of who is seen but not heard.
     """
-    variance = knowledge.process_variance(recording)
+    variance, fixes = knowledge.process_variance(recording), knowledge.fix_variance(recording)
     before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)
     uses = np.ones((recording.runs, 0), dtype=np.int64)
     for t in range(len(recording.t)):
@@ -68,8 +68,8 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
         relative = recording.relative[:, links]
         heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1)
         yield StarStep(
-            t, kept, links, relative, to_vector(relative), moved, process, fix, knowledge.gnss_variance + fix_variance,
-            heard,
+            t, kept, links, relative, to_vector(relative), moved, process, fix,
+            _when_sent(fixes, members, sent, t) + fix_variance, heard,
         )  # fmt: skip
         before, before_sent = members, sent
 
@@ -98,6 +98,15 @@ def held_motion(
     process = np.where(held, (2 * uses[..., None] - 1) * one_step, FORGOTTEN)
     fix = recording.gnss[runs, at, members] + np.where(held, age * moved, 0.0)
     return moved, process, fix, np.where(held, age**2 * one_step, 0.0)
+
+
+def _when_sent(variance: Floats, members: Ints, sent: Ints, t: int) -> Floats:
+    """(R or 1, n or 1, 3) of what is assumed of each fix, broadcastable to (R, T, N, 3), when it was sent."""
+    if variance.shape[:3] == (1, 1, 1):
+        return np.asarray(variance[0])
+    runs = np.arange(len(sent))[:, None]
+    whole = np.broadcast_to(variance, (len(sent), *variance.shape[1:]))
+    return np.asarray(whole[runs, np.where(sent >= 0, sent, t), members])
 
 
 def rows(members: Ints) -> Ints:

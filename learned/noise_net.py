@@ -1,0 +1,259 @@
+"""NoiseNet: a small net that tells a vehicle's noise from its own fixes and velocities, and the filter that uses it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from coopoc.arrays import Floats
+from coopoc.errors import InputError
+from coopoc.methods.star import FORGOTTEN
+from coopoc.methods.track import Method, Track
+from coopoc.world.recording import Recording
+from coopoc.world.v2x import NO_MESSAGE, Message
+
+from .clients import Batch
+from .gain import Gain
+from .machine import one_core
+from .stack import flatten, layers, named
+
+MEMORY = 100.0
+"""Steps after which what was seen counts 1/e: 10 s at 10 Hz, as long as a training piece."""
+GNSS_STD, SHARE, SPEED = 2.5, 0.1, 1.0
+"""m, a share of the speed, and the m/s of it: what one step before the first is taken to have shown."""
+SHARED = 5.0
+"""Steps that all axes together count in the GNSS std of each."""
+EVEN, LEAST = 0.001, 1e-3
+"""What keeps the two shares finite where all axes move alike, and where one of them is nothing."""
+
+
+class Variances(NamedTuple):
+    """What is told of the noise, (T, S, B, 3) m^2: of each fix, and of the motion into each step."""
+
+    fix: Tensor
+    process: Tensor
+
+
+class Guess(NamedTuple):
+    """What the net corrects: logs of the GNSS std r m, of the velocity noise's share a of the axis's velocity and its
+    share b of the speed, (T, S, B, 3); what it goes by: features of the fix (..., 2) and of the motion (..., 5)."""
+
+    gnss: Tensor
+    axis: Tensor
+    speed: Tensor
+    of_fix: Tensor
+    of_motion: Tensor
+
+
+def evidence(gnss: Tensor, velocity: Tensor, dt: float) -> Tensor:
+    """What fixes and velocities (T, ..., 3) show of their noise whatever a filter makes of them, (4, T, ..., 3).
+
+    Forgetting sums up to each step, per axis, of
+    0, 1: (z_t - z_{t-1} - dt u_t)^2, whose mean is 2 r^2 + q, and their number;
+    2, 3: (u_t - 2 u_{t-1} + u_{t-2})^2 / 6, which is noise alone where the true velocity is smooth, and u_t^2.
+    The first velocity is left out: a filter that starts at the first fix never uses it. NaN adds nothing.
+    """
+    jump = gnss[1:] - gnss[:-1] - dt * velocity[1:]
+    bend = velocity[3:] - 2.0 * velocity[2:-1] + velocity[1:-2]
+    sums = torch.zeros((len(gnss), 4, *gnss.shape[1:]), dtype=gnss.dtype)
+    sums[1:, 0], sums[1:, 1] = jump.square().nan_to_num(0.0), jump.isfinite().to(gnss.dtype)
+    sums[3:, 2] = (bend.square() / 6.0).nan_to_num(0.0)
+    sums[3:, 3] = torch.where(bend.isfinite(), velocity[3:].square(), 0.0)
+    for before, now in pairwise(sums):
+        now.add_(before, alpha=1.0 - 1.0 / MEMORY)
+    return sums.transpose(0, 1)
+
+
+def guess(gnss: Tensor, velocity: Tensor, dt: float) -> Guess:
+    """Closed-form noise of fixes and velocities (T, S, B, 3).
+
+    r per axis, drawn to that of all axes while little was seen. The velocity's noise variance is a^2 u_i^2 + b^2 |u|^2
+    on axis i: a line over the axis's share of the squared speed, fitted to the three axes.
+    """
+    jumps, count, bends, moved = evidence(gnss, velocity, dt)
+    unseen = SHARED / (count + SHARED)
+    all_jumps = (jumps.sum(-1, keepdim=True) + 2.0 * GNSS_STD**2) / (count.sum(-1, keepdim=True) + 1.0)
+    r = 0.5 * torch.log((jumps + SHARED * all_jumps) / (2.0 * (count + SHARED)))
+    driven = moved.sum(-1, keepdim=True) + SPEED**2
+    noise, part = (bends + SHARE**2 * SPEED**2 / 3.0) / driven, (moved + SPEED**2 / 3.0) / driven
+    mean = noise.mean(-1, keepdim=True)
+    slope = ((part * noise).sum(-1, keepdim=True) - mean) / (part.square().sum(-1, keepdim=True) - 1.0 / 3.0 + EVEN)
+    slope = torch.minimum(slope.clamp(min=0.0), 3.0 * mean)
+    a, b = (0.5 * torch.log(square + LEAST**2).expand_as(r) for square in (slope, mean - slope / 3.0))
+    now = velocity.nan_to_num(0.0).square() + 0.01
+    speed = now.sum(-1, keepdim=True)
+    of_motion = [0.5 * (a - math.log(SHARE)), 0.3 * (b - math.log(SHARE)), 0.25 * torch.log(driven / SPEED**2),
+                 torch.log(now / speed) / 8.0, 0.25 * torch.log(speed)]  # fmt: skip
+    of_motion = torch.stack([feature.expand_as(r) for feature in of_motion], -1)
+    return Guess(r, a, b, torch.stack([unseen * (r - math.log(GNSS_STD)), unseen], -1), of_motion)
+
+
+class NoiseNet(Gain):
+    """Noise of every fix and velocity from one small net for all axes; what filters with it is Kalman's.
+
+    var z_t = exp(2 (r + c_1)), q_t = dt^2 (exp(2 (a + c_2)) u_t^2 + exp(2 (b + c_3)) |u_t|^2 + exp(2 (f - 5))):
+    r, a and b from `guess`, corrections c from one hidden layer, 0 before training, and f trained. Nothing depends on
+    the state of a filter, so any filter may use it, the net cannot make one unstable, and all steps are told at once.
+
+    Args:
+        hidden: width. seed: of the initial weights.
+
+    Source of the training through the recursion: Haarnoja et al., Backprop KF, NeurIPS 2016.
+
+    >>> sum(p.numel() for p in NoiseNet().parameters())
+    100
+    """
+
+    def __init__(self, hidden: int = 8, seed: int = 0) -> None:
+        super().__init__()
+        self.hidden = hidden
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            self.fix_hidden, self.fix = nn.Linear(2, hidden), nn.Linear(hidden, 1)
+            self.motion_hidden, self.motion = nn.Linear(5, hidden), nn.Linear(hidden, 2)
+        for last in (self.fix, self.motion):
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+        self.floor = nn.Parameter(torch.zeros(1))
+
+    @property
+    def settings(self) -> Mapping[str, Any]:
+        """Width."""
+        return {"hidden": self.hidden}
+
+    def variances(self, theta: Tensor, gnss: Tensor, velocity: Tensor, dt: float) -> Variances:
+        """What S nets theta (S, P) tell of fixes and velocities (T, S, B, 3) m and m/s, NaN where there was none."""
+        with torch.no_grad():
+            found = guess(gnss, velocity, dt)
+        net, floor = layers(theta, self), torch.exp(2.0 * named(theta, self)["floor"] - 10.0)
+        steps, models, *rest = found.gnss.shape
+        of_fix, of_motion = (f.transpose(0, 1).reshape(models, -1, f.shape[-1]) for f in found[3:])
+        out = [net["fix"](net["fix_hidden"](of_fix).tanh()), net["motion"](net["motion_hidden"](of_motion).tanh())]
+        fix, axis, speed = torch.cat(out, 2).view(models, steps, *rest, 3).transpose(0, 1).unbind(-1)
+        square = velocity.nan_to_num(0.0).square()
+        noise = torch.exp(2.0 * (found.axis + axis)) * square
+        noise = noise + torch.exp(2.0 * (found.speed + speed)) * square.sum(-1, keepdim=True)
+        return Variances(torch.exp(2.0 * (found.gnss + fix)), dt**2 * (noise + floor[:, None]))
+
+    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
+        """(S, B) Gaussian negative log-likelihood of the true error, mean over time, sum over components."""
+        gnss = torch.cat([batch.x0[None], batch.gnss])
+        velocity = torch.cat([batch.velocity[:1], batch.velocity])
+        told = self.variances(theta, gnss, velocity, batch.dt)
+        x, spread = filtered(gnss, velocity, told, batch.dt, batch.known)
+        error = (x[1:] - batch.truth).square()
+        return 0.5 * (error / spread[1:] + spread[1:].log()).sum(-1).mean(0)
+
+    def method(self, name: str, x0: Floats | None = None) -> Method:
+        """`NoiseFilter` with this net."""
+        return NoiseFilter(self, name, x0)
+
+
+def filtered(
+    gnss: Tensor, velocity: Tensor, told: Variances, dt: float, known: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Kalman filter per axis whose past is revised with its noise: estimate and variance (T, S, B, 3) m, m^2.
+
+    p = s r_t + q_t;  k = p / (p + r_t);  x += k (z - x);  s = k. The spread s is the variance over that of a fix, so a
+    new r_t rescales what older fixes are thought to be worth: gains depend on q / r alone, as they should while r is
+    one unknown number. Where a fix is missing (NaN), k = 0 and s = p / r_t.
+
+    Args:
+        gnss, velocity: (T, S, B, 3) m, m/s. known: (S, B) where gnss[0] is the exact start.
+    """
+    x, spread = gnss[0], FORGOTTEN / (FORGOTTEN + told.fix[0])
+    if known is not None:
+        spread = torch.where(known[..., None], 0.0, spread)
+    xs, ps, whole = [x], [spread * told.fix[0]], bool(gnss.isfinite().all())
+    rows = (gnss[1:], dt * velocity[1:], told.fix[1:], told.process[1:])
+    for z, move, fix, process in zip(*rows, strict=True):
+        x, p = x + move, torch.addcmul(process, spread, fix)
+        spread = p / (p + fix)
+        if whole:
+            x = torch.addcmul(x, spread, z - x)
+        else:
+            x = torch.where(z.isfinite(), torch.addcmul(x, spread, z - x), x)
+            spread = torch.where(z.isfinite(), spread, p / fix)
+        xs.append(x)
+        ps.append(spread * fix)
+    return torch.stack(xs), torch.stack(ps)
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFilter:
+    """Position from own fixes and velocities by a Kalman filter with the noise that a NoiseNet tells.
+
+    Args:
+        model: trained net. name: in tables. x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+
+    >>> NoiseFilter(NoiseNet()).message.payload
+    0
+    """
+
+    model: NoiseNet
+    name: str = "noise-net"
+    x0: Floats | None = None
+    cooperative: bool = False
+    message: Message = NO_MESSAGE
+
+    @one_core()
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Estimates and covariances of the egos; InputError if one is unknown or absent, or x0 has another shape."""
+        began, columns = time.perf_counter(), recording.columns(egos)
+        gnss, velocity = (lanes(a[:, :, columns]) for a in (recording.gnss, recording.velocity))
+        theta = flatten([self.model]).double()
+        with torch.inference_mode():
+            told = self.model.variances(theta, gnss, velocity, recording.dt)
+            known = None
+            if self.x0 is not None:
+                gnss[0], known = self._start(gnss[0], recording.runs), torch.ones(gnss.shape[1:3], dtype=torch.bool)
+            x, p = (runs(a, recording.runs) for a in filtered(gnss, velocity, told, recording.dt, known))
+        silent = np.zeros((recording.runs, len(columns)))
+        seconds = time.perf_counter() - began
+        return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), silent, silent, seconds)
+
+    def _start(self, fixes: Tensor, count: int) -> Tensor:
+        shape = (count, fixes.shape[1] // count, 3)
+        if np.shape(self.x0) not in (shape, shape[1:]):
+            allowed = f"must be (R, E, 3) = {shape} or (E, 3)"
+            raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
+        return torch.from_numpy(np.broadcast_to(np.asarray(self.x0, dtype=float), shape).reshape(1, -1, 3).copy())
+
+
+def tell(model: NoiseNet, recording: Recording) -> tuple[Floats, Floats]:
+    """Variances of fixes and of motion (R, T, N, 3) m^2 that every vehicle's own net tells it; run by run."""
+    theta, found = flatten([model]).double(), []
+    with one_core(), torch.inference_mode():
+        for gnss, velocity in zip(recording.gnss, recording.velocity, strict=True):
+            told = model.variances(theta, lanes(gnss[None]), lanes(velocity[None]), recording.dt)
+            found.append([runs(a, 1)[0] for a in told])
+    fix, process = (np.stack(a) for a in zip(*found, strict=True))
+    return fix, process
+
+
+def lanes(array: Floats) -> Tensor:
+    """(R, T, E, 3) as (T, 1, R E, 3).
+
+    >>> lanes(np.zeros((2, 5, 3, 3))).shape
+    torch.Size([5, 1, 6, 3])
+    """
+    flat = np.moveaxis(array, 1, 0).reshape(array.shape[1], 1, -1, 3)
+    return torch.from_numpy(np.array(flat, dtype=np.float64))
+
+
+def runs(tensor: Tensor, count: int) -> Floats:
+    """(T, 1, R E, 3) as (R, T, E, 3) of R = `count` runs.
+
+    >>> runs(torch.zeros(5, 1, 6, 3), 2).shape
+    (2, 5, 3, 3)
+    """
+    rows: Floats = np.moveaxis(tensor[:, 0].numpy().reshape(len(tensor), count, -1, 3), 0, 1)
+    return rows
