@@ -17,6 +17,8 @@ def train(
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     start: Literal["gnss", "true"] = "gnss",
     reading: Literal["axis", "speed"] = "axis",
+    flower: bool = False,
+    rounds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
 ) -> None:
     """Train a recipe, or find its checkpoint if the same was trained before.
 
@@ -29,11 +31,23 @@ def train(
         seed: of noise, split, start and batches.
         start: of the filter in training: the first fix or the true position.
         reading: of "10 % of the velocity": per axis or of the speed on every axis.
+        flower: train a federation on Flower's simulation engine, every client in a process of its own.
+        rounds: of a federation on Flower; default: the recipe's.
     """
+    from coopoc.errors import InputError
     from coopoc.fleets import load
     from coopoc.learned.recipes import train_all
 
-    made = train_all(load(data), out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe])
+    fleet = load(data)
+    if flower:
+        from coopoc.learned import flower as engine
+
+        config = {"recipe": recipe, "seed": seed, "start": start, "reading": reading}
+        made = engine.train(engine.job_of(config | ({} if rounds is None else {"rounds": rounds})), fleet, out)
+    elif rounds is not None:
+        raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
+    else:
+        made = train_all(fleet, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe])
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")
     print(f"coopoc: {len(made)} checkpoints are in {out}", file=sys.stderr)

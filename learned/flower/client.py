@@ -1,0 +1,97 @@
+"""ClientApp: a vehicle that trains on its own drive and lets nothing out but a report."""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeAlias
+
+from torch import Tensor
+
+from coopoc.errors import InputError
+from coopoc.fleets import load
+
+from ..clients import Client
+from ..federated import local_fit
+from ..machine import one_core
+from ..recipes import Job
+from ..train import Judge
+from .job import data, job_of, local, net
+from .wire import Report, answer, asked, require_flower
+
+if TYPE_CHECKING:
+    from flwr.app import Context, Message
+    from flwr.clientapp import ClientApp
+
+Source: TypeAlias = "Callable[[Context], tuple[Client, Job]]"
+
+
+def client_app(source: Source | None = None) -> ClientApp:
+    """The ClientApp of one vehicle: `local_fit` on its own drive, hence the weights that `federate` would give it.
+
+    Args:
+        source: the vehicle with its pieces, and the job; default: what the configurations of node and run say.
+
+    Raises:
+        MissingLibraryError: Flower is not installed.
+    """
+    require_flower("a ClientApp")
+    from flwr.clientapp import ClientApp
+
+    app, found = ClientApp(), source or configured
+
+    @app.train()
+    def train(message: Message, context: Context) -> Message:
+        return _replied(message, context, found, training=True)
+
+    @app.evaluate()
+    def evaluate(message: Message, context: Context) -> Message:
+        return _replied(message, context, found, training=False)
+
+    return app
+
+
+def configured(context: Context) -> tuple[Client, Job]:
+    """The vehicle by the node's own configuration, `data` (a name or a path) and `vehicle` (an id, not needed if the
+    data hold one vehicle), and the job by the run's. No other vehicle's drive is looked at.
+
+    Raises:
+        InputError: no data, or several vehicles and no word on which of them is this node's.
+    """
+    own = context.node_config
+    if "data" not in own:
+        raise InputError("data", "missing", "must name a fleet or a file", "Start the SuperNode with --node-config.")
+    fleet = load(str(own["data"]))
+    vehicle = own.get("vehicle", fleet.ids[0] if len(fleet.ids) == 1 else None)
+    if vehicle is None:
+        raise InputError("vehicle", "missing", f"must be one of {len(fleet.ids)} ids", "Add it to --node-config.")
+    job = job_of(context.run_config)
+    (client,) = data(job, fleet.select([str(vehicle)]))
+    return client, job
+
+
+@one_core()
+def report(client: Client, job: Job, theta: Tensor, number: int, training: bool) -> Report:
+    """Judge theta (P,) on the client's own pieces and, if asked to, train on them: its half of round `number`."""
+    model = net(job)
+    validation = float(Judge([[client.validation], [client.long]], model)(theta[None]))
+    told = Report(client.name, len(client.training), validation)
+    if not training:
+        return told
+    weights, loss, broke = local_fit(model, theta, client, job.setting.seed, number, job.recipe.rounds, local(job))
+    return replace(told, broke=broke) if broke else replace(told, weights=weights, training_loss=loss)
+
+
+def _replied(message: Message, context: Context, source: Source, training: bool) -> Message:
+    """The reply. Of an exception only the type leaves, because its text may quote a coordinate."""
+    from flwr.app import Error, Message
+
+    try:
+        client, job = source(context)
+        return Message(answer(report(client, job, *asked(message.content), training)), reply_to=message)
+    except Exception as error:
+        traceback.print_exc(file=sys.stderr)
+        reason = f"{type(error).__name__} in the client, whose own log says more"
+        return Message(Error(code=0, reason=reason), reply_to=message)

@@ -1,0 +1,132 @@
+"""simulate: a federation on Flower's simulation engine, every client a virtual SuperNode in a Ray process."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coopoc.errors import MissingLibraryError
+from coopoc.world.fleet import Fleet
+
+from ..checkpoint import Checkpoint, load, read_card, save
+from ..clients import Client
+from ..machine import watched
+from ..recipes import Job
+from .ask import Wait
+from .client import Source, client_app
+from .job import data
+from .rows import Row, checkpoint
+from .server import rounds, server_app
+from .wire import require_flower
+
+if TYPE_CHECKING:
+    from flwr.app import Context
+    from flwr.serverapp import Grid
+
+DAY = 24 * 3600.0
+"""Seconds that a round may take here, where nobody can be absent."""
+QUIET = {
+    "RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "FLWR_TELEMETRY_ENABLED": "0",
+    "RAY_ENABLE_AUTO_CONNECT": "0",  # or a thread that asks Ray something after the end starts it again
+}  # fmt: skip
+
+
+def train(job: Job, fleet: Fleet, out: Path | str, progress: bool = True) -> dict[str, Checkpoint]:
+    """`simulate` and write the checkpoint, or read it from `out` if Flower made the same before.
+
+    Args:
+        job: recipe and setting. fleet: the clients' drives. out: folder of the checkpoint. progress: a bar on stderr.
+
+    Returns:
+        The checkpoint by its label, such as "fedkalmannet-gnss-axis-0".
+
+    Raises:
+        MissingLibraryError: Flower or its simulation engine is not installed.
+    """
+    path = Path(out) / f"{job.label}.safetensors"
+    card = read_card(path) if path.is_file() else {}
+    if card.get("key") != job.key(fleet) or not str(card.get("engine")).startswith("flower"):
+        save(path, simulate(job, fleet, f"train {job.name}" if progress else None))
+    return {job.label: load(path)}
+
+
+def simulate(job: Job, fleet: Fleet, progress: str | None = None, processes: int = 2) -> Checkpoint:
+    """The checkpoint of a federation that Flower's simulation engine ran, with the weights of `federate`.
+
+    Args:
+        job: recipe and setting. fleet: the clients' drives, one vehicle each. progress: name of a bar on stderr.
+        processes: clients that train at the same time; the weights do not depend on it.
+
+    Raises:
+        MissingLibraryError: Flower or its simulation engine is not installed.
+    """
+    require_flower("training with --flower")
+    rows, began, over = list[Row](), time.perf_counter(), threading.Event()
+
+    def pause(seconds: float) -> None:
+        if over.wait(seconds):
+            raise InterruptedError("the simulation is over")
+
+    def lead(grid: Grid, context: Context) -> None:
+        done = rounds(grid, job, len(fleet.ids), Wait(DAY, math.inf, pause))
+        rows.extend(watched(done, progress, "round", job.recipe.rounds + 1))
+
+    source = partial(partition, fleet=fleet, job=job)
+    with ThreadPoolExecutor(1) as thread:  # not here: Flower's threads would outlive a Ctrl-C
+        try:
+            thread.submit(_simulate, lead, source, len(fleet.ids), processes).result()
+        finally:
+            over.set()
+    made = checkpoint(rows, job, time.perf_counter() - began)
+    card = {**made.card, "key": job.key(fleet), "fleet": fleet.name, "digest": fleet.digest}
+    return replace(made, model=made.model.finished([client.training for client in data(job, fleet)]), card=card)
+
+
+def partition(context: Context, fleet: Fleet, job: Job) -> tuple[Client, Job]:
+    """The vehicle of the fleet that is this virtual node."""
+    return data(job, fleet)[int(context.node_config["partition-id"])], job
+
+
+def _simulate(lead: Callable[[Grid, Context], None], source: Source, nodes: int, processes: int) -> None:
+    with _quiet() as folder:
+        try:
+            import ray
+            from flwr.simulation import run_simulation
+        except ImportError:
+            raise MissingLibraryError("ray", "training with --flower", "'coopoc[flower]'") from None
+        backend: Any = {
+            "init_args": {"num_cpus": processes, "include_dashboard": False, "logging_level": logging.ERROR,
+                          "log_to_driver": False, "_temp_dir": folder, "object_store_memory": 80_000_000},
+            "client_resources": {"num_cpus": 1.0, "num_gpus": 0.0},
+        }  # fmt: skip
+        try:
+            run_simulation(server_app(lead), client_app(source), nodes, backend_config=backend)
+        finally:
+            ray.shutdown()
+
+
+@contextmanager
+def _quiet() -> Iterator[str]:
+    """No log lines, usage reports or files that stay; a folder for Ray's files while they last."""
+    log, before = logging.getLogger("flwr"), dict(os.environ)
+    level = log.level
+    log.setLevel(logging.ERROR)
+    os.environ |= QUIET
+    try:
+        with tempfile.TemporaryDirectory(prefix="ray", ignore_cleanup_errors=True) as folder:
+            yield folder
+    finally:
+        log.setLevel(level)
+        os.environ.clear()
+        os.environ |= before
