@@ -10,7 +10,8 @@ from typing import Any
 from .errors import InputError
 
 GROUPS = {"coopoc.datasets": "data set", "coopoc.methods": "method", "coopoc.studies": "study",
-          "coopoc.backends": "backend", "coopoc.recipes": "recipe", "coopoc.nets": "net", "coopoc.commands": "command"}  # fmt: skip
+          "coopoc.backends": "backend", "coopoc.recipes": "recipe", "coopoc.nets": "net",
+          "coopoc.commands": "command"}  # fmt: skip
 """Group -> what one of its names is called."""
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +34,9 @@ OTHER_WIDTHS = (CELLS, 4 * CELLS, 4 * CELLS, 4 * CELLS, 4, SIZE)
 def rollout(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
     """Estimates x (T, S, B, 3) m of S models with weights theta (S, P): `GainNet.step`, T times, compiled.
 
-    x_t = x_{t-1} + dt u_t + K_t (z_t - x_{t-1} - dt u_t). Differentiable in theta and in nothing else, by backpropagation
-    through time that is written out. The numbers of a model do not depend on the others, nor on the number of threads.
+    x_t = x_{t-1} + dt u_t + K_t (z_t - x_{t-1} - dt u_t). Differentiable in theta and in nothing else, by
+    backpropagation through time that is written out. The numbers of a model do not depend on the others, nor on the
+    number of threads.
 
     Args:
         like: net whose shape the rows have. gnss, velocity: (T, S, B, 3) m, m/s. x0: (S, B, 3) m. dt: s, or (T,).
@@ -123,7 +125,7 @@ def _spread(kernel: Callable[..., None], models: int, *arguments: Any) -> None:
     if shares == 1:
         kernel(*arguments, 0, models)
         return
-    jobs = [_pool(shares).submit(kernel, *arguments, *cut) for cut in zip(cuts, cuts[1:])]
+    jobs = [_pool(shares).submit(kernel, *arguments, *cut) for cut in pairwise(cuts)]
     for job in jobs:
         job.result()
 

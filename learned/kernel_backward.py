@@ -10,8 +10,26 @@ from coopoc.arrays import Floats, Ints
 
 from .arithmetic import Net, Tape, add_product, bias, compiled, rows, span, weight
 from .kernel_forward import (
-    BACK, EPS, EVOLUTION, EXPECTED, FLOOR, GAIN, HIDDEN, INNOVATION_GATES, INNOVATION_X, LENGTHS, OBSERVATION,
-    POSTERIOR, POSTERIOR_OUT, PRIOR_GATES, PRIOR_X, PROCESS_GATES, PROCESS_X, SURPRISE, UPDATE, missing,
+    BACK,
+    EPS,
+    EVOLUTION,
+    EXPECTED,
+    FLOOR,
+    GAIN,
+    HIDDEN,
+    INNOVATION_GATES,
+    INNOVATION_X,
+    LENGTHS,
+    OBSERVATION,
+    POSTERIOR,
+    POSTERIOR_OUT,
+    PRIOR_GATES,
+    PRIOR_X,
+    PROCESS_GATES,
+    PROCESS_X,
+    SURPRISE,
+    UPDATE,
+    missing,
 )  # fmt: skip
 
 
@@ -85,7 +103,8 @@ def _step(net: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, t: int, 
             gain[b, j] = 0.0 if gone else pull.x[b, j // 3] * surprise[b, j % 3]
         if not gone:
             for j in range(9):
-                process[b, j], posterior[b, j], innovation[b, j] = pull.process[b, j], pull.prior[b, j], pull.innovation[b, j]
+                process[b, j], posterior[b, j] = pull.process[b, j], pull.prior[b, j]
+                innovation[b, j] = pull.innovation[b, j]
                 in_surprise[b, j % 3] += back_in[b, 9 + j] * pull.x[b, j // 3]
 
     _active(posterior, 0, rows(tape, POSTERIOR_OUT, t), 0, rows(deltas, POSTERIOR, t))
@@ -128,11 +147,15 @@ def _step(net: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, t: int, 
                 pull.x[b, i] += pull.x_before[b, i]
                 pull.x_before[b, i] = 0.0
             else:
-                pull.x[b, i] += pull.prior_before[b, i] - in_surprise[b, i] + pull.x_before[b, i] + in_evolution[b, i] + in_update[b, i]
+                pull.x[b, i] += (
+                    pull.prior_before[b, i] - in_surprise[b, i] + pull.x_before[b, i]
+                    + in_evolution[b, i] + in_update[b, i]
+                )
                 pull.x_before[b, i], pull.prior_before[b, i] = -in_evolution[b, i], -in_update[b, i]
         if not gone:
             for j in range(9):
-                pull.process[b, j], pull.prior[b, j], pull.innovation[b, j] = process[b, j], prior[b, j], innovation[b, j]
+                pull.process[b, j], pull.prior[b, j] = process[b, j], prior[b, j]
+                pull.innovation[b, j] = innovation[b, j]
 
 
 @compiled
@@ -147,7 +170,7 @@ def _through(net: Net, name: int, deltas: Tape, t: int, work: Floats) -> Floats:
 
 @compiled
 def _active(values: Floats, at: int, reached: Floats, column: int, out: Floats) -> None:
-    """out (B, n) = the columns of values from `at` on where those of `reached` from `column` on are positive, else 0."""
+    """out (B, n) = the columns of values from `at` on where those of `reached` from `column` on are positive, or 0."""
     zero = values.dtype.type(0.0)
     for b in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -184,7 +207,7 @@ def _gru(
 
 @compiled
 def _turn(values: Floats, at: int, features: Floats, lengths: Floats, which: int, log: int) -> None:
-    """Gradient of a direction in values[:, at : at + 3], and of its logarithm if there is one, into that of its vector."""
+    """Gradient of a direction in values[:, at : at + 3], and of its length's logarithm, into that of the vector."""
     real = values.dtype.type
     for b in range(values.shape[0]):
         length, along = lengths[b, which], real(0.0)

@@ -16,8 +16,7 @@ GNSS_STD, VELOCITY_SHARE = 2.5, 0.1
 WEIGHT = 0.7
 """Steps that the assumption counts as."""
 POOL = 60.0
-"""Steps that the mean of the three axes counts as in the GNSS variance of each before it has fixes of its own; after n of
-them POOL^2 / (POOL + n)."""
+"""Steps that the mean of the axes counts as in the GNSS variance of each; after n fixes, POOL^2 / (POOL + n)."""
 STILL = 0.01
 """m/s, least velocity std, so that an axis that stands still keeps a process noise."""
 FEATURES = 6

@@ -65,7 +65,10 @@ class GainNet(Gain):
     19938
     """
 
-    def __init__(self, in_mult: int = 40, out_mult: int = 5, start_gain: float | None = 0.1, seed: int = 0, magnitudes: bool = False) -> None:
+    def __init__(
+        self, in_mult: int = 40, out_mult: int = 5, start_gain: float | None = 0.1, seed: int = 0,
+        magnitudes: bool = False,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.in_mult, self.out_mult, self.magnitudes = in_mult, out_mult, magnitudes
         wide, both, seen = SIZE * in_mult, 2 * CELLS, SIZE + magnitudes
@@ -152,7 +155,7 @@ class GainNet(Gain):
         return torch.stack(estimates, 1)
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (B, T, 3) m of T steps after the start x0 (B, 3) m, from fixes and velocities (B, T, 3), dt s or (T,).
+        """Estimates (B, T, 3) m of T steps after the start x0 (B, 3) m, from fixes, velocities (B, T, 3), dt or (T,) s.
 
         Compiled where numba is installed; where the inputs need gradients, or lie on another device, by `reference`.
         """

@@ -66,7 +66,7 @@ class Privacy:
             raise InputError("clients", self.clients, "must be >= 1", "Give those whose noise adds up, or None.")
 
     def protect(self, updates: Tensor, names: Sequence[str], seed: int, number: int) -> Tensor:
-        """Updates (C, P) of the named clients in round `number` as they leave: clipped, plus each client's own noise."""
+        """Updates (C, P) of the named clients in round `number` as they leave: clipped, plus noise of each client."""
         norms = torch.linalg.vector_norm(updates, dim=1, keepdim=True)
         shrunk = updates * torch.clamp(self.clip / norms, max=1.0)
         std = self.noise_multiplier * self.clip / math.sqrt(self.clients or len(updates))

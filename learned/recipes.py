@@ -65,7 +65,8 @@ RECIPES: dict[str, Recipe] = {
     "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
     "magnitude": Recipe("federated", noise="wide", options=(("magnitudes", True),)),
-    "recursive": Recipe("federated", Schedule(batch=24, mirror=False), 10, 10, noise="wide", piece=300, net="recursive"),
+    "recursive": Recipe("federated", Schedule(batch=24, mirror=False), rounds=10, local_epochs=10, noise="wide",
+                        piece=300, net="recursive"),
     "split": Recipe("federated", Schedule(batch=8, learning_rate=3e-3, weight_decay=0.1), local_epochs=10, noise="wide",
                     piece=300, net="split"),
 }

@@ -102,8 +102,8 @@ def test_gradcheck(models: int, lanes: int, magnitudes: bool) -> None:
 @pytest.mark.parametrize("magnitudes", [False, True])
 @pytest.mark.parametrize(("models", "lanes", "steps"), [(3, 1, 100), (1, 2, 900), (2, 7, 100), (1, 72, 100)])
 def test_float32_agrees_with_the_reference(models: int, lanes: int, steps: int, magnitudes: bool) -> None:
-    """Values to 1e-5. Gradients are about as near to float64's as torch's own float32 ones: rounding turns the direction
-    of a short vector, so that torch itself is up to 1e-4 off."""
+    """Values to 1e-5. Gradients are about as near to float64's as torch's own float32 ones: rounding turns the
+    direction of a short vector, so that torch itself is up to 1e-4 off."""
     nets = [GainNet(seed=s, magnitudes=magnitudes) for s in range(models)]
     data = batch(models, lanes, steps, torch.float32, 0.1)
     found, mine, expected, theirs = gradients(nets, data, 0.1)

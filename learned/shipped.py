@@ -1,0 +1,101 @@
+"""Shipped weights: made from their recipes, described by their cards, and made again to see that they are the same."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from coopoc.errors import InputError
+from coopoc.evaluate.metrics import nees_inside, rt_le
+from coopoc.fleets import load as load_fleet
+from coopoc.methods.kalman import Kalman
+from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.track import Method
+from coopoc.world.sensing import observe
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
+
+from .checkpoint import Checkpoint, load, save
+from .recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of, trained
+from .stack import flatten
+
+CLIENTS, JUDGES = "town10-clients", "town10-validation"
+"""Fleets that the weights are trained on, and that their cards' metrics are of."""
+SENSORS = {
+    "training noise": Sensors.paper_training(),
+    "scenario 1": Sensors.paper_scenario1(),
+    "scenario 2, 10 %": Sensors.paper_scenario2(0.10),
+    "scenario 2, 15 %": Sensors.paper_scenario2(0.15),
+    "scenario 2, 15 % of the speed": replace(Sensors.paper_scenario2(0.15), velocity_reading="speed"),
+}
+LIMITS = {
+    "static": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
+    "fresh": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
+    "wide": "Trained at 1 to 6 m and at 5 to 20 % of each velocity component or of the speed; beyond them untried.",
+}
+EVERYWHERE = (
+    "Four simulated drives on one flat map at 10 Hz.",
+    "White noise without a bias; no outliers and no missing fixes in training.",
+)
+
+
+def jobs(recipe: str) -> dict[str, Job]:
+    """What is shipped of a recipe, by names such as individual1: seed 0, start at the first fix, noise per axis."""
+    return {f"{job.name}{job.client or ''}": job for job in jobs_of(recipe, Setting(), load_fleet(CLIENTS))}
+
+
+def ship(recipes: Sequence[str] = tuple(RECIPES), out: Path = WEIGHTS, progress: bool = True) -> list[Path]:
+    """Train recipes and write the weights to `out`, each with its hash, its limits and what it does in validation."""
+    paths = []
+    for recipe in recipes:
+        for name, checkpoint in _made(recipe, progress).items():
+            card = {**checkpoint.card, "sha256": digest(checkpoint), "metrics": metrics(checkpoint.model.method(name)),
+                    "limits": [LIMITS[RECIPES[recipe].noise], *EVERYWHERE]}  # fmt: skip
+            paths.append(save(out / f"{name}.safetensors", Checkpoint(checkpoint.model, card)))
+    return paths
+
+
+def differences(name: str, folder: Path = WEIGHTS, progress: bool = True) -> dict[str, float]:
+    """Train shipped weights again: the largest difference of any of them, by name.
+
+    On the machine and with the versions that the card names they differ by less than 1e-6.
+
+    Args:
+        name: of weights, such as "individual2", or of a recipe, for all that it makes. folder: of the weights.
+
+    Raises:
+        InputError: a name that is neither, or weights that are not in the folder.
+    """
+    recipe = name if name in RECIPES else name.rstrip("0123456789")
+    if recipe not in RECIPES or name not in (recipe, *jobs(recipe)):
+        raise InputError("weights", repr(name), f"must be one of {sorted(RECIPES)}", "Pick one.")
+    pairs = {label: (flatten([checkpoint.model]), flatten([load(folder / f"{label}.safetensors").model]))
+             for label, checkpoint in _made(recipe, progress).items() if name in (recipe, label)}  # fmt: skip
+    return {label: float((again - shipped).abs().max()) for label, (again, shipped) in pairs.items()}
+
+
+def digest(checkpoint: Checkpoint) -> str:
+    """SHA-256 of the weights as one row of float32 bytes."""
+    return hashlib.sha256(flatten([checkpoint.model]).float().numpy().tobytes()).hexdigest()
+
+
+def _made(recipe: str, progress: bool) -> dict[str, Checkpoint]:
+    wanted = jobs(recipe)
+    return dict(zip(wanted, trained(list(wanted.values()), load_fleet(CLIENTS), progress), strict=True))
+
+
+def metrics(method: Method, runs: int = 20) -> dict[str, dict[str, float]]:
+    """RT-LE m, its multiple of the bias-ignorant oracle filter's and, where a covariance is claimed and no bias acts,
+    the share of steps whose NEES is in its 99 % band, by the names of `SENSORS`: means over the validation fleet."""
+    fleet, found = load_fleet(JUDGES), {}
+    egos = [i for i, column in enumerate(fleet.present.T) if column.all()]
+    for name, sensors in SENSORS.items():
+        recording = observe(fleet, sensors, V2X(max_neighbours=0), runs=runs, seed=1)
+        track, oracle = method(recording, egos), Kalman(Knowledge.oracle(sensors, fleet))(recording, egos)
+        ours = float(rt_le(track, fleet).mean())
+        found[name] = {"rt_le_m": ours, "times_oracle": ours / float(rt_le(oracle, fleet).mean())}
+        if track.covariance is not None and sensors.gnss_bias[1] == 0:
+            found[name]["nees_inside"] = float(nees_inside(track, fleet).mean())
+    return {name: {key: round(value, 4) for key, value in row.items()} for name, row in found.items()}
