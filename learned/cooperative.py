@@ -168,7 +168,8 @@ def summed(recording: Recording, ego: int, box: Inbox, told: Knowledge) -> Itera
         ledger += _entry(recording.gnss[:, t], step, r[:, t], process[:, t], ledger[..., 0])
         members = np.concatenate([[ego], recording.links.neighbour[star.links]])
         news = np.concatenate([np.ones((recording.runs, 1), bool), box.fresh[:, links]], axis=1)
-        last = Account(*(column[:, members] for column in record))
+        last = Account(record.sums[:, members], record.step[:, members], record.held[:, members],
+                       record.guessed[:, members], record.pace[:, members], record.worth[:, members])  # fmt: skip
         last.held[:, star.kept < 0] = False
         heard, after = settled(star, last, news, ledger[:, members], r[:, t, members])
         for column, rows in zip(record, after, strict=True):
@@ -179,7 +180,9 @@ def summed(recording: Recording, ego: int, box: Inbox, told: Knowledge) -> Itera
 def _entry(fix: Floats, step: Floats, r: Floats, process: Floats, moved: Floats) -> Floats:
     """What a step adds to the sums (R, N, 3, 4) of vehicles that have `moved` so far; what is missing adds nothing."""
     seen = np.isfinite(fix)
-    return np.nan_to_num(np.stack([step, process, np.where(seen, 1.0 / r, 0.0), (fix - moved - step) / r], axis=-1))
+    weight = np.where(seen, 1.0 / r, 0.0)
+    entry: Floats = np.nan_to_num(np.stack([step, process, weight, (fix - moved - step) / r], axis=-1))
+    return entry
 
 
 def settled(star: StarStep, last: Account, news: Bools, sums: Floats, r: Floats) -> tuple[Heard, Account]:

@@ -52,7 +52,7 @@ def rollout(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: Te
     """
     seen = _checked(theta, like, gnss, velocity, x0, dt)
     if theta.requires_grad and torch.is_grad_enabled():
-        x: Tensor = _Rollout.apply(theta, like, seen)
+        x: Tensor = _Rollout.apply(theta, like, seen)  # type: ignore[no-untyped-call]
         return x
     return torch.from_numpy(_forward(theta, like, seen, keep=False)[0])
 
@@ -150,5 +150,5 @@ def _checked(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: T
     spans = torch.as_tensor(dt, dtype=theta.dtype)
     if spans.shape not in ((), (steps,)):
         raise InputError("dt", f"shape {tuple(spans.shape)}", f"must be one number or ({steps},)", "Give s per step.")
-    given = (array.detach().to(theta.dtype).contiguous().numpy() for array in (gnss, velocity, x0))
-    return _Seen(*given, spans.expand(steps).contiguous().numpy())
+    fixes, speeds, start = (array.detach().to(theta.dtype).contiguous().numpy() for array in (gnss, velocity, x0))
+    return _Seen(fixes, speeds, start, spans.expand(steps).contiguous().numpy())

@@ -46,7 +46,7 @@ def secure_client_app(source: Source | None = None, privacy: Privacy | None = No
     from flwr.client.mod import secaggplus_mod
     from flwr.clientapp import ClientApp
 
-    class Vehicle(NumPyClient):  # type: ignore[misc]
+    class Vehicle(NumPyClient):
         def __init__(self, context: Context) -> None:
             self.fleet, self.job = (source or configured)(context)
 
@@ -90,7 +90,7 @@ def secure_server_app(
 
     app, rule = ServerApp(), SecureMean(job.recipe.aggregate)
 
-    @app.main()  # type: ignore[untyped-decorator]
+    @app.main()
     def main(grid: Grid, context: Context) -> None:
         from flwr.server import LegacyContext, ServerConfig
         from flwr.server.workflow import DefaultWorkflow, SecAggPlusWorkflow
@@ -110,7 +110,7 @@ def _strategy(job: Job, rule: SecureMean, clients: int, found: Callable[[int, Te
     from flwr.common import ndarrays_to_parameters, parameters_to_ndarrays
     from flwr.server.strategy import FedAvg
 
-    class Mean(FedAvg):  # type: ignore[misc]
+    class Mean(FedAvg):
         def __init__(self) -> None:
             (self.theta,) = flatten([net(job)])
             self.state = rule.start(self.theta)

@@ -31,7 +31,7 @@ class Levels(NamedTuple):
     driven: Tensor
     velocity: Tensor
     jumps: Tensor
-    count: Tensor
+    fixes: Tensor
     turns: Tensor
     squares: Tensor
 
@@ -65,7 +65,7 @@ def after(levels: Levels, gnss: Tensor, velocity: Tensor, dt: float) -> Levels:
         torch.where(there, 0.0, driven),
         velocity,
         FORGET * levels.jumps + (0.5 * jump.square()).nan_to_num(0.0),
-        FORGET * levels.count + jump.isfinite(),
+        FORGET * levels.fixes + jump.isfinite(),
         FADE * levels.turns + (0.5 * turn.square()).nan_to_num(0.0),
         FADE * levels.squares + torch.where(turn.isnan(), 0.0, velocity.square()),
     )
@@ -74,12 +74,12 @@ def after(levels: Levels, gnss: Tensor, velocity: Tensor, dt: float) -> Levels:
 def noise(levels: Levels, dt: float) -> Noise:
     """r = mean of half the squared fix changes, drawn towards that of all axes; q = dt^2 (share u^2 + still^2), share =
     mean squared velocity error over mean squared velocity. Features are logs of standard deviations near unit size."""
-    pooled = levels.jumps.sum(-1, keepdim=True) / levels.count.sum(-1, keepdim=True)
-    weight = POOL**2 / (POOL + levels.count)
-    gnss = (levels.jumps + weight * pooled) / (levels.count + weight)
+    pooled = levels.jumps.sum(-1, keepdim=True) / levels.fixes.sum(-1, keepdim=True)
+    weight = POOL**2 / (POOL + levels.fixes)
+    gnss = (levels.jumps + weight * pooled) / (levels.fixes + weight)
     share, now = levels.turns / levels.squares, levels.velocity.square()
     ratio = dt**2 * (share * now + STILL**2) / gnss
     speed, error = now.sum(-1, keepdim=True).expand_as(now), (1.0 - FADE) * levels.turns
-    seen = [gnss, share, now + STILL**2, speed + STILL**2, levels.count, error + STILL**2]
+    seen = [gnss, share, now + STILL**2, speed + STILL**2, levels.fixes, error + STILL**2]
     middle = torch.tensor([0.7, -2.3, 1.0, 2.0, 2.0, 0.0], dtype=gnss.dtype)
     return Noise(gnss, ratio, 0.5 * torch.stack(seen, -1).log() - middle)

@@ -26,7 +26,8 @@ def encode(values: Floats, resolution: float = RESOLUTION) -> Words:
     >>> decode(encode(np.array([-0.5])) + encode(np.array([0.25]))).tolist()
     [-0.25]
     """
-    return np.rint(values / resolution).astype(np.int64).astype(np.uint32)
+    words: Words = np.rint(values / resolution).astype(np.int64).astype(np.uint32)
+    return words
 
 
 def decode(words: Words, resolution: float = RESOLUTION) -> Floats:

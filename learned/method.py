@@ -84,7 +84,7 @@ class LearnedGain:
         """Gain, GRU states and K times the GNSS covariance at every step, with the caveat of `Diagnostics`."""
         columns = recording.columns(egos)
         gnss, velocity, x0 = self._lanes(recording, columns)
-        states = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
+        states: list[tuple[Tensor, ...]] = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
         with one_core(), torch.inference_mode(), _heard(self.model) as heard:
             memory = self.model.start(x0)
             for fix, speed in zip(gnss.unbind(1), velocity.unbind(1), strict=True):
@@ -95,7 +95,7 @@ class LearnedGain:
         found = torch.stack([torch.stack(step) for step in states]).double().numpy()
         found = found.reshape(len(states), 4, recording.runs, len(columns), SIZE, SIZE).transpose(1, 2, 0, 3, 4, 5)
         posterior = found[0] * np.square(np.array(recording.sensors.gnss_std))
-        return Diagnostics(*found, posterior)
+        return Diagnostics(found[0], found[1], found[2], found[3], posterior)
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""

@@ -98,7 +98,8 @@ class GainNet(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each piece, mean over time, sum over components, m^2 (equation 7)."""
         estimates = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return (estimates - batch.truth).square().sum(-1).mean(0)
+        errors = (estimates - batch.truth).square().sum(-1)
+        return errors.movedim(0, -1).contiguous().mean(-1)  # in an order that does not depend on who is beside it
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""

@@ -90,9 +90,9 @@ def guess(gnss: Tensor, velocity: Tensor, dt: float) -> Guess:
     a, b = (0.5 * torch.log(square + LEAST**2).expand_as(r) for square in (slope, mean - slope / 3.0))
     now = velocity.nan_to_num(0.0).square() + 0.01
     speed = now.sum(-1, keepdim=True)
-    of_motion = [0.5 * (a - math.log(SHARE)), 0.3 * (b - math.log(SHARE)), 0.25 * torch.log(driven / SPEED**2),
+    motions = [0.5 * (a - math.log(SHARE)), 0.3 * (b - math.log(SHARE)), 0.25 * torch.log(driven / SPEED**2),
                  torch.log(now / speed) / 8.0, 0.25 * torch.log(speed)]  # fmt: skip
-    of_motion = torch.stack([feature.expand_as(r) for feature in of_motion], -1)
+    of_motion = torch.stack([feature.expand_as(r) for feature in motions], -1)
     return Guess(r, a, b, torch.stack([unseen * (r - math.log(GNSS_STD)), unseen], -1), of_motion)
 
 
@@ -222,10 +222,11 @@ class NoiseFilter:
 
     def _start(self, fixes: Tensor, count: int) -> Tensor:
         shape = (count, fixes.shape[1] // count, 3)
-        if np.shape(self.x0) not in (shape, shape[1:]):
+        given = np.asarray(self.x0, dtype=float)
+        if given.shape not in (shape, shape[1:]):
             allowed = f"must be (R, E, 3) = {shape} or (E, 3)"
-            raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
-        return torch.from_numpy(np.broadcast_to(np.asarray(self.x0, dtype=float), shape).reshape(1, -1, 3).copy())
+            raise InputError("x0", f"shape {given.shape}", allowed, "Give one position per ego.")
+        return torch.from_numpy(np.broadcast_to(given, shape).reshape(1, -1, 3).copy())
 
 
 def tell(model: NoiseNet, recording: Recording) -> tuple[Floats, Floats]:

@@ -153,6 +153,18 @@ def noise_for(wanted: float, rounds: int, share: float = 1.0, delta: float = 1e-
     return float(found)
 
 
+def ceiling(noise_multiplier: float, rounds: int) -> float:
+    """Area under the ROC curve that no attack on a client's presence can beat: Phi(mu / sqrt 2), mu = sqrt(rounds) / z.
+
+    Source: Dong, Roth, Su, Gaussian differential privacy, JRSS B 84, 2022, section 2 (mu and the trade-off curve).
+
+    >>> round(ceiling(noise_for(1.0, 20), 20), 3)
+    0.575
+    """
+    _checked(rounds, 1.0, 0.5)
+    return 0.5 * (1.0 + math.erf(math.sqrt(rounds) / (2 * noise_multiplier))) if noise_multiplier > 0 else 1.0
+
+
 def _checked(rounds: int, share: float, delta: float) -> None:
     if rounds < 1:
         raise InputError("rounds", rounds, "must be >= 1", "Give the rounds in which updates are sent.")
@@ -167,7 +179,8 @@ def _library() -> ModuleType:
         import dp_accounting
     except ModuleNotFoundError:
         raise MissingLibraryError("dp-accounting", "the (epsilon, delta) of a training", "'coopoc[privacy]'") from None
-    return dp_accounting
+    library: ModuleType = dp_accounting
+    return library
 
 
 def _accountant() -> Any:

@@ -64,6 +64,8 @@ RECIPES: dict[str, Recipe] = {
     "individual": Recipe("individual", Schedule(epochs=500)),
     "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
+    "cooperative": Recipe("federated", Schedule(batch=8, learning_rate=0.01, weight_decay=0.01), local_epochs=10,
+                          noise="wide", net="noise_net"),
     "magnitude": Recipe("federated", noise="wide", options=(("magnitudes", True),)),
     "recursive": Recipe("federated", Schedule(batch=24, mirror=False), rounds=10, local_epochs=10, noise="wide",
                         piece=300, net="recursive"),

@@ -131,7 +131,8 @@ class RecursiveGain(Gain):
         rows = []
         for s in range(len(theta)):
             weights = {f"net.{name}": view[0] for name, view in named(theta[s : s + 1], self).items()}
-            alone = Batch(*(a[:, s : s + 1] for a in batch[:3]), batch.x0[s : s + 1], batch.dt,
+            gnss, velocity, truth = (a[:, s : s + 1] for a in batch[:3])
+            alone = Batch(gnss, velocity, truth, batch.x0[s : s + 1], batch.dt,
                           None if batch.known is None else batch.known[s : s + 1])  # fmt: skip
             rows.append(torch.stack(torch.func.functional_call(_Reference(self), weights, (alone,))))
         return torch.stack(rows, 2).unbind()  # type: ignore[return-value]

@@ -38,7 +38,7 @@ def rollout(theta: Tensor, like: RecursiveGain, batch: Batch) -> tuple[Tensor, T
     fix, velocity = (a.to(theta.dtype).transpose(0, 1).contiguous() for a in (batch.gnss, batch.velocity))
     x0 = batch.x0.to(theta.dtype).contiguous()
     gnss, ratio, told = torch.empty_like(fix), torch.empty_like(fix), fix.new_empty(*fix.shape, FEATURES)
-    _levels(*(a.numpy() for a in (fix, velocity, x0)), batch.dt, *(a.numpy() for a in (gnss, ratio, told)))
+    _levels(fix.numpy(), velocity.numpy(), x0.numpy(), batch.dt, gnss.numpy(), ratio.numpy(), told.numpy())
     spread0 = torch.ones_like(x0) if batch.known is None else (~batch.known)[..., None].to(x0.dtype).expand_as(x0)
     flat = [a.reshape(models, *a.shape[1:-2], 3 * lanes)
             for a in (fix, batch.dt * velocity, ratio, gnss, x0, spread0)]  # fmt: skip
@@ -47,7 +47,8 @@ def rollout(theta: Tensor, like: RecursiveGain, batch: Batch) -> tuple[Tensor, T
     into = into.view(models, shape[0], 3 * lanes, 3 * like.hidden)
     weights = (net["cell_ih"].weight[:, :, FEATURES:], net["cell_hh"].weight, net["cell_hh"].bias[:, 0],
                net["heads"].weight, net["heads"].bias[:, 0])  # fmt: skip
-    found = _Rollout.apply(tuple(a.contiguous().numpy() for a in flat), into, *weights)
+    given = tuple(a.contiguous().numpy() for a in flat)
+    found = _Rollout.apply(given, into, *weights)  # type: ignore[no-untyped-call]
     x, variance = (a.view(models, shape[0], lanes, 3).transpose(0, 1) for a in found)
     return x, variance
 

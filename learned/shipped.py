@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import platform
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import nees_inside, rt_le
@@ -51,7 +54,8 @@ def ship(recipes: Sequence[str] = tuple(RECIPES), out: Path = WEIGHTS, progress:
     paths = []
     for recipe in recipes:
         for name, checkpoint in _made(recipe, progress).items():
-            card = {**checkpoint.card, "sha256": digest(checkpoint), "metrics": metrics(checkpoint.model.method(name)),
+            card = {**checkpoint.card, "sha256": digest(checkpoint), "machine": machine(),
+                    "metrics": metrics(checkpoint.model.method(name)),
                     "limits": [LIMITS[RECIPES[recipe].noise], *EVERYWHERE]}  # fmt: skip
             paths.append(save(out / f"{name}.safetensors", Checkpoint(checkpoint.model, card)))
     return paths
@@ -60,7 +64,7 @@ def ship(recipes: Sequence[str] = tuple(RECIPES), out: Path = WEIGHTS, progress:
 def differences(name: str, folder: Path = WEIGHTS, progress: bool = True) -> dict[str, float]:
     """Train shipped weights again: the largest difference of any of them, by name.
 
-    On the machine and with the versions that the card names they differ by less than 1e-6.
+    On the machine and with the versions that the card names they differ by less than 1e-6; elsewhere rounding grows.
 
     Args:
         name: of weights, such as "individual2", or of a recipe, for all that it makes. folder: of the weights.
@@ -79,6 +83,15 @@ def differences(name: str, folder: Path = WEIGHTS, progress: bool = True) -> dic
 def digest(checkpoint: Checkpoint) -> str:
     """SHA-256 of the weights as one row of float32 bytes."""
     return hashlib.sha256(flatten([checkpoint.model]).float().numpy().tobytes()).hexdigest()
+
+
+def machine() -> str:
+    """The processor, as far as rounding depends on it: architecture, model and vector instructions."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().split("\n\n")[0].splitlines() if info.is_file() else []
+    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    facts = [told[name] for name in ("model name", "cpu family", "model") if name in told] or [platform.processor()]
+    return ", ".join([platform.machine(), *facts, torch.backends.cpu.get_cpu_capability()])
 
 
 def _made(recipe: str, progress: bool) -> dict[str, Checkpoint]:

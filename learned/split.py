@@ -58,9 +58,10 @@ class SplitGain(Gain):
             torch.manual_seed(seed)
             self.see = nn.ModuleList(nn.Linear(2 * SIZE, hidden) for _ in range(2))
             self.cell = nn.ModuleList(nn.GRUCell(hidden, hidden) for _ in range(2))
-            self.factor = nn.ModuleList(nn.Linear(hidden, SIZE * SIZE) for _ in range(2))
+            last = [nn.Linear(hidden, SIZE * SIZE) for _ in range(2)]
+        self.factor = nn.ModuleList(last)
         with torch.no_grad():
-            for part in self.factor:
+            for part in last:
                 part.weight.mul_(0.1)
                 part.bias.copy_(START_GAIN**0.5 * torch.eye(SIZE).flatten())
 
@@ -104,8 +105,8 @@ class SplitGain(Gain):
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (B, T, 3) m of T steps after the start x0 (B, 3) m, from fixes and velocities (B, T, 3)."""
         theta = nn.utils.parameters_to_vector(self.parameters())
-        lanes = (a.transpose(0, 1).unsqueeze(1) for a in (gnss, velocity))
-        return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
+        fixes, speeds = (a.transpose(0, 1).unsqueeze(1) for a in (gnss, velocity))
+        return self.rollout(theta[None], fixes, speeds, x0[None], dt)[:, 0].transpose(0, 1)
 
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (T, S, B, 3) m of S nets theta (S, P): `step` with both nets of all S as rows of one product.

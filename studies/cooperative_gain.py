@@ -90,7 +90,9 @@ def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
     from coopoc.learned.cooperative import CooperativeGain, ToldNoise
 
     if p["method"] in TRAINED:
-        models = [(seed, weights.checkpoint("cooperative", p, seed).model) for seed in weights.seeds(p)]
+        models: list[tuple[int, Any]] = [
+            (seed, weights.checkpoint("cooperative", p, seed).model) for seed in weights.seeds(p)
+        ]
         return [(seed, CooperativeGain(m, TRAINED[p["method"]], p["method"])) for seed, m in models]
     if p["knowledge"] == "told":
         drive = scene.fleet(p["data"])
@@ -249,6 +251,7 @@ def _finding(results: Results, loss: float) -> str:
 
 
 METHOD = ("loss", "method", "knowledge")
+FILTERS = {**ALIKE, "method": list(dict.fromkeys(method for method, _ in LINES))}
 STUDY = Study(
     name="cooperative_gain",
     question="Can vehicles that tell each other how large their noise is do without knowing it, and when messages are "
@@ -265,15 +268,16 @@ STUDY = Study(
     shares=("receivers", "max_neighbours", "loss"),
     tables={
         "rt_le": _table("rt_le_m", f"RT-LE [m] against K. {BOUND}", ALIKE, METHOD, decimals=3),
-        "bytes": _table("bytes_per_second", "Payload that an ego receives [B/s].", ALIKE | {"method": list(
-            dict.fromkeys(m for m, _ in LINES))}, METHOD, decimals=0, intervals=False),
-        "nees": _table("nees", "NEES (3 is consistent).", ALIKE, METHOD, intervals=False),
+        "bytes": _table("bytes_per_second", "Payload that an ego receives [B/s].", FILTERS, METHOD, decimals=0,
+                        intervals=False),
+        "nees": _table("nees", "NEES (3 is consistent).", FILTERS, METHOD, intervals=False),
         "nees_inside": _table("nees_inside", "Share of steps whose run-averaged NEES is in its 99 % band (gate: 0.95).",
-                              ALIKE, METHOD, intervals=False),
+                              FILTERS, METHOD, intervals=False),
         "receivers": _table(
             "rt_le_m", f"RT-LE [m] where two receivers in five have {POOR:g} m and the others {GOOD:g} m (mixed), and "
             f"where all have {POOR:g} m in the middle third of the drive (changing); nominal filters are told the rms, "
-            "'told' each fix's own.", {"receivers": list(RECEIVERS)}, ("receivers", "method", "knowledge"), decimals=3),
+            "'told' ones each fix's own.", {"receivers": list(RECEIVERS)}, ("receivers", "method", "knowledge"),
+            decimals=3),
     },
     figures={"rt_le": _figure},
     findings=_findings,

@@ -24,8 +24,9 @@ NEAR = 0.10
 """Share of the RT-LE without privacy within which privacy is called affordable."""
 NOTES = {
     "rt_le": "RT-LE [m] against the client-level epsilon of the sum of the updates, delta {delta:g}; inf: no privacy.",
-    "price": "Clip, noise multiplier z of the sum, and the epsilon of a server that sees single updates (no secure "
-    "aggregation), at the epsilon of the sum in the first column, delta {delta:g}.",
+    "price": "Clip, noise multiplier z of the sum, the epsilon of a server that sees single updates (no secure "
+    "aggregation), at the epsilon of the sum in the first column, delta {delta:g}, and the areas under the ROC curve "
+    "that no attack on a client's presence can beat.",
     "probe": "AUC of the membership probe (0.5: a coin) with 95 % bootstrap intervals over pieces, by what is seen, "
     "one client's updates or the aggregate's, and by what is scored; 0.50 [0.50, 0.50]: the weights diverged.",
 }
@@ -33,6 +34,16 @@ NOTES = {
 
 def _caption(results: Results, name: str) -> str:
     return f"{NOTES[name].format(**results.settings)} {scene.conditions(results.settings)}"
+
+
+def _each(frame: pd.DataFrame) -> list[Any]:
+    """Rows as named tuples, whose fields pandas does not type."""
+    return list(frame.itertuples())
+
+
+def _names(names: Any) -> Any:
+    """Names of a group, which pandas does not type."""
+    return names
 
 
 def _rows(results: Results, measure: str, **where: Any) -> pd.DataFrame:
@@ -66,8 +77,10 @@ def _price(results: Results) -> Table | None:
         return None
     each = frame.groupby(["epsilon", "clients", "method"], sort=False).first().reset_index()
     body = [(f"{row.epsilon:g}", scene.fleet(row.clients).name, look(row.method).label, f"{row.clip:.3g}",
-             f"{row.noise_multiplier:.3g}", f"{row.epsilon_alone:.3g}") for row in each.itertuples()]  # fmt: skip
-    header = ("Epsilon of the sum", "Clients", "Method", "Clip", "z", "Epsilon of single updates")
+             f"{row.noise_multiplier:.3g}", float(row.ceiling), f"{row.epsilon_alone:.3g}", float(row.ceiling_alone))
+            for row in _each(each)]  # fmt: skip
+    header = ("Epsilon of the sum", "Clients", "Method", "Clip", "z", "AUC at most", "Epsilon of single updates",
+              "AUC at most, single")  # fmt: skip
     return Table(header, tuple(body), _caption(results, "price"))
 
 
@@ -80,9 +93,11 @@ def _probe(results: Results) -> Table | None:
     if frame.empty:
         return None
     body, kinds = [], list(dict.fromkeys(zip(frame["seen"], frame["score"], strict=True)))
-    for (clients, method, epsilon), part in frame.groupby(["clients", "method", "epsilon"], sort=False):
-        known = {(row.seen, row.score): row for row in part.itertuples()}
-        entries = [Interval(r.auc, r.auc_low, r.auc_high, int(r.members + r.others)) for r in map(known.get, kinds)]
+    for names, part in frame.groupby(["clients", "method", "epsilon"], sort=False):
+        clients, method, epsilon = _names(names)
+        known = {(row.seen, row.score): row for row in _each(part)}
+        entries = [Interval(r.auc, r.auc_low, r.auc_high, int(r.members + r.others))
+                   for r in (known[kind] for kind in kinds)]  # fmt: skip
         body.append((clients, look(method).label, f"{epsilon:g}", *entries, known[kinds[0]].found_at_1_percent))
     titles = [f"{seen}, {score}" for seen, score in kinds]
     header = ("Clients", "Method", "Epsilon", *titles, f"Members found at 1 % false alarms ({titles[0]})")
@@ -169,13 +184,15 @@ def _attack(results: Results) -> Plot | None:
         return None
     frame, fleets, at = found
     styles = {("client", "gradient"): "-", ("aggregate", "loss"): ":"}
-    frame = frame.assign(attack=list(zip(frame["seen"], frame["score"], strict=True)))
+    attacks: Any = list(zip(frame["seen"], frame["score"], strict=True))
+    frame = frame.assign(attack=attacks)
     frame = frame[frame["attack"].isin(list(styles))]
     with canvas(1, len(fleets), width=7.6, sharey=True, squeeze=False) as (figure, axes):
         for panel, clients in zip(axes[0], fleets, strict=True):
             panel.axhline(0.5, color="#555555", linewidth=0.8)
             here = frame[frame["clients"] == clients]
-            for shift, ((method, attack), part) in enumerate(here.groupby(["method", "attack"], sort=False)):
+            for shift, (names, part) in enumerate(here.groupby(["method", "attack"], sort=False)):
+                method, attack = _names(names)
                 part = part.sort_values("epsilon")
                 x = [at[e] + 0.04 * (shift - 1.5) for e in part["epsilon"]]
                 spread = np.maximum([part["auc"] - part["auc_low"], part["auc_high"] - part["auc"]], 0.0)
@@ -206,7 +223,7 @@ def findings(results: Results) -> list[str]:
 def _paid(results: Results, where: dict[str, Any]) -> str:
     """The least epsilon at which RT-LE is near that without privacy, and the probe with and without it."""
     frame = _rows(results, "rt_le", **where)
-    means = frame.groupby("epsilon")["rt_le_m"].mean() if len(frame) else {}
+    means: dict[float, float] = dict(frame.groupby("epsilon")["rt_le_m"].mean()) if len(frame) else {}
     if math.inf not in means or len(means) < 2:
         return ""
     free = float(means[math.inf])

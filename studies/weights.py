@@ -26,7 +26,7 @@ INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, of as many as there are, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """What the paper trains, and the fair floor."""
-LEARNED = (*PAPER, "fedokf", "magnitude")
+LEARNED = (*PAPER, "fedokf", "magnitude", "split", "recursive", "cooperative")
 """Methods that are trained."""
 
 
@@ -139,7 +139,7 @@ def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
 def described(results: Results) -> Mapping[str, str]:
     """What the report says about the training of the methods that were run, from the cards of the first seed."""
     cards = {name: checkpoint(name, results.settings, 0).card for name in trained(results)}
-    nets = [card for card in cards.values() if card["kind"] == "gain_net"]
+    nets = [card for name, card in cards.items() if name in PAPER and card["kind"] == "gain_net"]
     told = {"nets": _nets(nets[0], len(seeds(results.settings)))} if nets else {}
     for name, card in cards.items():
         plan = card["settings"]
@@ -147,12 +147,23 @@ def described(results: Results) -> Mapping[str, str]:
         if plan["kind"] == "federated":
             text = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
         seconds, clients = f"{card['seconds']:.0f} s per net", ", ".join(card["clients"])
-        told[name] = f"{text}; clients {clients}; {seconds}; key {card['key'][:12]}"
+        own = "" if name in PAPER else f"; {_own(card)}"
+        told[name] = f"{text}{own}; clients {clients}; {seconds}; key {card['key'][:12]}"
     return told
 
 
+def _own(card: Mapping[str, Any]) -> str:
+    """How a net that the paper does not have was trained otherwise than the paper's."""
+    plan, how = card["settings"], card["settings"]["schedule"]
+    pieces = "mirrored" if how["mirror"] else "as they are"
+    return (
+        f"{card['parameters']} parameters, AdamW at {how['learning_rate']:g}, decoupled decay {how['weight_decay']:g}, "
+        f"batch {how['batch']}, pieces of {plan['piece']} steps {pieces}, {plan['noise']} noise"
+    )
+
+
 def _nets(card: Mapping[str, Any], count: int) -> str:
-    """What all nets have in common, from the card of one."""
+    """What the paper's nets have in common, from the card of one."""
     plan, how = card["settings"], card["settings"]["schedule"]
     pieces = "mirrored at random" if how["mirror"] else "as they are"
     which = f"seeds 0 to {count - 1}" if count > 1 else "seed 0"

@@ -23,7 +23,7 @@ from coopoc.learned import Client, GainNet, Pieces, Schedule, clients, federate,
 from coopoc.learned.aggregate import rule
 from coopoc.learned.masks import RESOLUTION, decode, encode, pair_seed, public, stretched
 from coopoc.learned.means import mean
-from coopoc.learned.privacy import Privacy, epsilon, noise_for
+from coopoc.learned.privacy import Privacy, ceiling, epsilon, noise_for
 from coopoc.learned.probe import Verdict, gradient_scores, loss_scores, renoised, verdict
 from coopoc.learned.secure import SHARE, STAGES, Party, SecureMean, secure_sum, traffic, unmask
 from coopoc.learned.server_rules import FedAvgM
@@ -87,6 +87,14 @@ def test_noise_is_the_inverse_of_epsilon() -> None:
     assert noise_for(3.0, 10, 0.5) < noise_for(3.0, 10)
     assert noise_for(math.inf, 10) == 0.0
     assert epsilon(0.0, 10) == math.inf
+
+
+def test_the_ceiling_is_the_auc_of_the_best_attack() -> None:
+    """A client's clip among the noise of T rounds, told from noise alone by their sum: the U statistic of scipy."""
+    noise = np.random.default_rng(0).normal(0, 3.0, (2, 4000, 9)).sum(-1)
+    found = stats.mannwhitneyu(noise[0] + 9.0, noise[1]).statistic / 4000**2
+    assert ceiling(3.0, 9) == pytest.approx(found, abs=0.015)
+    assert ceiling(0.0, 1) == 1.0
 
 
 def test_an_audit_stays_below_the_promise() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
-from coopoc import V2X, Fleet, Gnss, InputError, Sensors, observe
+from coopoc import V2X, Fleet, Gnss, InputError, Kalman, Sensors, observe
 from coopoc import load as load_fleet
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import (
@@ -27,6 +28,9 @@ from coopoc.learned import (
     train_all,
 )  # fmt: skip
 from coopoc.learned.checkpoint import read_card
+from coopoc.learned.recursive import RecursiveGain
+from coopoc.learned.shipped import SENSORS, differences, digest, machine, metrics
+from coopoc.learned.split import SplitGain
 from coopoc.learned.stack import flatten
 
 
@@ -72,6 +76,13 @@ def test_okf_round_trip(tmp_path: Path) -> None:
     assert (again.process_std, again.velocity_ratio, again.gnss_std) == (
         method.process_std, method.velocity_ratio, method.gnss_std,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("net", [RecursiveGain(5, seed=2), SplitGain(5, seed=2), GainNet(2, 1, magnitudes=True)])
+def test_every_kind_of_net_round_trips(net: RecursiveGain | SplitGain | GainNet, tmp_path: Path) -> None:
+    again = load(save(tmp_path / "net.safetensors", Checkpoint(net, {}))).model
+    assert type(again) is type(net)
+    assert (again.settings, torch.equal(flatten([again]), flatten([net]))) == (net.settings, True)
 
 
 def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
@@ -169,3 +180,36 @@ def test_shipped_weights_hold_over_unseen_drives(name: str) -> None:
     assert rt_le(found, some).max() < 2.0
     assert rt_le(found, some).mean() < 0.3 * rt_le(Gnss()(recording, egos), some).mean()
     assert found.notes == ()
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIGHTS.glob("*.safetensors")))
+def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
+    checkpoint = load(recipes.WEIGHTS / f"{name}.safetensors")
+    card = checkpoint.card
+    assert card["sha256"] == digest(checkpoint)
+    (job,) = (job for job in recipes.jobs_of(card["recipe"], recipes.Setting(), load_fleet("town10-clients"))
+              if job.client == card["client"])  # fmt: skip
+    assert card["settings"] == json.loads(json.dumps(asdict(job.recipe) | asdict(job.setting)))
+    assert set(card["metrics"]) == set(SENSORS)
+    assert all(1.0 < row["times_oracle"] < 2.0 for row in card["metrics"].values())
+    assert len(card["limits"]) == 3
+
+
+@pytest.mark.parametrize("name", ["fedokf", "recursive"])
+def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
+    """To 1e-6 with the versions and the machine that the card names; elsewhere training ends within a few percent."""
+    card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
+    same = card["environment"]["torch"] == torch.__version__ and card["machine"] == machine()
+    assert differences(name, progress=False)[name] < (1e-6 if same else 0.3)
+
+
+def test_metrics_are_those_of_the_validation_fleet() -> None:
+    """The oracle filter of the metrics, from outside by its nominal twin: Kalman with the acting noise is near 1."""
+    found = metrics(Kalman("nominal"), runs=2)
+    assert all(0.99 < row["times_oracle"] < 1.1 for row in found.values())
+    assert found["scenario 2, 10 %"]["rt_le_m"] < found["scenario 2, 15 %"]["rt_le_m"]
+
+
+def test_weights_that_are_not_shipped_cannot_be_made_again() -> None:
+    with pytest.raises(InputError, match="weights = 'individual9'"):
+        differences("individual9")

@@ -107,7 +107,7 @@ def test_levels_tell_the_noise() -> None:
     for t in range(1, 300):
         levels = after(levels, fixes[:, t], speeds[:, t], 0.1)
         shares.append(levels.turns / levels.squares)
-    count = float(levels.count[0, 0])
+    count = float(levels.fixes[0, 0])
     weight = POOL**2 / (POOL + count)
     pulled = (count * np.array([1.0, 4.0, 16.0]) + weight * 7.0) / (count + weight)
     np.testing.assert_allclose(noise(levels, 0.1).gnss.mean(0), pulled, rtol=0.06)
