@@ -121,7 +121,7 @@ def federate_many(
             history.append(_row(history[-1], *rest))
     seconds = (time.perf_counter() - began) / len(groups)
     own = [None if topology is None else s.held for s in standings]
-    return [_chosen(models[0], *rest, seconds) for rest in zip(histories, teams, own, strict=True)]
+    return [_chosen(models[0], *rest, seconds, privacy is not None) for rest in zip(histories, teams, own, strict=True)]
 
 
 def _group(clients: Sequence[Client], seed: int) -> Group:
@@ -183,8 +183,8 @@ def _row(
 
 
 def _chosen(
-    like: Gain, history: Sequence[Round], team: Group, own: Tensor | None, seconds: float
+    like: Gain, history: Sequence[Round], team: Group, own: Tensor | None, seconds: float, last: bool
 ) -> Federation:
-    """The federation with the weights of its best round."""
+    """The federation with the weights of its best round; under privacy of its last: losses are sent in the clear."""
     federation = Federation(like, tuple(history), team.sizes, seconds, team.names, own)
-    return replace(federation, model=federation.after(federation.best.number))
+    return replace(federation, model=federation.after(len(history) - 1 if last else federation.best.number))
