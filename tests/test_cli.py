@@ -83,7 +83,7 @@ def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     done = coopoc("list", cwd=tmp_path)
     assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
     groups = [line.split(":")[0] for line in done.stdout.splitlines()]
-    assert groups == ["datasets", "methods", "studies", "backends", "recipes"]
+    assert groups == ["datasets", "methods", "studies", "backends", "recipes", "nets"]
 
 
 def test_commands_of_others(tmp_path: Path) -> None:
