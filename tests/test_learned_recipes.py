@@ -191,7 +191,9 @@ def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
               if job.client == card["client"])  # fmt: skip
     assert card["settings"] == json.loads(json.dumps(asdict(job.recipe) | asdict(job.setting)))
     assert set(card["metrics"]) == set(SENSORS)
-    assert all(1.0 < row["times_oracle"] < 2.0 for row in card["metrics"].values())
+    times = {case: row["times_oracle"] for case, row in card["metrics"].items()}
+    assert all(0.95 < value < 2.0 for value in times.values())
+    assert all(value > 1.0 for case, value in times.items() if case != "scenario 1"), "there the oracle misses the bias"
     assert len(card["limits"]) == 3
 
 
