@@ -24,9 +24,9 @@ import tyro
 from flower_deployment import Site, deployment, family, finished, join, submit
 
 from coopoc import Fleet, load
-from coopoc.learned.clients import Client
 from coopoc.learned.flower.job import data as clients_of
 from coopoc.learned.flower.job import job_of
+from coopoc.learned.training.clients import Client
 
 HOME = (8361947.123, -4720583.456, 913.77)
 """Where the drive lies, m: far from all other numbers."""

@@ -1,19 +1,19 @@
 """Learned gains: nets that filter, their federated, centralised and individual training, and their shipped weights."""
 
 from .checkpoint import Checkpoint, load, save
-from .clients import Client, Pieces, clients
-from .federated import Federation, federate
-from .gain import Gain
+from .federation.federated import Federation, federate
 from .method import Diagnostics, LearnedGain
-from .net import GainNet
-from .okf import NoiseNumbers, OptimisedKF
-from .okf_fit import fit_okf
+from .nets.gain import Gain
+from .nets.gain_net import GainNet
+from .nets.okf import NoiseNumbers, OptimisedKF
+from .nets.recursive import RecursiveGain
+from .nets.recursive_filter import RecursiveFilter
+from .nets.split import SplitGain
 from .recipes import RECIPES, Recipe, Setting, load_method, train_all
-from .recursive import RecursiveGain
-from .recursive_filter import RecursiveFilter
-from .schedule import Schedule
-from .split import SplitGain
-from .train import Fit, fit
+from .training.clients import Client, Pieces, clients
+from .training.fit import Fit, fit
+from .training.okf_fit import fit_okf
+from .training.schedule import Schedule
 
 __all__ = [
     "RECIPES", "Checkpoint", "Client", "Diagnostics", "Federation", "Fit", "Gain", "GainNet", "LearnedGain",

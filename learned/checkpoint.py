@@ -19,8 +19,8 @@ from torch import Tensor
 from coopoc.errors import InputError
 from coopoc.plugins import find, points
 
-from .gain import Gain
-from .stack import unflatten
+from .nets.gain import Gain
+from .nets.stack import unflatten
 
 _HISTORY = "history"
 

@@ -21,7 +21,7 @@ from coopoc.errors import InputError, MissingLibraryError
 from coopoc.world.noise import stream
 
 from .checkpoint import Checkpoint
-from .net import GainNet, Memory
+from .nets.gain_net import GainNet, Memory
 
 INPUTS = (*Memory._fields, "gnss", "velocity", "dt")
 """Memory (B, 9) and (B, 3) m, fix (B, 3) m or NaN, velocity (B, 3) m/s, dt s without a dimension."""

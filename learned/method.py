@@ -19,9 +19,9 @@ from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
-from .machine import one_core
-from .net import SIZE, GainNet
+from .nets.gain_net import SIZE, GainNet
 from .stream import Driven, gain_stream
+from .training.machine import one_core
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,13 +22,13 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
-from .clients import Client, Noise, Pieces, Start, clients
-from .federated import federate_many
-from .gain import Gain
-from .machine import reporting_on
-from .okf_fit import fit_okf_many
-from .schedule import Epoch, Schedule
-from .train import Fit, Task, fit_many
+from .federation.federated import federate_many
+from .nets.gain import Gain
+from .training.clients import Client, Noise, Pieces, Start, clients
+from .training.fit import Fit, Task, fit_many
+from .training.machine import reporting_on
+from .training.okf_fit import fit_okf_many
+from .training.schedule import Epoch, Schedule
 
 REVISION = 4
 """Raised whenever the training code changes what it makes of the same recipe."""

@@ -21,8 +21,8 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from .checkpoint import Checkpoint, load, save
+from .nets.stack import flatten
 from .recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of, trained
-from .stack import flatten
 
 CLIENTS, JUDGES = "town10-clients", "town10-validation"
 """Fleets that the weights are trained on, and that their cards' metrics are of."""

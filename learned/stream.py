@@ -13,11 +13,11 @@ from coopoc.arrays import Floats
 from coopoc.methods.kalman import Gaussian, SoloKalman
 from coopoc.methods.stream import Stream, white
 
-from .machine import one_core
-from .net import GainNet, Memory
+from .nets.gain_net import GainNet, Memory
+from .training.machine import one_core
 
 if TYPE_CHECKING:
-    from .okf import OptimisedKF
+    from .nets.okf import OptimisedKF
 
 POSITIONS = ("x", "x_before", "prior_before", "gnss_before")
 """What of a net's memory is a place, m; the rest has no origin."""

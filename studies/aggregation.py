@@ -45,7 +45,7 @@ def _grid() -> list[dict[str, Any]]:
 
 def meaningful(p: Params) -> bool:
     """No rule that takes more clients than take part."""
-    from coopoc.learned import aggregate
+    from coopoc.learned.federation import aggregate
 
     asked = int(p["members"]) // 2 if p["condition"] == "half absent" else int(p["members"])
     return p["method"] not in RULES or aggregate.RULES[p["method"]].least <= asked

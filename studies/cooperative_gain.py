@@ -87,7 +87,7 @@ def cell(p: Params) -> list[Row]:
 
 
 def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
-    from coopoc.learned.cooperative import CooperativeGain, ToldNoise
+    from coopoc.learned.nets.cooperative import CooperativeGain, ToldNoise
 
     if p["method"] in TRAINED:
         models: list[tuple[int, Any]] = [

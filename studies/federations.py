@@ -20,8 +20,8 @@ from coopoc.world.v2x import V2X
 from . import scene
 
 if TYPE_CHECKING:
-    from coopoc.learned.clients import Client
-    from coopoc.learned.participation import Participation
+    from coopoc.learned.federation.participation import Participation
+    from coopoc.learned.training.clients import Client
 
 RULES = ("mean", "uniform", "fedprox", "fedavgm", "fedadam", "uncertainty", "median", "trimmed_mean", "krum",
          "multi_krum", "geometric_median")  # fmt: skip
@@ -57,7 +57,7 @@ def noise(p: Params) -> list[Sensors]:
 
 def clients(p: Params, seed: int) -> tuple[Client, ...]:
     """The clients of a condition for one training seed; the one in the middle is the bad one."""
-    from coopoc.learned.participation import moved, unlike
+    from coopoc.learned.federation.participation import moved, unlike
 
     count = int(p["members"])
     amounts = [SHARES[i % 3] if p["condition"] == "heterogeneous" else 1.0 for i in range(count)]
@@ -69,7 +69,7 @@ def clients(p: Params, seed: int) -> tuple[Client, ...]:
 
 def participation(p: Params) -> Participation:
     """Who takes part under a condition, and who lies."""
-    from coopoc.learned.participation import Participation, Poison
+    from coopoc.learned.federation.participation import Participation, Poison
 
     if p["condition"] == "poisoned update":
         return Poison(who=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
@@ -111,9 +111,9 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
 
 
 def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
-    from coopoc.learned.compression import Float16, Quantised, TopK
-    from coopoc.learned.federated import federate_many, ledger
-    from coopoc.learned.topology import Ring, V2XGraph
+    from coopoc.learned.federation.compression import Float16, Quantised, TopK
+    from coopoc.learned.federation.federated import federate_many, ledger
+    from coopoc.learned.federation.topology import Ring, V2XGraph
 
     name = p["method"]
     wires = dict(zip(WIRES, (Float16(), TopK(0.1), Quantised(8), Quantised(4)), strict=True))
@@ -133,10 +133,10 @@ def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]
 
 def _pooled(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
     """Nets trained on all pieces in one place; the clients send their drives, six float32 a step, and get the net."""
-    from coopoc.learned.clients import Pieces
-    from coopoc.learned.schedule import Schedule
-    from coopoc.learned.stack import flatten, unflatten
-    from coopoc.learned.train import Task, fit_many
+    from coopoc.learned.nets.stack import flatten, unflatten
+    from coopoc.learned.training.clients import Pieces
+    from coopoc.learned.training.fit import Task, fit_many
+    from coopoc.learned.training.schedule import Schedule
 
     def all_(group: Sequence[Client], part: str) -> Pieces:
         return Pieces.join([getattr(client, part) for client in group])

@@ -25,11 +25,11 @@ from .privacy_views import FIGURES, TABLES, findings
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from coopoc.learned.clients import Client
-    from coopoc.learned.gain import Gain
-    from coopoc.learned.history import Federation
-    from coopoc.learned.privacy import Privacy
-    from coopoc.learned.schedule import Schedule
+    from coopoc.learned.federation.history import Federation
+    from coopoc.learned.nets.gain import Gain
+    from coopoc.learned.privacy.differential import Privacy
+    from coopoc.learned.training.clients import Client
+    from coopoc.learned.training.schedule import Schedule
 
 EPSILONS = (1.0, 3.0, 10.0, 30.0, 100.0, math.inf)
 FLEETS = ("town10-clients", "town04")
@@ -116,10 +116,10 @@ def cell(p: Params) -> list[Row]:
 
 def trained(p: Params) -> Trained:
     """Federations of all training seeds with the cell's epsilon, equal weights and everyone in every round."""
-    from coopoc.learned.clients import clients
-    from coopoc.learned.federated import federate_many
-    from coopoc.learned.privacy import Privacy, ceiling, epsilon, noise_for
+    from coopoc.learned.federation.federated import federate_many
+    from coopoc.learned.privacy.differential import Privacy, ceiling, epsilon, noise_for
     from coopoc.learned.recipes import Setting, sensors
+    from coopoc.learned.training.clients import clients
 
     plan, drives, delta = PLANS[p["method"]], scene.fleet(p["clients"]), float(p["delta"])
     acting, seeds = sensors(Setting(reading=p["velocity_reading"])), weights.seeds(p)
@@ -145,7 +145,7 @@ def probed(made: Trained) -> list[Row]:
     Members are a client's training pieces, others its validation pieces: the same vehicle, never trained on. Scores
     are compared within a client: shifted and scaled by their mean and spread over all its candidates.
     """
-    from coopoc.learned.probe import verdict
+    from coopoc.learned.privacy.probe import verdict
 
     rows = []
     for seen, score in ATTACKS:
@@ -160,8 +160,8 @@ def probed(made: Trained) -> list[Row]:
 
 def _candidates(made: Trained, seen: str, score: str) -> Iterator[list[Floats]]:
     """Scores of members and others of every client of every federation; zeros where a client never sent anything."""
-    from coopoc.learned.clients import Pieces
-    from coopoc.learned.probe import gradient_scores, loss_scores
+    from coopoc.learned.privacy.probe import gradient_scores, loss_scores
+    from coopoc.learned.training.clients import Pieces
 
     straight = partial(gradient_scores, mirrors=False)
     judge: Callable[..., Floats] = loss_scores if score == "loss" else straight
@@ -183,14 +183,14 @@ def _standardised(members: Floats, others: Floats) -> tuple[Floats, Floats]:
 
 
 def _net(method: str, seed: int) -> Gain:
-    from coopoc.learned.net import GainNet
-    from coopoc.learned.okf import NoiseNumbers
+    from coopoc.learned.nets.gain_net import GainNet
+    from coopoc.learned.nets.okf import NoiseNumbers
 
     return GainNet(seed=seed) if method == "fedkalmannet" else NoiseNumbers(seed=seed)
 
 
 def _schedule(plan: Plan) -> Schedule:
-    from coopoc.learned.schedule import Schedule
+    from coopoc.learned.training.schedule import Schedule
 
     return Schedule(learning_rate=plan.learning_rate, weight_decay=plan.weight_decay)
 

@@ -15,12 +15,12 @@ from scipy import stats
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Sensors, observe
 from coopoc.evaluate.metrics import nees_inside
 from coopoc.learned.checkpoint import Checkpoint, load, save
-from coopoc.learned.clients import Batch, clients
-from coopoc.learned.cooperative import CooperativeGain, ToldNoise
-from coopoc.learned.federated import federate
-from coopoc.learned.noise_net import NoiseFilter, NoiseNet, Variances, filtered, guess, lanes
-from coopoc.learned.schedule import Schedule
-from coopoc.learned.stack import flatten
+from coopoc.learned.federation.federated import federate
+from coopoc.learned.nets.cooperative import CooperativeGain, ToldNoise
+from coopoc.learned.nets.noise_net import NoiseFilter, NoiseNet, Variances, filtered, guess, lanes
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import Batch, clients
+from coopoc.learned.training.schedule import Schedule
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.knowledge import Knowledge
 from coopoc.methods.track import Method

@@ -13,12 +13,13 @@ import torch
 from torch import Tensor
 
 from coopoc import InputError
-from coopoc.learned import GainNet, engine
-from coopoc.learned import net as net_module
-from coopoc.learned.arithmetic import compiled, sigmoid, tanh
-from coopoc.learned.clients import Batch
-from coopoc.learned.machine import one_core, row_threads
-from coopoc.learned.stack import flatten
+from coopoc.learned import GainNet
+from coopoc.learned.engine import rollout as engine
+from coopoc.learned.engine.arithmetic import compiled, sigmoid, tanh
+from coopoc.learned.nets import gain_net as net_module
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import Batch
+from coopoc.learned.training.machine import one_core, row_threads
 
 
 @pytest.fixture(autouse=True)

@@ -15,18 +15,28 @@ from torch import Tensor, nn
 from coopoc import Fleet, InputError, Sensors, load
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
-from coopoc.learned.clients import Batch, Noise
-from coopoc.learned.compression import Compression, Float16, Quantised, TopK
-from coopoc.learned.federated import Federation, adapt, federate_many, ledger, local_fit
-from coopoc.learned.gain import Gain
-from coopoc.learned.means import FedProx
-from coopoc.learned.participation import Participation, Poison, moved, unlike
-from coopoc.learned.robust_rules import MultiKrum
-from coopoc.learned.rule import Rule
-from coopoc.learned.server import SERVER, Group, Standing
-from coopoc.learned.stack import flatten
-from coopoc.learned.topology import Complete, Mesh, Pairs, Ring, Topology, V2XGraph, connected, disagreement, metropolis
-from coopoc.learned.train import Judge, pooled
+from coopoc.learned.federation.compression import Compression, Float16, Quantised, TopK
+from coopoc.learned.federation.federated import Federation, adapt, federate_many, ledger, local_fit
+from coopoc.learned.federation.means import FedProx
+from coopoc.learned.federation.participation import Participation, Poison, moved, unlike
+from coopoc.learned.federation.robust_rules import MultiKrum
+from coopoc.learned.federation.rule import Rule
+from coopoc.learned.federation.server import SERVER, Group, Standing
+from coopoc.learned.federation.topology import (
+    Complete,
+    Mesh,
+    Pairs,
+    Ring,
+    Topology,
+    V2XGraph,
+    connected,
+    disagreement,
+    metropolis,
+)
+from coopoc.learned.nets.gain import Gain
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import Batch, Noise
+from coopoc.learned.training.fit import Judge, pooled
 from coopoc.methods.track import Method
 
 PLAIN = Schedule(weight_decay=0.0, mirror=False, clip=1e9)

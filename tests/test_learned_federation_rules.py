@@ -14,14 +14,14 @@ from torch import Tensor
 
 from coopoc import InputError
 from coopoc.learned import Schedule
-from coopoc.learned.aggregate import RULES, rule
-from coopoc.learned.compression import Compression, Float16, Quantised, TopK
-from coopoc.learned.guard import screen
-from coopoc.learned.means import FedProx, inverse_variance, mean, uniform
-from coopoc.learned.robust import geometric_median, krum_scores
-from coopoc.learned.robust_rules import GeometricMedian, Krum, MultiKrum, TrimmedMean
-from coopoc.learned.rule import Rule
-from coopoc.learned.server_rules import FedAdam, FedAvgM, Moments
+from coopoc.learned.federation.aggregate import RULES, rule
+from coopoc.learned.federation.compression import Compression, Float16, Quantised, TopK
+from coopoc.learned.federation.guard import screen
+from coopoc.learned.federation.means import FedProx, inverse_variance, mean, uniform
+from coopoc.learned.federation.robust import geometric_median, krum_scores
+from coopoc.learned.federation.robust_rules import GeometricMedian, Krum, MultiKrum, TrimmedMean
+from coopoc.learned.federation.rule import Rule
+from coopoc.learned.federation.server_rules import FedAdam, FedAvgM, Moments
 
 SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])
 

@@ -24,7 +24,7 @@ from coopoc.cli import main
 from coopoc.data.table import write_table
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import clients, federate, load
-from coopoc.learned.federated import Federation, local_fit
+from coopoc.learned.federation.federated import Federation, local_fit
 from coopoc.learned.flower import client_app, rounds, train
 from coopoc.learned.flower.ask import Wait
 from coopoc.learned.flower.job import data, job_of, local, net

@@ -27,7 +27,7 @@ import torch
 from coopoc import V2X, Fleet, observe
 from coopoc.data.table import write_table
 from coopoc.learned import federate, load
-from coopoc.learned.federated import Federation, local_fit
+from coopoc.learned.federation.federated import Federation, local_fit
 from coopoc.learned.flower.job import data, job_of, local, net
 from coopoc.learned.recipes import Job, sensors
 

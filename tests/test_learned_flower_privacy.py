@@ -27,9 +27,9 @@ from flwr.supercore.task_identity import TaskIdentity
 
 from coopoc.learned import clients, federate
 from coopoc.learned.flower.job import job_of, net
+from coopoc.learned.flower.privacy import secure_client_app, secure_server_app
 from coopoc.learned.flower.simulation import partition
-from coopoc.learned.flower_privacy import secure_client_app, secure_server_app
-from coopoc.learned.privacy import Privacy
+from coopoc.learned.privacy.differential import Privacy
 from coopoc.learned.recipes import sensors
 
 TINY = {"recipe": "fedkalmannet", "rounds": 2, "local-epochs": 1, "net-in-mult": 2, "net-out-mult": 1, "piece": 10,

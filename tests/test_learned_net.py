@@ -11,9 +11,9 @@ from torch import nn
 
 from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
-from coopoc.learned.clients import Batch
-from coopoc.learned.machine import one_core
 from coopoc.learned.method import DIVERGED
+from coopoc.learned.training.clients import Batch
+from coopoc.learned.training.machine import one_core
 from coopoc.methods.track import Method
 
 

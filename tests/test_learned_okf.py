@@ -11,7 +11,7 @@ from filterpy.kalman import KalmanFilter
 from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.evaluate.metrics import nees
 from coopoc.learned import OptimisedKF, Pieces, clients, fit_okf
-from coopoc.learned.okf_fit import _stacked, fit_okf_many
+from coopoc.learned.training.okf_fit import _stacked, fit_okf_many
 
 
 def walk(steps: int, seed: int = 0) -> Fleet:

@@ -19,16 +19,17 @@ from scipy.optimize import brentq
 
 from coopoc import Fleet, InputError
 from coopoc.errors import MissingLibraryError
-from coopoc.learned import Client, GainNet, Pieces, Schedule, clients, federate, masks
-from coopoc.learned.aggregate import rule
-from coopoc.learned.masks import RESOLUTION, decode, encode, pair_seed, public, stretched
-from coopoc.learned.means import mean
-from coopoc.learned.privacy import Privacy, ceiling, epsilon, noise_for
-from coopoc.learned.probe import Verdict, gradient_scores, loss_scores, renoised, verdict
-from coopoc.learned.secure import SHARE, STAGES, Party, SecureMean, secure_sum, traffic, unmask
-from coopoc.learned.server_rules import FedAvgM
-from coopoc.learned.shamir import PRIME, join, split
-from coopoc.learned.stack import flatten
+from coopoc.learned import Client, GainNet, Pieces, Schedule, clients, federate
+from coopoc.learned.federation.aggregate import rule
+from coopoc.learned.federation.means import mean
+from coopoc.learned.federation.server_rules import FedAvgM
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.privacy import masks
+from coopoc.learned.privacy.differential import Privacy, ceiling, epsilon, noise_for
+from coopoc.learned.privacy.masks import RESOLUTION, decode, encode, pair_seed, public, stretched
+from coopoc.learned.privacy.probe import Verdict, gradient_scores, loss_scores, renoised, verdict
+from coopoc.learned.privacy.secure import SHARE, STAGES, Party, SecureMean, secure_sum, traffic, unmask
+from coopoc.learned.privacy.shamir import PRIME, join, split
 
 DELTA = 1e-5
 phi = stats.norm.cdf

@@ -28,10 +28,10 @@ from coopoc.learned import (
     train_all,
 )  # fmt: skip
 from coopoc.learned.checkpoint import read_card
-from coopoc.learned.recursive import RecursiveGain
+from coopoc.learned.nets.recursive import RecursiveGain
+from coopoc.learned.nets.split import SplitGain
+from coopoc.learned.nets.stack import flatten
 from coopoc.learned.shipped import SENSORS, differences, digest, machine, metrics
-from coopoc.learned.split import SplitGain
-from coopoc.learned.stack import flatten
 
 
 def drives() -> Fleet:

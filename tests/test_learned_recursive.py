@@ -10,16 +10,16 @@ import pytest
 import torch
 from filterpy.kalman import KalmanFilter
 
-import coopoc.learned.recursive as recursive
+import coopoc.learned.nets.recursive as recursive
 from coopoc import V2X, Fleet, Sensors, load, observe
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.learned import Schedule, clients, fit, load_method
-from coopoc.learned.clients import Batch
-from coopoc.learned.levels import POOL, after, first, noise
-from coopoc.learned.recursive import RecursiveGain
-from coopoc.learned.recursive_filter import RecursiveFilter
-from coopoc.learned.stack import flatten
+from coopoc.learned.nets.levels import POOL, after, first, noise
+from coopoc.learned.nets.recursive import RecursiveGain
+from coopoc.learned.nets.recursive_filter import RecursiveFilter
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import Batch
 
 
 def drive(steps: int = 60) -> Fleet:

@@ -8,9 +8,9 @@ from torch import Tensor, nn
 
 from coopoc import Fleet, Sensors, observe
 from coopoc.learned import Schedule, clients, fit
-from coopoc.learned.clients import Batch
-from coopoc.learned.split import SplitGain
-from coopoc.learned.stack import flatten
+from coopoc.learned.nets.split import SplitGain
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import Batch
 from coopoc.methods.stream import Stream
 
 

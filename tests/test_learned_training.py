@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-import coopoc.learned.train as train
+import coopoc.learned.training.fit as train
 from coopoc import Fleet, InputError, Sensors
 from coopoc.learned import GainNet, Pieces, Schedule, clients, federate, fit
-from coopoc.learned.clients import mirrored
-from coopoc.learned.means import mean, uniform
-from coopoc.learned.schedule import adamw, clip, cosine
-from coopoc.learned.stack import flatten
-from coopoc.learned.train import Task, fit_many
+from coopoc.learned.federation.means import mean, uniform
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import mirrored
+from coopoc.learned.training.fit import Task, fit_many
+from coopoc.learned.training.schedule import adamw, clip, cosine
 
 QUICK = Schedule(epochs=6, batch=2, checks=3)
 

@@ -19,9 +19,9 @@ from coopoc.data.table import write_table
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain
-from coopoc.learned.net import GainNet
+from coopoc.learned.nets.gain_net import GainNet
+from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import Setting, jobs_of, load_method
-from coopoc.learned.stack import flatten
 from coopoc.plugins import find
 from coopoc.studies import claims, convergence, error_cdf, neighbours, paper, scene, weights
 from coopoc.study.publish import views as published

@@ -12,7 +12,7 @@ import coopoc as co
 from coopoc.data.table import write_table
 from coopoc.evaluate.bounds import posterior_bound
 from coopoc.learned.checkpoint import Checkpoint, save
-from coopoc.learned.noise_net import NoiseNet
+from coopoc.learned.nets.noise_net import NoiseNet
 from coopoc.learned.recipes import Setting, jobs_of
 from coopoc.studies import cooperative_gain
 from coopoc.studies.cooperative_gain import STUDY, past_bound

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from ..server import SERVER
+from ..federation.server import SERVER
 from .wire import LONGEST, Report, question, reported, size
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from torch import Tensor
 from coopoc.errors import InputError
 from coopoc.fleets import load
 
-from ..clients import Client
-from ..federated import local_fit
-from ..machine import one_core
+from ..federation.federated import local_fit
 from ..recipes import Job
-from ..train import Judge
+from ..training.clients import Client
+from ..training.fit import Judge
+from ..training.machine import one_core
 from .job import data, job_of, local, net
 from .wire import Report, answer, asked, require_flower
 

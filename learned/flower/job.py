@@ -11,11 +11,11 @@ from typing import Any
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
-from ..aggregate import rule
-from ..clients import Client, clients
-from ..gain import Gain
+from ..federation.aggregate import rule
+from ..nets.gain import Gain
 from ..recipes import RECIPES, Job, Recipe, Setting, sensors, untrained
-from ..schedule import Schedule
+from ..training.clients import Client, clients
+from ..training.schedule import Schedule
 
 PREFIX = "net-"
 """Before the name of an option of the net."""

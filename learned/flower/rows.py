@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..checkpoint import Checkpoint
-from ..history import Federation, Round
+from ..federation.history import Federation, Round
 from ..recipes import Job, sensors
 from .job import net
 from .wire import Report

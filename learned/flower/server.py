@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from coopoc.errors import InputError
 
-from ..aggregate import rule
 from ..checkpoint import save
-from ..gain import Gain
+from ..federation.aggregate import rule
+from ..federation.server import Answer, combine
+from ..nets.gain import Gain
+from ..nets.stack import flatten
 from ..recipes import Job
-from ..server import Answer, combine
-from ..stack import flatten
 from .ask import Wait, gather, hear
 from .job import job_of, net
 from .rows import Row, checkpoint, line

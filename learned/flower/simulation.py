@@ -20,9 +20,9 @@ from coopoc.errors import MissingLibraryError
 from coopoc.world.fleet import Fleet
 
 from ..checkpoint import Checkpoint, load, read_card, save
-from ..clients import Client
-from ..machine import watched
 from ..recipes import Job
+from ..training.clients import Client
+from ..training.machine import watched
 from .ask import Wait
 from .client import Source, client_app
 from .job import data

@@ -20,10 +20,10 @@ from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
-from .clients import Batch, Pieces
+from ..stream import okf_stream
+from ..training.clients import Batch, Pieces
+from ..training.machine import one_core
 from .gain import Gain
-from .machine import one_core
-from .stream import okf_stream
 
 Three = tuple[float, float, float]
 

@@ -62,7 +62,7 @@ def combine(
         rule: how, and its state. theta: (P,) weights that the clients received. answers: by name, in any order.
         usual: what the last round gave; None at first.
 
-    >>> from coopoc.learned.aggregate import RULES
+    >>> from coopoc.learned.federation.aggregate import RULES
     >>> two = {"b": Answer(torch.tensor([3.0]), 1, 1.0), "a": Answer(torch.tensor([torch.nan]), 3, 1.0)}
     >>> done = combine(RULES["mean"], (), torch.tensor([2.0]), two)
     >>> done.theta.tolist(), done.rejected

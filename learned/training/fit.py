@@ -16,11 +16,11 @@ from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
+from ..nets.gain import Gain
+from ..nets.stack import flatten, unflatten
 from .clients import Batch, Pieces, mirrored
-from .gain import Gain
 from .machine import one_core, watched
 from .schedule import Schedule, adamw, clip, cosine, generator
-from .stack import flatten, unflatten
 
 
 @dataclass(frozen=True, eq=False)

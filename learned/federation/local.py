@@ -13,13 +13,13 @@ from torch import Tensor
 from coopoc.arrays import Ints
 from coopoc.world.noise import stream
 
-from .clients import Client, Pieces
-from .gain import Gain
-from .machine import one_core
+from ..nets.gain import Gain
+from ..training.clients import Client, Pieces
+from ..training.fit import Judge, descend, pooled
+from ..training.machine import one_core
+from ..training.schedule import Schedule, cosine, generator
 from .participation import Turn
-from .schedule import Schedule, cosine, generator
 from .server import Group, Standing
-from .train import Judge, descend, pooled
 
 
 def local_fit(

@@ -9,7 +9,7 @@ import numpy as np
 from coopoc.arrays import Floats, Ints
 
 from .arithmetic import Net, Tape, add_product, bias, compiled, rows, span, weight
-from .kernel_forward import (
+from .forward import (
     BACK,
     EPS,
     EVOLUTION,

@@ -20,9 +20,9 @@ from coopoc.methods.track import Method, Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
-from .clients import Batch
+from ..training.clients import Batch
+from ..training.machine import one_core
 from .gain import Gain
-from .machine import one_core
 from .stack import flatten, layers, named
 
 MEMORY = 100.0

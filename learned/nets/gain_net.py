@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
-from .clients import Batch
+from ..training.clients import Batch
 from .gain import Gain
 from .stack import named
 
@@ -103,7 +103,7 @@ class GainNet(Gain):
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
-        from .method import LearnedGain
+        from ..method import LearnedGain
 
         return LearnedGain(self, name, x0)
 
@@ -203,6 +203,6 @@ def _engine() -> ModuleType | None:
         mend = "pip install 'coopoc[fast]' (numba)"
         warnings.warn(f"GainNet runs in plain torch, some hundred times slower than compiled: {mend}", stacklevel=2)
         return None
-    from . import engine
+    from ..engine import rollout as engine
 
     return engine

@@ -11,8 +11,8 @@ from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray
 
-from .arithmetic import compiled, sigmoid, tanh
-from .clients import Batch
+from ..engine.arithmetic import compiled, sigmoid, tanh
+from ..training.clients import Batch
 from .levels import FADE, FEATURES, FORGET, GNSS_STD, POOL, STILL, VELOCITY_SHARE, WEIGHT
 from .recursive import HEADS, LIMIT, RecursiveGain
 from .stack import layers

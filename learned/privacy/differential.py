@@ -16,9 +16,9 @@ from torch import Tensor
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.world.noise import stream
 
-from .aggregate import rule
-from .means import uniform
-from .rule import Combine, Rule
+from ..federation.aggregate import rule
+from ..federation.means import uniform
+from ..federation.rule import Combine, Rule
 from .secure import SecureMean
 
 

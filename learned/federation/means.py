@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from ..training.schedule import Schedule
 from .rule import Combine, Rule, State, within
-from .schedule import Schedule
 
 
 def mean(weights: Tensor, sizes: Tensor, uncertainty: Tensor | None = None) -> Tensor:

@@ -12,18 +12,18 @@ from torch import Tensor
 
 from coopoc.errors import InputError
 
+from ..nets.gain import Gain
+from ..nets.stack import flatten
+from ..training.clients import Client
+from ..training.machine import one_core, watched
+from ..training.schedule import Epoch, Schedule
 from .aggregate import rule
-from .clients import Client
 from .compression import Compression
-from .gain import Gain
 from .history import Federation, Round, ledger
 from .local import Work, adapt, everyone, local_fit
-from .machine import one_core, watched
 from .participation import Participation, Turn
 from .rule import Combine, Rule
-from .schedule import Epoch, Schedule
 from .server import SERVER, Answer, Exchange, Group, Protection, Server, Standing, combine
-from .stack import flatten
 from .topology import Mesh, Topology, connected, disagreement
 
 __all__ = ["Answer", "Federation", "Round", "adapt", "combine", "federate", "federate_many", "ledger", "local_fit"]

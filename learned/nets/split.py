@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
-from .clients import Batch
+from ..training.clients import Batch
 from .gain import Gain
 from .stack import Layer, layers
 
@@ -77,7 +77,7 @@ class SplitGain(Gain):
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
-        from .method import LearnedGain
+        from ..method import LearnedGain
 
         return LearnedGain(cast(Any, self), name, x0)
 

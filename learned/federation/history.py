@@ -11,9 +11,9 @@ from torch import Tensor
 
 from coopoc.errors import InputError
 
-from .gain import Gain
+from ..nets.gain import Gain
+from ..nets.stack import unflatten
 from .server import SERVER
-from .stack import unflatten
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from coopoc.errors import InputError
 
-from .schedule import Schedule
+from ..training.schedule import Schedule
 
 Combine = Callable[[Tensor, Tensor, Tensor], Tensor]
 State = tuple[Tensor, ...]

@@ -18,9 +18,9 @@ from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
+from ..method import _divergence
+from ..training.machine import one_core
 from .levels import GNSS_STD, STILL
-from .machine import one_core
-from .method import _divergence
 from .recursive import Memory, RecursiveGain
 
 

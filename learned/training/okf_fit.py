@@ -12,9 +12,9 @@ from torch import Tensor
 
 from coopoc.world.noise import stream
 
+from ..nets.okf import NoiseNumbers, OptimisedKF, scan
 from .clients import Batch, Pieces
 from .machine import one_core, watched
-from .okf import NoiseNumbers, OptimisedKF, scan
 from .schedule import generator
 
 
@@ -41,7 +41,7 @@ def fit_okf(training: Pieces, validation: Pieces, steps: int = 300, velocity_par
     Args:
         training, validation: pieces. steps: of Adam on all training pieces. velocity_part: train b too, else b = 0.
 
-    >>> from coopoc.learned.clients import clients
+    >>> from coopoc.learned.training.clients import clients
     >>> from coopoc.world.fleet import Fleet
     >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
     >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio

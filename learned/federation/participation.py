@@ -14,7 +14,7 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensors import Sensors
 
-from .clients import Client, Pieces, clients
+from ..training.clients import Client, Pieces, clients
 
 
 class Turn(NamedTuple):

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from coopoc.errors import InputError
 
-from .flower.client import Source, configured, report
-from .flower.job import net
-from .flower.wire import require_flower
-from .privacy import Privacy
-from .recipes import Job
-from .secure import SecureMean
-from .stack import flatten
+from ..nets.stack import flatten
+from ..privacy.differential import Privacy
+from ..privacy.secure import SecureMean
+from ..recipes import Job
+from .client import Source, configured, report
+from .job import net
+from .wire import require_flower
 
 if TYPE_CHECKING:
     from flwr.app import Context

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
-from .clients import Batch
+from ..training.clients import Batch
 from .gain import Gain
 from .levels import FEATURES, GNSS_STD, Levels, after, first, noise
 from .stack import named

@@ -16,9 +16,10 @@ from torch.autograd.function import once_differentiable
 from coopoc.arrays import AnyArray, Ints
 from coopoc.errors import InputError
 
-from . import kernel_backward, kernel_forward
-from .machine import threads
-from .net import CELLS, SIZE, GainNet
+from ..nets.gain_net import CELLS, SIZE, GainNet
+from ..training.machine import threads
+from . import backward as kernel_backward
+from . import forward as kernel_forward
 
 NAMES = ("update.weight", "evolution.weight", "observation.weight", "process.weight_ih", "process.weight_hh",
          "prior.weight_ih", "prior.weight_hh", "prior_to_innovation.weight", "innovation.weight_ih",

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
-from .clients import Batch, Pieces
+from ..training.clients import Batch, Pieces
 
 
 class Gain(nn.Module, ABC):

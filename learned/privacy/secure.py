@@ -14,12 +14,12 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 
-from .aggregate import rule
+from ..federation.aggregate import rule
+from ..federation.means import Stateless, mean, uniform
+from ..federation.rule import Rule, State
+from ..federation.server_rules import FedAdam, FedAvgM
+from ..training.schedule import Schedule
 from .masks import KEY, RESOLUTION, TAG, Words, box, decode, encode, pair_seed, public, stretched
-from .means import Stateless, mean, uniform
-from .rule import Rule, State
-from .schedule import Schedule
-from .server_rules import FedAdam, FedAvgM
 from .shamir import PRIME, join, split
 
 Stage = Literal["keys", "shares", "upload", "unmask"]

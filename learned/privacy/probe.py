@@ -14,10 +14,10 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
-from .clients import Batch, Pieces
-from .gain import Gain
-from .machine import one_core
-from .schedule import generator
+from ..nets.gain import Gain
+from ..training.clients import Batch, Pieces
+from ..training.machine import one_core
+from ..training.schedule import generator
 
 Seen = Sequence[tuple[Tensor, Tensor]]
 """Weights (P,) before and after each training that was observed: a client's, or the aggregate's, of some rounds."""

@@ -1,6 +1,6 @@
 """The paper's optimiser taken literally: learning rate and weight decay 0.3, batch 1.
 
-`python -m coopoc.learned.literal` prints the table of docs/learned.md.
+`python -m coopoc.learned.training.literal` prints the table of docs/learned.md.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from tqdm import tqdm
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 
+from ..nets.gain_net import GainNet
+from ..nets.stack import flatten
 from .clients import Pieces, clients
+from .fit import Judge
 from .machine import one_core
-from .net import GainNet
-from .stack import flatten
-from .train import Judge
 
 OPTIMISERS = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
 

@@ -1,0 +1,179 @@
+"""GainNet's training and inference: plain torch, the compiled engine and the arithmetic's floor, in one run.
+
+    python benchmarks/learned_gain.py            # two Markdown tables on stdout, about two minutes
+
+All rows use the same net and the same drives (town10-clients, pieces of 100 steps) on one thread unless said, one after
+the other in every round; the ratios are to be compared, the times are this machine's. "Plain torch" is the loop of
+KalmanNet's public training code re-expressed with our reference module: one Python step after the other, autograd, and
+torch.optim.AdamW. The floor is 2 flops for each weight of a layer and step (forward; three times that to train) at this
+core's measured peak of single-precision multiply-adds. A row counts only if its answer is the reference's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import torch
+from tabulate import tabulate
+from torch import Tensor
+
+import coopoc as co
+from coopoc.learned.nets.gain_net import GainNet
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training.clients import Pieces, clients
+from coopoc.learned.training.fit import descend
+from coopoc.learned.training.machine import one_core, row_threads
+from coopoc.learned.training.schedule import Schedule
+
+ROUNDS = 5
+RATE = 1e-3
+SCHEDULE = Schedule(learning_rate=RATE, weight_decay=0.3, clip=1e9, mirror=False)
+
+
+class Row(NamedTuple):
+    """One way to do the job: its words, trajectory-steps per call, the call, and whether its answer is right."""
+
+    words: str
+    steps: int
+    call: Callable[[], Any]
+    error: float
+    """Largest difference from plain torch: of trained weights, or of positions in m."""
+    threads: int = 1
+
+
+@numba.njit(fastmath=True)
+def _multiply_add(v: np.ndarray, rounds: int) -> float:
+    a, b = np.float32(0.999), np.float32(1e-3)
+    for _ in range(rounds):
+        for i in range(v.size):
+            v[i] = v[i] * a + b
+    return float(v.sum())
+
+
+def peak() -> float:
+    """Single-precision flops per second of one core: multiply-adds in registers or the largest matrix product."""
+    v, found = np.ones(256, np.float32), []
+    big = np.ones((1024, 1024), np.float32)
+    _multiply_add(v, 1)
+    for _ in range(9):
+        took = timed(lambda: _multiply_add(v, 400_000))
+        found.append(2.0 * v.size * 400_000 / took)
+        took = timed(lambda: torch.mm(torch.from_numpy(big), torch.from_numpy(big)))
+        found.append(2.0 * 1024**3 / took)
+    return max(found)
+
+
+def timed(call: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    call()
+    return time.perf_counter() - began
+
+
+def plain_training(net: GainNet, pieces: Pieces, plan: np.ndarray) -> Tensor:
+    """Weights (P,) after one optimiser step per row of the plan (steps, batch)."""
+    mine = GainNet(**net.settings)
+    mine.load_state_dict(net.state_dict())
+    optimiser = torch.optim.AdamW(mine.parameters(), lr=RATE, weight_decay=SCHEDULE.weight_decay)
+    for index in plan:
+        batch = pieces.batch(torch.from_numpy(index)[None])
+        gnss, velocity, truth = (a[:, 0].transpose(0, 1) for a in (batch.gnss, batch.velocity, batch.truth))
+        optimiser.zero_grad()
+        found = mine.reference(gnss, velocity, batch.x0[0], batch.dt)
+        (found - truth).square().sum(-1).mean().backward()
+        optimiser.step()
+    return flatten([mine])[0]
+
+
+def our_training(net: GainNet, pieces: Pieces, plans: list[np.ndarray]) -> Tensor:
+    """The same (S, P) for S nets that all start as this one, each with its plan."""
+    theta, rates = flatten([net] * len(plans)), [np.full(len(plan), RATE) for plan in plans]
+    draws = [torch.Generator() for _ in plans]
+    for _ in descend(theta, net, pieces, plans, rates, SCHEDULE, draws, {}):
+        pass
+    return theta
+
+
+def training(net: GainNet, pieces: Pieces) -> list[Row]:
+    """One pass over the pieces, or for plain torch at batch 1 over a few."""
+    count, length = len(pieces), pieces.gnss.shape[1] - 1
+    order = np.arange(count)
+    one, few, full = order[:, None], order[:4, None], order[None]
+    four = [part.reshape(-1, count // 6) for part in np.split(np.tile(order, 4), 4)]
+    many = [np.roll(order, s)[:36].reshape(-1, 2) for s in range(35)]
+    rows = [Row("plain torch, batch 1", len(few) * length, lambda: plain_training(net, pieces, few), 0.0),
+            Row(f"plain torch, batch {count}", count * length, lambda: plain_training(net, pieces, full), 0.0)]
+    ours = [("engine, batch 1", [one], [few], 1), (f"engine, batch {count}", [full], [full], 1),
+            (f"engine, 4 nets x batch {count // 6}", four, [p[:2] for p in four], 1),
+            (f"engine, 4 nets x batch {count // 6}, 2 threads", four, [p[:2] for p in four], 2),
+            ("engine, 35 nets x batch 2", many, [p[:2] for p in many[:3]], 1),
+            ("engine, 35 nets x batch 2, 2 threads", many, [p[:2] for p in many[:3]], 2)]  # fmt: skip
+    for words, plans, checked, threads in ours:
+        wanted = torch.stack([plain_training(net, pieces, plan) for plan in checked])
+        error = float((our_training(net, pieces, checked) - wanted).abs().max())
+        total = sum(plan.size for plan in plans) * length
+        rows.append(Row(words, total, lambda plans=plans: our_training(net, pieces, plans), error, threads))
+    return rows
+
+
+def inference(net: GainNet, drive: Pieces) -> list[Row]:
+    """One drive of 900 steps, and 128 of them at once."""
+    batch = drive.batch(torch.zeros(1, 1, dtype=torch.long))
+    gnss, velocity, x0 = batch.gnss[:, 0].transpose(0, 1), batch.velocity[:, 0].transpose(0, 1), batch.x0[0]
+    many = [a.expand(128, *a.shape[1:]).contiguous() for a in (gnss, velocity, x0)]
+    wanted, length = net.reference(gnss, velocity, x0, batch.dt), gnss.shape[1]
+    rows = [Row("plain torch, 1 drive", length, lambda: net.reference(gnss, velocity, x0, batch.dt), 0.0)]
+    for words, inputs in (("engine, 1 drive", (gnss, velocity, x0)), ("engine, 128 drives", many)):
+        found = net(*inputs, batch.dt)
+        error = float((found - wanted).abs().max())
+        rows.append(Row(words, length * len(found), lambda inputs=inputs: net(*inputs, batch.dt), error))
+    return rows
+
+
+def table(rows: list[Row], flops: float, allowed: float, against: Callable[[Row], Row]) -> str:
+    """Microseconds per trajectory-step (median of interleaved rounds), steps/s, ratios to plain torch and the floor."""
+    spent: dict[str, list[float]] = {row.words: [] for row in rows}
+    for _ in range(ROUNDS):
+        for row in rows:
+            with row_threads(row.threads):
+                spent[row.words].append(timed(row.call) / row.steps)
+    medians = {words: float(np.median(times)) for words, times in spent.items()}
+    lines: list[Iterable[Any]] = []
+    for row in rows:
+        us = 1e6 * medians[row.words]
+        ratio = medians[against(row).words] / medians[row.words]
+        lines.append([row.words, us, f"{1e6 / us:,.0f}", ratio, us / (1e6 * flops), row.error,
+                      "yes" if row.error <= allowed else "NO"])  # fmt: skip
+    header = ["", "us per step", "steps/s", "x plain torch", "x flop floor", "difference", "same answer"]
+    return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", "", ".3g", ".3g", ".1e", ""))
+
+
+@one_core()
+def main() -> None:
+    """Print the tables."""
+    net, group = GainNet(), clients(co.load("town10-clients"))
+    pieces = Pieces.join([c.training for c in group])
+    count = len(pieces) // 12 * 12
+    pieces = replace(pieces.take(range(count)))
+    drive = group[0].long.take([0])
+    weights = sum(p.numel() for name, p in net.named_parameters() if "weight" in name)
+    speed = peak()
+    floor = 2.0 * weights / speed
+    versions = f"numba {numba.__version__}, torch {torch.__version__}"
+    print(f"{weights:,} weights in layers; peak {speed / 1e9:.0f} GFLOP/s on one core; {versions}; {count} pieces of "
+          f"{pieces.gnss.shape[1] - 1} steps.\n")  # fmt: skip
+    rows = training(net, pieces)
+    print("Training, AdamW included:\n")
+    print(table(rows, 3 * floor, 1e-4, lambda row: rows[1] if row.words.endswith(str(count)) else rows[0]), "\n")
+    with torch.no_grad():
+        drives = inference(net, drive)
+        print(f"Inference, {drives[0].steps} steps a drive:\n")
+        print(table(drives, floor, 1e-3, lambda row: drives[0]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Training together: rules, participation, compression, topologies, and the guard against bad updates."""

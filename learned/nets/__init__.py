@@ -1,0 +1,1 @@
+"""What is trained: nets that filter, as functions of flat weights."""

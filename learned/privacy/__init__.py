@@ -1,0 +1,1 @@
+"""What shared weights give away, and what can be done about it."""
