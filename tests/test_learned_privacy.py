@@ -360,6 +360,11 @@ def test_federate_with_masks_and_privacy() -> None:
     ]  # fmt: skip
     torch.testing.assert_close(made[1].weights, made[0].weights, rtol=0, atol=1e-5)
     assert torch.equal(made[1].weights, made[2].weights)
+    count = len(group)
+    sent, received = traffic(count, sum(p.numel() for p in small().parameters()))
+    four = 4 * sum(p.numel() for p in small().parameters())
+    assert made[1].sent_bytes - made[0].sent_bytes == sum(sent) - count * four
+    assert made[1].received_bytes - made[0].received_bytes == sum(received)
 
 
 # The probe

@@ -31,6 +31,10 @@ class Rule(ABC):
         """Fewest clients that it can combine."""
         return 1
 
+    def overhead(self, clients: int, parameters: int) -> tuple[int, int]:
+        """Bytes that each of so many clients sends and receives in a round beyond the weights themselves."""
+        return 0, 0
+
     def start(self, theta: Tensor) -> State:
         """State before the first round, with weights theta (P,)."""
         return ()

@@ -134,9 +134,10 @@ class Server:
         """
         theta = standing.theta
         sent, kept, size = self._leave(group, standing, number, adapted)
-        traffic = {(SERVER, name): NUMBER * len(theta)
-                   for name, turn in zip(group.names, turns, strict=True) if turn.asked}  # fmt: skip
-        traffic |= {(name, SERVER): bytes_ + NUMBER for name, bytes_ in size.items()}
+        asked = [name for name, turn in zip(group.names, turns, strict=True) if turn.asked]
+        up, down = self.rule.overhead(max(len(asked), self.rule.least), len(theta))
+        traffic = {(SERVER, name): NUMBER * len(theta) + down for name in asked}
+        traffic |= {(name, SERVER): bytes_ + NUMBER + up for name, bytes_ in size.items()}
         answers = {
             name: Answer(self.participation.answer(name, number, theta, sent[name]), pieces, loss)
             for name, pieces, loss in zip(group.names, group.sizes, reports, strict=True) if name in sent

@@ -22,7 +22,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain
+from .gain import Gain, over_time
 from .stack import flatten, layers, named
 
 MEMORY = 100.0
@@ -150,7 +150,7 @@ class NoiseNet(Gain):
         told = self.variances(theta, gnss, velocity, batch.dt)
         x, spread = filtered(gnss, velocity, told, batch.dt, batch.known)
         error = (x[1:] - batch.truth).square()
-        return 0.5 * (error / spread[1:] + spread[1:].log()).sum(-1).mean(0)
+        return over_time(0.5 * (error / spread[1:] + spread[1:].log()).sum(-1))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`NoiseFilter` with this net."""

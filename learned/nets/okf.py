@@ -23,7 +23,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 from ..stream import okf_stream
 from ..training.clients import Batch, Pieces
 from ..training.machine import one_core
-from .gain import Gain
+from .gain import Gain, over_time
 
 Three = tuple[float, float, float]
 
@@ -109,7 +109,7 @@ class NoiseNumbers(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each piece, mean over time, sum over components, m^2."""
         x, _ = scan(self.numbers(theta), batch)
-        return (x - batch.truth).square().sum(-1).mean(0)
+        return over_time((x - batch.truth).square().sum(-1))
 
     def method(self, name: str, x0: Floats | None = None) -> OptimisedKF:
         """`OptimisedKF` with these numbers."""

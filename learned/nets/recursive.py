@@ -15,7 +15,7 @@ from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
 from ..training.clients import Batch
-from .gain import Gain
+from .gain import Gain, over_time
 from .levels import FEATURES, GNSS_STD, Levels, after, first, noise
 from .stack import named
 
@@ -74,7 +74,7 @@ class RecursiveGain(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) negative log-likelihood of the true error without its constant, mean over time, sum over axes."""
         x, variance = self.rollout(theta, batch)
-        return 0.5 * ((x - batch.truth).square() / variance + variance.log()).sum(-1).mean(0)
+        return over_time(0.5 * ((x - batch.truth).square() / variance + variance.log()).sum(-1))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`RecursiveFilter` with this net."""

@@ -12,7 +12,7 @@ from coopoc.arrays import Floats
 from coopoc.methods.track import Method
 
 from ..training.clients import Batch
-from .gain import Gain
+from .gain import Gain, over_time
 from .stack import Layer, layers
 
 SIZE = 3
@@ -73,7 +73,7 @@ class SplitGain(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each piece, mean over time, sum over components, m^2."""
         x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return (x - batch.truth).square().sum(-1).mean(0)
+        return over_time((x - batch.truth).square().sum(-1))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
