@@ -181,7 +181,7 @@ STUDY = Study(
     limitations=(
         f"{TOLD}: the Kalman filters with nominal and oracle knowledge. The adaptive filters are told the velocity "
         "noise.",
-        "What was trained at 5 to 20 % and 1 to 4 m saw the noise of the tests among others; the paper's nets saw one.",
+        "What was trained at 5 to 20 % and 1 to 6 m saw the noise of the tests among others; the paper's nets saw one.",
     ),
     minutes=6,
 )  # fmt: skip
