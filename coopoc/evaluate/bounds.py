@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..errors import InputError
+from ..methods.drift_state import drifting, require_white
 from ..world.fleet import Fleet
+from ..world.recording import Links
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
 from ..world.v2x import V2X
-from .recursion import covariances, stages_of
+from .recursion import covariances, drifting_covariances, stages_of
 
 
 def posterior_bound(
@@ -26,7 +29,7 @@ def posterior_bound(
     says. The information set is the ego's own measurements (solo, `v2x` None or K = 0), also the fixes and velocities
     of the linked neighbours over an ideal channel (star), or all that any vehicle measures (fleet); a vehicle that
     leaves the star is forgotten, as nothing is heard of its motion. The bias is left out: it is unobservable from a
-    GNSS start.
+    GNSS start. Drift and common errors of the fixes are unknowns beside the positions (filtering only).
 
     Args:
         fleet: truth. sensors: the noise that acts, stds positive. ego: column or id. v2x: K and radius, not loss.
@@ -50,9 +53,9 @@ def posterior_bound(
         return fleet_bound(fleet, sensors, v2x, smoothing=smoothing)[:, column]
     links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range)
     steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
-    stages = stages_of(fleet, sensors, links, [np.concatenate([[column], near]) for near in steps])
+    members = [np.concatenate([[column], near]) for near in steps]
     out = np.empty((len(fleet.t), 3, 3))
-    for t, cov in covariances(stages, smoothing):
+    for t, cov in _recursion(fleet, sensors, links, members, smoothing):
         out[t] = cov[:3, :3]
     return out
 
@@ -72,11 +75,20 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
     links = find_links(fleet, everyone, v2x.max_neighbours, v2x.radius, sensors.min_range)
     members = [np.flatnonzero(row) for row in fleet.present]
     out = np.full((*fleet.position.shape, 3), np.nan)
-    stages = stages_of(fleet, sensors, links, members)
-    for t, cov in covariances(stages, smoothing):
+    for t, cov in _recursion(fleet, sensors, links, members, smoothing):
         n = len(members[t])
         out[t, members[t]] = cov.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
     return out
+
+
+def _recursion(
+    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool
+) -> Iterator[tuple[int, Floats]]:
+    if not drifting(sensors):
+        return covariances(stages_of(fleet, sensors, links, members), smoothing)
+    if smoothing:
+        require_white(sensors, "the smoothing bound")
+    return drifting_covariances(stages_of(fleet, sensors, links, members, fixes=False), sensors, fleet.dt)
 
 
 def bound_rt_le(cov: Floats) -> float:

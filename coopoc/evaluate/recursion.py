@@ -9,6 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats, Ints
+from ..methods.drift_state import Drift
 from ..methods.star import rows
 from ..world.fleet import Fleet
 from ..world.recording import Links
@@ -26,8 +27,10 @@ class Stage:
     gained: Floats
 
 
-def stages_of(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints]) -> list[Stage]:
-    """Every step of the vehicles (columns) that are members of it."""
+def stages_of(
+    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], *, fixes: bool = True
+) -> list[Stage]:  # fmt: skip
+    """Every step of the vehicles (columns) that are members of it, with what fixes say or without."""
     start = np.searchsorted(links.step, np.arange(len(fleet.t) + 1))
     stages, before = [], np.full(len(fleet.ids), -1)
     for t, now in enumerate(members):
@@ -36,15 +39,17 @@ def stages_of(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints])
         place[now] = np.arange(len(now))
         process = (fleet.dt * sensors.velocity_std(fleet.velocity[t, now])) ** 2
         gained = _fisher(fleet.position[t, now], place[links.observer[span]], place[links.neighbour[span]], sensors)
+        if fixes:
+            gained += np.diag(np.tile(1.0 / np.square(sensors.gnss_std), len(now)))
         stages.append(Stage(now, before[now], process, gained))
         before = place
     return stages
 
 
 def _fisher(position: Floats, observer: Ints, neighbour: Ints, sensors: Sensors) -> Floats:
-    """Information (3n, 3n) of n fixes and of what observers measure of neighbours (places), at the truth."""
+    """Information (3n, 3n) about n vehicles of what observers measure of neighbours (places), at the truth."""
     n = len(position)
-    information = np.kron(np.eye(n), np.diag(1.0 / np.square(sensors.gnss_std)))
+    information = np.zeros((3 * n, 3 * n))
     if len(observer):
         relative = np.stack(spherical(*(position[neighbour] - position[observer]).T), axis=-1)
         edge = np.linalg.inv(vector_cov(relative, sensors.relative_std))
@@ -77,6 +82,22 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
             yield t, np.linalg.inv(filtered.pop() + future)
             future = _from_ahead(future, stages[t], len(stages[t - 1].members)) if t else future
             bar.update()
+
+
+def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> Iterator[tuple[int, Floats]]:
+    """Filtering bound (3n, 3n) where fixes err for a while, which the state then holds (`Drift`).
+
+    Args:
+        stages: without the fixes, which do not see positions alone.
+    """
+    drift, cov = Drift.of(sensors, dt), np.zeros((0, 0))
+    for t, stage in enumerate(tqdm(stages, desc="bound", unit="step", delay=2.0)):
+        n = len(stage.members)
+        sees, weight = drift.sees(n), np.tile(1.0 / np.square(sensors.gnss_std), n)
+        information = np.linalg.inv(drift.carry(cov, stage.kept, stage.process)) + (sees.T * weight) @ sees
+        information[: 3 * n, : 3 * n] += stage.gained
+        cov = np.linalg.inv(information)
+        yield t, cov[: 3 * n, : 3 * n]
 
 
 def _carry(cov: Floats, kept: Ints, process: Floats) -> Floats:

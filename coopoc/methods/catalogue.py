@@ -11,6 +11,7 @@ from .central_filter import CentralFilter
 from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
 from .diffusion import Diffusion
+from .drift_filter import DriftFilter
 from .fixed_lag import FixedLagSmoother
 from .gbp import GaussianBeliefPropagation
 from .gnss import Gnss
@@ -36,6 +37,7 @@ METHODS: Mapping[str, Factory] = {
     "lkf-sa": lambda knowledge: LaplacianKalman(knowledge),
     "lkf-sa-edge": lambda knowledge: JointFilter(knowledge, exact=False, name="lkf-sa-edge"),
     "msmv-r": lambda knowledge: Msmv(knowledge),
+    "drift": lambda knowledge: DriftFilter(knowledge),
     "joint": lambda knowledge: JointFilter(knowledge),
     "cooperative-map": lambda knowledge: CooperativeMAP(knowledge=knowledge),
     "cooperative-map-5": lambda knowledge: CooperativeMAP(knowledge=knowledge, window=5, name="cooperative-map-5"),

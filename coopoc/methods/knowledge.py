@@ -50,9 +50,10 @@ class Knowledge:
 
     @classmethod
     def nominal(cls, sensors: Sensors) -> Knowledge:
-        """The standard deviations of `sensors`, process noise from the measured velocity."""
+        """The standard deviations of `sensors`, process noise from the measured velocity; all of a fix's error as if it
+        were white."""
         sensors = sensors.check_assumed().without_bias()
-        return cls("nominal", sensors, gnss_std=sensors.gnss_std)
+        return cls("nominal", sensors, gnss_std=sensors.fix_std)
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> Knowledge:

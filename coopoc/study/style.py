@@ -32,6 +32,7 @@ METHODS = {
     "lkf-sa": Look("LKF-SA", SKY, "^"),
     "lkf-sa-edge": Look("LKF-SA (edge form)", BLUE, "v"),
     "joint": Look("Joint filter", GREEN, "o"),
+    "drift": Look("Drift filter", "#7A1FA2", "s"),
     "cooperative-map": Look("Cooperative MAP", "#00543C", "P"),
     "cooperative-map-5": Look("Cooperative MAP, 5 steps", "#00A37A", "P"),
     "cooperative-map-gnc": Look("Cooperative MAP, GNC", "#6B8E23", "P"),

@@ -28,8 +28,8 @@ def observe(
 ) -> Recording:
     """Measurements of a drive in `runs` noise realisations.
 
-    GNSS z = x + n + b, velocity u + e, relative (d, az, inc) + n of the K nearest within the radius. Noise is keyed by
-    (seed, sensor, run, vehicle, partner) and step: 30 runs are a prefix of 100, K = 2 is a subset of K = 10.
+    GNSS z = x + n + b + drift, velocity u + e, relative (d, az, inc) + n of the K nearest within the radius. Noise is
+    keyed by (seed, sensor, run, vehicle, partner) and step: 30 runs are a prefix of 100, K = 2 is a subset of K = 10.
     A noisy range that would be negative is reflected, as in the authors' public code.
 
     Args:
@@ -93,7 +93,29 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
         for r in range(runs):
             for column, name in enumerate(fleet.ids):
                 fixes[r, :, column] += stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3))
+    for std, names in ((sensors.gnss_drift_std, fleet.ids), (sensors.gnss_common_std, ("",))):
+        if std > 0:  # the common error is that of nobody in particular
+            for r in range(runs):
+                draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
+                fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
     return fixes
+
+
+def gauss_markov(normals: Floats, steps: float) -> Floats:
+    """Stationary e_t = a e_{t-1} + sqrt(1 - a^2) w_t of unit variance from normals w (T, ...), a = exp(-steps).
+
+    Args:
+        steps: time between samples over the correlation time.
+
+    >>> gauss_markov(np.ones((3, 1)), 0.0).ravel()
+    array([1., 1., 1.])
+    """
+    keep = np.exp(-steps)
+    fresh = np.sqrt(-np.expm1(-2.0 * steps))
+    error = normals.copy()
+    for t in range(1, len(error)):
+        error[t] = keep * error[t - 1] + fresh * normals[t]
+    return np.asarray(error)
 
 
 def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:

@@ -28,6 +28,13 @@ class Sensors:
     """m, (low, high) of a uniform draw, positive on every axis as the paper's U[0.5, 1] reads."""
     gnss_bias_mode: BiasMode = "run"
     """"run": one draw per run, vehicle and axis (a bias is constant; default). "sample": a new draw at every step."""
+    gnss_drift_std: float = 0.0
+    """m, per axis, of an error of each receiver that stays for a while (multipath): Gauss-Markov, added to the white
+    one of `gnss_std`."""
+    gnss_common_std: float = 0.0
+    """m, per axis, of the same kind of error that all vehicles share (ionosphere, orbits)."""
+    gnss_drift_time: float = 60.0
+    """s, correlation time of both: e(t) and e(t + s) have correlation exp(-s / gnss_drift_time)."""
     velocity_std_ratio: float = 0.10
     """Velocity noise over true velocity: the paper's 10 % (training) and 15 % (test)."""
     velocity_reading: VelocityReading = "axis"
@@ -60,6 +67,8 @@ class Sensors:
         for name, allowed in (("gnss_bias_mode", BiasMode), ("velocity_reading", VelocityReading)):
             if getattr(self, name) not in get_args(allowed):
                 raise InputError(name, repr(getattr(self, name)), f"must be one of {get_args(allowed)}", "Pick one.")
+        if self.gnss_drift_time <= 0:
+            raise InputError("gnss_drift_time", self.gnss_drift_time, "must be > 0 s", "For white noise set the stds.")
         if self.azimuth_std > np.pi or self.inclination_std > np.pi:
             raise InputError(
                 "azimuth_std/inclination_std",
@@ -72,6 +81,13 @@ class Sensors:
     def relative_std(self) -> Floats:
         """(3,) m, rad, rad."""
         return np.array([self.range_std, self.azimuth_std, self.inclination_std])
+
+    @property
+    def fix_std(self) -> tuple[float, float, float]:
+        """(3,) m per axis of all that is wrong with a fix but the bias: white noise, drift and the common error."""
+        more = self.gnss_drift_std**2 + self.gnss_common_std**2
+        x, y, z = (float(np.sqrt(white**2 + more)) if more else white for white in self.gnss_std)
+        return x, y, z
 
     def velocity_std(self, velocity: Floats, floor: float | None = None) -> Floats:
         """Noise std (..., 3) m/s at a velocity (..., 3) m/s, at least `floor` (default 0: what acts)."""

@@ -179,8 +179,10 @@ def clients(
     if piece < 2 or not 0 < split < 1:
         raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
     sensors = sensors or Sensors.paper_training()
-    if noise != "static" and sensors.gnss_bias[1] > 0:
-        raise InputError("gnss_bias", sensors.gnss_bias, f"must be (0, 0) with {noise} noise", "Train without a bias.")
+    if noise != "static" and (sensors.gnss_bias[1] > 0 or sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0):
+        given = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std)
+        raise InputError("gnss_bias, gnss_drift_std, gnss_common_std", given, f"must be zero with {noise} noise",
+                         "Train with white noise, or static.")  # fmt: skip
     seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
     found, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):

@@ -1,0 +1,142 @@
+"""Fixes that err for a while: their statistics, the filter that estimates the error, and the bound."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from scipy.linalg import solve_discrete_are
+
+from coopoc import (
+    V2X,
+    Fleet,
+    InputError,
+    JointFilter,
+    Kalman,
+    Sensors,
+    bound_rt_le,
+    fleet_bound,
+    nees,
+    observe,
+    posterior_bound,
+    rt_le,
+)
+from coopoc.methods.drift_filter import DriftFilter
+from coopoc.methods.knowledge import Knowledge
+from coopoc.world.sensing import gauss_markov
+
+WHITE = Sensors(gnss_std=(1.5, 1.5, 1.5))
+OWN = replace(WHITE, gnss_drift_std=2.0, gnss_drift_time=5.0)
+COMMON = replace(WHITE, gnss_common_std=2.0, gnss_drift_time=5.0)
+BOTH = replace(OWN, gnss_common_std=1.0)
+
+
+def convoy(vehicles: int = 4, steps: int = 150, dt: float = 0.1) -> Fleet:
+    """Vehicles 12 m apart at 10 m/s, the second one leaving for a while in the middle."""
+    t = dt * np.arange(steps)
+    velocity = np.broadcast_to([10.0, 2.0, 0.0], (steps, vehicles, 3)).copy()
+    velocity[:, 1:2, 1] += (np.where((t > 4) & (t < 8), 12.0, 0.0) - np.where((t > 8) & (t < 12), 12.0, 0.0))[:, None]
+    position = np.cumsum(dt * velocity, axis=0) + 12.0 * np.arange(vehicles)[:, None] * [1.0, 0.5, 0.0]
+    return Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, velocity)
+
+
+def test_gauss_markov_has_the_stated_correlation() -> None:
+    """Closed form: variance 1 and correlation exp(-k / 20) at k steps."""
+    error = gauss_markov(np.random.default_rng(0).standard_normal((400, 3000)), 1 / 20)
+    assert error.var(axis=1) == pytest.approx(np.ones(400), abs=0.15)
+    for lag in (1, 20, 60):
+        assert (error[lag:] * error[:-lag]).mean() == pytest.approx(np.exp(-lag / 20), abs=0.02)
+
+
+def test_drift_is_each_receivers_and_the_common_error_everyones() -> None:
+    fleet = convoy()
+    apart, alike = (observe(fleet, replace(s, gnss_std=(0.0,) * 3), assumed=WHITE, runs=40).gnss - fleet.position
+                    for s in (OWN, COMMON))  # fmt: skip
+    assert apart.std() == pytest.approx(2.0, rel=0.1)
+    assert alike.std() == pytest.approx(2.0, rel=0.15)
+    assert abs(np.corrcoef(apart[:, -1, 0, 0], apart[:, -1, 1, 0])[0, 1]) < 0.5
+    np.testing.assert_allclose(alike[:, :, 0], alike[:, :, 1], atol=1e-12)
+
+
+def test_draws_of_white_noise_stay() -> None:
+    fleet = convoy()
+    np.testing.assert_array_equal(observe(fleet, WHITE, runs=2).velocity, observe(fleet, OWN, runs=2).velocity)
+    added = observe(fleet, OWN, runs=3).gnss - observe(fleet, WHITE, runs=3).gnss
+    np.testing.assert_allclose(added[:2], observe(fleet, OWN, runs=2).gnss - observe(fleet, WHITE, runs=2).gnss)
+
+
+def test_without_drift_it_is_the_joint_filter() -> None:
+    fleet = convoy()
+    seen = observe(fleet, WHITE, V2X(2, 20.0), runs=2)
+    ours, joint = DriftFilter()(seen, [0, 2]), JointFilter()(seen, [0, 2])
+    np.testing.assert_allclose(ours.x, joint.x, atol=1e-6)
+    np.testing.assert_allclose(ours.covariance, joint.covariance, atol=1e-6)
+
+
+def test_alone_it_is_filterpys_augmented_filter() -> None:
+    """filterpy with state (x, drift, common) per axis, from the first fix with a vague position."""
+    fleet = convoy(1)
+    seen = observe(fleet, BOTH, V2X(0), runs=1, seed=3)
+    track, keep = DriftFilter()(seen, [0]), np.exp(-0.1 / 5.0)
+    q = Knowledge.nominal(BOTH).process_variance(seen)[0, :, 0]
+    for axis in range(3):
+        kf = KalmanFilter(dim_x=3, dim_z=1)
+        kf.x, kf.P = np.array([[seen.gnss[0, 0, 0, axis]], [0.0], [0.0]]), np.diag([1e6, 4.0, 1.0])
+        kf.H, kf.R = np.ones((1, 3)), np.array([[1.5**2]])
+        kf.F, kf.B = np.diag([1.0, keep, keep]), np.array([[0.1], [0.0], [0.0]])
+        for t in range(len(fleet.t)):
+            if t:
+                kf.predict(u=seen.velocity[0, t, 0, axis], Q=np.diag([q[t, axis], 4 * (1 - keep**2), 1 - keep**2]))
+            kf.update(seen.gnss[0, t, 0, axis])
+            assert track.x[0, t, 0, axis] == pytest.approx(kf.x[0, 0], abs=1e-5)
+            assert track.covariance[0, t, 0, axis, axis] == pytest.approx(kf.P[0, 0], rel=1e-4)
+
+
+def test_bound_of_a_single_vehicle_is_the_riccati_equations() -> None:
+    """SciPy's solve_discrete_are of (x, drift) per axis, after many steps at constant velocity."""
+    fleet, keep = convoy(1, steps=3000), np.exp(-0.1 / 5.0)
+    found = posterior_bound(fleet, OWN, 0)[-1, 0, 0]
+    process = np.diag([(0.1 * OWN.velocity_std_ratio * 10.0) ** 2, 4 * (1 - keep**2)])
+    prior = solve_discrete_are(np.diag([1.0, keep]).T, np.ones((2, 1)), process, np.array([[1.5**2]]))
+    gain = prior.sum(axis=1) / (prior.sum() + 1.5**2)
+    assert found == pytest.approx((prior - np.outer(gain, prior.sum(axis=0)))[0, 0], rel=1e-3)
+
+
+def test_rms_and_nees_agree_with_the_bound() -> None:
+    fleet, v2x = convoy(), V2X(3, 25.0)
+    for sensors in (OWN, COMMON, BOTH):
+        seen = observe(fleet, sensors, v2x, runs=60, observers=[0])
+        track = DriftFilter()(seen, [0])
+        rms = float(np.sqrt(np.mean(rt_le(track, fleet) ** 2)))
+        assert rms == pytest.approx(bound_rt_le(posterior_bound(fleet, sensors, 0, v2x)), rel=0.12)
+        assert np.nanmean(nees(track, fleet)) == pytest.approx(3.0, abs=0.45)
+
+
+def test_neighbours_help_against_what_they_do_not_share() -> None:
+    """The bound: own drifts average out over neighbours, the common one cannot."""
+    fleet = convoy()
+    alone, together = ({s: bound_rt_le(posterior_bound(fleet, s, 0, V2X(k, 60.0))) for s in (OWN, COMMON)}
+                       for k in (0, 3))  # fmt: skip
+    assert together[OWN] < 0.75 * alone[OWN]
+    assert together[COMMON] > 0.9 * alone[COMMON]
+    whole = fleet_bound(fleet, COMMON, V2X(3, 60.0))[:, 0]
+    assert bound_rt_le(whole) <= together[COMMON] * (1 + 1e-9)
+
+
+def test_white_filters_take_the_whole_error_as_white() -> None:
+    known = Knowledge.nominal(BOTH)
+    assert known.gnss_std == pytest.approx((np.sqrt(1.5**2 + 4 + 1),) * 3)
+    seen = observe(convoy(), BOTH, V2X(0), runs=20)
+    assert np.nanmean(nees(Kalman()(seen, [0]), convoy())) > 6  # and are far too sure of themselves
+
+
+def test_what_cannot_be_is_refused() -> None:
+    fleet = convoy()
+    with pytest.raises(InputError, match="gnss_drift_time"):
+        Sensors(gnss_drift_time=0.0)
+    with pytest.raises(InputError, match="gnss_drift_std"):
+        Sensors(gnss_drift_std=-1.0)
+    with pytest.raises(InputError, match="smoothing"):
+        posterior_bound(fleet, OWN, 0, smoothing=True)
