@@ -71,14 +71,35 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
     return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
 
 
+LASTING = ("own_share", "common_share")
+"""Parameters: shares of a fix's variance that last for a while, of each receiver and of all alike."""
+
+
 def sensors(p: Params) -> Sensors:
     """What acts in scenario 1 or 2 of the paper, or in its training (0), with the velocity noise of the cell."""
     ratio, reading = float(p["velocity_ratio"]), p["velocity_reading"]
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
-    found = presets[p["scenario"]]()
-    return replace(found, velocity_std_ratio=ratio, velocity_reading=reading)
+    found = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
+    return replace(found, velocity_std_ratio=ratio, velocity_reading=reading,
+                   gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)))  # fmt: skip
+
+
+def lasting(noise: Sensors, own: float, common: float) -> Sensors:
+    """The same variance of a fix, of which the shares `own` and `common` last for a while (`Sensors.gnss_drift_std`).
+
+    >>> lasting(Sensors(), 0.36, 0.0).gnss_drift_std.__round__(3)
+    0.9
+    """
+    if not (own >= 0 and common >= 0 and own + common < 1):
+        raise InputError(", ".join(LASTING), (own, common), "must be >= 0 and below 1 together", "0.5 is half of it.")
+    std = np.array(noise.gnss_std)
+    if own + common and not np.allclose(std, std[0]):
+        raise InputError("gnss_std", noise.gnss_std, "must be the same on every axis here", "Use Sensors directly.")
+    white = tuple((std * np.sqrt(1.0 - own - common)).tolist())
+    return replace(noise, gnss_std=white, gnss_drift_std=float(std[0] * np.sqrt(own)),
+                   gnss_common_std=float(std[0] * np.sqrt(common)))  # fmt: skip
 
 
 def acting(p: Params) -> Sensors:
@@ -105,7 +126,7 @@ def heading(p: Params) -> str:
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
     near = f", {relative(noise)}, radius {p['radius_m']:g} m" if "radius_m" in p else ""
     return (
-        f"Scenario {p['scenario']}: GNSS {noise.gnss_std[0]:g} m per axis{bias}, velocity "
+        f"Scenario {p['scenario']}: GNSS {noise.fix_std[0]:.3g} m per axis{bias}, velocity "
         f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}, {begin}"
     )
 

@@ -90,7 +90,8 @@ def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> It
     Args:
         stages: without the fixes, which do not see positions alone.
     """
-    drift, cov = Drift.of(sensors, dt), np.zeros((0, 0))
+    drift = Drift.of(sensors, dt)
+    cov: Floats = np.zeros((0, 0))
     for t, stage in enumerate(tqdm(stages, desc="bound", unit="step", delay=2.0)):
         n = len(stage.members)
         sees, weight = drift.sees(n), np.tile(1.0 / np.square(sensors.gnss_std), n)

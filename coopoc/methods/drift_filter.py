@@ -48,7 +48,8 @@ class DriftFilter:
         sensors = known.sensors or recording.sensors
         drift = Drift.of(sensors, recording.dt)
         white = np.square(sensors.gnss_std) - known.gnss_variance if known.sensors else np.zeros(3)
-        state, spread = np.zeros((recording.runs, 0)), np.zeros((recording.runs, 0, 0))
+        state: Floats = np.zeros((recording.runs, 0))
+        spread: Floats = np.zeros((recording.runs, 0, 0))
         for star in star_steps(recording, ego, box, known):
             n = len(star.kept)
             spread = drift.carry(spread, star.kept, np.broadcast_to(star.process, star.moved.shape))

@@ -1,0 +1,169 @@
+"""What cooperation is worth when the errors of GNSS last: each receiver's own, or one that all vehicles share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
+from coopoc.study.study import Params, Row, Study
+
+from . import lineup, scene, views, weights
+
+if TYPE_CHECKING:
+    from coopoc.study.figures import Plot
+    from coopoc.study.results import Results
+    from coopoc.study.tables import Table
+
+ERRORS = {"white": (0.0, 0.0), "half own": (0.5, 0.0), "own": (0.9, 0.0), "own and common": (0.45, 0.45),
+          "common": (0.0, 0.9)}  # fmt: skip
+"""Name -> shares of a fix's variance that last: of each receiver, and of all vehicles alike."""
+NEIGHBOURS = (0, 2, 6, 10)
+SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"), ("recursive", "trained"))
+SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("drift", "nominal"))
+"""What nominal knowledge means: all but `drift` take the whole error of a fix as white, of the same variance."""
+BOUND = ("bound", "bound")
+
+
+def _grid() -> list[dict[str, Any]]:
+    """Who talks to nobody at K = 0 only; the drift filter there, too, as the solo filter of coloured noise."""
+    return [
+        {"own_share": own, "common_share": common, "max_neighbours": k, "method": method, "knowledge": known}
+        for own, common in ERRORS.values() for k in NEIGHBOURS
+        for method, known in ((*SOLO, *SHARED[2:], BOUND) if k == 0 else (*SHARED, BOUND))
+    ]  # fmt: skip
+
+
+def cell(p: Params) -> list[Row]:
+    """Rows of one method; of the bound, one row per ego."""
+    if p["method"] != "bound":
+        return lineup.rows(p)
+    drive, acting, v2x = scene.fleet(p["data"]), scene.sensors(p), scene.channel(p)
+    egos = scene.egos(p["data"], str(p["egos"]))
+    return [{"run": 0, "ego": ego, "rt_le_m": bound_rt_le(posterior_bound(drive, acting, ego, v2x))} for ego in egos]
+
+
+def case(name: str) -> dict[str, Any]:
+    """An error model as a selection."""
+    return dict(zip(scene.LASTING, ERRORS[name], strict=True))
+
+
+def rms(results: Results, where: dict[str, Any]) -> float | None:
+    """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: what the bound bounds."""
+    kept = views.present(results, where)
+    if kept is None:
+        return None
+    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
+    seeded = "train_seed" in frame and frame["train_seed"].notna().any()
+    return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
+
+
+def at(method: str, k: int) -> int:
+    """K at which a method ran: who talks to nobody ran without neighbours."""
+    return 0 if method in {name for name, _ in SOLO} else k
+
+
+def _against_k(value: Callable[[Results, dict[str, Any]], float | None], text: str, decimals: int) -> Any:
+    """View of methods down, K across, one block per error model."""
+
+    def table(results: Results) -> Table | None:
+        from coopoc.study.style import look
+        from coopoc.study.tables import Table
+
+        body: list[tuple[Any, ...]] = []
+        for name in ERRORS:
+            for method, known in (*SOLO, *SHARED, BOUND):
+                where = {**case(name), "method": method, "knowledge": known}
+                found = [value(results, {**where, "max_neighbours": k}) for k in NEIGHBOURS]
+                if any(number is not None for number in found):
+                    body.append((name, look(method).label, *found))
+        header = ("Errors of GNSS that last", "Method", *(f"K = {k}" for k in NEIGHBOURS))
+        return Table(header, tuple(body), _caption(results, text), decimals=decimals) if body else None
+
+    return table
+
+
+def _nees(results: Results, where: dict[str, Any]) -> float | None:
+    return views.mean(results, where, "nees")
+
+
+def _caption(results: Results, text: str) -> str:
+    kept = results.settings
+    return (
+        f"{text} Lasting errors are 50 % or 90 % of a fix's variance, {kept['drift_time_s']:g} s correlated. All but "
+        "the drift filter take them as white noise of the same variance. The bound knows how they last. "
+        f"{scene.conditions(kept)}"
+    )
+
+
+def _figure(results: Results) -> Plot | None:
+    """rms against K, one panel per error model."""
+    from coopoc.study.plot import Plot, canvas, legend, strokes
+
+    cases = [name for name in ERRORS if views.present(results, case(name))]
+    if not cases:
+        return None
+    with canvas(1, len(cases), width=1.2 + 1.55 * len(cases), height=3.0, sharey=True, squeeze=False) as (
+        figure, (panels,),
+    ):  # fmt: skip
+        for panel, name in zip(panels, cases, strict=True):
+            drawn = []
+            for method, known in (*SOLO[1:], *SHARED, BOUND):
+                found = {k: rms(results, {**case(name), "method": method, "knowledge": known,
+                                          "max_neighbours": at(method, k)}) for k in NEIGHBOURS}  # fmt: skip
+                ran = {k: value for k, value in found.items() if value is not None}
+                if ran:
+                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": known}))
+                    drawn.append({"method": method, "knowledge": known})
+            panel.set(title=name, xlabel="Neighbours K", xticks=NEIGHBOURS)
+        panels[0].set(ylabel="rms RT-LE [m]", ylim=(0, None))
+        legend(panels[-1], drawn)
+    return Plot(figure, _caption(results, "rms over runs of RT-LE against the number of neighbours."))
+
+
+def _findings(results: Results) -> Sequence[str]:
+    found = [_finding(results, name) for name in ERRORS]
+    return [sentence for sentence in found if sentence]
+
+
+def _finding(results: Results, name: str) -> str:
+    most = max((k for k in NEIGHBOURS if views.present(results, {"max_neighbours": k})), default=0)
+    value = {method: [rms(results, {**case(name), "method": method, "max_neighbours": k}) for k in (0, most)]
+             for method in ("kalman", "joint", "drift", "bound")}  # fmt: skip
+    alone, joint, drift, bound = value["kalman"][0], value["joint"][1], value["drift"][1], value["bound"][1]
+    if most == 0 or alone is None or joint is None or drift is None or bound is None:
+        return ""
+    return (
+        f"{name}: {most} neighbours take the filter from {alone:.2f} m alone to {joint:.2f} m ({joint / alone:.2f} "
+        f"times); to {drift:.2f} m if it knows how errors last; bound {bound:.2f} m."
+    )
+
+
+STUDY = Study(
+    name="correlated_gnss",
+    question="What is cooperation worth when GNSS errors last, so that no filter can average them out alone?",
+    cell=cell,
+    key=lineup.key,
+    prepare=weights.prepare,
+    grid=_grid(),
+    settings={
+        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
+        "velocity_reading": "axis", "radius_m": 30.0, "drift_time_s": 60.0, "egos": "auto", "runs": 50, "seed": 0,
+        "train_seeds": 3,
+    },
+    shares=(*scene.LASTING, "max_neighbours"),
+    tables={"rms": _against_k(rms, "rms over runs of RT-LE [m].", 2),
+            "nees": _against_k(_nees, "NEES (3 is consistent).", 1)},
+    figures={"rms": _figure},
+    findings=_findings,
+    recipe=weights.described,
+    limitations=(
+        "A Gauss-Markov error with one correlation time stands for multipath and atmosphere; real ones depend on the "
+        "place and on the satellites in view.",
+        "What lasts for all alike is shared by the whole map: over some hundred metres that is nearly so.",
+        "Learned gains were trained with white noise.",
+    ),
+    minutes=12,
+)  # fmt: skip
