@@ -57,6 +57,7 @@ METHODS = {
     "split": Look("Split-KalmanNet", "#3B7080", "<"),
     "recursive": Look("Recursive gain", "#C2185B", "o"),
     "cooperative": Look("Cooperative gain", "#00796B", "H"),
+    "cooperative-newest": Look("Cooperative gain, newest fix", "#4DB6AC", "h"),
     "individual": Look("Individual KalmanNet", "#9370C9", "h"),
     "oracle": Look("Oracle KF", "#5B3A1E", "d"),
     "bound": Look("Cramér-Rao bound", BLACK, ""),
