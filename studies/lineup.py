@@ -46,6 +46,8 @@ def knowledge(p: Params) -> Knowledge | str:
         if scene.is_real(p["data"]):
             raise InputError("knowledge", "'oracle'", "is for simulated noise", "Take nominal or fitted on real data.")
         return Knowledge.oracle(scene.sensors(p), scene.fleet(p["data"]))
+    if p["knowledge"] == "heading taken as exact":
+        return Knowledge.nominal(replace(scene.sensors(p), heading_std=0.0, heading_bias_std=0.0))
     return str(p["knowledge"])
 
 

@@ -82,8 +82,12 @@ def sensors(p: Params) -> Sensors:
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
     found = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
-    return replace(found, velocity_std_ratio=ratio, velocity_reading=reading,
-                   gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)))  # fmt: skip
+    return replace(
+        found, velocity_std_ratio=ratio, velocity_reading=reading,
+        gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)),
+        heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
+        heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
+    )  # fmt: skip
 
 
 def lasting(noise: Sensors, own: float, common: float) -> Sensors:

@@ -50,9 +50,10 @@ class Knowledge:
 
     @classmethod
     def nominal(cls, sensors: Sensors) -> Knowledge:
-        """The standard deviations of `sensors`, process noise from the measured velocity; all of a fix's error as if it
-        were white."""
+        """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
+        an azimuth as if it were white and its own."""
         sensors = sensors.check_assumed().without_bias()
+        sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
         return cls("nominal", sensors, gnss_std=sensors.fix_std)
 
     @classmethod

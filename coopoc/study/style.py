@@ -71,6 +71,7 @@ UNITS = {
     "error_cdf": ("Error CDF", ""), "rate_hz": ("Rate", "Hz"),
     "cap_bytes_per_second": ("Cap", "B/s"), "nees_inside": ("NEES inside its band", ""),
     "neighbour_rt_le_m": ("Error of neighbours", "m"), "loss": ("Message loss", ""), "latency": ("Latency", "s"),
+    "heading_std_deg": ("Heading noise", "°"), "heading_bias_deg": ("Heading bias", "°"),
     "epsilon": ("Epsilon", ""), "auc": ("AUC of the probe", ""),
 }  # fmt: skip
 """Column -> (words, unit)."""

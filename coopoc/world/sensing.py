@@ -141,9 +141,23 @@ def _relative(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int
         for r in range(runs):
             draws = stream(seed, "relative", r, observer, neighbour).standard_normal((last, 3))
             relative[r, index] += draws[links.step[index]] * sensors.relative_std
+    relative[..., 1] += _heading(fleet, links, sensors, runs, seed)
     relative[..., 0] = np.abs(relative[..., 0])
     relative[..., 1] = wrap(relative[..., 1])
     return relative
+
+
+def _heading(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
+    """(R, L) rad that the observer's wrong heading turns what it sees by."""
+    turned = np.zeros((runs, len(links)))
+    for kind, std in (("heading", sensors.heading_std), ("heading_bias", sensors.heading_bias_std)):
+        for column in np.unique(links.observer) if std > 0 else ():
+            mine = links.of(column)
+            for r in range(runs):
+                size = len(fleet.t) if kind == "heading" else 1
+                draws = std * stream(seed, kind, r, fleet.ids[column]).standard_normal(size)
+                turned[r, mine] += draws[links.step[mine]] if kind == "heading" else draws[0]
+    return turned
 
 
 def schedule(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:

@@ -45,9 +45,14 @@ class Sensors:
     range_std: float = 1.0
     """m."""
     azimuth_std: float = float(np.deg2rad(4.0))
-    """rad, in the world frame: heading is taken as known, as the paper implies."""
+    """rad, of the bearing as the sensor sees it. The paper implies that the heading, which makes it a world azimuth, is
+    known."""
     inclination_std: float = float(np.deg2rad(4.0))
     """rad."""
+    heading_std: float = 0.0
+    """rad, noise of the observer's heading, new at every step: it turns all that is seen at the step alike."""
+    heading_bias_std: float = 0.0
+    """rad, of an error of the heading that each vehicle has for a whole run (mounting, magnetic declination)."""
     min_range: float = 2.0
     """m, centres closer than a vehicle is wide are not measured (a range near zero makes angles seem exact)."""
 
@@ -81,6 +86,12 @@ class Sensors:
     def relative_std(self) -> Floats:
         """(3,) m, rad, rad."""
         return np.array([self.range_std, self.azimuth_std, self.inclination_std])
+
+    @property
+    def world_azimuth_std(self) -> float:
+        """rad, of all that is wrong with an azimuth in the world frame: bearing and heading."""
+        more = self.heading_std**2 + self.heading_bias_std**2
+        return float(np.sqrt(self.azimuth_std**2 + more)) if more else self.azimuth_std
 
     @property
     def fix_std(self) -> tuple[float, float, float]:

@@ -1,0 +1,55 @@
+"""A heading that is wrong: what it turns, and what it costs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopoc import V2X, Fleet, Sensors, observe, run
+from coopoc.methods.knowledge import Knowledge
+from coopoc.studies import heading_error as study
+from coopoc.studies import views
+from coopoc.world.spherical import wrap
+
+NOISE = Sensors(heading_std=0.05)
+BIAS = Sensors(heading_bias_std=0.05)
+
+
+def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing: Fleet) -> None:
+    """Against the same draws without it: azimuths of one observer and step move by one number, nothing else moves."""
+    v2x, plain = V2X(4, 80.0), observe(crossing, Sensors(), V2X(4, 80.0), runs=30)
+    for sensors, per_step in ((NOISE, True), (BIAS, False)):
+        seen = observe(crossing, sensors, v2x, runs=30)
+        np.testing.assert_array_equal(seen.gnss, plain.gnss)
+        np.testing.assert_array_equal(seen.relative[..., [0, 2]], plain.relative[..., [0, 2]])
+        turned, mine = wrap(seen.relative[..., 1] - plain.relative[..., 1]), plain.links.of(2)
+        steps = plain.links.step[mine]
+        for t in np.unique(steps):
+            assert np.ptp(turned[:, mine[steps == t]], axis=1) == pytest.approx(np.zeros(30), abs=1e-9)
+        assert (np.ptp(turned[:, mine], axis=1) > 1e-3).all() == per_step
+        assert turned.std() == pytest.approx(0.05, rel=0.2)
+
+
+def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
+    both = replace(NOISE, heading_bias_std=0.12, azimuth_std=0.0)
+    known = Knowledge.nominal(replace(both, azimuth_std=1e-12))
+    assert known.sensors is not None
+    assert known.sensors.azimuth_std == pytest.approx(0.13)
+    assert Knowledge.nominal(Sensors()).sensors == Sensors()
+
+
+def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path) -> None:
+    wanted = {"runs": 3, "egos": "2", "heading_std_deg": "0.0,8.0", "heading_bias_deg": "0.0,8.0",
+              "max_neighbours": "0,10", "method": "kalman,joint,bound"}  # fmt: skip
+    results = run("heading_error", tmp_path, settings=wanted, progress=False)
+    for kind in study.KINDS:
+        none, told, ignored = (views.mean(results, study.at(kind, size, "joint", known, 10), "nees")
+                               for size, known in ((0.0, "nominal"), (8.0, "nominal"), (8.0, study.EXACT)))  # fmt: skip
+        assert none is not None
+        assert told is not None
+        assert ignored is not None
+        assert none < told < ignored
+    assert "Joint filter" in (tmp_path / "heading_error" / "tables" / "rt_le.md").read_text()
