@@ -18,8 +18,10 @@ from coopoc.learned.engine import rollout as engine
 from coopoc.learned.engine.arithmetic import compiled, sigmoid, tanh
 from coopoc.learned.nets import gain_net as net_module
 from coopoc.learned.nets.stack import flatten
+from coopoc.learned.training import schedule as schedule_module
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core, row_threads
+from coopoc.learned.training.schedule import Schedule, advance
 
 
 @pytest.fixture(autouse=True)
@@ -167,6 +169,10 @@ def test_a_model_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> N
     assert torch.equal(stacked[1], shared[1])
     assert torch.equal(stacked[0][:, 3:4], alone[0])
     assert torch.equal(stacked[1][3:4], alone[1])
+    one = Batch(*(part[:, 3:4] for part in data[:3]), data.x0[3:4], 0.1)
+    for whole, part in zip(nets[0].loss_and_gradient(flatten(nets), data),
+                           nets[0].loss_and_gradient(flatten(nets[3:4]), one), strict=True):  # fmt: skip
+        assert torch.equal(whole[3:4], part)
 
 
 def test_without_gradients_the_answer_is_the_same() -> None:
@@ -174,6 +180,37 @@ def test_without_gradients_the_answer_is_the_same() -> None:
     theta = flatten(nets)
     silent = engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, 0.1)
     assert torch.equal(silent, engine.rollout(theta.requires_grad_(), nets[0], data.gnss, data.velocity, data.x0, 0.1))
+
+
+@pytest.mark.parametrize("numba", [True, False])
+def test_an_optimiser_step_is_that_of_torch(numba: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the loss with penalties; other rows stay."""
+    if not numba:
+        monkeypatch.setattr(schedule_module, "_compiled", lambda: None)
+    torch.manual_seed(0)
+    schedule, rates = Schedule(weight_decay=0.3, l2=0.1, proximal=0.2, clip=1.0), [1e-2, 2e-2, 3e-2]
+    theta = torch.randn(5, 50, dtype=torch.float64)
+    began, first, second, start = theta + 1, torch.zeros_like(theta), torch.zeros_like(theta), theta.clone()
+    rows, leaves = [0, 2, 3], [theta[row].clone().requires_grad_() for row in (0, 3)]
+    optimisers = [torch.optim.AdamW([leaf], rates[2 * i], weight_decay=0.3) for i, leaf in enumerate(leaves)]
+    for step in range(1, 5):
+        gradient = torch.randn(3, 50, dtype=torch.float64) * torch.tensor([[1.0], [1.0], [1e-3]])
+        for leaf, optimiser, row in zip(leaves, optimisers, (0, 2), strict=True):
+            optimiser.zero_grad()
+            away = (leaf - began[rows[row]]).square().sum()
+            (gradient[row] @ leaf + 0.1 * leaf.square().sum() + 0.1 * away).backward()
+            torch.nn.utils.clip_grad_norm_([leaf], 1.0)
+            optimiser.step()
+        gradient[1, step] = torch.inf if step % 2 else torch.nan
+        losses = torch.ones(3, dtype=torch.float64)
+        found = advance(theta, gradient, began, first, second, losses, rows, step, rates, schedule)
+        assert found.tolist() == [True, False, True]
+    torch.testing.assert_close(theta[[0, 3]], torch.stack(leaves).detach(), rtol=1e-10, atol=1e-12)
+    assert torch.equal(theta[[1, 2, 4]], start[[1, 2, 4]])
+    assert not first[[1, 2, 4]].any()
+    still, lost = theta.clone(), torch.tensor([torch.inf], dtype=torch.float64)
+    assert not advance(theta, torch.zeros(1, 50).double(), began, first, second, lost, [3], 5, [0.1], schedule).any()
+    assert torch.equal(theta, still)
 
 
 def test_gradients_of_inputs_go_through_the_reference() -> None:
@@ -193,6 +230,8 @@ def test_what_does_not_fit_is_named() -> None:
         engine.rollout(theta.half(), net, data.gnss, data.velocity, data.x0, 0.1)
     with pytest.raises(InputError, match="velocity"):
         engine.rollout(theta, net, data.gnss, data.velocity[1:], data.x0, 0.1)
+    with pytest.raises(InputError, match="truth"):
+        net.loss_and_gradient(theta, data._replace(truth=data.truth[1:]))
     with pytest.raises(InputError, match="dt"):
         engine.rollout(theta, net, data.gnss, data.velocity, data.x0, torch.ones(4))
 

@@ -1,41 +1,72 @@
-"""Arithmetic of the compiled kernels: products, tanh and sigmoid that vectorise, and views into flat memory."""
+"""What the compiled kernels share: how they are compiled, tanh and sigmoid that vectorise, views into flat memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
-from coopoc.arrays import AnyArray, Ints
+from coopoc.arrays import AnyArray
 
+PAD = 16
+"""Columns of matrices come in multiples of this: whole vectors in either precision."""
+ZERO, ONE, TWO, THREE = np.arange(4)
+"""NumPy's integers, because numba compiles a function anew for each constant of Python's."""
+SOURCES = tuple(Path(__file__).with_stem(stem).stat().st_mtime_ns for stem in
+                ("arithmetic", "places", "product", "tape", "forward", "backward", "optimiser"))  # fmt: skip
+"""What compiled code on disk was made from: numba itself looks at a function's own file only, not at those it calls."""
+Index: TypeAlias = int | np.integer[Any]
+"""What kernels count and index with: Python's integers, and NumPy's that come from tables of them."""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Compiled at the first call and cached on disk, without the interpreter's lock.
+    """Compiled with the first kernel that calls it, without the interpreter's lock.
 
     A product and a sum may become one instruction; nothing is reordered.
     """
-    made = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
-    return cast(Function, made(function))
+    return cast(Function, numba.njit(nogil=True, error_model="numpy", fastmath={"contract"})(function))
+
+
+def summing(function: Function) -> Function:
+    """The same for a function that adds many terms: it may do so in several sums, in one way for all arguments."""
+    return cast(Function, numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})(function))
+
+
+def kernel(function: Function) -> Function:
+    """The same for what Python calls; machine code, with that of all it calls, is kept on disk for the next process."""
+    made = cast(Any, compiled(function))
+    try:
+        made.enable_caching()
+        made._cache._cache_file._source_stamp = SOURCES
+    except RuntimeError:  # neither this folder nor the user's can be written: every process compiles
+        pass
+    return cast(Function, made)
+
+
+def view(function: Callable[..., Any]) -> Callable[..., AnyArray]:
+    """What `function` writes in LLVM's instructions, as a function of compiled code that returns an array."""
+    return cast(Callable[..., AnyArray], intrinsic(function))
 
 
 @compiled
 def tanh(v: Any, real: Any) -> Any:
-    """tanh from [9/8] of its continued fraction at v/4 and two doublings, tanh 2y = 2 tanh y / (1 + tanh^2 y).
+    """tanh from [7/6] of its continued fraction at v/4 and two doublings, tanh 2y = 2 tanh y / (1 + tanh^2 y).
 
-    No table and no branch, so that a loop over it vectorises; NaN stays NaN. Error 2e-7 in float32, 2e-13 in float64.
+    No table and no branch, so that a loop over it vectorises; NaN stays NaN. Error 2e-7 in float32, 3e-13 in float64.
     """
     v = real(15.0) if v > real(15.0) else v
     v = real(-15.0) if v < real(-15.0) else v
     y = v * real(0.25)
     s = y * y
-    p = s * real(1 / 34459425) + real(990 / 34459425)
-    p = y * (((p * s + real(135135 / 34459425)) * s + real(4729725 / 34459425)) * s + real(1.0))
-    q = s * real(45 / 34459425) + real(13860 / 34459425)
-    q = ((q * s + real(945945 / 34459425)) * s + real(16216200 / 34459425)) * s + real(1.0)
+    p = ((s * real(1 / 135135) + real(378 / 135135)) * s + real(17325 / 135135)) * s + real(1.0)
+    q = ((s * real(28 / 135135) + real(3150 / 135135)) * s + real(62370 / 135135)) * s + real(1.0)
+    p = y * p
     p, q = (p + p) * q, p * p + q * q
     return (p + p) * q / (p * p + q * q)
 
@@ -47,78 +78,53 @@ def sigmoid(v: Any, real: Any) -> Any:
 
 
 @compiled
-def add_product(a: AnyArray, b: AnyArray, out: AnyArray) -> None:
-    """out (m, n) += a (m, k) b (k, n)."""
-    for i in range(a.shape[0]):
-        for k in range(a.shape[1]):
-            factor = a[i, k]
-            for j in range(out.shape[1]):
-                out[i, j] += factor * b[k, j]
+def whole(columns: Index) -> Index:
+    """Columns rounded up to whole vectors."""
+    return (columns + PAD - 1) // PAD * PAD
 
 
-class Net(NamedTuple):
-    """Flat weights (P,) of one model, its transposed weights at the same places, and where its layers lie.
+@compiled
+def aligned(size: Index, like: AnyArray) -> AnyArray:
+    """Zeros (size,) that begin where a vector may begin: one that crosses a line of the cache takes twice as long."""
+    memory = np.zeros(size + PAD, like.dtype)
+    first = -(memory.ctypes.data // memory.itemsize) % PAD
+    return memory[first : first + size]
 
-    `layers` (layers, 4): where a weight and its bias begin, outputs, inputs.
+
+@view
+def window(typing: Any, flat: Any, at: Any, rows: Any, columns: Any) -> Any:
+    """A view (rows, columns) into flat memory from `at` on that does not count as a reference to it.
+
+    NumPy's views do, and in a time loop of many small steps counting takes as long as the arithmetic. The memory must
+    be held by an argument of the calling function.
     """
+    shaped = types.Array(flat.dtype, 2, "C")
 
-    theta: AnyArray
-    turned: AnyArray
-    layers: Ints
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        owner = context.make_array(signature.args[0])(context, builder, values[0])
+        made, size = context.make_array(shaped)(context, builder), owner.itemsize
+        _, at, rows, columns = values
+        context.populate_array(
+            made, data=builder.gep(owner.data, [at]), shape=_pair(builder, rows, columns),
+            strides=_pair(builder, builder.mul(columns, size), size), itemsize=size, meminfo=None,
+        )  # fmt: skip
+        return made._getvalue()
 
-
-class Tape(NamedTuple):
-    """What the steps of one model leave behind: `fields` (fields, 3) says where each begins, its width, its slots.
-
-    A field with fewer slots than there are steps is overwritten in turn: one slot keeps nothing.
-    """
-
-    memory: AnyArray
-    fields: Ints
-    lanes: int
+    return shaped(flat, types.intp, types.intp, types.intp), generate
 
 
-@compiled
-def weight(net: Net, layer: int) -> AnyArray:
-    """Weight (outputs, inputs) of a layer, a view."""
-    at, outputs, inputs = net.layers[layer, 0], net.layers[layer, 2], net.layers[layer, 3]
-    return net.theta[at : at + outputs * inputs].reshape(outputs, inputs)
+def _pair(builder: Any, *values: Any) -> Any:
+    return cast(Any, cgutils).pack_array(builder, values)
 
 
-@compiled
-def turned(net: Net, layer: int) -> AnyArray:
-    """Transposed weight (inputs, outputs) of a layer, a view: products run along its last axis."""
-    at, outputs, inputs = net.layers[layer, 0], net.layers[layer, 2], net.layers[layer, 3]
-    return net.turned[at : at + outputs * inputs].reshape(inputs, outputs)
+@view
+def lent(typing: Any, array: Any) -> Any:
+    """The same array, not counted as a reference; as for `window`, an argument must hold the memory."""
 
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        owner, made = (context.make_array(array)(context, builder, *given) for given in (values, ()))
+        context.populate_array(made, data=owner.data, shape=owner.shape, strides=owner.strides, itemsize=owner.itemsize,
+                               meminfo=None)  # fmt: skip
+        return made._getvalue()
 
-@compiled
-def bias(net: Net, layer: int) -> AnyArray:
-    """Bias (outputs,) of a layer, a view."""
-    return net.theta[net.layers[layer, 1] : net.layers[layer, 1] + net.layers[layer, 2]]
-
-
-@compiled
-def opened(theta: AnyArray, layers: Ints) -> Net:
-    """A model's flat weights with their transposes."""
-    net = Net(theta, np.empty_like(theta), layers)
-    for layer in range(len(layers)):
-        source, target = weight(net, layer), turned(net, layer)
-        for i in range(target.shape[0]):
-            for j in range(target.shape[1]):
-                target[i, j] = source[j, i]
-    return net
-
-
-@compiled
-def rows(tape: Tape, name: int, step: int) -> AnyArray:
-    """(B, width) of a field at a step, a view."""
-    return span(tape, name, step % tape.fields[name, 2], 1)
-
-
-@compiled
-def span(tape: Tape, name: int, slot: int, count: int) -> AnyArray:
-    """(count B, width) of `count` slots of a field from `slot` on, a view."""
-    at, width = tape.fields[name, 0], tape.fields[name, 1]
-    size = tape.lanes * width
-    return tape.memory[at + slot * size : at + (slot + count) * size].reshape(count * tape.lanes, width)
+    return array(array), generate

@@ -8,29 +8,12 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints
 
-from .arithmetic import Net, Tape, add_product, bias, compiled, rows, span, weight
-from .forward import (
-    BACK,
-    EPS,
-    EVOLUTION,
-    EXPECTED,
-    FLOOR,
-    GAIN,
-    HIDDEN,
-    INNOVATION_GATES,
-    INNOVATION_X,
-    LENGTHS,
-    OBSERVATION,
-    POSTERIOR,
-    POSTERIOR_OUT,
-    PRIOR_GATES,
-    PRIOR_X,
-    PROCESS_GATES,
-    PROCESS_X,
-    SURPRISE,
-    UPDATE,
-    missing,
-)  # fmt: skip
+from ..nets.gain_net import LOG_FLOOR, SHORTEST
+from . import places as on
+from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, compiled, kernel, lent, window
+from .forward import blend, layer, missing
+from .product import add_outer, add_product, dots, gated_product
+from .tape import Net, Tape, bias, matrix, pack, rows, span, unpack
 
 
 class Pull(NamedTuple):
@@ -44,177 +27,247 @@ class Pull(NamedTuple):
     prior_before: Floats
 
 
-@compiled
+class Inner(NamedTuple):
+    """Gradients within a step: new GRU states (B, PAD), innovation, what the first layers read; and a GRU's gates."""
+
+    process: Floats
+    prior: Floats
+    innovation: Floats
+    surprise: Floats
+    observed: Floats
+    evolved: Floats
+    updated: Floats
+    gates: Floats
+
+
+@kernel
 def backward(
-    theta: Floats, layers: Ints, gnss: Floats, pulls: Floats, memory: Floats, fields: Ints, deltas: Floats,
-    delta_fields: Ints, gradient: Floats, first: int, last: int,
+    theta: Floats, padded: Floats, layers: Ints, gnss: Floats, pulls: Floats, kept: Floats, fields: Ints, size: Index,
+    delta_fields: Ints, delta_size: Index, slots: Index, gradient: Floats, first: Index, last: Index,
 ) -> None:  # fmt: skip
     """Gradient (S, P) of the models first..last - 1 from that of their estimates, `pulls` (T, S, B, 3).
 
-    The gradients of the layers' outputs wait in `deltas` (S, size), a tape with room for a few steps; when it is full,
-    the gradient of each weight grows by one product over all its rows.
+    The wide layers are computed again, which is faster than to fetch them from memory. They and the gradients of the
+    layers' outputs wait in fields with room for a few steps; when these are full, the gradient of each weight grows by
+    one product over all their rows.
 
     Args:
-        theta: (S, P). layers: as in `Net`. gnss: (T, S, B, 3). memory, fields: the tape, as in `Tape`.
+        theta: (S, P). padded, layers, gnss, kept: as `forward` left them. fields, delta_fields: as in `Tape`, the
+            latter of the gradients of the outputs. size, delta_size: of the memory that is not kept, with room for
+            `slots` steps.
     """
-    room = delta_fields[0, 2]
+    steps, models, lanes, _ = gnss.shape
+    ahead_turned, turned, longer = layers[:, 2] > 0, layers[:, 2] < 0, layers[:, 2] > layers[:, 3]
+    passing, waiting, now = aligned(size, theta), aligned(delta_size, theta), np.zeros(2, np.int64)
+    straight, grown = aligned(padded.shape[1], theta), aligned(padded.shape[1], theta)
+    work, positions = aligned(lanes * 14 * PAD, theta), np.empty(3 * lanes * 3, theta.dtype)
+    fixes, pulled = gnss.reshape(-1), pulls.reshape(-1)
     for s in range(first, last):
-        net, made = Net(theta[s], theta[s], layers), Net(gradient[s], gradient[s], layers)
-        tape, waiting = Tape(memory[s], fields, gnss.shape[2]), Tape(deltas[s], delta_fields, gnss.shape[2])
-        work = np.empty(3 * gnss.shape[2] * layers[:, 3].max(), theta.dtype)
-        pull, gradient[s] = _nothing(gnss.shape[2], theta), 0.0
-        for t in range(len(pulls) - 1, -1, -1):
-            pull.x[:] += pulls[t, s]
-            _step(net, gnss[t, s], pull, tape, waiting, t, work)
-            if t % room == 0:
-                _collect(made, tape, waiting, t, min(room, len(pulls) - t))
+        ahead = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(ahead_turned))
+        net = Net(lent(theta[s]), lent(straight), lent(layers), lent(turned))
+        made = Net(lent(gradient[s]), lent(grown), lent(layers), lent(longer))
+        tape = Tape(lent(passing), lent(kept[s]), lent(fields), lent(now), lanes)
+        deltas = Tape(lent(waiting), lent(waiting), lent(delta_fields), lent(now), lanes)
+        _rollback(net, ahead, made, tape, deltas, fixes, pulled, steps, s * lanes * 3, models * lanes * 3, slots, work,
+                  positions)  # fmt: skip
 
 
 @compiled
-def _nothing(lanes: int, like: Floats) -> Pull:
-    """No gradient yet."""
-    grus, positions = np.zeros((3, lanes, 9), like.dtype), np.zeros((3, lanes, 3), like.dtype)
-    return Pull(grus[0], grus[1], grus[2], positions[0], positions[1], positions[2])
+def _rollback(
+    net: Net, ahead: Net, made: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, steps: Index, at: Index,
+    stride: Index, slots: Index, work: Floats, positions: Floats,
+) -> None:  # fmt: skip
+    """One model, whose lanes begin at `at` in flat gnss and pulls, and a step later `stride` further on."""
+    unpack(net)
+    made.padded[:] = 0.0
+    lanes, recompute = tape.lanes, tape.fields[on.CORRECTED, 2] == 0
+    pull, inner = _nothing(lanes, work, positions)
+    for t in range(steps - 1, -1, -1):
+        tape.now[0], tape.now[1] = t % slots, t
+        given = window(pulls, at + t * stride, lanes, THREE)
+        for b in range(lanes):
+            for i in range(3):
+                pull.x[b, i] += given[b, i]
+        if recompute:
+            _again(ahead, tape)
+        _step(net, ahead, window(gnss, at + t * stride, lanes, THREE), pull, tape, deltas, inner)
+        if t % slots == 0:
+            _collect(made, tape, deltas, min(slots, steps - t))
+    pack(made)
 
 
 @compiled
-def _collect(gradient: Net, tape: Tape, deltas: Tape, t: int, count: int) -> None:
-    """Add what the steps t..t + count - 1 contribute to the gradient of every weight and bias."""
+def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Pull, Inner]:
+    """No gradient yet, in this memory, and room for those within a step."""
+    wide, size, step = np.int64(PAD), lanes * PAD, lanes * THREE
+    work[:], positions[:] = 0.0, 0.0
+    pull = Pull(window(work, ZERO, lanes, wide), window(work, size, lanes, wide), window(work, 2 * size, lanes, wide),
+                window(positions, ZERO, lanes, THREE), window(positions, step, lanes, THREE),
+                window(positions, 2 * step, lanes, THREE))  # fmt: skip
+    inner = Inner(
+        window(work, 3 * size, lanes, wide), window(work, 4 * size, lanes, wide), window(work, 5 * size, lanes, wide),
+        window(work, 6 * size, lanes, wide), window(work, 7 * size, lanes, wide), window(work, 8 * size, lanes, wide),
+        window(work, 9 * size, lanes, wide), window(work, 10 * size, lanes, 4 * wide),
+    )  # fmt: skip
+    return pull, inner
+
+
+@compiled
+def _again(net: Net, tape: Tape) -> None:
+    """The outputs of the wide layers at the present step, and what stands beside them."""
+    moved, seen, wide = rows(tape, on.PRIOR_IN), rows(tape, on.INNOVATION_IN), net.layers[on.UPDATE, 2]
+    layer(net, on.UPDATE, tape, rows(tape, on.CORRECTED), on.FIRST)
+    layer(net, on.EVOLUTION, tape, moved, on.FIRST)
+    layer(net, on.OBSERVATION, tape, seen, on.FIRST)
+    layer(net, on.HIDDEN, tape, rows(tape, on.HIDDEN_OUT), on.FIRST)
+    layer(net, on.EXPECTED, tape, seen, 2 * wide)
+    blend(tape, on.PROCESS_OLD, on.PROCESS_GATES, moved, wide)
+
+
+@compiled
+def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
+    """Add what `count` steps from the present one on contribute to the gradient of every weight and bias.
+
+    The matrix of a layer with more outputs than inputs is turned: the longer axis runs along the vectors.
+    """
+    one = np.ones((count * tape.lanes, 1), gradient.padded.dtype)
     for name in range(len(gradient.layers)):
-        delta = span(deltas, name, 0, count)
-        add_product(delta.T, span(tape, name, t, count), weight(gradient, name))
-        constant = bias(gradient, name)
-        for row in range(delta.shape[0]):
-            for j in range(delta.shape[1]):
-                constant[j] += delta[row, j]
+        outputs, inputs = gradient.layers[name, 2], gradient.layers[name, 3]
+        given, at = span(tape, gradient.layers[name, 7], count), gradient.layers[name, 8]
+        delta, column = span(deltas, gradient.layers[name, 9], count), gradient.layers[name, 10]
+        if gradient.turned[name]:
+            add_outer(given, at, inputs, delta, column, matrix(gradient, name))
+        else:
+            add_outer(delta, column, outputs, given, at, matrix(gradient, name))
+        add_outer(lent(one), ZERO, ONE, delta, column, bias(gradient, name))
 
 
 @compiled
-def _step(net: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, t: int, work: Floats) -> None:
-    """Back over step t: `pull` becomes the gradient with respect to the state before it."""
-    surprise, back_in, posterior_in = rows(tape, SURPRISE, t), rows(tape, BACK, t), rows(tape, POSTERIOR, t)
-    seen, moved = rows(tape, INNOVATION_X, t), rows(tape, PRIOR_X, t)
-    lanes, gain = tape.lanes, rows(deltas, GAIN, t)
-    grus, in_surprise = np.zeros((4, lanes, 9), work.dtype), np.zeros((lanes, 3), work.dtype)
-    process, prior, innovation, posterior = grus[0], grus[1], grus[2], grus[3]
-    for b in range(lanes):
-        gone = missing(gnss, b)
-        for j in range(9):
-            gain[b, j] = 0.0 if gone else pull.x[b, j // 3] * surprise[b, j % 3]
-        if not gone:
-            for j in range(9):
-                process[b, j], posterior[b, j] = pull.process[b, j], pull.prior[b, j]
-                innovation[b, j] = pull.innovation[b, j]
-                in_surprise[b, j % 3] += back_in[b, 9 + j] * pull.x[b, j // 3]
+def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
+    """Back over a step: `pull` becomes the gradient with respect to the state before it."""
+    gain = _room(net, on.GAIN, deltas)
+    _begin(gnss, pull, tape, inner, gain, _room(net, on.POSTERIOR, deltas))
+    _gate(net, on.POSTERIOR, tape, on.CORE, on.BACK, deltas)
+    _add(net, on.POSTERIOR, deltas, on.SECOND, inner.prior)
+    _add(net, on.BACK, deltas, on.FIRST, inner.innovation)
+    _add(net, on.BACK, deltas, on.SECOND, gain)
+    _gate(net, on.GAIN, tape, on.HIDDEN_OUT, on.HIDDEN, deltas)
+    _add(net, on.HIDDEN, deltas, on.FIRST, inner.prior)
+    _add(net, on.HIDDEN, deltas, on.SECOND, inner.innovation)
 
-    _active(posterior, 0, rows(tape, POSTERIOR_OUT, t), 0, rows(deltas, POSTERIOR, t))
-    both = _through(net, POSTERIOR, deltas, t, work)
-    _add(both, 0, prior)
-    _active(both, 9, posterior_in, 9, rows(deltas, BACK, t))
-    both = _through(net, BACK, deltas, t, work)
-    _add(both, 0, innovation)
-    _add(both, 9, gain)
-    _active(_through(net, GAIN, deltas, t, work), 0, rows(tape, GAIN, t), 0, rows(deltas, HIDDEN, t))
-    both = _through(net, HIDDEN, deltas, t, work)
-    _add(both, 0, prior)
-    _add(both, 9, innovation)
+    _gru(net, on.INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION_GATES, inner.innovation, inner.gates, tape, deltas)
+    _gate(net, on.INNOVATION_X, tape, on.INNOVATION_IN, on.OBSERVATION, deltas)
+    _add(net, on.EXPECTED, deltas, on.FIRST, inner.prior)
+    _gru(net, on.PRIOR_X, on.PRIOR_OLD, on.PRIOR_GATES, inner.prior, inner.gates, tape, deltas)
+    _gate(net, on.PRIOR_X, tape, on.PRIOR_IN, on.EVOLUTION, deltas)
+    _add(net, on.PRIOR_X, deltas, net.layers[on.UPDATE, 2], inner.process)
+    _gru(net, on.PROCESS_X, on.PROCESS_OLD, on.PROCESS_GATES, inner.process, inner.gates, tape, deltas)
+    _gate(net, on.PROCESS_X, tape, on.CORRECTED, on.UPDATE, deltas)
+    _end(net, ahead, gnss, pull, tape, deltas, inner)
 
-    given = _gru(net, INNOVATION_X, INNOVATION_GATES, innovation, tape, deltas, t, work)
-    _active(given, 0, seen, 0, rows(deltas, EXPECTED, t))
-    _active(given, 9, seen, 9, rows(deltas, OBSERVATION, t))
-    _add(_through(net, EXPECTED, deltas, t, work), 0, prior)
-    given = _gru(net, PRIOR_X, PRIOR_GATES, prior, tape, deltas, t, work)
-    _add(given, 0, process)
-    _active(given, 9, moved, 9, rows(deltas, EVOLUTION, t))
-    given = _gru(net, PROCESS_X, PROCESS_GATES, process, tape, deltas, t, work)
-    _active(given, 0, rows(tape, PROCESS_X, t), 0, rows(deltas, UPDATE, t))
 
-    observed, evolved, updated = rows(tape, OBSERVATION, t), rows(tape, EVOLUTION, t), rows(tape, UPDATE, t)
-    lengths = rows(tape, LENGTHS, t)
-    out = _through(net, OBSERVATION, deltas, t, work)
-    _turn(out, 3, observed, lengths, 1, 7)
-    for b in range(lanes):
-        for i in range(3):
-            in_surprise[b, i] += out[b, 3 + i]
-    in_evolution = _through(net, EVOLUTION, deltas, t, work)
-    _turn(in_evolution, 0, evolved, lengths, 2, 3)
-    in_update = _through(net, UPDATE, deltas, t, work[in_evolution.size :])
-    _turn(in_update, 0, updated, lengths, 3, 3)
-    for b in range(lanes):
+@compiled
+def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, posterior: Floats) -> None:
+    """Gradients of what a step gives: new states, K and innovation by x = x_prior + K (z - x_prior), posterior.
+
+    None of them where there is no fix, so that all further ones of that lane are zero.
+    """
+    core, lengths, posterior_out = rows(tape, on.CORE), rows(tape, on.LENGTHS), rows(tape, on.POSTERIOR_OUT)
+    zero = core.dtype.type(0.0)
+    for b in range(tape.lanes):
         gone = missing(gnss, b)
         for i in range(3):
-            if gone:
+            along = zero
+            for j in range(3):
+                gain[b, 3 * i + j] = zero if gone else pull.x[b, i] * lengths[b, on.SURPRISE + j]
+                along += core[b, on.CORE_GAIN + 3 * j + i] * pull.x[b, j]
+            inner.surprise[b, i] = zero if gone else along
+        for j in range(PAD):
+            inner.process[b, j] = zero if gone else pull.process[b, j]
+            inner.innovation[b, j] = zero if gone else pull.innovation[b, j]
+            inner.prior[b, j] = zero
+        for j in range(PAD):
+            posterior[b, j] = zero if gone or posterior_out[b, j] <= zero else pull.prior[b, j]
+
+
+@compiled
+def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
+    """Gradients of the four changes, and `pull` before the step; without a fix only x and x_before were moved on."""
+    wide = net.layers[on.UPDATE, 2]
+    dots(_room(net, on.OBSERVATION, deltas), 2 * wide, matrix(ahead, on.OBSERVATION), THREE, inner.observed)
+    dots(_room(net, on.EVOLUTION, deltas), wide, matrix(ahead, on.EVOLUTION), ZERO, inner.evolved)
+    dots(_room(net, on.UPDATE, deltas), wide, matrix(ahead, on.UPDATE), ZERO, inner.updated)
+    features, lengths = rows(tape, on.FEATURES), rows(tape, on.LENGTHS)
+    for b in range(tape.lanes):
+        _turn(features, lengths, b, ONE, inner.observed)
+        _turn(features, lengths, b, TWO, inner.evolved)
+        _turn(features, lengths, b, THREE, inner.updated)
+        if missing(gnss, b):
+            for i in range(3):
                 pull.x[b, i] += pull.x_before[b, i]
                 pull.x_before[b, i] = 0.0
-            else:
-                pull.x[b, i] += (
-                    pull.prior_before[b, i] - in_surprise[b, i] + pull.x_before[b, i]
-                    + in_evolution[b, i] + in_update[b, i]
-                )
-                pull.x_before[b, i], pull.prior_before[b, i] = -in_evolution[b, i], -in_update[b, i]
-        if not gone:
-            for j in range(9):
-                pull.process[b, j], pull.prior[b, j] = process[b, j], prior[b, j]
-                pull.innovation[b, j] = innovation[b, j]
+            continue
+        for i in range(3):
+            evolved, updated = inner.evolved[b, i], inner.updated[b, i]
+            in_surprise = inner.surprise[b, i] + inner.observed[b, i]
+            pull.x[b, i] += pull.prior_before[b, i] + pull.x_before[b, i] - in_surprise + evolved + updated
+            pull.x_before[b, i], pull.prior_before[b, i] = -evolved, -updated
+        for j in range(9):
+            pull.process[b, j], pull.prior[b, j] = inner.process[b, j], inner.prior[b, j]
+            pull.innovation[b, j] = inner.innovation[b, j]
 
 
 @compiled
-def _through(net: Net, name: int, deltas: Tape, t: int, work: Floats) -> Floats:
-    """Gradient (B, inputs) of what a layer reads, in the memory `work`."""
-    weights = weight(net, name)
-    out = work[: deltas.lanes * weights.shape[1]].reshape(deltas.lanes, weights.shape[1])
-    out[:] = 0.0
-    add_product(rows(deltas, name, t), weights, out)
-    return out
+def _turn(features: Floats, lengths: Floats, b: Index, which: Index, values: Floats) -> None:
+    """Gradient of a change, in place, from that of its direction and of the logarithm of its length."""
+    real, at = values.dtype.type, on.CHANGES[which, 0]
+    u, v, w = features[b, at], features[b, at + 1], features[b, at + 2]
+    p, q, r = values[b, 0], values[b, 1], values[b, 2]
+    length, along = lengths[b, which], u * p + v * q + w * r
+    scale = real(0.0) if length <= real(SHORTEST) else real(1.0) / length
+    in_length = values[b, 3] / (length + real(LOG_FLOOR)) - along * scale
+    values[b, 0], values[b, 1] = p * scale + u * in_length, q * scale + v * in_length
+    values[b, 2] = r * scale + w * in_length
 
 
 @compiled
-def _active(values: Floats, at: int, reached: Floats, column: int, out: Floats) -> None:
-    """out (B, n) = the columns of values from `at` on where those of `reached` from `column` on are positive, or 0."""
-    zero = values.dtype.type(0.0)
-    for b in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[b, j] = values[b, at + j] if reached[b, column + j] > zero else zero
+def _room(net: Net, name: Index, deltas: Tape) -> Floats:
+    """The field where the gradient of a layer's outputs stands."""
+    return rows(deltas, net.layers[name, 9])
 
 
 @compiled
-def _add(values: Floats, at: int, out: Floats) -> None:
-    """out (B, n) += the columns of values from `at` on."""
-    for b in range(out.shape[0]):
-        for j in range(out.shape[1]):
-            out[b, j] += values[b, at + j]
+def _add(net: Net, name: Index, deltas: Tape, at: Index, out: Floats) -> None:
+    """Add to out (B, PAD) the gradient of a layer's inputs from input `at` on."""
+    add_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name), at, out)
+
+
+@compiled
+def _gate(net: Net, name: Index, tape: Tape, reached: Index, below: Index, deltas: Tape) -> None:
+    """The gradient of a layer's inputs, where these are positive, as that of the outputs of the layer below."""
+    gated_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name),
+                  rows(tape, reached), _room(net, below, deltas))  # fmt: skip
 
 
 @compiled
 def _gru(
-    net: Net, name: int, gates_name: int, after: Floats, tape: Tape, deltas: Tape, t: int, work: Floats
-) -> Floats:
-    """Gradient of a GRU's input, in `work`; `after` (B, 9), that of its new state, becomes that of its old one."""
-    one = work.dtype.type(1.0)
-    before, gates = rows(tape, name + 1, t), rows(tape, gates_name, t)
-    given, kept = rows(deltas, name, t), rows(deltas, name + 1, t)
+    net: Net, name: Index, old: Index, gates_name: Index, after: Floats, work: Floats, tape: Tape, deltas: Tape
+) -> None:
+    """Gradients of a GRU's X and H; `after` (B, PAD), that of its new state, becomes its part in the old one's."""
+    one, before, gates = after.dtype.type(1.0), rows(tape, old), rows(tape, gates_name)
+    given, kept = _room(net, name, deltas), _room(net, name + 1, deltas)
     for b in range(tape.lanes):
-        for j in range(9):
-            reset, keep, fresh = gates[b, j], gates[b, 9 + j], gates[b, 18 + j]
+        for j in range(PAD):
+            reset, keep, fresh = gates[b, j], gates[b, on.KEEP + j], gates[b, on.FRESH + j]
             in_fresh = after[b, j] * (one - keep) * (one - fresh * fresh)
-            given[b, j] = kept[b, j] = in_fresh * gates[b, 27 + j] * reset * (one - reset)
-            given[b, 9 + j] = kept[b, 9 + j] = after[b, j] * (before[b, j] - fresh) * keep * (one - keep)
-            given[b, 18 + j], kept[b, 18 + j] = in_fresh, in_fresh * reset
+            work[b, j] = in_fresh * gates[b, on.KEPT + j] * reset * (one - reset)
+            work[b, on.KEEP + j] = after[b, j] * (before[b, j] - fresh) * keep * (one - keep)
+            work[b, on.FRESH + j], work[b, on.KEPT + j] = in_fresh, in_fresh * reset
             after[b, j] *= keep
-    _add(_through(net, name + 1, deltas, t, work), 0, after)
-    return _through(net, name, deltas, t, work)
-
-
-@compiled
-def _turn(values: Floats, at: int, features: Floats, lengths: Floats, which: int, log: int) -> None:
-    """Gradient of a direction in values[:, at : at + 3], and of its length's logarithm, into that of the vector."""
-    real = values.dtype.type
-    for b in range(values.shape[0]):
-        length, along = lengths[b, which], real(0.0)
-        for i in range(3):
-            along += features[b, at + i] * values[b, at + i]
-        scale = real(0.0) if length <= real(EPS) else real(1.0) / length
-        in_length = values[b, log] / (length + real(FLOOR)) if values.shape[1] > log else real(0.0)
-        for i in range(3):
-            unit = features[b, at + i]
-            values[b, at + i] = (values[b, at + i] - unit * along) * scale + unit * in_length
+        for j in range(PAD):
+            given[b, j] = kept[b, j] = work[b, j]
+        for j in range(PAD):
+            given[b, 9 + j] = kept[b, 9 + j] = work[b, on.KEEP + j]
+        for j in range(PAD):
+            given[b, 18 + j], kept[b, 18 + j] = work[b, on.FRESH + j], work[b, on.KEPT + j]
+    _add(net, name + 1, deltas, on.FIRST, after)

@@ -8,21 +8,15 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints
 
-from .arithmetic import Net, Tape, add_product, bias, compiled, opened, rows, sigmoid, tanh, turned
-
-UPDATE, EVOLUTION, OBSERVATION, PROCESS_X, PROCESS_H, PRIOR_X, PRIOR_H, EXPECTED, INNOVATION_X, INNOVATION_H = range(10)
-HIDDEN, GAIN, BACK, POSTERIOR = range(10, 14)
-"""The layers (of a GRU, X reads its input and H its state), and the fields of the tape with what they read."""
-POSTERIOR_OUT, PROCESS_GATES, PRIOR_GATES, INNOVATION_GATES, LENGTHS, SURPRISE = range(14, 20)
-"""The other fields of the tape; gates are r, z, n and the part of n that r scales."""
-EPS = 1e-12
-"""Least length that has a direction, m."""
-FLOOR = 0.01
-"""Added to a length before its logarithm is taken, m."""
+from ..nets.gain_net import LOG_FLOOR, SHORTEST
+from . import places as on
+from .arithmetic import PAD, THREE, ZERO, Index, aligned, compiled, kernel, lent, sigmoid, tanh, window
+from .product import affine, spread
+from .tape import Net, Tape, bias, matrix, rows, unpack
 
 
 class State(NamedTuple):
-    """`net.Memory` for the B lanes of one model, changed in place."""
+    """`net.Memory` for the B lanes of one model, changed in place; the GRU states have PAD columns."""
 
     process: Floats
     prior: Floats
@@ -41,150 +35,167 @@ class Seen(NamedTuple):
     dt: float
 
 
-@compiled
+@kernel
 def forward(
-    theta: Floats, layers: Ints, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, memory: Floats, fields: Ints,
-    x: Floats, first: int, last: int,
+    theta: Floats, padded: Floats, layers: Ints, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, kept: Floats,
+    fields: Ints, size: Index, keep: Index, x: Floats, first: Index, last: Index,
 ) -> None:  # fmt: skip
-    """Estimates x (T, S, B, 3) m of the models first..last - 1, and their tape.
+    """Estimates x (T, S, B, 3) m of the models first..last - 1, and what backward needs of their tape.
 
     Args:
-        theta: (S, P). layers: as in `Net`. gnss, velocity: (T, S, B, 3). x0: (S, B, 3) m. dt: (T,) s.
-        memory: (S, size) of the tape. fields: as in `Tape`.
+        theta: (S, P). padded: (S, .) for the matrices. layers: as in `Net`. gnss, velocity: (T, S, B, 3) m, m/s.
+        x0: (S, B, 3) m. dt: (T,) s. kept: (S, .) of the tape. fields: as in `Tape`. size: of its memory that is not
+            kept. keep: 1 keeps all steps, 0 the last.
     """
+    _, models, lanes, _ = gnss.shape
+    turned, now = layers[:, 2] > 0, np.zeros(2, np.int64)
+    work, passing = aligned(2 * lanes * on.GATES, x), aligned(size, x)
+    grus, positions = aligned(3 * lanes * PAD, x), np.empty(4 * lanes * 3, x.dtype)
+    fixes, speeds, starts, made = gnss.reshape(-1), velocity.reshape(-1), x0.reshape(-1), x.reshape(-1)
     for s in range(first, last):
-        net, tape, state = opened(theta[s], layers), Tape(memory[s], fields, x0.shape[1]), _start(x0[s])
-        work = np.empty(2 * x0.shape[1] * layers[:, 2].max(), x.dtype)
-        for t in range(len(x)):
-            seen = Seen(gnss[t, s], velocity[t, s], dt[t])
-            _look(seen, state, tape, t)
-            _think(net, state, tape, t, work)
-            _move(seen, state, tape, t)
-            x[t, s] = state.x
+        net = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(turned))
+        tape = Tape(lent(passing), lent(kept[s]), lent(fields), lent(now), lanes)
+        _rollout(net, tape, fixes, speeds, window(starts, s * lanes * 3, lanes, THREE), dt, made, s * lanes * 3,
+                 models * lanes * 3, keep, work, grus, positions)  # fmt: skip
 
 
 @compiled
-def _start(x0: Floats) -> State:
-    """The state before the first step: GRU states I, 0, I, all positions x0 (B, 3) m."""
-    grus = np.zeros((3, len(x0), 9), x0.dtype)
-    for axis in range(3):
-        grus[::2, :, 4 * axis] = 1.0
-    return State(grus[0], grus[1], grus[2], x0.copy(), x0.copy(), x0.copy(), x0.copy())
+def _rollout(
+    net: Net, tape: Tape, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, x: Floats, at: Index, stride: Index,
+    keep: Index, work: Floats, grus: Floats, positions: Floats,
+) -> None:  # fmt: skip
+    """One model, whose lanes begin at `at` in flat gnss, velocity and x, and a step later `stride` further on."""
+    unpack(net)
+    lanes, wide, logs, scratch = tape.lanes, net.layers[on.UPDATE, 2], net.layers[on.UPDATE, 3] > 3, lent(work)
+    state = _start(x0, grus, positions)
+    for t in range(len(dt)):
+        tape.now[1] = t * keep
+        seen = Seen(window(gnss, at, lanes, THREE), window(velocity, at, lanes, THREE), dt[t])
+        _look(seen, state, tape, logs)
+        _think(net, state, tape, scratch)
+        _move(seen, state, tape, wide, window(x, at, lanes, THREE))
+        at += stride
 
 
 @compiled
-def missing(gnss: Floats, b: int) -> bool:
+def _start(x0: Floats, grus: Floats, positions: Floats) -> State:
+    """The state before the first step, in this memory: GRU states I, 0, I, all positions x0 (B, 3) m."""
+    lanes, wide = len(x0), np.int64(PAD)
+    grus[:] = 0.0
+    size, step = lanes * wide, lanes * THREE
+    state = State(
+        window(grus, ZERO, lanes, wide), window(grus, size, lanes, wide), window(grus, 2 * size, lanes, wide),
+        window(positions, ZERO, lanes, THREE), window(positions, step, lanes, THREE),
+        window(positions, 2 * step, lanes, THREE), window(positions, 3 * step, lanes, THREE),
+    )  # fmt: skip
+    for b in range(lanes):
+        for i in range(3):
+            state.process[b, 4 * i] = state.innovation[b, 4 * i] = 1.0
+            state.x[b, i] = state.x_before[b, i] = state.prior_before[b, i] = state.gnss_before[b, i] = x0[b, i]
+    return state
+
+
+@compiled
+def missing(gnss: Floats, b: Index) -> bool:
     """Whether lane b of gnss (B, 3) has no fix."""
     return bool(np.isnan(gnss[b, 0]) and np.isnan(gnss[b, 1]) and np.isnan(gnss[b, 2]))
 
 
 @compiled
-def _look(seen: Seen, state: State, tape: Tape, t: int) -> None:
+def _look(seen: Seen, state: State, tape: Tape, logs: bool) -> None:
     """The four changes as the layers read them, their lengths, and the innovation; a missing fix repeats the last."""
-    real = state.x.dtype.type
-    updated, evolved, observed = rows(tape, UPDATE, t), rows(tape, EVOLUTION, t), rows(tape, OBSERVATION, t)
-    lengths, surprise = rows(tape, LENGTHS, t), rows(tape, SURPRISE, t)
+    real, features, lengths = state.x.dtype.type, rows(tape, on.FEATURES), rows(tape, on.LENGTHS)
     for b in range(tape.lanes):
         gone = missing(seen.gnss, b)
         for i in range(3):
             fix = state.gnss_before[b, i] if gone else seen.gnss[b, i]
-            surprise[b, i] = fix - (state.x[b, i] + seen.dt * seen.velocity[b, i])
-            observed[b, i] = fix - state.gnss_before[b, i]
-            observed[b, 3 + i] = surprise[b, i]
-            evolved[b, i] = state.x[b, i] - state.x_before[b, i]
-            updated[b, i] = state.x[b, i] - state.prior_before[b, i]
-        lengths[b, 0], lengths[b, 1] = _unit(observed, b, 0), _unit(observed, b, 3)
-        lengths[b, 2], lengths[b, 3] = _unit(evolved, b, 0), _unit(updated, b, 0)
-        if updated.shape[1] > 3:
-            observed[b, 6] = np.log(lengths[b, 0] + real(FLOOR))
-            observed[b, 7] = np.log(lengths[b, 1] + real(FLOOR))
-            evolved[b, 3] = np.log(lengths[b, 2] + real(FLOOR))
-            updated[b, 3] = np.log(lengths[b, 3] + real(FLOOR))
+            features[b, i] = fix - state.gnss_before[b, i]
+            features[b, 3 + i] = fix - (state.x[b, i] + seen.dt * seen.velocity[b, i])
+            features[b, 8 + i] = state.x[b, i] - state.x_before[b, i]
+            features[b, 12 + i] = state.x[b, i] - state.prior_before[b, i]
+            lengths[b, on.SURPRISE + i] = features[b, 3 + i]
+        for which in range(4):
+            at, log = on.CHANGES[which]
+            u, v, w = features[b, at], features[b, at + 1], features[b, at + 2]
+            length = np.sqrt(u * u + v * v + w * w)
+            scale = real(0.0) if length <= real(SHORTEST) else real(1.0) / length
+            features[b, at], features[b, at + 1], features[b, at + 2] = u * scale, v * scale, w * scale
+            features[b, log] = np.log(length + real(LOG_FLOOR)) if logs else real(0.0)
+            lengths[b, which] = length
 
 
 @compiled
-def _unit(v: Floats, b: int, at: int) -> float:
-    """Divide the vector v[b, at : at + 3] by its length and give the length; what has no direction becomes zero."""
-    real = v.dtype.type
-    length = np.sqrt(v[b, at] * v[b, at] + v[b, at + 1] * v[b, at + 1] + v[b, at + 2] * v[b, at + 2])
-    scale = real(0.0) if length <= real(EPS) else real(1.0) / length
-    for i in range(at, at + 3):
-        v[b, i] *= scale
-    return length  # type: ignore[no-any-return]
-
-
-@compiled
-def _think(net: Net, state: State, tape: Tape, t: int, work: Floats) -> None:
+def _think(net: Net, state: State, tape: Tape, work: Floats) -> None:
     """The net itself, from features to gain and posterior, all on the tape."""
-    moved, seen, prior = rows(tape, PRIOR_X, t), rows(tape, INNOVATION_X, t), rows(tape, EXPECTED, t)
-    pair, back_in, posterior_in = rows(tape, HIDDEN, t), rows(tape, BACK, t), rows(tape, POSTERIOR, t)
-    _relu(_layer(net, UPDATE, tape, t, work), rows(tape, PROCESS_X, t), 0)
-    _relu(_layer(net, EVOLUTION, tape, t, work), moved, 9)
-    _relu(_layer(net, OBSERVATION, tape, t, work), seen, 9)
-
-    _gru(net, PROCESS_X, PROCESS_GATES, state.process, tape, t, work, moved)
-    _gru(net, PRIOR_X, PRIOR_GATES, state.prior, tape, t, work, prior)
-    _relu(_layer(net, EXPECTED, tape, t, work), seen, 0)
-    _gru(net, INNOVATION_X, INNOVATION_GATES, state.innovation, tape, t, work, back_in)
+    wide, core, back = net.layers[on.UPDATE, 2], rows(tape, on.CORE), window(work, ZERO, tape.lanes, np.int64(PAD))
+    moved, seen = rows(tape, on.PRIOR_IN), rows(tape, on.INNOVATION_IN)
+    layer(net, on.UPDATE, tape, rows(tape, on.CORRECTED), on.FIRST)
+    layer(net, on.EVOLUTION, tape, moved, on.FIRST)
+    layer(net, on.OBSERVATION, tape, seen, on.FIRST)
+    _gru(net, on.PROCESS_X, on.PROCESS_OLD, on.PROCESS_GATES, state.process, tape, work, moved, wide)
+    _gru(net, on.PRIOR_X, on.PRIOR_OLD, on.PRIOR_GATES, state.prior, tape, work, core, on.CORE_PRIOR)
+    layer(net, on.EXPECTED, tape, seen, 2 * wide)
+    _gru(net, on.INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION_GATES, state.innovation, tape, work, core,
+         on.CORE_INNOVATION)  # fmt: skip
+    layer(net, on.HIDDEN, tape, rows(tape, on.HIDDEN_OUT), on.FIRST)
+    layer(net, on.GAIN, tape, core, on.CORE_GAIN)
+    layer(net, on.BACK, tape, back, on.FIRST)
     for b in range(tape.lanes):
         for j in range(9):
-            pair[b, j] = posterior_in[b, j] = prior[b, j]
-            pair[b, 9 + j] = back_in[b, j]
-
-    _relu(_layer(net, HIDDEN, tape, t, work), rows(tape, GAIN, t), 0)
-    gain = _layer(net, GAIN, tape, t, work)
-    for b in range(tape.lanes):
-        for j in range(9):
-            back_in[b, 9 + j] = gain[b, j]
-    _relu(_layer(net, BACK, tape, t, work), posterior_in, 9)
-    _relu(_layer(net, POSTERIOR, tape, t, work), rows(tape, POSTERIOR_OUT, t), 0)
+            core[b, j] = back[b, j]
+    layer(net, on.POSTERIOR, tape, rows(tape, on.POSTERIOR_OUT), on.FIRST)
 
 
 @compiled
-def _layer(net: Net, name: int, tape: Tape, t: int, work: Floats) -> Floats:
-    """(B, outputs) of a layer, in the memory `work`."""
-    constant = bias(net, name)
-    out = work[: tape.lanes * len(constant)].reshape(tape.lanes, len(constant))
-    for b in range(tape.lanes):
-        for j in range(len(constant)):
-            out[b, j] = constant[j]
-    add_product(rows(tape, name, t), turned(net, name), out)
-    return out
+def layer(net: Net, name: Index, tape: Tape, out: Floats, at: Index) -> None:
+    """What a layer makes of its window of the tape, into out (B, n) from column `at` on, with padding."""
+    inputs, relu, field, column = net.layers[name, 3], net.layers[name, 6], net.layers[name, 7], net.layers[name, 8]
+    affine(rows(tape, field), column, inputs, matrix(net, name), bias(net, name), relu > 0, out, at)
 
 
 @compiled
-def _relu(values: Floats, out: Floats, at: int) -> None:
-    """max(values, 0) into the columns of out from `at` on; NaN stays NaN."""
-    zero = values.dtype.type(0.0)
-    for b in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            out[b, at + j] = zero if values[b, j] < zero else values[b, j]
+def _gru(
+    net: Net, name: Index, old: Index, gates_name: Index, state: Floats, tape: Tape, work: Floats, out: Floats,
+    at: Index,
+) -> None:  # fmt: skip
+    """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h <- n + z (h - n), biases in W and U; h from column `at` on.
 
-
-@compiled
-def _gru(net: Net, name: int, gates_name: int, state: Floats, tape: Tape, t: int, work: Floats, out: Floats) -> None:
-    """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h <- n + z (h - n), biases in W and U; into out[:, :9]."""
-    real = work.dtype.type
-    before, gates = rows(tape, name + 1, t), rows(tape, gates_name, t)
+    Loops run over PAD columns, more than the nine that count, because loops of such a length vectorise.
+    """
+    real, before, gates = work.dtype.type, rows(tape, old), rows(tape, gates_name)
+    given, kept = window(work, ZERO, tape.lanes, on.GATES), window(work, tape.lanes * on.GATES, tape.lanes, on.GATES)
     for b in range(tape.lanes):
-        for j in range(9):
+        for j in range(PAD):
             before[b, j] = state[b, j]
-    given = _layer(net, name, tape, t, work)
-    kept = _layer(net, name + 1, tape, t, work[given.size :])
+    layer(net, name, tape, given, on.FIRST)
+    layer(net, name + 1, tape, kept, on.FIRST)
+    spread(given)
+    spread(kept)
     for b in range(tape.lanes):
-        for j in range(9):
+        for j in range(PAD):
             reset = sigmoid(given[b, j] + kept[b, j], real)
-            keep = sigmoid(given[b, 9 + j] + kept[b, 9 + j], real)
-            fresh = tanh(given[b, 18 + j] + reset * kept[b, 18 + j], real)
-            gates[b, j], gates[b, 9 + j], gates[b, 18 + j], gates[b, 27 + j] = reset, keep, fresh, kept[b, 18 + j]
-            out[b, j] = fresh + keep * (before[b, j] - fresh)
+            keep = sigmoid(given[b, on.KEEP + j] + kept[b, on.KEEP + j], real)
+            fresh = tanh(given[b, on.FRESH + j] + reset * kept[b, on.FRESH + j], real)
+            gates[b, j], gates[b, on.KEEP + j] = reset, keep
+            gates[b, on.FRESH + j], gates[b, on.KEPT + j] = fresh, kept[b, on.FRESH + j]
+    blend(tape, old, gates_name, out, at)
 
 
 @compiled
-def _move(seen: Seen, state: State, tape: Tape, t: int) -> None:
+def blend(tape: Tape, old: Index, gates_name: Index, out: Floats, at: Index) -> None:
+    """h <- n + z (h - n), the new state of a GRU, into out from column `at` on."""
+    before, gates = rows(tape, old), rows(tape, gates_name)
+    for b in range(tape.lanes):
+        for j in range(PAD):
+            fresh = gates[b, on.FRESH + j]
+            out[b, at + j] = fresh + gates[b, on.KEEP + j] * (before[b, j] - fresh)
+
+
+@compiled
+def _move(seen: Seen, state: State, tape: Tape, wide: Index, x: Floats) -> None:
     """x <- x_prior + K (z - x_prior) and the states of the GRUs; without a fix x <- x_prior and nothing else."""
-    surprise, back_in, moved = rows(tape, SURPRISE, t), rows(tape, BACK, t), rows(tape, PRIOR_X, t)
-    posterior = rows(tape, POSTERIOR_OUT, t)
+    lengths, core, moved = rows(tape, on.LENGTHS), rows(tape, on.CORE), rows(tape, on.PRIOR_IN)
+    posterior = rows(tape, on.POSTERIOR_OUT)
     for b in range(tape.lanes):
         gone = missing(seen.gnss, b)
         for i in range(3):
@@ -192,9 +203,32 @@ def _move(seen: Seen, state: State, tape: Tape, t: int) -> None:
             state.x[b, i] += seen.dt * seen.velocity[b, i]
             if not gone:
                 state.prior_before[b, i], state.gnss_before[b, i] = state.x[b, i], seen.gnss[b, i]
-                state.x[b, i] += (back_in[b, 9 + 3 * i] * surprise[b, 0] + back_in[b, 10 + 3 * i] * surprise[b, 1]
-                                  + back_in[b, 11 + 3 * i] * surprise[b, 2])  # fmt: skip
+                row = on.CORE_GAIN + 3 * i
+                state.x[b, i] += (core[b, row] * lengths[b, on.SURPRISE]
+                                  + core[b, row + 1] * lengths[b, on.SURPRISE + 1]
+                                  + core[b, row + 2] * lengths[b, on.SURPRISE + 2])  # fmt: skip
+            x[b, i] = state.x[b, i]
         if not gone:
             for j in range(9):
-                state.process[b, j], state.prior[b, j] = moved[b, j], posterior[b, j]
-                state.innovation[b, j] = back_in[b, j]
+                state.process[b, j], state.prior[b, j] = moved[b, wide + j], posterior[b, j]
+                state.innovation[b, j] = core[b, on.CORE_INNOVATION + j]
+
+
+@kernel
+def score(x: Floats, truth: Floats, pulls: Floats, losses: Floats) -> None:
+    """Squared errors (S,), mean over time and lanes, sum over components, and their gradient in x, pulls (T, S, B, 3).
+
+    Added in one order, so that a number does not depend on who is beside it.
+    """
+    steps, models, lanes, _ = x.shape
+    share = 1.0 / (steps * lanes)
+    scale = x.dtype.type(2.0 * share)
+    for s in range(models):
+        total = 0.0
+        for t in range(steps):
+            for b in range(lanes):
+                for i in range(3):
+                    error = x[t, s, b, i] - truth[t, s, b, i]
+                    pulls[t, s, b, i] = scale * error
+                    total += error * error
+        losses[s] = total * share

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -13,23 +14,19 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coopoc.arrays import AnyArray, Ints
+from coopoc.arrays import AnyArray
 from coopoc.errors import InputError
 
-from ..nets.gain_net import CELLS, SIZE, GainNet
+from ..nets.gain_net import GainNet
+from ..training.clients import Batch
 from ..training.machine import threads
 from . import backward as kernel_backward
 from . import forward as kernel_forward
+from .arithmetic import PAD
+from .layout import Plan, plan_of
 
-NAMES = ("update.weight", "evolution.weight", "observation.weight", "process.weight_ih", "process.weight_hh",
-         "prior.weight_ih", "prior.weight_hh", "prior_to_innovation.weight", "innovation.weight_ih",
-         "innovation.weight_hh", "gain_hidden.weight", "gain.weight", "posterior_hidden.weight",
-         "posterior.weight")  # fmt: skip
-"""The layers in the order of the kernels."""
-PRODUCT = 256
-"""Rows of one weight-gradient product, about as many as stay in the cache until it."""
-OTHER_WIDTHS = (CELLS, 4 * CELLS, 4 * CELLS, 4 * CELLS, 4, SIZE)
-"""Of the fields of the tape that the kernels name after what the layers read."""
+PRODUCT = 128
+"""Rows of one weight-gradient product, so few that they stay in the cache until it."""
 
 
 def rollout(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
@@ -51,11 +48,32 @@ def rollout(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: Te
     >>> rollout(torch.zeros(1, 19938), GainNet(), still, still, still[0], 0.1).abs().max().item()
     0.0
     """
-    seen = _checked(theta, like, gnss, velocity, x0, dt)
+    plan = plan_of(tuple(like.settings.items()))
+    seen = _checked(theta, plan.parameters, gnss, velocity, x0, dt)
     if theta.requires_grad and torch.is_grad_enabled():
-        x: Tensor = _Rollout.apply(theta, like, seen)  # type: ignore[no-untyped-call]
+        x: Tensor = _Rollout.apply(theta, plan, seen)  # type: ignore[no-untyped-call]
         return x
-    return torch.from_numpy(_forward(theta, like, seen, keep=False)[0])
+    return torch.from_numpy(_forward(theta, plan, seen, keep=False)[0])
+
+
+def loss_and_gradient(theta: Tensor, like: GainNet, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Squared error (S,) m^2, mean over time and batch, sum over components, and its gradient (S, P); as `rollout`.
+
+    It does without torch's graph, whose bookkeeping takes a fifth as long as one trajectory.
+
+    >>> still = torch.zeros(5, 1, 2, 3)
+    >>> loss_and_gradient(torch.zeros(1, 19938), GainNet(), Batch(still, still, still, still[0], 0.1))[0]
+    tensor([0.])
+    """
+    plan = plan_of(tuple(like.settings.items()))
+    seen = _checked(theta, plan.parameters, batch.gnss, batch.velocity, batch.x0, batch.dt)
+    truth = batch.truth.to(theta.dtype).contiguous().numpy()
+    if truth.shape != seen.gnss.shape:
+        raise InputError("truth", f"shape {truth.shape}", f"must be {seen.gnss.shape}", "Give one position per fix.")
+    x, padded, kept = _forward(theta, plan, seen, keep=True)
+    pulls, found = np.empty_like(x), np.empty(len(theta), x.dtype)
+    kernel_forward.score(x, truth, pulls, found)
+    return torch.from_numpy(found), _backward(theta, plan, seen.gnss, pulls, padded, kept)
 
 
 class _Seen(NamedTuple):
@@ -71,57 +89,51 @@ class _Rollout(torch.autograd.Function):
     """The kernels as one operation of torch."""
 
     @staticmethod
-    def forward(ctx: Any, theta: Tensor, like: GainNet, seen: _Seen) -> Tensor:
-        x, ctx.memory, ctx.fields = _forward(theta, like, seen, keep=True)
+    def forward(ctx: Any, theta: Tensor, plan: Plan, seen: _Seen) -> Tensor:
+        x, *ctx.left = _forward(theta, plan, seen, keep=True)
         ctx.save_for_backward(theta)
-        ctx.layers, ctx.gnss = _layers(like), seen.gnss
+        ctx.plan, ctx.gnss = plan, seen.gnss
         return torch.from_numpy(x)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, pulls: Tensor) -> tuple[Tensor, None, None]:
         (theta,) = ctx.saved_tensors
-        lanes, steps = ctx.gnss.shape[2], len(pulls)
-        fields, size = _table(ctx.layers[:, 2], lanes, min(steps, -(-PRODUCT // lanes)))
-        gradient, deltas = torch.empty_like(theta), np.empty((len(theta), size), ctx.memory.dtype)
-        _spread(kernel_backward.backward, len(theta), theta.detach().numpy(), ctx.layers, ctx.gnss,
-                pulls.contiguous().numpy(), ctx.memory, ctx.fields, deltas, fields, gradient.numpy())  # fmt: skip
-        return gradient, None, None
+        return _backward(theta, ctx.plan, ctx.gnss, pulls.contiguous().numpy(), *ctx.left), None, None
 
 
-def _forward(theta: Tensor, like: GainNet, seen: _Seen, keep: bool) -> tuple[AnyArray, AnyArray, Ints]:
-    """Estimates (T, S, B, 3), the memory (S, size) of the tape, which keeps every step or the last, and its table."""
-    layers, x = _layers(like), np.empty_like(seen.gnss)
-    widths = np.concatenate([layers[:, 3], OTHER_WIDTHS])
-    fields, size = _table(widths, x.shape[2], len(x) if keep else 1)
-    memory = np.empty((len(theta), size), x.dtype)
-    _spread(kernel_forward.forward, len(theta), theta.detach().numpy(), layers, *seen, memory, fields, x)
-    return x, memory, fields
+def _forward(theta: Tensor, plan: Plan, seen: _Seen, keep: bool) -> tuple[AnyArray, AnyArray, AnyArray]:
+    """Estimates (T, S, B, 3), and for backward matrices (S, .) and the tape (S, .) of all steps, or of the last."""
+    x, (steps, models, lanes, _) = np.empty_like(seen.gnss), seen.gnss.shape
+    tape = plan.tape(lanes, steps if keep else 1)
+    padded, kept = _aligned(models, plan.size, x.dtype), _aligned(models, tape.kept, x.dtype)
+    _spread(kernel_forward.forward, models, theta.detach().contiguous().numpy(), padded, plan.layers, *seen, kept,
+            tape.fields, tape.passing, int(keep), x)  # fmt: skip
+    return x, padded, kept
 
 
-def _table(widths: Ints, lanes: int, slots: int) -> tuple[Ints, int]:
-    """(fields, 3): where each begins, its width, its slots; and the size of all."""
-    ends = np.cumsum(lanes * widths * slots)
-    return np.stack([ends - lanes * widths * slots, widths, np.full_like(widths, slots)], axis=1), int(ends[-1])
+def _backward(
+    theta: Tensor, plan: Plan, gnss: AnyArray, pulls: AnyArray, padded: AnyArray, kept: AnyArray
+) -> Tensor:  # fmt: skip
+    """Gradient (S, P) from that of the estimates, `pulls` (T, S, B, 3)."""
+    (steps, models, lanes, _), gradient = pulls.shape, torch.empty_like(theta)
+    together = min(steps, -(-PRODUCT // lanes))
+    tape, deltas = plan.tape(lanes, steps, together), plan.deltas(lanes, together)
+    _spread(kernel_backward.backward, models, theta.detach().contiguous().numpy(), padded, plan.layers, gnss, pulls,
+            kept, tape.fields, tape.passing, deltas.fields, deltas.passing, together, gradient.numpy())  # fmt: skip
+    return gradient
 
 
-def _layers(like: GainNet) -> Ints:
-    """(layers, 4): where weight and bias begin in flat weights, outputs, inputs."""
-    return _known(tuple(like.settings.items()))
-
-
-@cache
-def _known(settings: tuple[tuple[str, Any], ...]) -> Ints:
-    begin, shapes, at = {}, {}, 0
-    for name, parameter in GainNet(**dict(settings)).named_parameters():
-        begin[name], shapes[name] = at, parameter.shape
-        at += parameter.numel()
-    return np.array([[begin[name], begin[name.replace("weight", "bias")], *shapes[name]] for name in NAMES])
+def _aligned(models: int, size: int, dtype: np.dtype[Any]) -> AnyArray:
+    """Memory (S, size) whose rows begin where a vector may begin."""
+    memory = np.empty(models * size + PAD, dtype)
+    first = -(memory.ctypes.data // memory.itemsize) % PAD
+    return memory[first : first + models * size].reshape(models, size)
 
 
 def _spread(kernel: Callable[..., None], models: int, *arguments: Any) -> None:
     """Run a kernel over all models, a share of them in each thread."""
-    shares = min(threads(), models)
+    shares = max(1, min(threads(), models))
     cuts = [models * share // shares for share in range(shares + 1)]
     if shares == 1:
         kernel(*arguments, 0, models)
@@ -136,20 +148,22 @@ def _pool(workers: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(workers, "rollout")
 
 
-def _checked(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> _Seen:
+os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads
+
+
+def _checked(theta: Tensor, parameters: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> _Seen:
     """The inputs as contiguous arrays of theta's dtype."""
     if theta.dtype not in (torch.float32, torch.float64) or theta.device.type != "cpu":
-        given = f"{theta.dtype} on {theta.device}"
-        raise InputError("theta", given, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
+        found = f"{theta.dtype} on {theta.device}"
+        raise InputError("theta", found, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
     steps, models, lanes = gnss.shape[:3]
-    count = sum(p.numel() for p in like.parameters())
-    wanted = {"theta": (theta, (models, count)), "gnss": (gnss, (steps, models, lanes, 3)),
-              "velocity": (velocity, gnss.shape), "x0": (x0, gnss.shape[1:])}  # fmt: skip
+    wanted = {"theta": (theta, (models, parameters)), "gnss": (gnss, (steps, models, lanes, 3)),
+              "velocity": (velocity, (steps, models, lanes, 3)), "x0": (x0, (models, lanes, 3))}  # fmt: skip
     for name, (array, shape) in wanted.items():
         if array.shape != shape:
-            raise InputError(name, f"shape {tuple(array.shape)}", f"must be {tuple(shape)}", "See rollout.")
-    spans = torch.as_tensor(dt, dtype=theta.dtype)
-    if spans.shape not in ((), (steps,)):
-        raise InputError("dt", f"shape {tuple(spans.shape)}", f"must be one number or ({steps},)", "Give s per step.")
+            raise InputError(name, f"shape {tuple(array.shape)}", f"must be {shape}", "See rollout.")
     fixes, speeds, start = (array.detach().to(theta.dtype).contiguous().numpy() for array in (gnss, velocity, x0))
-    return _Seen(fixes, speeds, start, spans.expand(steps).contiguous().numpy())
+    spans = np.asarray(dt, dtype=fixes.dtype)
+    if spans.shape not in ((), (steps,)):
+        raise InputError("dt", f"shape {spans.shape}", f"must be one number or ({steps},)", "Give s per step.")
+    return _Seen(fixes, speeds, start, spans + np.zeros(steps, spans.dtype))

@@ -101,6 +101,13 @@ class GainNet(Gain):
         errors = (estimates - batch.truth).square().sum(-1)
         return errors.movedim(0, -1).contiguous().mean(-1)  # in an order that does not depend on who is beside it
 
+    def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
+        if engine := _engine():
+            found: tuple[Tensor, Tensor] = engine.loss_and_gradient(theta, self, batch)
+            return found
+        return super().loss_and_gradient(theta, batch)
+
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
         from ..method import LearnedGain
@@ -160,7 +167,7 @@ class GainNet(Gain):
 
         Compiled where numba is installed; where the inputs need gradients, or lie on another device, by `reference`.
         """
-        theta = nn.utils.parameters_to_vector(self.parameters())
+        theta = torch.cat([p.view(-1) for p in self.parameters()])
         if any(a.requires_grad for a in (gnss, velocity, x0)) or theta.device.type != "cpu":
             return self.reference(gnss, velocity, x0, dt)
         lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)

@@ -20,7 +20,7 @@ from ..nets.gain import Gain
 from ..nets.stack import flatten, unflatten
 from .clients import Batch, Pieces, mirrored
 from .machine import one_core, watched
-from .schedule import Schedule, adamw, clip, cosine, generator
+from .schedule import Schedule, advance, cosine, generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,16 +153,12 @@ def descend(
             dice = [draws[r] for r in rows]
             batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), dice)
             batch = mirrored(batch, dice) if schedule.mirror else batch
-            mine, m, v = theta[rows], first[rows], second[rows]
-            losses[rows], gradient = like.loss_and_gradient(mine, batch)
-            finite = losses[rows].isfinite() & gradient.isfinite().all(1)
+            found, gradient = like.loss_and_gradient(theta if len(rows) == len(theta) else theta[rows], batch)
+            losses[rows] = found
+            rate = [rates[r][step] for r in rows]
+            finite = advance(theta, gradient, began, first, second, found, rows, step + 1, rate, schedule)
             stopped |= {r: f"loss or gradient not finite at step {step + 1}"
                         for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
-            rate = torch.tensor([[rates[r][step]] for r in rows], dtype=theta.dtype)
-            gradient = gradient + 2 * schedule.l2 * mine + schedule.proximal * (mine - began[rows])
-            adamw(mine, clip(gradient, schedule.clip), m, v, step + 1, rate, schedule.weight_decay)
-            good = torch.tensor(rows)[finite]
-            theta[good], first[good], second[good] = mine[finite], m[finite], v[finite]
         yield step + 1, losses
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
+from types import ModuleType
 from typing import Literal
 
 import numpy as np
@@ -95,6 +99,44 @@ def adamw(
     second.lerp_(gradient.square(), 0.001)
     size = (second / (1.0 - 0.999**step)).sqrt_().add_(1e-8)
     theta.addcdiv_(first * (-rate / (1.0 - 0.9**step)), size)
+
+
+def advance(
+    theta: Tensor, gradient: Tensor, began: Tensor, first: Tensor, second: Tensor, losses: Tensor,
+    rows: Sequence[int], step: int, rates: Sequence[float], schedule: Schedule,
+) -> Tensor:  # fmt: skip
+    """One optimiser step in place for `rows` of theta and moments (S, P); whether each could be taken, (R,) booleans.
+
+    The gradient of the penalties gamma ||theta||^2 + mu / 2 ||theta - began||^2 is added, the sum clipped, and AdamW
+    moves the weights; a row whose loss or gradient is not finite stays as it is. Compiled where numba is installed.
+
+    Args:
+        gradient, losses: (R, P) and (R,) of the rows. began: (S, P), where training started. step: >= 1.
+    """
+    if engine := _compiled():
+        finite = np.empty(len(rows), np.bool_)
+        engine.advance(*(a.numpy() for a in (theta, gradient, began, first, second, losses)), np.array(rows), step,
+                       np.array(rates), float(schedule.weight_decay), float(schedule.l2), float(schedule.proximal),
+                       float(schedule.clip), finite)  # fmt: skip
+        return torch.from_numpy(finite)
+    good = losses.isfinite() & gradient.isfinite().all(1)
+    at = torch.tensor(rows)[good]
+    mine, m, v = theta[at], first[at], second[at]
+    rate = torch.tensor(rates, dtype=theta.dtype)[good, None]
+    pulled = gradient[good] + 2 * schedule.l2 * mine + schedule.proximal * (mine - began[at])
+    adamw(mine, clip(pulled, schedule.clip), m, v, step, rate, schedule.weight_decay)
+    theta[at], first[at], second[at] = mine, m, v
+    return good
+
+
+@cache
+def _compiled() -> ModuleType | None:
+    """The compiled step; None where numba is missing."""
+    if find_spec("numba") is None:
+        return None
+    from ..engine import optimiser
+
+    return optimiser
 
 
 def generator(draw: np.random.Generator) -> torch.Generator:

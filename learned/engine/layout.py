@@ -1,0 +1,93 @@
+"""Where the compiled kernels find everything: the layers in theta and as matrices, the fields of the tape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coopoc.arrays import Bools, Ints
+
+from ..nets.gain_net import CELLS, GainNet
+from . import places as on
+from .arithmetic import PAD, Index, whole
+from .tape import room
+
+LAYERS: tuple[tuple[str, int, bool, Index, Index, int], ...] = (
+    ("update.weight", 0, True, on.FEATURES, 12, 0),
+    ("evolution.weight", 0, True, on.FEATURES, 8, 1),
+    ("observation.weight", 0, True, on.FEATURES, 0, 2),
+    ("process.weight_ih", 0, False, on.CORRECTED, 0, 3),
+    ("process.weight_hh", 0, False, on.PROCESS_OLD, 0, 4),
+    ("prior.weight_ih", CELLS, False, on.PRIOR_IN, 0, 5),
+    ("prior.weight_hh", 0, False, on.PRIOR_OLD, 0, 6),
+    ("prior_to_innovation.weight", 0, True, on.CORE, on.CORE_PRIOR, 2),
+    ("innovation.weight_ih", CELLS, False, on.INNOVATION_IN, 0, 7),
+    ("innovation.weight_hh", 0, False, on.INNOVATION_OLD, 0, 8),
+    ("gain_hidden.weight", 0, True, on.CORE, on.CORE_PRIOR, 9),
+    ("gain.weight", 0, False, on.HIDDEN_OUT, 0, 10),
+    ("posterior_hidden.weight", 0, True, on.CORE, on.CORE_INNOVATION, 11),
+    ("posterior.weight", CELLS, True, on.CORE, 0, 12),
+)
+"""The layers in the order of the kernels: how many of their inputs, the first ones, come last on the tape; whether a
+ReLU follows; field and first column of their inputs; and the field of the deltas for the gradient of their outputs."""
+
+
+class Layout(NamedTuple):
+    """`fields` of `tape.Tape`, and the lengths of its memory that is not kept and of what is kept."""
+
+    fields: Ints
+    passing: int
+    kept: int
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """For nets of one shape: the table of `tape.Net`, the lengths of theta and of the memory of the matrices."""
+
+    layers: Ints
+    parameters: int
+    size: int
+
+    @lru_cache(maxsize=64)  # noqa: B019  (plans live as long as the process)
+    def tape(self, lanes: int, kept: int, passing: int = 1) -> Layout:
+        """Of B lanes, with slots for so many steps; if there are several, wide fields are computed again, not kept."""
+        wide, hidden = self.layers[on.UPDATE, 2], self.layers[on.HIDDEN, 2]
+        widths = np.array([PAD, PAD, whole(wide), whole(wide + PAD), whole(2 * wide + PAD), *[PAD] * 3, *[4 * PAD] * 3,
+                           3 * PAD, whole(hidden), PAD])  # fmt: skip
+        again = np.zeros(len(widths), np.bool_)
+        again[[on.CORRECTED, on.PRIOR_IN, on.INNOVATION_IN, on.HIDDEN_OUT]] = lanes > 1
+        return _layout(lanes * widths * np.where(again, passing, kept), widths, ~again)
+
+    @lru_cache(maxsize=64)  # noqa: B019
+    def deltas(self, lanes: int, steps: int) -> Layout:
+        """Of the gradients of the layers' outputs, none of which is kept."""
+        wide, hidden = self.layers[on.UPDATE, 2], self.layers[on.HIDDEN, 2]
+        widths = np.array([whole(wide), whole(wide), whole(2 * wide + PAD), *[3 * PAD] * 6, whole(hidden), *[PAD] * 3])
+        return _layout(lanes * widths * steps, widths, widths < 0)
+
+
+def _layout(sizes: Ints, widths: Ints, kept: Bools) -> Layout:
+    """Fields one after the other in the memory that is kept or in the other; products read a bit behind their end."""
+    begin = np.where(kept, np.cumsum(sizes * kept), np.cumsum(sizes * ~kept)) - sizes
+    fields = np.stack([begin, widths, kept], axis=1).astype(np.int64)
+    return Layout(fields, int(sizes[~kept].sum()) + 2 * PAD, int(sizes[kept].sum()) + 2 * PAD)
+
+
+@cache
+def plan_of(settings: tuple[tuple[str, Any], ...]) -> Plan:
+    """The plan of nets with these settings."""
+    begin, shapes, at = {}, {}, 0
+    for name, parameter in GainNet(**dict(settings)).named_parameters():
+        begin[name], shapes[name] = at, parameter.shape
+        at += parameter.numel()
+    found, size = [], 0
+    for name, last, relu, field, column, delta in LAYERS:
+        outputs, inputs = shapes[name]
+        behind = shapes["observation.weight"][0] if name == "prior_to_innovation.weight" else 0
+        found.append([begin[name], begin[name.replace("weight", "bias")], outputs, inputs, size, last, relu, field,
+                      column, delta, behind])  # fmt: skip
+        size += room(outputs, inputs)
+    return Plan(np.array(found), at, size)

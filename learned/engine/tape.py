@@ -1,0 +1,116 @@
+"""Where the compiled kernels find weights and what a step leaves behind: matrices with padded columns, and a tape."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from coopoc.arrays import AnyArray, Bools, Ints
+
+from .arithmetic import ONE, PAD, Index, compiled, whole, window
+
+
+class Net(NamedTuple):
+    """Flat weights (P,) of one model, or their gradient, and memory for the same as matrices with padded columns.
+
+    `layers` (layers, 11) says of each where its weight and its bias begin in theta, its outputs, its inputs, where it
+    begins in `padded`; how many of its inputs, the first ones, come last on the tape; whether it ends in a ReLU; the
+    field of the tape with its inputs and their first column; the field of the deltas with the gradient of its outputs
+    and their first column. `turned` (layers,) says whose matrix is turned, (inputs, outputs).
+    """
+
+    theta: AnyArray
+    padded: AnyArray
+    layers: Ints
+    turned: Bools
+
+
+class Tape(NamedTuple):
+    """What the steps of one model leave behind, in memory that is kept for backward and in memory that is not.
+
+    `fields` (fields, 3) says of each where it begins, its width, and whether it is kept (1, else 0). `now` (2,) holds
+    the slot of the present step in the memory that is not kept, which has few and uses them in turn, and in the other.
+    """
+
+    passing: AnyArray
+    kept: AnyArray
+    fields: Ints
+    now: Ints
+    lanes: Index
+
+
+@compiled
+def room(outputs: Index, inputs: Index) -> Index:
+    """Padded memory of a layer: its weight, turned or not, and its bias."""
+    return max(inputs * whole(outputs), outputs * whole(inputs + PAD - 9)) + whole(outputs)
+
+
+@compiled
+def matrix(net: Net, layer: Index) -> AnyArray:
+    """Weight (outputs, inputs) of a layer, or turned (inputs, outputs), a view; inputs stand as on the tape.
+
+    Unturned rows are so long that PAD columns may be read from the last nine inputs on.
+    """
+    outputs, inputs, at = net.layers[layer, 2], net.layers[layer, 3], net.layers[layer, 4]
+    rows, columns = (inputs, whole(outputs)) if net.turned[layer] else (outputs, whole(inputs + PAD - 9))
+    return window(net.padded, at, rows, columns)
+
+
+@compiled
+def bias(net: Net, layer: Index) -> AnyArray:
+    """Bias (1, outputs) of a layer with padded columns, a view."""
+    outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
+    end = net.layers[layer, 4] + room(outputs, inputs)
+    return window(net.padded, end - whole(outputs), ONE, whole(outputs))
+
+
+@compiled
+def unpack(net: Net) -> None:
+    """Every layer's weight and bias from theta into its matrix, with zeros as padding."""
+    net.padded[:] = 0.0
+    for layer in range(len(net.layers)):
+        begin, last = net.layers[layer, 1], net.layers[layer, 5]
+        outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
+        weights, source = matrix(net, layer), window(net.theta, net.layers[layer, 0], outputs, inputs)
+        bias(net, layer)[0, :outputs] = net.theta[begin : begin + outputs]
+        for o in range(outputs):
+            if not net.turned[layer]:
+                weights[o, : inputs - last] = source[o, last:]
+                weights[o, inputs - last : inputs] = source[o, :last]
+        for i in range(inputs):
+            column = i - last if i >= last else i - last + inputs
+            if net.turned[layer]:
+                for o in range(outputs):
+                    weights[column, o] = source[o, i]
+
+
+@compiled
+def pack(net: Net) -> None:
+    """Every layer's weight and bias from its matrix into theta."""
+    for layer in range(len(net.layers)):
+        begin, last = net.layers[layer, 1], net.layers[layer, 5]
+        outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
+        weights, target = matrix(net, layer), window(net.theta, net.layers[layer, 0], outputs, inputs)
+        net.theta[begin : begin + outputs] = bias(net, layer)[0, :outputs]
+        for o in range(outputs):
+            if net.turned[layer]:
+                for i in range(inputs):
+                    target[o, i] = weights[i - last if i >= last else i - last + inputs, o]
+            else:
+                target[o, last:] = weights[o, : inputs - last]
+                target[o, :last] = weights[o, inputs - last : inputs]
+
+
+@compiled
+def rows(tape: Tape, name: Index) -> AnyArray:
+    """(B, width) of a field at the present step, a view."""
+    return span(tape, name, ONE)
+
+
+@compiled
+def span(tape: Tape, name: Index, count: Index) -> AnyArray:
+    """(count B, width) of a field at `count` steps from the present one on, a view."""
+    width, kept = tape.fields[name, 1], tape.fields[name, 2]
+    at = tape.fields[name, 0] + tape.now[kept] * tape.lanes * width
+    if kept:
+        return window(tape.kept, at, count * tape.lanes, width)
+    return window(tape.passing, at, count * tape.lanes, width)
