@@ -69,6 +69,7 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     save_file(tensors, partial, metadata={"card": json.dumps(card, sort_keys=True)})
+    partial.chmod(0o644)  # the writer of safetensors lets the owner alone read it
     os.replace(partial, path)
     return path
 
