@@ -59,7 +59,9 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
     """
     name, known = p["method"], start(p)
     if name in weights.LEARNED:
-        return [(seed, _learned(name, p, seed, known)) for seed in weights.seeds(p)]
+        together = name == "cooperative" and recording.v2x.max_neighbours > 0
+        made = _together if together else _learned
+        return [(seed, made(name, p, seed, known)) for seed in weights.seeds(p)]
     method: Method = find("coopoc.methods", name)(knowledge(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=known)
@@ -78,6 +80,14 @@ def start(p: Params) -> Floats | None:
 
 def _learned(name: str, p: Params, seed: int, known: Floats | None) -> Method:
     return weights.checkpoint(name, p, seed).model.method(name, known)
+
+
+def _together(name: str, p: Params, seed: int, known: Floats | None) -> Method:
+    """The gain that tells neighbours its noise: sums where messages are in time, else the newest fix."""
+    from coopoc.learned import CooperativeGain
+
+    model: Any = weights.checkpoint(name, p, seed).model
+    return CooperativeGain(model, sums=scene.channel(p).latency == 0, name=name)
 
 
 def rows(p: Params, *, quantiles: int = 0) -> list[Row]:

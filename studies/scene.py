@@ -71,6 +71,8 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
     return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
 
 
+CHANNELS = {"ideal": V2X.ideal, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
+"""Channels by name; "ideal" counts payload only."""
 LASTING = ("own_share", "common_share")
 """Parameters: shares of a fix's variance that last for a while, of each receiver and of all alike."""
 
@@ -159,12 +161,18 @@ def _count(number: int, noun: str) -> str:
 
 
 def channel(p: Params) -> V2X:
-    """Neighbourhood and budget of the cell; what it does not name is ideal; a cap of 0 is none."""
-    cap = float(p.get("cap_bytes_per_second", 0.0))
-    return V2X(
-        max_neighbours=int(p.get("max_neighbours", 0)),
+    """Neighbourhood and budget of the cell; what it does not name is ideal; a cap of 0 is none, a rate of 0 the
+    channel's own."""
+    name, cap = p.get("channel", "ideal"), float(p.get("cap_bytes_per_second", 0.0))
+    if name not in CHANNELS:
+        raise InputError("channel", repr(name), f"must be one of {sorted(CHANNELS)}", "Pick one.")
+    found: V2X = CHANNELS[name](int(p.get("max_neighbours", 0)))
+    return replace(
+        found,
         radius=float(p.get("radius_m", 30.0)),
-        rate=p.get("rate_hz"),
+        rate=p.get("rate_hz") or found.rate,
+        loss=float(p.get("loss", found.loss)),
+        latency=float(p.get("latency_s", found.latency)),
         bytes_per_second=cap or float("inf"),
     )
 
