@@ -116,8 +116,8 @@ def _pareto(results: Results) -> Plot | None:
     text = (
         "RT-LE against bytes. Left: what each vehicle sends and receives in training, spread over 1, 10 and 100 hours "
         "of driving (right to left). Right: payload that an ego receives over a channel that loses nothing, at each K, "
-        "rate and cap; lines: the best for the bytes. Horizontal: what costs no bytes. The bound forgets what newcomers "
-        "did before; estimates and sums tell it."
+        "rate and cap; lines: the best for the bytes. Horizontal: what costs no bytes. The bound forgets what newcomers"
+        " did before; estimates and sums tell it."
     )
     return Plot(figure, f"{text} {scene.conditions(results.settings)}")
 

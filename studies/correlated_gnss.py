@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.study.study import Params, Row, Study
@@ -50,37 +48,22 @@ def case(name: str) -> dict[str, Any]:
     return dict(zip(scene.LASTING, ERRORS[name], strict=True))
 
 
-def rms(results: Results, where: dict[str, Any]) -> float | None:
-    """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: what the bound bounds."""
-    kept = views.present(results, where)
-    if kept is None:
-        return None
-    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
-    seeded = "train_seed" in frame and frame["train_seed"].notna().any()
-    return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
-
-
 def at(method: str, k: int) -> int:
     """K at which a method ran: who talks to nobody ran without neighbours."""
     return 0 if method in {name for name, _ in SOLO} else k
 
 
-def _against_k(value: Callable[[Results, dict[str, Any]], float | None], text: str, decimals: int) -> Any:
+def _against_k(number: views.Number, text: str, decimals: int) -> Any:
     """View of methods down, K across, one block per error model."""
 
     def table(results: Results) -> Table | None:
         from coopoc.study.style import look
-        from coopoc.study.tables import Table
 
-        body: list[tuple[Any, ...]] = []
-        for name in ERRORS:
-            for method, known in (*SOLO, *SHARED, BOUND):
-                where = {**case(name), "method": method, "knowledge": known}
-                found = [value(results, {**where, "max_neighbours": k}) for k in NEIGHBOURS]
-                if any(number is not None for number in found):
-                    body.append((name, look(method).label, *found))
-        header = ("Errors of GNSS that last", "Method", *(f"K = {k}" for k in NEIGHBOURS))
-        return Table(header, tuple(body), _caption(results, text), decimals=decimals) if body else None
+        rows = [((name, look(method).label), {**case(name), "method": method, "knowledge": known})
+                for name in ERRORS for method, known in (*SOLO, *SHARED, BOUND)]  # fmt: skip
+        columns = [(f"K = {k}", {"max_neighbours": k}) for k in NEIGHBOURS]
+        head = ("Errors of GNSS that last", "Method")
+        return views.crossed(results, head, rows, columns, number, _caption(results, text), decimals)
 
     return table
 
@@ -111,7 +94,7 @@ def _figure(results: Results) -> Plot | None:
         for panel, name in zip(panels, cases, strict=True):
             drawn = []
             for method, known in (*SOLO[1:], *SHARED, BOUND):
-                found = {k: rms(results, {**case(name), "method": method, "knowledge": known,
+                found = {k: views.rms(results, {**case(name), "method": method, "knowledge": known,
                                           "max_neighbours": at(method, k)}) for k in NEIGHBOURS}  # fmt: skip
                 ran = {k: value for k, value in found.items() if value is not None}
                 if ran:
@@ -130,7 +113,7 @@ def _findings(results: Results) -> Sequence[str]:
 
 def _finding(results: Results, name: str) -> str:
     most = max((k for k in NEIGHBOURS if views.present(results, {"max_neighbours": k})), default=0)
-    value = {method: [rms(results, {**case(name), "method": method, "max_neighbours": k}) for k in (0, most)]
+    value = {method: [views.rms(results, {**case(name), "method": method, "max_neighbours": k}) for k in (0, most)]
              for method in ("kalman", "joint", "drift", "bound")}  # fmt: skip
     alone, joint, drift, bound = value["kalman"][0], value["joint"][1], value["drift"][1], value["bound"][1]
     if most == 0 or alone is None or joint is None or drift is None or bound is None:
@@ -154,7 +137,7 @@ STUDY = Study(
         "train_seeds": 3,
     },
     shares=(*scene.LASTING, "max_neighbours"),
-    tables={"rms": _against_k(rms, "rms over runs of RT-LE [m].", 2),
+    tables={"rms": _against_k(views.rms, "rms over runs of RT-LE [m].", 2),
             "nees": _against_k(_nees, "NEES (3 is consistent).", 1)},
     figures={"rms": _figure},
     findings=_findings,

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.study.study import Params, Row, Study
 
@@ -58,21 +56,11 @@ def case(name: str) -> dict[str, Any]:
     return {"scenario": scenario, "velocity_ratio": ratio}
 
 
-def rms(results: Results, where: dict[str, Any]) -> float | None:
-    """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: what the bound bounds."""
-    kept = views.present(results, where)
-    if kept is None:
-        return None
-    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
-    by = ["ego", "train_seed"] if frame.get("train_seed") is not None and frame["train_seed"].notna().any() else ["ego"]
-    return float(np.sqrt(frame.groupby(by)["square"].mean()).mean())
-
-
 def reference(results: Results, name: str) -> tuple[float | None, str]:
     """What a case is held against: the bound; under a bias, which no solo filter can see, the oracle filter."""
     if CASES[name][0] == 1:
-        return rms(results, {**case(name), "method": "kalman", "knowledge": "oracle"}), "oracle KF"
-    return rms(results, {**case(name), "method": "bound"}), "bound"
+        return views.rms(results, {**case(name), "method": "kalman", "knowledge": "oracle"}), "oracle KF"
+    return views.rms(results, {**case(name), "method": "bound"}), "bound"
 
 
 def _table(name: str) -> Any:
@@ -85,7 +73,7 @@ def _table(name: str) -> Any:
             where = {**case(name), "method": method, "knowledge": known}
             if not views.present(results, where):
                 continue
-            found = rms(results, where)
+            found = views.rms(results, where)
             inside = views.mean(results, where, "nees_inside")
             consistent = views.mean(results, where, "nees")
             body.append((
@@ -130,7 +118,7 @@ def _figure(results: Results) -> Plot | None:
 def _each_seed(results: Results, where: dict[str, Any]) -> list[float]:
     frame = results.select(where)
     seeds = sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
-    found = [rms(results, {**where, "train_seed": seed}) for seed in seeds] or [rms(results, where)]
+    found = [views.rms(results, {**where, "train_seed": seed}) for seed in seeds] or [views.rms(results, where)]
     return [value for value in found if value is not None]
 
 
@@ -142,7 +130,7 @@ def _findings(results: Results) -> Sequence[str]:
 def _finding(results: Results, name: str) -> str:
     base, words = reference(results, name)
     trained = [method for method, known in ASSUMED if known == "trained"]
-    each = {method: rms(results, {**case(name), "method": method, "knowledge": "trained"}) for method in trained}
+    each = {method: views.rms(results, {**case(name), "method": method, "knowledge": "trained"}) for method in trained}
     ran = {method: value for method, value in each.items() if value is not None}
     if not ran or base is None:
         return ""

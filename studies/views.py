@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from coopoc.evaluate.statistics import Interval, over_seeds, paired_difference
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
+    from coopoc.study.tables import Table
 
 
 def present(results: Results, where: Mapping[str, Any], value: str = "rt_le_m") -> dict[str, Any] | None:
@@ -37,6 +38,45 @@ def mean(results: Results, where: Mapping[str, Any], value: str = "rt_le_m") -> 
     """Mean of a metric over egos, runs and training seeds; None where it was not run."""
     kept = present(results, where, value)
     return None if kept is None else results.interval(value, kept).mean
+
+
+def rms(results: Results, where: Mapping[str, Any]) -> float | None:
+    """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds, m: what the bound bounds; None where it
+    was not run."""
+    kept = present(results, where)
+    if kept is None:
+        return None
+    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
+    seeded = "train_seed" in frame and frame["train_seed"].notna().any()
+    return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
+
+
+Number = Callable[["Results", dict[str, Any]], float | None]
+"""A number of a selection; None where it was not run."""
+
+
+def crossed(
+    results: Results,
+    head: Sequence[str],
+    rows: Sequence[tuple[Sequence[Any], Mapping[str, Any]]],
+    columns: Sequence[tuple[str, Mapping[str, Any]]],
+    number: Number,
+    caption: str,
+    decimals: int = 2,
+) -> Table | None:
+    """Table of a number: selections down, selections across; rows that were not run are left out, None if all were.
+
+    Args:
+        head: over the labels of a row. rows: labels and selection of each. columns: the same, one label.
+    """
+    from coopoc.study.tables import Table
+
+    body = []
+    for labels, where in rows:
+        found = [number(results, {**where, **also}) for _, also in columns]
+        if any(value is not None for value in found):
+            body.append((*labels, *found))
+    return Table((*head, *(label for label, _ in columns)), tuple(body), caption, decimals=decimals) if body else None
 
 
 def listed(found: Mapping[str, float | None]) -> str:

@@ -17,7 +17,7 @@ QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 
 def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path) -> None:
     wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
     results = run("correlated_gnss", tmp_path, settings={**QUICK, **wanted}, progress=False)
-    value = {name: [study.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
+    value = {name: [views.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
              for name in ("white", "own", "common")}  # fmt: skip
     own, common = value["own"], value["common"]
     assert own[0] is not None
