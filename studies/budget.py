@@ -66,7 +66,7 @@ def _payload_share(p: Params) -> float:
         return 1.0
     recording = scene.recording({**p, "runs": 1})
     method = lineup.methods({**p, "train_seeds": 1}, recording)[0][1]
-    return method.message.size() / method.message.size(overhead)
+    return float(method.message.size() / method.message.size(overhead))
 
 
 def ways(results: Results) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-FLOORS = ["formats", "world", "optimize", "methods", "evaluate", "study", "cli"]
+FLOORS = ["kernels", "formats", "world", "optimize", "methods", "evaluate", "study", "cli"]
 
 
 def imports(path: Path) -> set[str]:

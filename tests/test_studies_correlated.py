@@ -9,7 +9,7 @@ import pytest
 
 from coopoc import InputError, Sensors, run
 from coopoc.studies import correlated_gnss as study
-from coopoc.studies import scene
+from coopoc.studies import scene, views
 
 QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
 

@@ -6,11 +6,13 @@ from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..optimize.batch import solve_batch
 from ..optimize.gnc import graduate, graduate_batch, surrogate_of
 from ..optimize.initial import converted
@@ -24,7 +26,7 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
-from .star import StarStep, star_steps
+from .star import StarStep, assumed_arrays, measured_arrays, star_steps
 from .track import Track
 
 TOLERANCE = 1e-4
@@ -82,8 +84,8 @@ class CooperativeMAP:
         known = resolve(self.knowledge, recording)
         replaced: list[tuple[int, int]] = []
 
-        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
-            for windows in alike(_windows(recording, ego, box, known, self.window)):
+        def follow(ego: int, box: Inbox, steps: Ints | None = None) -> Iterator[Estimate]:
+            for windows in alike(_windows(recording, ego, box, known, self.window, steps)):
                 points, spread, counts = self._solve(windows, known)
                 replaced.append(counts)
                 for k, window in enumerate(windows):
@@ -92,7 +94,16 @@ class CooperativeMAP:
                     theirs = np.where(held[:, 1:, None], points[k][:, rank[1:]], np.nan)
                     yield Estimate(star.step, points[k, :, 0], spread[k], star.links, theirs)
 
-        track = follow_egos(self, recording, egos, follow)
+        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
+            whole, lost, met = _snapshots(recording, ego, box, assumed)
+            replaced.append((met, 0))
+            yield whole
+            if len(lost):
+                yield from follow(ego, box, lost)
+
+        kernels = self.window == 1 and self.robust is None and self.backend == "gauss-newton" and use_kernels()
+        assumed = assumed_arrays(recording, known) if kernels else ()
+        track = follow_egos(self, recording, egos, drive if kernels else follow)
         return replace(track, notes=self._notes(*np.sum(replaced, axis=0)))
 
     def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, tuple[int, int]]:
@@ -160,15 +171,29 @@ class Seen:
 Window = tuple[Seen, ...]
 
 
-def _windows(recording: Recording, ego: int, box: Inbox, known: Knowledge, length: int) -> Iterator[Window]:
-    """The last `length` steps at every step, fewer at the start."""
+def _snapshots(recording: Recording, ego: int, box: Inbox, assumed: tuple[Any, ...]) -> tuple[Estimate, Ints, int]:
+    """All snapshots of a drive by compiled code, the steps at which one did not settle, and how many of the other
+    problems were solved converted."""
+    from ..kernels.snapshot import LOST, MET, snapshots
+
+    measured = measured_arrays(recording, ego, replace(box, fresh=box.newest >= 0))
+    x, cov, neighbours, ended = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
+    lost = np.flatnonzero((ended == LOST).any(axis=0))
+    return Estimate(slice(None), x, cov, box.link, neighbours), lost, int((np.delete(ended, lost, axis=1) == MET).sum())
+
+
+def _windows(
+    recording: Recording, ego: int, box: Inbox, known: Knowledge, length: int, steps: Ints | None = None
+) -> Iterator[Window]:
+    """The last `length` steps at every step, or at these, fewer at the start."""
     recent: deque[Seen] = deque(maxlen=length)
     for star in star_steps(recording, ego, box, known):
         members = np.concatenate([[ego], recording.links.neighbour[star.links]])
         span = slice(box.start[star.step], box.start[star.step + 1])
         held = np.concatenate([np.ones((recording.runs, 1), dtype=bool), box.newest[:, span] >= 0], axis=1)
         recent.append(Seen(star, members, held))
-        yield tuple(recent)
+        if steps is None or star.step in steps:
+            yield tuple(recent)
 
 
 def alike(windows: Iterator[Window]) -> Iterator[list[Window]]:

@@ -17,9 +17,9 @@ from .track import Method, Track
 
 class Estimate(NamedTuple):
     """One ego at one step: position (R, 3) m, covariance (R or 1, 3, 3) m^2, its links there, and its neighbours
-    (R, k, 3) m, NaN where it says nothing of them."""
+    (R, k, 3) m, NaN where it says nothing of them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3)."""
 
-    step: int
+    step: int | slice
     x: Floats
     covariance: Floats
     links: Ints
@@ -51,6 +51,6 @@ def follow_egos(
             for found in follow(ego, box):
                 x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
                 neighbours[:, found.links] = found.neighbours
-                bar.update()
+                bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
     seconds = time.perf_counter() - began
     return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats
+from ..kernels.compile import use_kernels
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import spherical
@@ -16,7 +17,7 @@ from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .network import whitened
-from .star import FORGOTTEN, StarStep, rows, star_steps
+from .star import FORGOTTEN, StarStep, assumed_arrays, measured_arrays, rows, star_steps
 from .star_stream import Advance, StarStream
 from .stream import alone
 from .track import Track
@@ -44,7 +45,21 @@ class JointFilter:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.knowledge, recording)
+        if use_kernels():
+            return follow_egos(self, recording, egos, self._compiled(recording, known))
         return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known))
+
+    def _compiled(self, recording: Recording, known: Knowledge) -> Callable[[int, Inbox], Iterator[Estimate]]:
+        """What `_follow` yields, as one estimate of all steps from compiled code."""
+        from ..kernels.star_filter import follow
+
+        assumed, exact = assumed_arrays(recording, known), self.exact and known.exact_relative
+
+        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x, cov, neighbours = follow(measured_arrays(recording, ego, box), assumed, exact)
+            yield Estimate(slice(None), x, cov, box.link, neighbours)
+
+        return drive
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
         state: Floats = np.empty((recording.runs, 0, 3))

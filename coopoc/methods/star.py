@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -72,6 +73,27 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
             _when_sent(fixes, members, sent, t) + fix_variance, heard,
         )  # fmt: skip
         before, before_sent = members, sent
+
+
+def measured_arrays(recording: Recording, ego: int, box: Inbox) -> tuple[Any, ...]:
+    """What `star_steps` gathers from, as the tuple `measured` of `coopoc.kernels.star_filter`."""
+    from ..kernels.sighting import unfolded
+
+    neighbour, start, newest = (
+        np.ascontiguousarray(numbers, dtype=np.int64)
+        for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
+    )
+    seen, fresh = np.ascontiguousarray(unfolded(recording.relative[:, box.link])), np.ascontiguousarray(box.fresh)
+    return recording.gnss, recording.velocity, seen, neighbour, start, newest, fresh, int(ego), recording.dt
+
+
+def assumed_arrays(recording: Recording, known: Knowledge) -> tuple[Any, ...]:
+    """What is assumed of it, as the tuple `assumed` of `coopoc.kernels.star_filter`."""
+    variance = np.ascontiguousarray(known.process_variance(recording))
+    fixes = np.ascontiguousarray(known.fix_variance(recording))
+    sensors = known.sensors
+    std, least = (np.empty(0), 0.0) if sensors is None else (sensors.relative_std, sensors.min_range)
+    return variance, fixes, std, least, FORGOTTEN, ACCELERATION_STD
 
 
 def _prompt(

@@ -1,0 +1,1 @@
+"""Compiled kernels: the same answers as the NumPy code that they stand beside, in machine code, float64."""

@@ -1,0 +1,98 @@
+"""The inner loops of dense 3x3-block algebra, written as vector instructions: three rows -= (3, 3) x three rows.
+
+A loop over a short row costs more to enter than to run when the compiler must first prove that arrays do not overlap;
+here it is told so. Matrices are flat arrays whose rows are `stride` numbers apart, a multiple of `LANES`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+LANES = 4
+"""Numbers in one vector: 256 bits."""
+_INDEX = types.intp
+_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+_FUSED = ("contract",)
+
+
+class _Code:
+    """Places, vectors and sums in the function that is being built."""
+
+    def __init__(self, context: Any, build: Any, signature: Any, args: Any, arrays: tuple[int, ...]) -> None:
+        self.build = build
+        self.arrays = [
+            cgutils.create_struct_proxy(signature.args[k])(context, build, args[k]).data for k in arrays
+        ]
+
+    def index(self, at: Any, *steps: tuple[Any, int]) -> Any:
+        """at + sum of count x size."""
+        for size, count in steps:
+            at = self.build.add(at, self.build.mul(size, ir.Constant(size.type, count)))
+        return at
+
+    def vector(self, array: int, at: Any) -> Any:
+        """Pointer to LANES numbers."""
+        return self.build.bitcast(self.build.gep(self.arrays[array], [at]), _VECTOR.as_pointer())
+
+    def minus(self, array: int, at: Any) -> Any:
+        """Minus one number, in all lanes."""
+        number = self.build.fneg(self.build.load(self.build.gep(self.arrays[array], [at])))
+        none, first = ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.IntType(32), 0)
+        everywhere = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+        return self.build.shuffle_vector(self.build.insert_element(none, number, first), none, everywhere)
+
+    def plus_product(self, total: Any, a: Any, b: Any) -> Any:
+        """total + a b in one instruction."""
+        return self.build.fadd(total, self.build.fmul(a, b, flags=_FUSED), flags=_FUSED)
+
+
+def _three_rows(begins: bool) -> Any:
+    """Code of `subtract`, or of `minus_product`, whose rows begin at zero."""
+
+    def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
+        code = _Code(context, build, signature, args, (0, 2, 4))
+        out_at, left_at, right_at, stride, tiles = (args[k] for k in (1, 3, 5, 6, 7))
+        one, across = ir.Constant(stride.type, 1), ir.Constant(stride.type, 3) if begins else stride
+        factors = [[code.minus(1, code.index(left_at, (across, c), (one, a))) for c in range(3)] for a in range(3)]
+        with cgutils.for_range(build, tiles) as loop:
+            shift = build.mul(loop.index, ir.Constant(stride.type, LANES))
+            rows = [build.load(code.vector(2, code.index(build.add(right_at, shift), (stride, c))), align=8)
+                    for c in range(3)]  # fmt: skip
+            for a in range(3):
+                target = code.vector(0, code.index(build.add(out_at, shift), (stride, a)))
+                total = ir.Constant(_VECTOR, [0.0] * LANES) if begins else build.load(target, align=8)
+                for factor, row in zip(factors[a], rows, strict=True):
+                    total = code.plus_product(total, factor, row)
+                build.store(total, target, align=8)
+        return context.get_dummy_value()
+
+    return generate
+
+
+def _flat(out: Any, left: Any, right: Any) -> Any:
+    n = _INDEX
+    return types.void(out, n, left, n, right, n, n, n)
+
+
+def _subtract(
+    context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
+) -> Any:  # fmt: skip
+    """out[out_at + a stride + j] -= sum_c left[left_at + c stride + a] right[right_at + c stride + j], a, c < 3 and
+    j < LANES tiles: three rows less the transposed (3, 3) of `left` times three rows of `right`."""
+    return _flat(out, left, right), _three_rows(False)
+
+
+def _minus_product(
+    context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
+) -> Any:  # fmt: skip
+    """out[out_at + a stride + j] = -sum_c left[left_at + 3 c + a] right[right_at + c stride + j]: three rows are minus
+    the transposed (3, 3) of `left`, its numbers in sequence, times three rows of `right`."""
+    return _flat(out, left, right), _three_rows(True)
+
+
+subtract: Any = intrinsic(_subtract)
+minus_product: Any = intrinsic(_minus_product)
