@@ -16,6 +16,7 @@ from coopoc.errors import InputError
 from coopoc.methods.catalogue import WHOLE_FLEET
 from coopoc.study.environment import revision
 from coopoc.study.study import Params
+from coopoc.world.attack import attacked
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
@@ -172,6 +173,7 @@ def channel(p: Params) -> V2X:
         radius=float(p.get("radius_m", 30.0)),
         rate=p.get("rate_hz") or found.rate,
         loss=float(p.get("loss", found.loss)),
+        burst=float(p.get("burst", found.burst)),
         latency=float(p.get("latency_s", found.latency)),
         bytes_per_second=cap or float("inf"),
     )
@@ -198,7 +200,9 @@ def recording(p: Params) -> Recording:
     """What the vehicles of the cell see; the real measurements where there are any."""
     who = egos(p["data"], str(p["egos"]))
     observers = None if p.get("method") in WHOLE_FLEET else who
-    return _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
+    seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
+    share = float(p.get("attacked_share", 0.0))
+    return attacked(seen, share, seed=int(p["seed"]), honest=who) if share else seen
 
 
 @lru_cache(maxsize=2)

@@ -1,0 +1,127 @@
+"""Messages that come late, or not at all, alone or in bursts: what is left of cooperation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from coopoc.study.study import Params, Row, Study
+
+from . import lineup, scene, views
+
+if TYPE_CHECKING:
+    from coopoc.study.figures import Plot
+    from coopoc.study.results import Results
+    from coopoc.study.tables import Table
+
+LATENCIES = (0.0, 0.1, 0.3, 0.5, 1.0)
+LOSSES = (0.0, 0.1, 0.3, 0.6, 0.9)
+BURSTS = (1.0, 10.0)
+METHODS = ("kalman", "lkf-sa", "joint", "split-ci", "fixed-lag", "mhe")
+PERFECT = {"latency_s": 0.0, "loss": 0.0, "burst": 1.0}
+
+
+def _grid() -> list[dict[str, Any]]:
+    """Latency without loss, and loss without latency; the solo filter once."""
+    ways = [PERFECT, *({**PERFECT, "latency_s": late} for late in LATENCIES[1:])]
+    ways += [{**PERFECT, "loss": loss, "burst": burst} for burst in BURSTS for loss in LOSSES[1:]]
+    grid: list[dict[str, Any]] = [{**PERFECT, "max_neighbours": 0, "method": "kalman", "knowledge": "nominal"}]
+    together = {"max_neighbours": 6, "knowledge": "nominal"}
+    return grid + [{**way, **together, "method": method} for way in ways for method in METHODS[1:]]
+
+
+def cell(p: Params) -> list[Row]:
+    """Rows of one method over one channel."""
+    return lineup.rows(p)
+
+
+def _lines() -> list[tuple[str, str, list[tuple[float, dict[str, Any]]]]]:
+    """Title, axis label and (value, channel) of each panel."""
+    late = [(value, {**PERFECT, "latency_s": value}) for value in LATENCIES]
+    lossy = [[(100 * value, {**PERFECT, "loss": value, "burst": burst if value else 1.0}) for value in LOSSES]
+             for burst in BURSTS]  # fmt: skip
+    return [("late", "Latency [s]", late), ("lost one by one", "Lost [%]", lossy[0]),
+            (f"lost in runs of {BURSTS[1]:g}", "Lost [%]", lossy[1])]  # fmt: skip
+
+
+def _at(method: str, way: dict[str, Any]) -> dict[str, Any]:
+    return {"method": method} if method == "kalman" else {"method": method, **way}
+
+
+def _table(results: Results) -> Table | None:
+    """RT-LE of each method over each channel."""
+    from coopoc.study.style import look
+    from coopoc.study.tables import Table
+
+    body: list[tuple[Any, ...]] = []
+    ran = [method for method in METHODS if views.present(results, {"method": method})]
+    for title, label, ways in _lines():
+        for value, way in ways:
+            found = [views.mean(results, _at(method, way)) for method in ran]
+            if any(number is not None for number, method in zip(found, ran, strict=True) if method != "kalman"):
+                body.append((title, f"{value:g} {label.partition('[')[2].rstrip(']')}", *found))
+    header = ("Messages are", "How much", *(look(method).label for method in ran))
+    return Table(header, tuple(body), _caption(results, "RT-LE [m]."), decimals=3) if body else None
+
+
+def _caption(results: Results, text: str) -> str:
+    return (
+        f"{text} K = 6. The moving horizon puts a late message at its true time; the others bring it forward with the "
+        f"velocity that came with it. What is older than 1 s is forgotten. {scene.conditions(results.settings)}"
+    )
+
+
+def _figure(results: Results) -> Plot | None:
+    from coopoc.study.plot import Plot, canvas, legend, strokes
+
+    lines = _lines()
+    with canvas(1, len(lines), width=8.2, height=3.2, sharey=True, squeeze=False) as (figure, (panels,)):
+        drawn: list[dict[str, Any]] = []
+        for panel, (title, label, ways) in zip(panels, lines, strict=True):
+            for method in METHODS:
+                found = {value: views.mean(results, _at(method, way)) for value, way in ways}
+                ran = {value: number for value, number in found.items() if number is not None}
+                if ran:
+                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": "fitted"}))
+                    drawn.append({"method": method})
+            panel.set(title=title, xlabel=label)
+        if not drawn:
+            return None
+        panels[0].set(ylabel="RT-LE [m]", ylim=(0, None))
+        legend(panels[-1], drawn)
+    return Plot(figure, _caption(results, "RT-LE against latency and loss."))
+
+
+def _findings(results: Results) -> Sequence[str]:
+    found = []
+    for title, label, ways in _lines():
+        (_, none), (most, worst) = ways[0], ways[-1]
+        alone, best, left = (views.mean(results, _at(*pair)) for pair in
+                             (("kalman", none), ("joint", none), ("joint", worst)))  # fmt: skip
+        if alone is not None and best is not None and left is not None:
+            kept = (alone - left) / (alone - best)
+            unit = label.partition("[")[2].rstrip("]")
+            found.append(
+                f"{most:g} {unit} {title}: the joint filter keeps {100 * kept:.0f} % of what six neighbours bring "
+                f"({left:.2f} m; alone {alone:.2f}, perfect {best:.2f} m)."
+            )
+    return found
+
+
+STUDY = Study(
+    name="latency_loss",
+    question="How much of cooperation is left when messages come late or not at all?",
+    cell=cell,
+    key=lineup.key,
+    grid=_grid(),
+    settings={
+        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0,
+        "egos": "auto", "runs": 20, "seed": 0, "train_seeds": 0,
+    },
+    shares=tuple(PERFECT),
+    tables={"rt_le": _table},
+    figures={"rt_le": _figure},
+    findings=_findings,
+    limitations=("Latency is the same for all messages of a cell, in whole steps of the drive.",),
+    minutes=15,
+)  # fmt: skip

@@ -1,0 +1,122 @@
+"""What neighbours whose fixes are false do to those who listen to them, and what it costs to be careful."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from coopoc.study.study import Params, Row, Study
+
+from . import lineup, scene, views
+
+if TYPE_CHECKING:
+    from coopoc.study.figures import Plot
+    from coopoc.study.results import Results
+    from coopoc.study.tables import Table
+
+SHARES = (0.0, 0.1, 0.2, 0.4)
+METHODS = ("kalman", "lkf-sa", "joint", "split-ci", "ci", "cooperative-map-5", "cooperative-map-gnc")
+NEIGHBOURS = (4, 10)
+
+
+def _grid() -> list[dict[str, Any]]:
+    alone = {"max_neighbours": 0, "attacked_share": 0.0, "method": "kalman", "knowledge": "nominal"}
+    return [alone] + [
+        {"max_neighbours": k, "attacked_share": share, "method": method, "knowledge": "nominal"}
+        for k in NEIGHBOURS for share in SHARES for method in METHODS[1:]
+    ]  # fmt: skip
+
+
+def cell(p: Params) -> list[Row]:
+    """Rows of one method at one K and share of attacked vehicles."""
+    return lineup.rows(p)
+
+
+def at(method: str, k: int, share: float) -> dict[str, Any]:
+    """A selection; the solo filter, to which nobody can lie, ran once."""
+    if method == "kalman":
+        return {"method": method}
+    return {"method": method, "max_neighbours": k, "attacked_share": share}
+
+
+def _table(value: str, text: str, decimals: int) -> Any:
+    def number(results: Results, where: dict[str, Any]) -> float | None:
+        return views.mean(results, at(where["method"], where["max_neighbours"], where["attacked_share"]), value)
+
+    def table(results: Results) -> Table | None:
+        from coopoc.study.style import look
+
+        rows = [((k, look(method).label), {"method": method, "max_neighbours": k})
+                for k in NEIGHBOURS if views.present(results, {"max_neighbours": k}) for method in METHODS]  # fmt: skip
+        columns = [(f"{100 * share:g} % attacked", {"attacked_share": share}) for share in SHARES
+                   if views.present(results, {"attacked_share": share})]  # fmt: skip
+        return views.crossed(results, ("K", "Method"), rows, columns, number, _caption(results, text), decimals)
+
+    return table
+
+
+def _caption(results: Results, text: str) -> str:
+    return (
+        f"{text} An attacked vehicle broadcasts fixes that are 5 to 40 m off on each axis, the same for a whole drive; "
+        f"egos are honest. {scene.conditions(results.settings)}"
+    )
+
+
+def _figure(results: Results) -> Plot | None:
+    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
+
+    ks = [k for k in NEIGHBOURS if views.present(results, {"max_neighbours": k})]
+    if not ks:
+        return None
+    with canvas(1, len(ks), width=2.4 + 2.3 * len(ks), height=3.2, sharey=True, squeeze=False) as (figure, (panels,)):
+        for panel, k in zip(panels, ks, strict=True):
+            drawn = []
+            for method in METHODS:
+                found = {100 * share: views.mean(results, at(method, k, share)) for share in SHARES}
+                ran = {share: value for share, value in found.items() if value is not None}
+                if ran:
+                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": "fitted"}))
+                    drawn.append({"method": method})
+            plain_log(panel.yaxis)
+            panel.set(title=f"K = {k}", xlabel="Attacked vehicles [%]", xticks=[100 * share for share in SHARES])
+        panels[0].set(ylabel="RT-LE [m]")
+        legend(panels[-1], drawn)
+    return Plot(figure, _caption(results, "RT-LE against the share of attacked vehicles."))
+
+
+def _findings(results: Results) -> Sequence[str]:
+    found = []
+    for k in NEIGHBOURS:
+        alone, trusting, careful = (views.mean(results, at(method, k, 0.2)) for method in
+                                    ("kalman", "joint", "cooperative-map-gnc"))  # fmt: skip
+        window, same = (views.mean(results, at(method, k, 0.0)) for method in
+                        ("cooperative-map-5", "cooperative-map-gnc"))  # fmt: skip
+        if alone is None or trusting is None or careful is None or window is None or same is None:
+            continue
+        found.append(
+            f"K = {k}, 20 % attacked: who trusts everybody has {trusting:.2f} m, who is careful {careful:.2f} m, who "
+            f"listens to nobody {alone:.2f} m; without an attack care costs {same - window:+.3f} m."
+        )
+    return found
+
+
+STUDY = Study(
+    name="robustness",
+    question="What do neighbours with false fixes do to those who listen, and what does it cost to be careful?",
+    cell=cell,
+    key=lineup.key,
+    grid=_grid(),
+    settings={
+        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0,
+        "backend": "gauss-newton", "egos": "auto", "runs": 10, "seed": 0, "train_seeds": 0,
+    },
+    shares=("max_neighbours", "attacked_share"),
+    tables={"rt_le": _table("rt_le_m", "RT-LE [m].", 2), "nees": _table("nees", "NEES (3 is consistent).", 1)},
+    figures={"rt_le": _figure},
+    findings=_findings,
+    limitations=(
+        "Velocities and sightings stay true: a liar who also forges its motion can be found by neither.",
+        "Nobody conspires: each attacked vehicle has an offset of its own.",
+    ),
+    minutes=20,
+)  # fmt: skip
