@@ -32,7 +32,7 @@ $(READY): pyproject.toml constraints.txt
 
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
-	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,fast,flower,privacy,export]'
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,fast,flower,privacy,export,cluster]'
 	@touch $@
 
 clean:

@@ -1,4 +1,4 @@
-"""The command line: `coopoc run | table | report | list`, and the commands that installed distributions add."""
+"""The command line: coopoc run, merge, compare, table, report, list, and what installed distributions add."""
 
 from __future__ import annotations
 
@@ -44,9 +44,12 @@ def run(
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs"),
     jobs: Annotated[int, arg(metavar="N")] = 1,
     set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEY=VALUE ...")] = (),
+    shard: Annotated[str, arg(metavar="I/N")] = "",
+    cluster: Annotated[str, arg(metavar="tcp://HOST:PORT")] = "",
+    retry_failed: bool = False,
     dry_run: bool = False,
 ) -> int:
-    """Run a study, or resume it: finished cells are kept, failed ones are tried again.
+    """Run a study, or resume it: what is finished is kept, and what failed is left until you ask for it.
 
     Example: coopoc run neighbours --jobs 2 --set runs=100 max_neighbours=0,4
 
@@ -56,7 +59,10 @@ def run(
         out: of all studies; this one goes to FOLDER/NAME.
         jobs: worker processes. Results do not depend on it.
         set: settings or axes of the study. Lists are split at commas.
-        dry_run: count the cells and stop.
+        shard: compute only the I-th of N parts; a run without it completes and publishes them.
+        cluster: a Dask scheduler, whose workers compute instead of processes here.
+        retry_failed: compute failed cells once more.
+        dry_run: say what would be kept, repeated and computed, and stop.
     """
     from .study.parse import assignments
     from .study.publish import tables
@@ -67,17 +73,68 @@ def run(
     if data is not None:
         changes["data"] = data
     if dry_run:
-        print(json.dumps(plan(name, out, changes), indent=1, default=str))
+        print(json.dumps(plan(name, out, changes, shard, retry_failed), indent=1, default=str))
         return 0
-    results = run_study(name, out, jobs, changes)
+    results = run_study(name, out, jobs, changes, shard=shard, retry_failed=retry_failed, cluster=cluster)
     folder = out / results.study
-    for text in tables(folder):
+    for text in () if shard else tables(folder):
         print(text, end="\n\n")
     for _, row in results.failures.head(5).iterrows():
-        print(f"coopoc: failed: {row['reason']}", file=sys.stderr)
-    failed = f"; cells failed: {results.failed}, repeat the command to try them again" if results.failed else ""
-    print(f"coopoc: results are in {folder}{failed}. Report: coopoc report {folder}", file=sys.stderr)
+        params = ", ".join(f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
+        print(f"coopoc: failed: {row['reason']} ({params})", file=sys.stderr)
+    failed = f"; cells failed: {results.failed}, try them again with --retry-failed" if results.failed else ""
+    done = f"shard {shard} is in {folder}" if shard else f"results are in {folder}"
+    then = "When all shards are: the same command without --shard" if shard else f"Report: coopoc report {folder}"
+    print(f"coopoc: {done}{failed}. {then}", file=sys.stderr)
     return int(results.failed > 0)
+
+
+def merge(
+    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")],
+    /,
+    out: Annotated[Path, arg(metavar="FOLDER")],
+) -> int:
+    """Bring the folders of one study together, such as those that several machines filled shard by shard.
+
+    Example: coopoc merge a/neighbours b/neighbours --out runs
+
+    Args:
+        folders: of the study, run with the same settings.
+        out: of all studies; this one goes to FOLDER/NAME.
+    """
+    from .study.merge import merge as merge_folders
+
+    found = merge_folders(folders, out)
+    print(found.folder)
+    counts = f"{found.finished} of {found.cells} cells finished, {found.failed} failed, {found.missing} to compute"
+    print(f"coopoc: {counts}. Tables: coopoc run {found.folder.name} --out {out}, with the same --set", file=sys.stderr)
+    return int(found.failed > 0)
+
+
+def compare(
+    run_a: Annotated[Positional[Path], arg(metavar="RUN_A")],
+    run_b: Annotated[Positional[Path], arg(metavar="RUN_B")],
+    /,
+    value: Annotated[str, arg(metavar="METRIC")] = "rt_le_m",
+    by: Annotated[tuple[str, ...], arg(metavar="COLUMN ...")] = (),
+    where: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
+    format: Literal["markdown", "csv", "latex", "html"] = "markdown",
+) -> None:
+    """Show what changed beyond noise between two runs of one study.
+
+    Example: coopoc compare before/neighbours after/neighbours --where method=okf,kalman
+
+    Args:
+        run_a: folder of the study.
+        run_b: folder of the same study, run with other code or settings.
+        value: the metric.
+        by: columns beside the parameters that tell rows apart, such as round.
+        where: rows of the results to compare.
+        format: of the tables.
+    """
+    from .study.compare import compare as compare_runs
+
+    print(compare_runs(run_a, run_b, value, by, where).render(format))
 
 
 def table(
@@ -146,7 +203,9 @@ def list_names() -> None:
             print(f"{group.removeprefix('coopoc.')}: {', '.join(plugins.names(group)) or '(none)'}")
 
 
-OWN: Mapping[str, Command] = {"run": run, "table": table, "report": report, "list": list_names}
+OWN: Mapping[str, Command] = {
+    "run": run, "merge": merge, "compare": compare, "table": table, "report": report, "list": list_names,
+}  # fmt: skip
 
 
 def _status(argv: list[str]) -> int:

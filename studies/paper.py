@@ -30,7 +30,8 @@ def paper(
     names = ("convergence", "error_cdf", "neighbours")
     for number, name in enumerate(names, start=1):
         print(f"coopoc: stage {number} of {len(names) + 1}: {name}", file=sys.stderr)
-        results = run(name, out=out, jobs=jobs, settings={"weights": str(out / "weights"), "data": data})
+        changes = {"weights": str(out / "weights"), "data": data}
+        results = run(name, out=out, jobs=jobs, settings=changes, retry_failed=True)
         failed += results.failed
     print(f"coopoc: stage {len(names) + 1} of {len(names) + 1}: report", file=sys.stderr)
     cards = {

@@ -43,7 +43,7 @@ def test_help_loads_nothing_heavy_and_lists_what_others_add(tmp_path: Path) -> N
     assert re.search(r"run +Run a study", own.stdout)
 
 
-@pytest.mark.parametrize("name", ["run", "table", "report", "list", "greet"])
+@pytest.mark.parametrize("name", ["run", "merge", "compare", "table", "report", "list", "greet"])
 def test_each_command_explains_itself_with_an_example(tmp_path: Path, name: str) -> None:
     done = coopoc(name, "--help", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -102,6 +102,9 @@ def test_commands_of_others(tmp_path: Path) -> None:
         (["run", "small", "--set", "runs"], "--set = 'runs': must be key=value"),
         (["run", "small", "--set", "rums=3"], "Did you mean runs?"),
         (["run", "small", "--jobs", "0"], "jobs = 0: must be >= 1"),
+        (["run", "small", "--shard", "4/3"], "shard = '4/3': must be i/n with 1 <= i <= n"),
+        (["merge", "nowhere", "--out", "runs"], "folder = nowhere: holds no manifest.json"),
+        (["compare", "nowhere", "nowhere"], "folder = nowhere: holds no manifest.json"),
         (["table", "nowhere"], "folder = nowhere: holds no views yet"),
         (["report"], "folders = none"),
     ],
@@ -124,8 +127,34 @@ def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("raise")
     done = coopoc("run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
-    assert "coopoc: failed: FloatingPointError: the filter diverged at step 3" in done.stderr
-    assert "cells failed: 1" in done.stderr
+    assert "coopoc: failed: FloatingPointError: the filter diverged at step 3 (max_neighbours = 1, met" in done.stderr
+    assert "cells failed: 1, try them again with --retry-failed" in done.stderr
+
+
+def test_a_failed_cell_is_repeated_when_asked(tmp_path: Path) -> None:
+    (tmp_path / "trouble").write_text("raise")
+    words = ["run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}"]
+    coopoc(*words, cwd=tmp_path)
+    (tmp_path / "trouble").unlink()
+    assert json.loads(coopoc(*words, "--dry-run", cwd=tmp_path).stdout)["to_compute"] == 0
+    assert json.loads(coopoc(*words, "--dry-run", "--retry-failed", cwd=tmp_path).stdout)["to_compute"] == 1
+    assert coopoc(*words, "--retry-failed", cwd=tmp_path).returncode == 0
+
+
+def test_shards_are_merged_and_two_runs_compared(tmp_path: Path) -> None:
+    for index in (1, 2):
+        done = coopoc("run", "small", "--shard", f"{index}/2", "--out", f"m{index}", "--set", "runs=2", cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (0, "")
+        assert f"coopoc: shard {index}/2 is in m{index}/small. When all shards are:" in done.stderr
+    done = coopoc("merge", "m1/small", "m2/small", "--out", "all", cwd=tmp_path)
+    assert done.stdout == "all/small\n"
+    assert "9 of 9 cells finished, 0 failed, 0 to compute. Tables: coopoc run small --out all" in done.stderr
+    assert coopoc("run", "small", "--out", "all", "--set", "runs=2", cwd=tmp_path).stdout.startswith("| Neighbours K")
+    words = ["--value", "max_error_m", "--where", "method=kalman", "--format", "csv"]
+    done = coopoc("compare", "all/small", "m1/small", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Neighbours K,Method,A,B,B - A,B - A low,B - A high,Change\n0,KF,")
+    assert "\n1,KF,finished,not computed\n" in done.stdout
 
 
 @pytest.mark.parametrize("jobs", ["1", "2"])

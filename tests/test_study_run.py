@@ -14,9 +14,10 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
+from coopoc.study.compute import WorkerDiedError, schedule
 from coopoc.study.publish import views
 from coopoc.study.results import Results
-from coopoc.study.run import WorkerDiedError, plan, run, schedule
+from coopoc.study.run import plan, run
 from coopoc.study.study import Cell, Study
 
 DISTRIBUTION = Path(__file__).parent / "distribution"
@@ -32,8 +33,8 @@ def numbers(frame: pd.DataFrame) -> pd.DataFrame:
     return frame[[c for c in frame if not c.endswith("seconds")]]
 
 
-def files(folder: Path) -> dict[str, tuple[int, bytes]]:
-    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / "cells").iterdir()}
+def files(folder: Path, kind: str = "cells") -> dict[str, tuple[int, bytes]]:
+    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / kind).iterdir()}
 
 
 def command(out: Path, *settings: str, jobs: int = 1) -> list[str]:
@@ -83,10 +84,13 @@ def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -
         assert (tmp_path / "one/small" / name).read_bytes() == (tmp_path / "two/small" / name).read_bytes()
 
 
-def test_a_failed_cell_is_a_row_with_its_reason_and_is_tried_again(study: Study, tmp_path: Path) -> None:
+def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_for(
+    study: Study, tmp_path: Path
+) -> None:
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
-    first = run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
+    changes = {"trouble": str(trouble)}
+    first = run(study, tmp_path, settings=changes, progress=False)
     assert first.failed == 1
     row = first.failures.iloc[0]
     assert (row["method"], row["max_neighbours"], row["status"]) == ("kalman", 1, "failed")
@@ -94,14 +98,27 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_is_tried_again(study: Study,
     assert "small_study.py" in row["traceback"]
     assert set(first.frame["status"]) == {"ok"}
     assert "–" in (tmp_path / "small/tables/rt_le.md").read_text()
-    assert plan(study, tmp_path, {"trouble": str(trouble)})["failed_before"] == 1
-    finished = files(tmp_path / "small")
+    finished, failed = files(tmp_path / "small"), files(tmp_path / "small", "failed")
     trouble.unlink()
-    second = run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
+    assert run(study, tmp_path, settings=changes, progress=False).failed == 1
+    assert files(tmp_path / "small", "failed") == failed
+    second = run(study, tmp_path, settings=changes, progress=False, retry_failed=True)
     assert second.failed == 0
     assert len(second.frame) == 9 * 2 * 4
     assert not list((tmp_path / "small/failed").iterdir())
     assert {name: files(tmp_path / "small")[name] for name in finished} == finished
+
+
+def test_a_plan_says_what_becomes_of_failed_cells(study: Study, tmp_path: Path) -> None:
+    trouble = tmp_path / "trouble"
+    trouble.write_text("raise")
+    run(study, tmp_path, settings={"trouble": str(trouble), "max_neighbours": "0,1"}, progress=False)
+    left = plan(study, tmp_path, {"trouble": str(trouble)})
+    again = plan(study, tmp_path, {"trouble": str(trouble)}, retry_failed=True)
+    for found, todo in ((left, 3), (again, 4)):
+        assert (found["cells"], found["finished"], found["failed_before"], found["to_compute"]) == (9, 5, 1, todo)
+        assert found["failures"] == [{"max_neighbours": 1, "method": "kalman", "repeated": found is again,
+                                      "reason": "FloatingPointError: the filter diverged at step 3"}]  # fmt: skip
 
 
 def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..evaluate.statistics import Interval, mean_interval
 from ..plugins import unknown
 from . import store
+from .manifest import read
 from .parse import assignments, parse
 
 if TYPE_CHECKING:
@@ -47,14 +48,16 @@ class Results:
     environment: Mapping[str, str]
 
     @classmethod
-    def load(cls, folder: str | Path) -> Results:
-        """Results in the folder of a study, finished or not; InputError if it holds none."""
-        path = Path(folder) / "manifest.json"
-        manifest = store.content(path, "holds no manifest.json", "Give a folder that coopoc run has made.")
+    def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:
+        """Results in the folder of a study, finished or not, or of the cells that are named; InputError if none."""
+        folder = Path(folder)
+        manifest = read(folder)
         done, failed, pending = [], [], 0
         for cell in manifest["cells"]:
-            table = store.load(path.parent, cell["name"])
-            failure = None if table is not None else store.load_failure(path.parent, cell["name"])
+            if names is not None and cell["name"] not in names:
+                continue
+            table = store.load(folder, cell["name"])
+            failure = None if table is not None else store.load_failure(folder, cell["name"])
             done += [table] if table is not None else []
             failed += [failure] if failure is not None else []
             pending += table is None and failure is None
@@ -90,7 +93,7 @@ class Results:
         """(E, R) of one metric, sorted by ego and run: what paired comparisons take. Averaged over training seeds."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
-        found = _grid(frame, value)[0]
+        found = ego_by_run(frame, value)[0]
         if found.size == 0:
             raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
         return found
@@ -122,7 +125,7 @@ class Results:
         rows = []
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
-            grid, missing = _grid(frame, value)
+            grid, missing = ego_by_run(frame, value)
             found = mean_interval(grid) if grid.size else NOTHING
             rows.append([*names, found.mean, found.low, found.high, found.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
@@ -171,7 +174,7 @@ def _joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
     return pa.concat_tables(tables, promote_options="permissive").to_pandas() if tables else pd.DataFrame()
 
 
-def _grid(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
+def ego_by_run(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
     """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing."""
     frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame}, _value=frame[value].astype(float))
     cells = frame.groupby(["ego", "run"])["_value"]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +23,19 @@ def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
     """Write a file atomically: a temporary neighbour, flushed to disk, then renamed onto `path`.
 
     Whoever is killed in between leaves the old file or none, and never half a file.
+
+    Raises:
+        OSError: of a full or read-only disk, with the path.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _write(path, content)
+    except OSError as error:
+        text = f"{error.strerror or error}. What is finished is kept: make room and repeat"
+        raise OSError(error.errno, text, str(path)) from error
+
+
+def _write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -41,41 +50,6 @@ def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
-
-
-@contextmanager
-def held(folder: Path) -> Iterator[None]:
-    """Make the folder and keep it for this process: a second run would swap the manifest under the first.
-
-    The lock goes with the process, however that ends.
-
-    Raises:
-        InputError: another process holds it, or it cannot be written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = (folder / ".lock").open("w")
-    except OSError as error:
-        raise _unwritable(folder, error) from None
-    with lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            mend = "Wait until it ends, or choose another --out."
-            raise InputError("out", str(folder), "is in use by another run", mend) from None
-        yield
-
-
-def prepare(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Write the manifest of a folder; InputError if it cannot be written."""
-    try:
-        write(folder / "manifest.json", json.dumps(manifest, indent=1, default=str) + "\n")
-    except OSError as error:
-        raise _unwritable(folder, error) from None
-
-
-def _unwritable(folder: Path, error: OSError) -> InputError:
-    return InputError("out", str(folder), f"cannot be written ({error.strerror})", "Choose another --out.")
 
 
 def content(path: Path, absent: str, mend: str) -> dict[str, Any]:
@@ -103,6 +77,15 @@ def save_failure(folder: Path, cell: Cell, reason: str, trace: str, seconds: flo
     own = {"cell": cell.name, "status": "failed", "reason": reason, "cell_seconds": seconds, "traceback": trace}
     table = to_table([{**cell.params, **own}])
     write(_failed(folder, cell.name), lambda file: pq.write_table(table, file))
+
+
+def copy(source: Path, target: Path, name: str, failed: bool) -> None:
+    """Copy the file of a finished or failed cell from one folder to another as it is; a finished one failed no more."""
+    place = _failed if failed else _finished
+    if source != target:
+        write(place(target, name), place(source, name).read_bytes())
+    if not failed:
+        _failed(target, name).unlink(missing_ok=True)
 
 
 def load(folder: Path, name: str) -> pa.Table | None:

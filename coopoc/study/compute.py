@@ -1,0 +1,101 @@
+"""compute: outcomes of cells as they come, here, in worker processes, or on a cluster; nothing is written here."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+import traceback
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from joblib import Parallel, delayed, parallel_config
+from threadpoolctl import threadpool_limits
+
+from ..errors import InputError
+from ..workers import leave_with
+from . import store
+from .study import Cell, Params, Row
+
+Function: TypeAlias = Callable[[Params], list[Row]]
+
+
+class WorkerDiedError(ChildProcessError):
+    """A worker process was killed from outside; finished cells are kept and the next run resumes."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a worker returns: rows, or the reason why there are none."""
+
+    cell: Cell
+    rows: list[Row]
+    reason: str
+    trace: str
+    seconds: float
+
+
+def groups(cells: Sequence[Cell], shares: Sequence[str]) -> list[list[Cell]]:
+    """Cells that agree on the parameters `shares`, and so on their recording, in the order of the grid."""
+    found: dict[tuple[Any, ...], list[Cell]] = {}
+    for cell in cells:
+        found.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
+    return list(found.values())
+
+
+def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Cell]:
+    """Cells in an order in which those that share a recording follow each other within one of `jobs` lanes.
+
+    Groups are dealt to the lanes in turn and the lanes are interleaved, so that each worker mostly meets one group
+    at a time. A worker that drifts into another lane computes that recording once more, nothing else changes. The last
+    groups come first: grids mostly grow towards their end, and a long cell at the end would leave other workers idle.
+    """
+    ordered = groups(cells, shares)[::-1]
+    lanes = [list(itertools.chain.from_iterable(ordered[lane::jobs])) for lane in range(jobs)]
+    return [cell for step in itertools.zip_longest(*lanes) for cell in step if cell is not None]
+
+
+def attempt(function: Function, cell: Cell) -> Outcome:
+    """Compute one cell on one thread; whatever it raises becomes its reason."""
+    start = time.perf_counter()
+    try:
+        with threadpool_limits(limits=1):
+            rows = [dict(row) for row in function(cell.given)]
+        _check(rows, cell)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"
+        return Outcome(cell, [], reason, traceback.format_exc(), time.perf_counter() - start)
+    return Outcome(cell, rows, "", "", time.perf_counter() - start)
+
+
+def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:
+    """Outcomes as they come: here for one job, else from worker processes; WorkerDiedError if one was killed."""
+    if jobs == 1 or len(cells) < 2:
+        yield from (attempt(function, cell) for cell in cells)
+        return
+    os.environ.setdefault("TQDM_DISABLE", "1")  # workers read it when they import tqdm: one bar, ours, is enough
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        workers = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
+        try:
+            yield from workers(delayed(_in_worker)(function, cell, os.getpid()) for cell in cells)
+        except BrokenProcessPool as error:
+            raise WorkerDiedError(
+                "A worker process was killed, mostly for want of memory. Finished cells are kept: "
+                "repeat the command to resume, with fewer --jobs."
+            ) from error
+
+
+def _in_worker(function: Function, cell: Cell, parent: int) -> Outcome:
+    leave_with(parent)
+    return attempt(function, cell)
+
+
+def _check(rows: Sequence[Row], cell: Cell) -> None:
+    if not rows:
+        raise InputError("rows", "none", "a cell must return at least one row", "Return one dict per run and ego.")
+    taken = {name for row in rows for name in row} & {*cell.params, *store.OWN_COLUMNS}
+    if taken:
+        raise InputError("rows", sorted(taken), "must not repeat a parameter", "The engine adds those columns.")
+    store.to_table(rows)

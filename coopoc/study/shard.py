@@ -1,0 +1,44 @@
+"""Shard: one of n disjoint parts of a study, for batch systems; the same part whenever and wherever it is asked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..errors import InputError
+from .compute import groups
+from .study import Cell
+
+
+@dataclass(frozen=True)
+class Shard:
+    """The `index`-th of `count` parts, counted from 1.
+
+    >>> str(Shard.parse("2/3"))
+    '2/3'
+    """
+
+    index: int
+    count: int
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Read "2/3"; InputError for anything else."""
+        found = re.fullmatch(r"([0-9]+)/([0-9]+)", text.strip())
+        if not found or not 1 <= int(found[1]) <= int(found[2]):
+            raise InputError("shard", repr(text), "must be i/n with 1 <= i <= n", "Write for example: --shard 2/3.")
+        return cls(int(found[1]), int(found[2]))
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
+
+    def of(self, cells: Sequence[Cell], shares: Sequence[str]) -> list[Cell]:
+        """Its cells: cells floor((i-1) N / n) to floor(i N / n) of the N, after those of one recording are together.
+
+        Parts differ by one cell at most, and n - 1 recordings at most are made twice. Which cells are finished does not
+        matter: a shard that is repeated resumes its own cells.
+        """
+        ordered = [cell for group in groups(cells, shares) for cell in group]
+        size = len(ordered)
+        return ordered[(self.index - 1) * size // self.count : self.index * size // self.count]

@@ -1,0 +1,165 @@
+"""Dask: a real scheduler and worker processes on loopback; tables are those of one process, whatever happens."""
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from coopoc.errors import InputError, MissingLibraryError
+from coopoc.study.compute import WorkerDiedError
+from coopoc.study.run import plan, run
+from coopoc.study.study import Study
+
+pytest.importorskip("distributed")
+
+DISTRIBUTION = Path(__file__).parent / "distribution"
+ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
+Process = "subprocess.Popen[bytes]"
+
+
+@pytest.fixture
+def study(monkeypatch: pytest.MonkeyPatch) -> Study:
+    monkeypatch.syspath_prepend(str(DISTRIBUTION))
+    return importlib.import_module("small_study").STUDY
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of a scheduler."""
+    file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
+    words = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
+    process = dask(words, file.parent)
+    wait_for(file.is_file)
+    yield json.loads(file.read_text())["address"]
+    end(process)
+
+
+@pytest.fixture
+def worker(scheduler: str, tmp_path: Path) -> Iterator[Callable[..., Process]]:
+    """Starts a worker; ends those that are left."""
+    started = []
+
+    def start(*words: str, **env: str) -> Process:
+        place = ["--local-directory", str(tmp_path / f"worker{len(started)}"), "--no-dashboard", "--no-nanny"]
+        started.append(dask(["worker", scheduler, *place, *(words or ("--nthreads", "1"))], tmp_path, **env))
+        return started[-1]
+
+    yield start
+    for process in started:
+        end(process)
+
+
+def dask(words: list[str], cwd: Path, **env: str) -> Process:
+    command = [sys.executable, "-m", "dask", *words]
+    return subprocess.Popen(command, cwd=cwd, env={**ENV, **env}, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def end(process: Process) -> None:
+    process.kill()
+    process.wait()
+
+
+def wait_for(happened: Callable[[], object], seconds: float = 40.0) -> None:
+    for _ in range(int(seconds / 0.02)):
+        if happened():
+            return
+        time.sleep(0.02)
+    raise AssertionError(f"did not happen in {seconds:g} s")
+
+
+def tables(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for kind in ("tables", "figures") for path in (folder / kind).iterdir()}
+
+
+def test_a_worker_that_is_killed_in_mid_run_changes_no_table(
+    study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path
+) -> None:
+    whole = run(study, tmp_path / "whole", progress=False)
+    first, _ = worker(), worker()
+    words = ["run", "small", "--out", str(tmp_path), "--cluster", scheduler, "--set", "pause=0.3"]
+    driver = subprocess.Popen([sys.executable, "-m", "coopoc.cli", *words], cwd=tmp_path, env=ENV, text=True,
+                              stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+    folder = tmp_path / "small"
+    wait_for(lambda: len(list(folder.glob("cells/*.parquet"))) >= 2)
+    os.kill(first.pid, signal.SIGKILL)
+    left = 9 - len(list(folder.glob("cells/*.parquet")))
+    stdout, stderr = driver.communicate(timeout=60)
+    assert driver.returncode == 0, stderr
+    assert left >= 2
+    assert stdout.startswith("| Neighbours K")
+    assert "9/9" in stderr
+    assert tables(folder) == tables(tmp_path / "whole/small")
+    found = pd.read_parquet(folder / "results.parquet")
+    other = ["cell", *(name for name in found if name.endswith("seconds"))]  # `pause` is in the names of cells, too
+    pd.testing.assert_frame_equal(found.drop(columns=other), whole.frame.drop(columns=other), check_exact=True)
+
+
+def test_failures_come_back_as_rows_and_a_killer_ends_the_run(
+    study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path
+) -> None:
+    """A cell that kills its worker takes the next one with it, until Dask gives it up or no worker is left."""
+    trouble = tmp_path / "trouble"
+    trouble.write_text("raise")
+    changes = {"trouble": str(trouble)}
+    for _ in range(2):
+        worker()
+    failed = run(study, tmp_path, settings=changes, progress=False, cluster=scheduler)
+    row = failed.failures.iloc[0]
+    assert (failed.failed, row["reason"]) == (1, "FloatingPointError: the filter diverged at step 3")
+    assert "small_study.py" in row["traceback"]
+    trouble.write_text("kill")
+    for _ in range(2):
+        worker()
+    with pytest.raises(WorkerDiedError, match=r"does not go on \(KilledWorker.*Finished cells are kept"):
+        run(study, tmp_path, settings=changes, progress=False, cluster=scheduler, retry_failed=True)
+    assert plan(study, tmp_path, changes)["finished"] == 8
+
+
+def test_a_run_ends_when_no_worker_is_left(
+    study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 2.0)
+    (tmp_path / "trouble").write_text("kill")
+    worker()
+    with pytest.raises(WorkerDiedError, match="no worker is left for 2 s"):
+        run(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False, cluster=scheduler)
+    (tmp_path / "trouble").unlink()
+    found = run(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False)
+    assert (found.failed, found.pending) == (0, 0)
+
+
+def test_a_cluster_that_cannot_compute_is_named_before_any_work(
+    study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 3.0)
+
+    def refused(match: str, address: str = scheduler) -> None:
+        with pytest.raises(InputError, match=match):
+            run(study, tmp_path / "new", progress=False, cluster=address)
+        assert not (tmp_path / "new").exists()
+
+    refused("has no Dask scheduler", "tcp://127.0.0.1:9")
+    refused("has no Dask scheduler", "nowhere at all")
+    refused("has no Dask scheduler", "tcp://127.0.0.1:99999")
+    refused(r"has no worker\. Start one on each machine: dask worker tcp://")
+    monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 30.0)
+    several = worker("--nthreads", "2")
+    refused("has a worker of several threads.*Start workers with --nthreads 1")
+    end(several)
+    worker(PYTHONPATH="")
+    refused("that cannot load the study .*small_study.*Install the same coopoc")
+
+
+def test_dask_is_asked_for_only_by_who_needs_it(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(MissingLibraryError, match=r"--cluster needs dask.*pip install 'coopoc\[cluster\]'"):
+        run(study, tmp_path, progress=False, cluster="tcp://127.0.0.1:8786")
+    assert run(study, tmp_path, progress=False).failed == 0

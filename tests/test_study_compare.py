@@ -1,0 +1,207 @@
+"""compare: means against pandas, intervals against scipy and against what is known of the draws."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy import stats
+
+from coopoc.errors import InputError
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.study.compare import Comparison, compare, unpaired
+from coopoc.study.results import Results
+from coopoc.study.run import run
+from coopoc.study.study import Params, Row, Study
+from coopoc.study.tables import FORMATS
+
+GRID = {"method": ("kf", "net"), "k": (0, 4)}
+SETTINGS = {"runs": 40, "seed": 0, "shift": 0.0, "spread": 0.0, "fails": "", "own": "–"}
+
+
+def cell(p: Params) -> list[Row]:
+    """Errors around 2 m: noise of the seed that all methods share, `shift` for the net, `spread` of what is its own."""
+    if f"{p['method']}{p['k']}" in p["fails"].split("+"):
+        raise FloatingPointError("diverged")
+    shared = np.random.default_rng([p["seed"], p["k"]]).normal(2.0, 0.5, (3, 500))[:, : p["runs"]]
+    own = np.random.default_rng([len(p["own"]), ord(p["own"][0]), p["k"]]).normal(0.0, 1.0, (3, 500))
+    error = shared + (p["shift"] if p["method"] == "net" else 0.0) + p["spread"] * own[:, : p["runs"]]
+    return [{"run": r, "ego": f"v{e}", "rt_le_m": error[e, r], "word": "a"} for e in range(3) for r in range(p["runs"])]
+
+
+def runner(folder: Path, cell: Callable[[Params], list[Row]] = cell) -> Callable[..., Path]:
+    def ran(name: str, **settings: Any) -> Path:
+        study = Study("demo", "?", cell, GRID, SETTINGS)
+        run(study, folder / name, settings=settings, progress=False)
+        return folder / name / "demo"
+
+    return ran
+
+
+@pytest.fixture
+def ran(tmp_path: Path) -> Callable[..., Path]:
+    return runner(tmp_path)
+
+
+def changes(found: Comparison) -> pd.DataFrame:
+    return pd.DataFrame(found.changes.rows, columns=found.changes.header)
+
+
+def test_a_run_is_the_same_as_itself(ran: Callable[..., Path]) -> None:
+    found = compare(ran("a"), ran("b"))
+    assert set(changes(found)["Change"]) == {"same"}
+    assert (found.settings, found.cells) == (None, None)
+    assert "0 of 4 groups changed beyond noise" in found.render("markdown")
+
+
+def test_means_are_those_of_pandas_and_what_is_shared_cancels(ran: Callable[..., Path]) -> None:
+    a, b = ran("a", spread=0.05, own="x"), ran("b", spread=0.05, own="yy", shift=0.03)
+    found = changes(compare(a, b))
+    for folder, side in ((a, "A"), (b, "B")):
+        means = Results.load(folder).frame.groupby(["method", "k"], sort=False)["rt_le_m"].mean()
+        np.testing.assert_allclose(found[side].astype(float), means, rtol=1e-12)
+    for _, row in found.iterrows():
+        assert row["B - A"].mean == pytest.approx(row["B"] - row["A"], abs=1e-12)
+        assert row["B - A"].high - row["B - A"].low < 0.1  # the shared noise alone would make it 0.4 m wide
+    assert set(found[found["Method"] == "net"]["Change"]) == {"higher"}
+    back = changes(compare(b, a))
+    assert set(back[back["Method"] == "net"]["Change"]) == {"lower"}
+
+
+def test_other_noise_seeds_are_compared_mean_by_mean(ran: Callable[..., Path]) -> None:
+    a, b = ran("a", runs=200), ran("b", runs=200, seed=1, shift=0.4)
+    found = compare(a, b)
+    rows = changes(found)
+    assert "not paired, as the noise seeds differ" in found.changes.caption
+    assert set(rows[rows["Method"] == "net"]["Change"]) == {"higher"}
+    assert found.settings is not None
+    assert found.settings.rows == (("seed", "0", "1"), ("shift", "0.0", "0.4"))
+    one, two = (Results.load(folder) for folder in (a, b))
+    for _, row in rows.iterrows():
+        x, y = (results.interval("rt_le_m", method=row["Method"], k=int(row["K"])) for results in (one, two))
+        assert row["B - A"] == unpaired(x, y)
+
+
+def test_the_unpaired_interval_is_that_of_welch_for_one_ego() -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(1.0, 1.0, 400), rng.normal(1.3, 2.0, 300)
+    ours = unpaired(mean_interval(a), mean_interval(b))
+    welch = stats.ttest_ind(b, a, equal_var=False).confidence_interval()
+    assert ours.low == pytest.approx(welch.low, abs=0.02)
+    assert ours.high == pytest.approx(welch.high, abs=0.02)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_noise_alone_is_seldom_called_a_change(tmp_path: Path, seed: int) -> None:
+    """100 groups of the same mean, 94 % intervals: 17 or more would be marked once in 10,000 times."""
+
+    def noise(p: Params) -> list[Row]:
+        draws = np.random.default_rng([p["seed"], p["stream"], p["k"]]).normal(2.0, 0.5, 30)
+        return [{"run": r, "ego": "v", "rt_le_m": x} for r, x in enumerate(draws)]
+
+    study = Study("noise", "?", noise, {"k": tuple(range(100))}, {"seed": 0, "stream": 0})
+    run(study, tmp_path / "a", progress=False)
+    run(study, tmp_path / "b", settings={"seed": seed, "stream": 1}, progress=False)
+    found = compare(tmp_path / "a/noise", tmp_path / "b/noise")
+    assert 0 < changes(found)["Change"].isin(["higher", "lower"]).sum() < 17
+    assert "by chance alone about 5.0 would" in found.changes.notes[0]
+
+
+def test_cells_that_only_one_has_and_failed_ones_are_listed(ran: Callable[..., Path]) -> None:
+    a, b = ran("a", fails="kf4"), ran("b", method="kf", k="0,4,9")
+    found = compare(a, b)
+    assert changes(found).shape[0] == 1
+    assert found.cells is not None
+    became = {row[:2]: row[2:] for row in found.cells.rows}
+    assert became == {
+        ("kf", "4"): ("failed: FloatingPointError: diverged", "finished"),
+        ("kf", "9"): ("not in the grid", "finished"),
+        ("net", "0"): ("finished", "not in the grid"),
+        ("net", "4"): ("finished", "not in the grid"),
+    }
+    next((b / "cells").iterdir()).unlink()
+    assert any("not computed" in row for row in compare(a, b).cells.rows)
+    assert found.settings is not None
+    assert [row[0] for row in found.settings.rows] == ["fails"]
+
+
+def test_runs_that_only_one_has_are_left_out_and_said_so(ran: Callable[..., Path]) -> None:
+    found = compare(ran("a"), ran("b", runs=60))
+    assert set(changes(found)["Change"]) == {"same"}
+    assert "240 values that only one of the two has" in found.changes.notes[1]
+
+
+def test_an_axis_that_became_a_setting_still_matches(tmp_path: Path) -> None:
+    ran = runner(tmp_path)
+    wide = Study("demo", "?", cell, {**GRID, "shift": (0.0, 0.5)}, {k: v for k, v in SETTINGS.items() if k != "shift"})
+    run(wide, tmp_path / "wide", progress=False)
+    found = compare(ran("a", shift=0.5), tmp_path / "wide/demo")
+    assert changes(found)["Change"].tolist() == ["same"] * 4
+    assert found.cells is not None
+    assert all(row[2:] == ("0", "not in the grid", "finished") for row in found.cells.rows)
+
+
+def test_training_seeds_are_pairs_too_and_their_spread_is_shown(tmp_path: Path) -> None:
+    def trained(p: Params) -> list[Row]:
+        rng = np.random.default_rng(p["seed"])
+        return [{"train_seed": s, "run": r, "ego": "v", "rt_le_m": rng.normal() + p["shift"] * (s + 1)}
+                for s in range(3) for r in range(20)]  # fmt: skip
+
+    ran = runner(tmp_path, trained)
+    found = changes(compare(ran("a"), ran("b", shift=0.1)))
+    assert set(found["Over training seeds"]) == {"0.100 to 0.300"}
+    assert found["B - A"][0].mean == pytest.approx(0.2)
+    assert found["B - A"][0].n == 20
+
+
+def test_several_rows_of_one_draw_need_a_name(tmp_path: Path) -> None:
+    def rounds(p: Params) -> list[Row]:
+        return [{"round": n, "run": r, "ego": 0, "rt_le_m": n + p["shift"] + 0.1 * r} for n in (0, 1) for r in range(9)]
+
+    ran = runner(tmp_path, rounds)
+    a, b = ran("a"), ran("b", shift=0.5)
+    with pytest.raises(InputError, match=r"several rows per ego, run and training seed.*--by round"):
+        compare(a, b)
+    found = changes(compare(a, b, by=["round"], where=["method=kf", "k=0"]))
+    assert found["Round"].tolist() == ["0", "1"]
+    assert [row.mean for row in found["B - A"]] == pytest.approx([0.5, 0.5])
+
+
+def test_a_value_that_is_not_finite_leaves_its_ego_out(tmp_path: Path) -> None:
+    def gaps(p: Params) -> list[Row]:
+        rows = cell(p)
+        rows[0]["rt_le_m"] = float("nan") if p["shift"] else 1.0
+        return [{**row, "nees": float("nan")} for row in rows]
+
+    ran = runner(tmp_path, gaps)
+    a, b = ran("a"), ran("b", shift=0.5)
+    found = compare(a, b, where=["k=0"])
+    assert "2 egos are left out" in found.changes.notes[-1]
+    assert changes(found)["B - A"][1].mean == pytest.approx(0.5)
+    assert set(changes(compare(a, b, "nees"))["Change"]) == {"no finite value"}
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_every_format_holds_every_part(ran: Callable[..., Path], form: str) -> None:
+    text = compare(ran("a", fails="kf4"), ran("b", shift=0.3)).render(form)
+    for part in ("shift", "higher", "FloatingPointError"):
+        assert part in text
+
+
+def test_what_cannot_be_compared_is_named(ran: Callable[..., Path], tmp_path: Path) -> None:
+    a, b = ran("a"), ran("b")
+    run(Study("other", "?", cell, GRID, SETTINGS), tmp_path, progress=False)
+    with pytest.raises(InputError, match="hold different studies, demo and other"):
+        compare(a, tmp_path / "other")
+    with pytest.raises(InputError, match=r"holds no manifest\.json"):
+        compare(a, tmp_path)
+    with pytest.raises(InputError, match=r"metric = 'rt_le'.*Did you mean rt_le_m"):
+        compare(a, b, "rt_le")
+    with pytest.raises(InputError, match="metric = 'word': must be a column of numbers"):
+        compare(a, b, "word")
+    with pytest.raises(InputError, match=r"column = 'metod'.*Did you mean method"):
+        compare(a, b, where=["metod=kf"])
+    with pytest.raises(InputError, match="must have a row in one of the runs"):
+        compare(a, b, where=["method=okf"])

@@ -1,0 +1,143 @@
+"""What may happen to a run: kills at any moment, a full disk, a read-only one, two runners. No cell is lost."""
+
+import importlib
+import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopoc.study import store
+from coopoc.study.manifest import read
+from coopoc.study.run import plan, run
+from coopoc.study.study import Study
+
+DISTRIBUTION = Path(__file__).parent / "distribution"
+ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
+COMMAND = [sys.executable, "-m", "coopoc.cli", "run", "small"]
+
+
+@pytest.fixture
+def study(monkeypatch: pytest.MonkeyPatch) -> Study:
+    monkeypatch.syspath_prepend(str(DISTRIBUTION))
+    return importlib.import_module("small_study").STUDY
+
+
+def views(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for kind in ("tables", "figures") for path in (folder / kind).iterdir()}
+
+
+def cells(folder: Path) -> dict[str, tuple[int, bytes]]:
+    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.glob("cells/*.parquet")}
+
+
+def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path) -> None:
+    """Thirty cells; each process goes on where the one before was killed: at its start, in a cell, or in a file."""
+    settings = {"max_neighbours": ",".join(map(str, range(10)))}
+    whole = run(study, tmp_path / "whole", settings=settings, progress=False)
+    rng = np.random.default_rng(6)
+    processes = multiprocessing.get_context("forkserver")
+    processes.set_forkserver_preload(["coopoc.study.run", "coopoc.study.figures"])
+    folder, before = tmp_path / "small", {}
+    for more, moment in zip(rng.integers(0, 6, 10), rng.uniform(0.0, 0.1, 10), strict=True):
+        process = processes.Process(target=run, args=("small", tmp_path, 1, settings, False))
+        process.start()
+        while process.is_alive() and len(list(folder.glob("cells/*.parquet"))) < len(before) + more:
+            time.sleep(0.002)
+        time.sleep(moment)
+        process.kill()
+        process.join()
+        after = cells(folder)
+        assert {name: after[name] for name in before} == before
+        assert all(store.load(folder, name.removesuffix(".parquet")) is not None for name in after)
+        before = after
+    assert len(before) >= 10
+    resumed = run(study, tmp_path, settings=settings, progress=False)
+    after = cells(folder)
+    assert {name: after[name] for name in before} == before
+    assert len(after) == 30
+    timings = [name for name in whole.frame if name.endswith("seconds")]
+    assert resumed.frame.drop(columns=timings).equals(whole.frame.drop(columns=timings))
+    assert views(folder) == views(tmp_path / "whole/small")
+    assert not list(folder.rglob(".*.part"))
+
+
+def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(study: Study, tmp_path: Path) -> None:
+    run(study, tmp_path, progress=False)
+    whole = views(tmp_path / "small")
+    process = multiprocessing.get_context("forkserver").Process(target=run, args=("small", tmp_path, 1, {}, False))
+    (tmp_path / "small/tables/rt_le.md").unlink()
+    process.start()
+    while not (tmp_path / "small/tables/rt_le.md").exists():
+        time.sleep(0.002)
+    process.kill()
+    process.join()
+    (tmp_path / "small/views.json").write_text("")
+    run(study, tmp_path, progress=False)
+    assert views(tmp_path / "small") == whole
+
+
+def test_two_runners_that_start_together(study: Study, tmp_path: Path) -> None:
+    words = [*COMMAND, "--out", str(tmp_path)]
+    both = [subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in "ab"]
+    ends = [(process, *process.communicate(timeout=60)) for process in both]
+    statuses = sorted(process.returncode for process, _, _ in ends)
+    assert statuses in ([0, 2], [0, 0]), ends
+    for process, stdout, stderr in ends:
+        assert (process.returncode == 0) == stdout.startswith("| Neighbours K")
+        assert (process.returncode == 2) == ("is in use by another run. Wait until it ends" in stderr)
+    assert plan(study, tmp_path)["finished"] == 9
+
+
+def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
+    """Lines of a script that runs where `disk` is a file system of its own, which goes with the script."""
+    if not shutil.which("unshare"):
+        pytest.skip("util-linux is not installed")
+    (tmp_path / "disk").mkdir()
+    shell = ["unshare", "--user", "--map-root-user", "--mount", "sh", "-c"]
+    mount = "mount -t tmpfs -o size=10m tmpfs disk"
+    if subprocess.run([*shell, mount], cwd=tmp_path, capture_output=True, timeout=20).returncode:
+        pytest.skip("this system lets nobody mount a disk of their own")
+    done = subprocess.run([*shell, f"{mount}\n{script}"], cwd=tmp_path, env={**ENV, "RUN": " ".join(COMMAND)},
+                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    return (done.stdout + done.stderr).splitlines()
+
+
+def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterwards(study: Study, tmp_path: Path) -> None:
+    table = " ".join([*COMMAND[:-2], "table", "disk/small"])
+    said = in_a_small_disk(f"""
+        mount -o remount,size=32k disk
+        $RUN --out disk > /dev/null; echo "full: $?"
+        mkdir kept; cp -a disk/small/cells kept
+        mount -o remount,size=10m disk
+        $RUN --out disk > /dev/null; echo "room: $?"
+        mount -o remount,ro disk
+        $RUN --out disk; echo "read-only: $?"
+        {table} | head -1
+        cp -a disk/small .
+    """, tmp_path)  # fmt: skip
+    assert {"full: 1", "room: 0", "read-only: 2"} <= set(said)
+    message = next(line for line in said if "No space left" in line)
+    assert "No space left on device. What is finished is kept: make room and repeat: 'disk/small/cells/" in message
+    assert "coopoc: out = disk/small: cannot be written (Read-only file system). Choose another --out." in said
+    assert any(line.startswith("| Neighbours K") for line in said)
+    kept, after = cells(tmp_path / "kept"), cells(tmp_path / "small")
+    assert 0 < len(kept) < 9
+    assert {name: after[name] for name in kept} == kept
+    assert not list((tmp_path / "small").glob("failed/*"))
+    run(study, tmp_path / "whole", progress=False)
+    assert views(tmp_path / "small") == views(tmp_path / "whole/small")
+
+
+def test_a_manifest_survives_whoever_is_killed_while_writing_it(study: Study, tmp_path: Path) -> None:
+    run(study, tmp_path, progress=False)
+    left = tmp_path / "small" / ".manifest.json.abc.part"
+    left.write_text('{"half": ')
+    assert read(tmp_path / "small")["study"] == "small"
+    run(study, tmp_path, progress=False)
+    assert not left.exists()
