@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, StrMethodFormatter
 
 from . import store
 from .results import Results
@@ -112,14 +112,20 @@ def legend(
 
 
 def plain_log(axis: Axis) -> None:
-    """Logarithmic axis with plain numbers at 1, 2 and 5 of each decade."""
+    """Logarithmic axis with plain numbers at 1, 2 and 5 of each decade, and at more where it spans less than one."""
     if axis is axis.axes.xaxis:
         axis.axes.set_xscale("log")
     else:
         axis.axes.set_yscale("log")
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(LogLocator(subs=(1.2, 1.5, 3.0, 4.0, 7.0), numticks=50))
+
+    def number(value: float, _: int | None = None) -> str:
+        low, high = axis.get_view_interval()
+        return f"{value:g}" if high < 5 * low else ""
+
+    axis.set_minor_formatter(FuncFormatter(number))
 
 
 def apart(heights: Mapping[str, float], gap: float) -> dict[str, float]:
