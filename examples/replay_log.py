@@ -114,6 +114,7 @@ FILTERS: dict[str, Callable[[], Any]] = {
     "variational, 10 % of speed": lambda: co.VariationalKalman(SPEED).start(),
     "OKF": lambda: load_method("okf").start(),
     "FedKalmanNet": lambda: load_method("fedkalmannet").start(),
+    "Recursive gain": lambda: load_method("recursive").start(),
 }
 WAYS: dict[str, dict[str, bool]] = {
     "as recorded": {"jitter": False, "drop": False, "late": False},
