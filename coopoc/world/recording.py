@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -27,7 +28,18 @@ class Links:
 
     def of(self, observer: int) -> Ints:
         """Indices of the links of one observer, in time order and nearest first within a step."""
-        return np.flatnonzero(self.observer == observer)
+        order, start = self._by_observer
+        if not 0 <= observer < len(start) - 1:
+            return np.empty(0, dtype=np.int64)
+        return order[start[observer] : start[observer + 1]]
+
+    @cached_property
+    def _by_observer(self) -> tuple[Ints, Ints]:
+        """Links in the order of their observers, and where each one's begin: a search of all links for every observer
+        would make a fleet's cost per vehicle grow with the fleet."""
+        order = np.argsort(self.observer, kind="stable")
+        last = int(self.observer.max(initial=-1))
+        return order, np.searchsorted(self.observer[order], np.arange(last + 2))
 
     def __len__(self) -> int:
         return len(self.step)

@@ -1,0 +1,36 @@
+"""The studies of consistency and of cost as fleets grow, on few cells."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from coopoc import load, run
+from coopoc.studies import scaling, views
+from coopoc.world.sensing import find_links
+
+
+def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path) -> None:
+    wanted = {"runs": 4, "egos": "2", "method": "kalman,joint,lkf-sa", "knowledge": "nominal,identity"}
+    results = run("consistency", tmp_path, settings=wanted, progress=False)
+    table = (tmp_path / "consistency" / "tables" / "nees.md").read_text()
+    good = views.mean(results, {"method": "joint", "knowledge": "nominal"}, "nees_inside")
+    bad = views.mean(results, {"method": "lkf-sa", "knowledge": "identity"}, "nees_inside")
+    assert good is not None
+    assert bad is not None
+    assert good > 0.9 > 0.1 > bad
+    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in table.splitlines()]
+    assert rows.index(["Joint filter", "nominal"]) < rows.index(["LKF-SA", "identity"])  # the most credible first
+
+
+def test_copies_do_not_see_each_other_and_cost_is_counted_per_vehicle(tmp_path: Path) -> None:
+    fleet = scaling.copied("town10", 2, 10)
+    links = find_links(fleet, range(len(fleet.ids)), 6, 30.0)
+    assert ((links.observer < 60) == (links.neighbour < 60)).all()
+    assert len(links) == 2 * len(find_links(load("town10").between(0, 10), range(60), 6, 30.0))
+    wanted = {"steps": 10, "runs": 1, "repeats": 1, "copies": "1,2", "method": "observe,kalman,gbp"}
+    results = run("scaling", tmp_path, settings=wanted, progress=False)
+    each = [scaling._us(results, "gbp", copies) for copies in (1, 2)]
+    assert all(value is not None and np.isfinite(value) and value > 0 for value in each)
+    assert "Most / least" in (tmp_path / "scaling" / "tables" / "cost.md").read_text()
