@@ -69,7 +69,7 @@ class LearnedGain:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` name the runs that left the fixes behind."""
-        began, columns = time.perf_counter(), recording.columns(egos)
+        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
         with one_core(), torch.inference_mode():
             moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)
@@ -82,7 +82,7 @@ class LearnedGain:
 
     def diagnostics(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Diagnostics:
         """Gain, GRU states and K times the GNSS covariance at every step, with the caveat of `Diagnostics`."""
-        columns = recording.columns(egos)
+        columns = recording.columns(egos, missing=True)
         gnss, velocity, x0 = self._lanes(recording, columns)
         states: list[tuple[Tensor, ...]] = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
         with one_core(), torch.inference_mode(), _heard(self.model) as heard:

@@ -115,7 +115,7 @@ class NoiseAdaptive(ABC):
 
     def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
-        states = scan(self._solo(recording.dt), recording, recording.columns(egos), self.x0)
+        states = scan(self._solo(recording.dt), recording, recording.columns(egos, missing=True), self.x0)
         return np.sqrt(np.stack([state.noise for state in states], axis=1))
 
     def _solo(self, interval: float) -> AdaptiveSolo:

@@ -42,7 +42,9 @@ class DriftFilter:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.knowledge, recording)
-        return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known))
+        return follow_egos(
+            self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known), missing=True
+        )
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
         sensors = known.sensors or recording.sensors

@@ -32,14 +32,21 @@ def follow_egos(
     egos: Sequence[int | str],
     follow: Callable[[int, Inbox], Iterable[Estimate]],
     notes: tuple[str, ...] = (),
+    *,
+    missing: bool = False,
 ) -> Track:
     """Track of the egos from what `follow(column, inbox)` yields, every step once in any order; bytes counted.
 
+    Args:
+        missing: whether the method does without a fix where it is missing.
+
     Raises:
-        InputError: an ego that is unknown, no observer of this recording, or absent at times.
+        InputError: an ego that is unknown, no observer of this recording, or absent at times; a missing fix.
     """
     began = time.perf_counter()
-    columns = recording.columns(egos)
+    columns = recording.columns(egos, missing)
+    if not missing:
+        recording.require_complete()
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
     neighbours = np.full_like(recording.relative, np.nan)

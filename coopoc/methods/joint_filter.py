@@ -45,9 +45,11 @@ class JointFilter:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.knowledge, recording)
-        if use_kernels():
+        if use_kernels() and recording.complete:
             return follow_egos(self, recording, egos, self._compiled(recording, known))
-        return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known))
+        return follow_egos(
+            self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known), missing=True
+        )
 
     def _compiled(self, recording: Recording, known: Knowledge) -> Callable[[int, Inbox], Iterator[Estimate]]:
         """What `_follow` yields, as one estimate of all steps from compiled code."""

@@ -69,7 +69,7 @@ class Kalman:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
-        columns = recording.columns(egos)
+        columns = recording.columns(egos, missing=True)
         known = resolve(self.knowledge, recording)
         variance = known.process_variance(recording)
         variance = variance[:, :, columns] if variance.shape[2] > 1 else variance

@@ -48,7 +48,9 @@ class LaplacianKalman:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.knowledge, recording)
-        return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known))
+        return follow_egos(
+            self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known), missing=True
+        )
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
         state: Floats = np.empty((recording.runs, 0, 3))

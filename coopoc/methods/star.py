@@ -67,7 +67,9 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
         motion = _prompt if (sent == t).all() else held_motion
         moved, process, fix, fix_variance = motion(recording, variance, members, sent, uses, t)
         relative = recording.relative[:, links]
-        heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1)
+        there: Bools = np.asarray(np.isfinite(fix).all(axis=-1))
+        heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1) & there
+        fix = np.where(there[..., None], fix, 0.0)
         yield StarStep(
             t, kept, links, relative, to_vector(relative), moved, process, fix,
             _when_sent(fixes, members, sent, t) + fix_variance, heard,

@@ -220,7 +220,7 @@ def solo_track(
     solo: Solo[State], recording: Recording, egos: Sequence[int | str], x0: Floats | None, notes: tuple[str, ...] = ()
 ) -> Track:
     """Track of a solo filter, which receives and sends nothing; InputError if an ego is unknown or absent."""
-    began, columns = time.perf_counter(), recording.columns(egos)
+    began, columns = time.perf_counter(), recording.columns(egos, missing=True)
     found = [solo.read(state) for state in scan(solo, recording, columns, x0)]
     x = np.stack([position for position, _ in found], axis=1)
     claims = [covariance for _, covariance in found if covariance is not None]

@@ -33,6 +33,7 @@ def fleet_track(
     """
     began = time.perf_counter()
     columns = recording.columns(egos)
+    recording.require_complete()
     met = contacts()
     x, cov = solve(met)
     return Track(

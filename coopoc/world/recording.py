@@ -51,7 +51,8 @@ class Recording:
 
     Args:
         ids: (N,) names. t: (T,) s.
-        gnss: (R, T, N, 3) m. velocity: (R, T, N, 3) m/s, with x_t ~ x_{t-1} + dt u_t; NaN where absent.
+        gnss: (R, T, N, 3) m. velocity: (R, T, N, 3) m/s, with x_t ~ x_{t-1} + dt u_t; both NaN where absent, a fix
+            alone where it is missing.
         links: L directed links; `observers` are the columns whose links were recorded.
         relative: (R, L, 3) range m, world azimuth rad, inclination rad of the neighbour as the observer sees it.
         broadcasts: (T, N) True where a vehicle broadcasts.
@@ -88,12 +89,28 @@ class Recording:
         """R."""
         return int(self.gnss.shape[0])
 
+    @cached_property
+    def complete(self) -> bool:
+        """Whether every vehicle has a fix wherever it is."""
+        return bool((np.isfinite(self.gnss) | np.isnan(self.velocity)).all())
+
+    def require_complete(self) -> None:
+        """InputError, which names the vehicle and the step, if a fix is missing."""
+        if not self.complete:
+            _, step, column, _ = np.argwhere(np.isnan(self.gnss) & np.isfinite(self.velocity))[0]
+            raise InputError("gnss", f"none of {self.ids[column]} at step {step}", "must be there at every step here",
+                             "Take a filter, a learned gain or the joint filter, which do without.")  # fmt: skip
+
     def neighbours(self, ego: int) -> Ints:
         """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
         return np.bincount(self.links.step[self.links.of(ego)], minlength=len(self.t)).astype(np.int64)
 
-    def columns(self, egos: Sequence[int | str]) -> list[int]:
-        """Columns of the egos; InputError if one is unknown, no observer of this recording, or absent at times."""
+    def columns(self, egos: Sequence[int | str], missing: bool = False) -> list[int]:
+        """Columns of the egos; InputError if one is unknown, no observer of this recording, or absent at times.
+
+        Args:
+            missing: whether fixes may be missing (NaN) after the first one while the vehicle drives on.
+        """
         cols = []
         for ego in egos:
             col = self.ids.index(ego) if isinstance(ego, str) and ego in self.ids else ego
@@ -103,9 +120,14 @@ class Recording:
             if col not in self.observers:
                 raise InputError("egos", repr(ego), f"has no links here, only {list(self.observers)} have",
                                  "Name it in observe(..., observers=[...]).")  # fmt: skip
-            if not np.isfinite(self.gnss[0, :, col]).all():
+            if not np.isfinite(self.velocity[:, :, col]).all():
                 mend = "Choose another ego or cut the drive with fleet.between(...)."
                 raise InputError("egos", repr(ego), "is absent at some steps", mend)
+            fixes: Bools = np.asarray(np.isfinite(self.gnss[:, :, col]).all(axis=-1))
+            if not (fixes[:, 0] if missing else fixes).all():
+                step = int(np.argwhere(~fixes)[0, 1])
+                mend = "Cut the drive with fleet.between(...)." if step == 0 else "Take a method that does without."
+                raise InputError("egos", repr(ego), f"has no fix at step {step}, where this method needs one", mend)
             cols.append(int(col))
         return cols
 

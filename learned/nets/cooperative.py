@@ -116,7 +116,9 @@ class CooperativeGain:
             raise InputError("latency", f"{recording.v2x.latency} s", "must be 0 s with sums",
                              "Use CooperativeGain(noise, sums=False).")  # fmt: skip
         told = ToldNoise.by(self.noise, recording) if isinstance(self.noise, NoiseNet) else self.noise
-        return follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, told))
+        return follow_egos(
+            self, recording, egos, lambda ego, box: self._follow(recording, ego, box, told), missing=True
+        )
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, told: Knowledge) -> Iterator[Estimate]:
         state: Floats = np.empty((recording.runs, 0, 3))

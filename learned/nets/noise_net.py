@@ -207,7 +207,7 @@ class NoiseFilter:
     @one_core()
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began, columns = time.perf_counter(), recording.columns(egos)
+        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
         gnss, velocity = (lanes(a[:, :, columns]) for a in (recording.gnss, recording.velocity))
         theta = flatten([self.model]).double()
         with torch.inference_mode():

@@ -66,7 +66,7 @@ class OptimisedKF:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos."""
-        began, columns = time.perf_counter(), recording.columns(egos)
+        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
         velocity = recording.velocity[:, :, columns]
         moved = np.array(self.velocity_ratio) * recording.dt * velocity
         x, spread = solo_filter(recording.gnss[:, :, columns], velocity, np.square(self.process_std) + moved**2,
