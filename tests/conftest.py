@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopoc import Fleet
+from coopoc import Fleet, load
+from coopoc.data.table import write_table
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -52,3 +53,11 @@ def formation() -> Fleet:
 @pytest.fixture(scope="session")
 def crossing() -> Fleet:
     return crossing_fleet()
+
+
+@pytest.fixture(scope="session")
+def short_town(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Path of the first fifteen seconds of the bundled town, for studies that need no more."""
+    path = tmp_path_factory.mktemp("town") / "short.csv"
+    write_table(load("town10").between(0, 150), path)
+    return str(path)

@@ -41,8 +41,8 @@ def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
     assert Knowledge.nominal(Sensors()).sensors == Sensors()
 
 
-def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path) -> None:
-    wanted = {"runs": 3, "egos": "2", "heading_std_deg": "0.0,8.0", "heading_bias_deg": "0.0,8.0",
+def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path, short_town: str) -> None:
+    wanted = {"data": short_town, "runs": 3, "egos": "2", "heading_std_deg": "0.0,8.0", "heading_bias_deg": "0.0,8.0",
               "max_neighbours": "0,10", "method": "kalman,joint,bound"}  # fmt: skip
     results = run("heading_error", tmp_path, settings=wanted, progress=False)
     for kind in study.KINDS:

@@ -14,18 +14,19 @@ QUICK = {"runs": 2, "egos": "2", "max_neighbours": "0,2", "method": "kalman,join
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Results:
-    return run("budget", tmp_path_factory.mktemp("budget"), settings=QUICK, progress=False)
+def results(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
+    wanted = {**QUICK, "data": short_town}
+    return run("budget", tmp_path_factory.mktemp("budget"), settings=wanted, progress=False)
 
 
 def at(**where: object) -> dict[str, object]:
     return {"max_neighbours": 2, **study.FREE, "method": "joint", "knowledge": "nominal", **where}
 
 
-def test_bytes_are_payload_and_what_goes_on_air(results: Results) -> None:
+def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: str) -> None:
     """By hand: 32 B at 10 Hz from each of the neighbours that are there; a CAM carries 350 B more."""
-    drive = load("town10")
-    egos = [drive.index(ego) for ego in scene.egos("town10", "2")]
+    drive = load(short_town)
+    egos = [drive.index(ego) for ego in scene.egos(short_town, "2")]
     near = len(find_links(drive, egos, 2, 30.0, 2.0)) / len(egos) / len(drive.t)
     ideal = [views.mean(results, at(channel="ideal"), kind) for kind in study.BYTES]
     assert ideal == pytest.approx([near * 320, near * 320])

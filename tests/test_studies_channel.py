@@ -10,8 +10,9 @@ from coopoc import run
 from coopoc.studies import latency_loss, robustness, views
 
 
-def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path) -> None:
-    wanted = {"runs": 3, "egos": "1", "method": "kalman,joint", "latency_s": "0.0,0.3", "loss": "0.0,0.6"}
+def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
+    wanted = {"data": short_town, "runs": 3, "egos": "1", "method": "kalman,joint", "latency_s": "0.0,0.3",
+              "loss": "0.0,0.6"}  # fmt: skip
     results = run("latency_loss", tmp_path, settings=wanted, progress=False)
     perfect, late, lossy = (
         views.mean(results, {**latency_loss.PERFECT, "method": "joint", **change})
@@ -26,9 +27,9 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path) -> No
     assert "0.3 s" in table
 
 
-def test_who_trusts_everybody_is_led_astray_and_who_is_careful_is_not(tmp_path: Path) -> None:
-    wanted = {"runs": 1, "egos": "1", "method": "kalman,joint,cooperative-map-gnc", "max_neighbours": "0,4",
-              "attacked_share": "0.0,0.4"}  # fmt: skip
+def test_who_trusts_everybody_is_led_astray_and_who_is_careful_is_not(tmp_path: Path, short_town: str) -> None:
+    wanted = {"data": short_town, "runs": 1, "egos": "1", "method": "kalman,joint,cooperative-map-gnc",
+              "max_neighbours": "0,4", "attacked_share": "0.0,0.4"}  # fmt: skip
     results = run("robustness", tmp_path, settings=wanted, progress=False)
     alone, trusting, careful, unharmed = (
         views.mean(results, robustness.at(method, 4, share))

@@ -14,9 +14,9 @@ from coopoc.studies import scene, views
 QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
 
 
-def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path) -> None:
+def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path, short_town: str) -> None:
     wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
-    results = run("correlated_gnss", tmp_path, settings={**QUICK, **wanted}, progress=False)
+    results = run("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
     value = {name: [views.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
              for name in ("white", "own", "common")}  # fmt: skip
     own, common = value["own"], value["common"]

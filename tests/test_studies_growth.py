@@ -11,8 +11,9 @@ from coopoc.studies import scaling, views
 from coopoc.world.sensing import find_links
 
 
-def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path) -> None:
-    wanted = {"runs": 4, "egos": "2", "method": "kalman,joint,lkf-sa", "knowledge": "nominal,identity"}
+def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path, short_town: str) -> None:
+    wanted = {"data": short_town, "runs": 4, "egos": "2", "method": "kalman,joint,lkf-sa",
+              "knowledge": "nominal,identity"}  # fmt: skip
     results = run("consistency", tmp_path, settings=wanted, progress=False)
     table = (tmp_path / "consistency" / "tables" / "nees.md").read_text()
     good = views.mean(results, {"method": "joint", "knowledge": "nominal"}, "nees_inside")
