@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy import stats
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.world.inbox import inbox
+from coopoc.world.noise import stream
 from coopoc.world.spherical import spherical, to_vector, vector_cov
 from coopoc.world.v2x import FIX_AND_VELOCITY, lost
 
@@ -216,3 +218,11 @@ def test_unknown_and_unrecorded_egos(crossing: Fleet) -> None:
     with pytest.raises(InputError, match="egos"):
         recording.columns(["ghost"])
     assert recording.columns(["c2", 1]) == [2, 1]
+
+
+@pytest.mark.parametrize(("seed", "run"), [(0, 0), (7, 99), (2**32 - 1, 3), (2**40, 2)])
+def test_a_stream_is_that_of_its_key(seed: int, run: int) -> None:
+    """Against NumPy's own way from a tuple of numbers."""
+    key = (seed, run, *(zlib.crc32(word.encode()) for word in ("gnss", "a", "b")))
+    wanted = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
+    assert stream(seed, "gnss", run, "a", "b").normal() == wanted.normal()

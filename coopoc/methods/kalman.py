@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..world.recording import Recording
 from ..world.v2x import NO_MESSAGE, Message
 from .knowledge import Knowledge, resolve
@@ -72,16 +73,17 @@ class Kalman:
         columns = recording.columns(egos, missing=True)
         known = resolve(self.knowledge, recording)
         variance = known.process_variance(recording)
-        variance = variance[:, :, columns] if variance.shape[2] > 1 else variance
+        variance = variance.take(columns, axis=2) if variance.shape[2] > 1 else variance
         x0 = self.x0
         if x0 is not None and x0.shape[-2:] != (len(columns), 3):
             raise InputError("x0", x0.shape, f"must end in (E, 3) = ({len(columns)}, 3)", "One start per ego.")
         x, p = solo_filter(
-            recording.gnss[:, :, columns], recording.velocity[:, :, columns], variance, known.gnss_variance,
-            recording.dt, x0,
+            recording.gnss.take(columns, axis=2), recording.velocity.take(columns, axis=2), variance,
+            known.gnss_variance, recording.dt, x0,
         )  # fmt: skip
-        free = np.zeros((recording.runs, len(columns)))
-        return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), free, free, time.perf_counter() - began)
+        cov, free = np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
+        np.einsum("...ii->...i", cov)[:] = p
+        return Track(recording.t, tuple(columns), x, cov, free, free, time.perf_counter() - began)
 
     def start(
         self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0
@@ -133,9 +135,15 @@ def solo_filter(
         x and p of shape (R, T, N, 3): m and m^2.
     """
     q = np.broadcast_to(process_variance, gnss.shape)
-    x, p = np.empty_like(gnss), np.empty_like(gnss)
+    x, p = np.empty(gnss.shape), np.empty(gnss.shape)
     x[:, 0] = gnss[:, 0] if x0 is None else x0
     p[:, 0] = gnss_variance if x0 is None else 0.0
+    if use_kernels():
+        from ..kernels.solo import follow
+
+        gnss, velocity = np.ascontiguousarray(gnss), np.ascontiguousarray(velocity)
+        follow(gnss, velocity, q, np.asarray(gnss_variance), dt, x, p)
+        return x, p
     for t in range(1, gnss.shape[1]):
         prior = x[:, t - 1] + dt * velocity[:, t]
         found = correct(prior, p[:, t - 1] + q[:, t], gnss[:, t], gnss_variance)

@@ -71,9 +71,7 @@ def exchange(recording: Recording, message: Message) -> Exchange:
     np.add.at(contacts, (step, first), 1)
     np.add.at(contacts, (step, second), 1)
     size = np.broadcast_to(message.size(recording.v2x.overhead, contacts), contacts.shape)
-    received = np.zeros((recording.runs, vehicles))
-    for vehicle in range(vehicles):
-        _receive(recording, vehicle, (step, first, second, sight, back), (to_first, to_second), size, received)
+    received = _receive(recording, (step, first, second, sight, back), (to_first, to_second), size)
     sends = recording.broadcasts * (contacts if message.unicast else recording.v2x.max_neighbours > 0)
     delay = int(np.ceil(recording.v2x.latency / recording.dt - 1e-9))
     in_time = delay * recording.dt <= recording.v2x.max_age + 1e-9
@@ -112,22 +110,18 @@ def _arrivals(
     return reaching(sight, back, second), reaching(back, sight, first)
 
 
-def _receive(
-    recording: Recording, vehicle: int, pairs: tuple[Ints, ...], arrivals: tuple[Ints, Ints], size: Ints,
-    received: Floats,
-) -> None:  # fmt: skip
-    """Apply the cap to what one vehicle receives, in place, and count its bytes."""
+def _receive(recording: Recording, pairs: tuple[Ints, ...], arrivals: tuple[Ints, Ints], size: Ints) -> Floats:
+    """Apply the cap to what each vehicle receives, in place, and count its bytes (R, N)."""
     step, first, second, sight, back = pairs
-    mine = np.flatnonzero((first == vehicle) | (second == vehicle))
-    here = first[mine] == vehicle
-    own = np.where(here, sight[mine], back[mine])
-    rank = np.where(own >= 0, own, len(recording.links) + np.where(here, back[mine], sight[mine]))
-    order = np.lexsort((rank, step[mine]))
-    mine, here = mine[order], here[order]
-    sender = np.where(here, second[mine], first[mine])
-    arrival = np.where(here, arrivals[0][:, mine], arrivals[1][:, mine])
-    sizes = size[step[mine], sender]
-    arrival = within_cap(arrival, sizes, recording)
-    arrivals[0][:, mine[here]] = arrival[:, here]
-    arrivals[1][:, mine[~here]] = arrival[:, ~here]
-    received[:, vehicle] = ((arrival >= 0) & (arrival < len(recording.t))) @ sizes
+    vehicles, count = len(recording.ids), len(step)
+    arrival, receiver = np.concatenate(arrivals, axis=1), np.concatenate([first, second])
+    sizes = np.concatenate([size[step, second], size[step, first]])
+    if np.isfinite(recording.v2x.bytes_per_second):
+        own, other = np.concatenate([sight, back]), np.concatenate([back, sight])
+        rank = np.where(own >= 0, own, len(recording.links) + other)
+        order = np.lexsort((rank, np.tile(step, 2), receiver))
+        for mine in np.split(order, np.searchsorted(receiver[order], np.arange(1, vehicles))):
+            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], recording)
+        arrivals[0][:], arrivals[1][:] = arrival[:, :count], arrival[:, count:]
+    there = (arrival >= 0) & (arrival < len(recording.t))
+    return np.stack([np.bincount(receiver, row * sizes, minlength=vehicles) for row in there]).astype(float)

@@ -15,6 +15,11 @@ from .sensors import Sensors
 from .spherical import spherical, wrap
 from .v2x import V2X, lost
 
+PAIRS = 2_000_000
+"""Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
+GRID = 1000
+"""Cells along each side of the ground, at most."""
+
 
 def observe(
     fleet: Fleet,
@@ -63,18 +68,49 @@ def observe(
 
 
 def find_links(fleet: Fleet, observers: Sequence[int], most: int, radius: float, min_range: float = 0.0) -> Links:
-    """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance."""
+    """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance.
+
+    Vehicles at one distance come by column. Near vehicles are looked up in a grid: linear in vehicles and steps.
+    """
     found = [np.empty((0, 3), dtype=np.int64)]
-    for observer in observers if most else ():
-        gap = np.linalg.norm(fleet.position - fleet.position[:, observer : observer + 1], axis=2)
-        gap[:, observer] = np.inf
-        gap[~((gap <= radius) & (gap >= min_range))] = np.inf
-        order = np.argsort(gap, axis=1, kind="stable")[:, :most]
-        step, rank = np.nonzero(np.isfinite(np.take_along_axis(gap, order, axis=1)))
-        found.append(np.column_stack([step, np.full(len(step), observer), order[step, rank]]))
+    vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
+    at_once = max(1, PAIRS // (vehicles * max(1, len(columns))))
+    for first in range(0, len(fleet.t), at_once) if most and len(columns) else ():
+        position = fleet.position[first : first + at_once]
+        place, other = _near(position, columns, radius)
+        gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[place], axis=1)
+        fits = (gap <= radius) & (gap >= min_range) & (place != other)
+        place, other, gap = place[fits], other[fits], gap[fits]
+        order = np.lexsort((other, gap, place))
+        place, other = place[order], other[order]
+        rank = np.arange(len(place)) - np.searchsorted(place, place)
+        place, other = place[rank < most], other[rank < most]
+        found.append(np.column_stack([place // vehicles + first, place % vehicles, other % vehicles]))
     rows = np.concatenate(found)
-    rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     return Links(rows[:, 0], rows[:, 1], rows[:, 2])
+
+
+def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
+    """Places (step x vehicles + column) of observers and of all vehicles in their cell or the eight around it.
+
+    Args:
+        position: (T, N, 3) m, NaN where absent. columns: of the observers. radius: m, cells are no smaller.
+    """
+    vehicles = position.shape[1]
+    here = np.flatnonzero(np.isfinite(position[..., 0]))
+    ground = position.reshape(-1, 3)[here, :2]
+    low, high = ground.min(axis=0, initial=np.inf), ground.max(axis=0, initial=-np.inf)
+    side = max(1.001 * radius, float((high - low).max(initial=0.0)) / GRID, 1e-9)
+    cell = np.floor((ground - low) / side).astype(np.int64) + 1
+    width = GRID + 3  # an empty row and column around the cells of each step
+    key = ((here // vehicles) * width + cell[:, 0]) * width + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    looks = np.isin(np.arange(vehicles), columns)[here % vehicles]
+    rows = key[looks][:, None] + width * np.arange(-1, 2)
+    begin, end = np.searchsorted(key[order], rows - 1), np.searchsorted(key[order], rows + 1, side="right")
+    count = (end - begin).ravel()
+    place = np.repeat(begin.ravel() - np.cumsum(count) + count, count) + np.arange(count.sum())
+    return np.repeat(here[looks], (end - begin).sum(axis=1)), here[order[place]]
 
 
 def _normals(fleet: Fleet, sensor: str, runs: int, seed: int) -> Floats:
@@ -135,12 +171,13 @@ def _relative(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
-    relative = np.repeat(exact[None], runs, axis=0)
+    relative = np.empty((runs, *exact.shape))
     for observer, neighbour, index in _pairs(fleet, links):
-        last = int(links.step[index[-1]]) + 1
+        step = links.step[index]
         for r in range(runs):
-            draws = stream(seed, "relative", r, observer, neighbour).standard_normal((last, 3))
-            relative[r, index] += draws[links.step[index]] * sensors.relative_std
+            draws = stream(seed, "relative", r, observer, neighbour).standard_normal((step[-1] + 1, 3))
+            relative[r, index] = draws[step]
+    relative = exact + relative * sensors.relative_std
     relative[..., 1] += _heading(fleet, links, sensors, runs, seed)
     relative[..., 0] = np.abs(relative[..., 0])
     relative[..., 1] = wrap(relative[..., 1])

@@ -1,0 +1,293 @@
+"""The whole fleet: batch smoother of 60 vehicles and 900 steps, neighbour search, noise, solo filter, in one run.
+
+    OMP_NUM_THREADS=1 python benchmarks/fleet.py            # three Markdown tables on stdout, about two minutes
+
+Vehicles drive at random through a grid of streets, blocks of 60 m, as many a block at every size. Times are those of
+the process on its processors, medians of interleaved rounds; the ratios are to be compared. GTSAM gets factors whose
+matrices NumPy has made beforehand. A row counts only if its answer is that of its problem: position within 1 mm and
+cost within 1e-6 of the reference, links the same in the same order, the solo filter within 1e-9 m.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import time
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+import gtsam
+import numba
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from scipy.linalg.lapack import dpotrf, dpotri
+from tabulate import tabulate
+
+import coopoc as co
+from coopoc.kernels.compile import SWITCH
+from coopoc.methods.kalman import solo_filter
+from coopoc.methods.network import whitened
+from coopoc.world import exchange, sensing
+from coopoc.world.spherical import to_vector
+from coopoc.world.v2x import NO_MESSAGE
+
+VEHICLES, STEPS, BLOCK = 60, 900, 60.0
+SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=10)
+KNOWN = co.Knowledge.nominal(SENSORS)
+ROUNDS = 3
+
+
+class Row(NamedTuple):
+    """One way to do the job: its words, the call, the distance from its reference in metres, if it is right."""
+
+    words: str
+    call: Callable[[], Any]
+    difference: float | None
+    right: bool
+
+
+def town(vehicles: int, steps: int, seed: int = 0) -> co.Fleet:
+    """Vehicles that turn at random where streets cross; four or so to a crossing, whatever their number."""
+    rng, across = np.random.default_rng(seed), round(np.sqrt(vehicles / 60) * 4)
+    turns = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])
+    position = np.empty((steps, vehicles, 3))
+    for vehicle in range(vehicles):
+        here, course = rng.integers(0, across, 2), int(rng.integers(4))
+        gone = rng.uniform(0, BLOCK) + 0.1 * rng.uniform(6, 13) * np.arange(steps)
+        corners = [here]
+        while len(corners) * BLOCK < gone[-1] + 2 * BLOCK:
+            ways = [c for c in (course, course - 1, course + 1, course + 2)
+                    if ((here + turns[c % 4] >= 0) & (here + turns[c % 4] < across)).all()][:3]  # fmt: skip
+            course = int(rng.choice(ways)) % 4
+            here = here + turns[course]
+            corners.append(here)
+        at = BLOCK * np.arange(len(corners))
+        lane = rng.uniform(-3, 3, 2)
+        for c in range(2):
+            position[:, vehicle, c] = np.interp(gone, at, BLOCK * np.array(corners)[:, c]) + lane[c]
+        position[:, vehicle, 2] = 0.5 * np.sin(gone / 50)
+    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
+    return co.Fleet(tuple(f"v{i}" for i in range(vehicles)), 0.1 * np.arange(steps), position, velocity)
+
+
+def timed(call: Callable[[], Any]) -> float:
+    gc.collect()
+    gc.disable()  # GTSAM's factors are many objects, which every collection would visit at the cost of whoever is next
+    began = time.process_time()
+    call()
+    spent = time.process_time() - began
+    gc.enable()
+    return spent
+
+
+def plain(call: Callable[[], Any]) -> Any:
+    """The call in NumPy."""
+    before = os.environ.get(SWITCH)
+    os.environ[SWITCH] = "numpy"
+    try:
+        return call()
+    finally:
+        os.environ.pop(SWITCH)
+        if before is not None:
+            os.environ[SWITCH] = before
+
+
+class Linear(NamedTuple):
+    """The converted problem as GTSAM takes it: keys, vectors m and square-root informations of its factors."""
+
+    fixes: list[Any]
+    ties: list[Any]
+    start: np.ndarray
+
+
+def linear(recording: co.Recording) -> Linear:
+    """Factors of run 0, everything but their objects."""
+    steps, vehicles = recording.gnss.shape[1:3]
+    links, relative = recording.links, recording.relative[0]
+    vectors = to_vector(relative)
+    roots = whitened(vectors, relative, KNOWN)[0]
+    keys = np.arange(steps * vehicles).reshape(steps, vehicles)
+    moved, std = recording.dt * recording.velocity[0], np.sqrt(KNOWN.process_variance(recording)[0])
+    fixes = list(zip(keys.ravel().tolist(), recording.gnss[0].reshape(-1, 3), strict=True))
+    ties = [(int(keys[t - 1, k]), int(keys[t, k]), moved[t, k], gtsam.noiseModel.Diagonal.Sigmas(std[t, k]))
+            for t in range(1, steps) for k in range(vehicles)]  # fmt: skip
+    ties += [(int(a), int(b), vector, gtsam.noiseModel.Gaussian.SqrtInformation(np.asfortranarray(root), False))
+             for a, b, vector, root in zip(keys[links.step, links.observer], keys[links.step, links.neighbour],
+                                           vectors, roots, strict=True)]  # fmt: skip
+    variance = KNOWN.process_variance(recording)
+    start = solo_filter(recording.gnss, recording.velocity, variance, KNOWN.gnss_variance, recording.dt)[0][0]
+    return Linear(fixes, ties, start)
+
+
+def by_gtsam(problem: Linear) -> tuple[np.ndarray, float]:
+    """Positions (T, N, 3) and the cost of GTSAM's Levenberg-Marquardt, from the solo filters."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    of_a_fix = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
+    for key, fix in problem.fixes:
+        graph.add(gtsam.PriorFactorPoint3(key, fix, of_a_fix))
+    for first, second, vector, model in problem.ties:
+        graph.add(gtsam.BetweenFactorPoint3(first, second, vector, model))
+    for key, x in enumerate(problem.start.reshape(-1, 3)):
+        values.insert(key, x)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
+    x = np.array([found.atPoint3(k) for k in range(len(problem.fixes))])
+    return x.reshape(problem.start.shape), graph.error(found)
+
+
+def cost(problem: Linear, x: np.ndarray) -> float:
+    """Half the squared whitened residuals, as GTSAM counts."""
+    flat = x.reshape(-1, 3)
+    total = float(np.square((flat - np.array([z for _, z in problem.fixes])) / KNOWN.gnss_std).sum())
+    for first, second, vector, model in problem.ties:
+        total += float(np.square(model.R() @ (flat[second] - flat[first] - vector)).sum())
+    return total / 2
+
+
+def smoother_rows(recording: co.Recording) -> list[Row]:
+    """Linear ones against GTSAM's, exact ones against converged Gauss-Newton."""
+    problem, everyone = linear(recording), range(VEHICLES)
+    wanted, least = by_gtsam(problem)
+    once, exact, two = co.BatchSmoother(exact_steps=0), co.BatchSmoother(), co.BatchSmoother(settle=np.inf)
+
+    def ours(method: co.BatchSmoother) -> Any:
+        return method(recording, everyone)
+
+    def row(words: str, method: co.BatchSmoother, reference: np.ndarray, in_numpy: bool = False) -> Row:
+        def call() -> Any:
+            return plain(lambda: ours(method)) if in_numpy else ours(method)
+
+        x = call().x[0]
+        away = float(np.abs(x - reference).max())
+        right = away < 1e-3 and (method is not once or cost(problem, x) / least - 1 < 1e-6)
+        return Row(words, call, away, right)
+
+    converged = ours(co.BatchSmoother(exact_steps=8, settle=1e-7)).x[0]
+    size = 3 * VEHICLES
+    root = np.random.default_rng(0).normal(size=(size, 2 * size))
+    full, work = np.asfortranarray(root @ root.T), np.empty((size, size), order="F")
+
+    def floor() -> None:
+        for _ in range(2 * STEPS):
+            work[:] = full
+            dpotrf(work, lower=1, overwrite_a=1, clean=0)
+            dpotri(work, lower=1, overwrite_c=1)
+
+    return [
+        row("BatchSmoother, converted problem, all marginals", once, wanted),
+        row("BatchSmoother, one exact step, all marginals", two, converged),
+        row("BatchSmoother, exact and settled, all marginals", exact, converged),
+        row("the same in NumPy", exact, converged, in_numpy=True),
+        Row(GTSAM, lambda: by_gtsam(problem), 0.0, True),
+        Row("floor: LAPACK's factors and inverses of two sweeps", floor, None, True),
+    ]
+
+
+GTSAM = "GTSAM Levenberg-Marquardt, converted problem, no marginals"
+
+
+def table(rows: Sequence[Row], peer: str) -> str:
+    """Medians of interleaved rounds, and ratios to a peer and to the last row, the floor."""
+    spent: dict[str, list[float]] = {row.words: [] for row in rows}
+    for _ in range(ROUNDS):
+        for row in rows:
+            spent[row.words].append(timed(row.call))
+    medians = {words: float(np.median(times)) for words, times in spent.items()}
+    lines = [[row.words, medians[row.words], medians[peer] / medians[row.words],
+              medians[row.words] / medians[rows[-1].words], row.difference, "yes" if row.right else "NO"]
+             for row in rows]  # fmt: skip
+    header = ["", "s", "x peer", "x floor", "difference m", "same answer"]
+    return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", ".3g", ".3g", ".1e", ""))
+
+
+def by_pairs(fleet: co.Fleet, most: int, radius: float, least: float) -> np.ndarray:
+    """Links (L, 3) from every distance, N x N of them at each step."""
+    found = []
+    for t, position in enumerate(fleet.position):
+        gap = np.linalg.norm(position - position[:, None], axis=2)
+        np.fill_diagonal(gap, np.inf)
+        gap[~((gap <= radius) & (gap >= least))] = np.inf
+        order = np.argsort(gap, axis=1, kind="stable")[:, :most]
+        observer, rank = np.nonzero(np.isfinite(np.take_along_axis(gap, order, axis=1)))
+        found.append(np.column_stack([np.full(len(observer), t), observer, order[observer, rank]]))
+    return np.concatenate(found)
+
+
+def growth(sizes: Sequence[tuple[int, int]]) -> str:
+    """Microseconds per vehicle and step of what makes a recording, from 60 to 2,000 vehicles."""
+    lines = []
+    for vehicles, steps in sizes:
+        fleet, everyone = town(vehicles, steps), range(vehicles)
+        args = (CHANNEL.max_neighbours, CHANNEL.radius, SENSORS.min_range)
+        links = sensing.find_links(fleet, everyone, *args)
+        few = fleet.between(0, 900 // vehicles + 2)
+        wanted = by_pairs(few, *args)
+        found = sensing.find_links(few, everyone, *args)
+        same = np.array_equal(wanted, np.column_stack([found.step, found.observer, found.neighbour]))
+        recording = co.observe(fleet, SENSORS, CHANNEL)
+        each = 1e6 / (vehicles * steps)
+        lines.append([
+            vehicles, steps, len(links) / vehicles / steps,
+            each * timed(lambda f=fleet, e=everyone, a=args: sensing.find_links(f, e, *a)),
+            1e6 / (vehicles * len(few.t)) * timed(lambda f=few, a=args: by_pairs(f, *a)),
+            each * timed(lambda f=fleet: sensing._normals(f, "gnss", 1, 0)),
+            each * timed(lambda f=fleet, n=links: sensing._relative(f, n, SENSORS, 1, 0)),
+            each * timed(lambda f=fleet: co.observe(f, SENSORS, CHANNEL)),
+            each * timed(lambda r=recording: exchange.exchange(r, NO_MESSAGE)), "yes" if same else "NO",
+        ])  # fmt: skip
+    header = ["vehicles", "steps", "links each", "search", "search, N x N", "draws of fixes", "sightings", "observe",
+              "exchange", "same links"]  # fmt: skip
+    return tabulate(lines, header, tablefmt="github", floatfmt=".3g")
+
+
+def solo_rows(recording: co.Recording) -> list[Row]:
+    """All vehicles; filterpy's is one vehicle's time times their number."""
+    variance, vehicles = KNOWN.process_variance(recording), len(recording.ids)
+
+    def ours() -> Any:
+        return solo_filter(recording.gnss, recording.velocity, variance, KNOWN.gnss_variance, recording.dt)
+
+    def peer(vehicle: int) -> np.ndarray:
+        filter_ = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+        filter_.x, filter_.P = recording.gnss[0, 0, vehicle].copy(), np.diag(KNOWN.gnss_variance)
+        filter_.B, filter_.H, filter_.R = 0.1 * np.eye(3), np.eye(3), np.diag(KNOWN.gnss_variance)
+        found = [filter_.x]
+        for t in range(1, len(recording.t)):
+            filter_.predict(u=recording.velocity[0, t, vehicle], Q=np.diag(variance[0, t, vehicle]))
+            filter_.update(recording.gnss[0, t, vehicle])
+            found.append(filter_.x)
+        return np.array(found)
+
+    wanted = np.stack([peer(k) for k in range(vehicles)], axis=1)
+
+    def row(words: str, call: Callable[[], Any], found: np.ndarray) -> Row:
+        away = float(np.abs(found - wanted).max())
+        return Row(words, call, away, away < 1e-9)
+
+    return [
+        row("solo filter, compiled", ours, ours()[0][0]),
+        row("solo filter, NumPy", lambda: plain(ours), plain(ours)[0][0]),
+        row("Kalman, compiled", lambda: co.Kalman()(recording, range(vehicles)),
+            co.Kalman()(recording, range(vehicles)).x[0]),
+        Row("filterpy, KalmanFilter", lambda: [peer(k) for k in range(vehicles)], 0.0, True),
+        Row("floor: a copy of what is read and written",
+            lambda: [a.copy() for a in (recording.gnss, recording.velocity, variance, recording.gnss, variance)],
+            None, True),
+    ]  # fmt: skip
+
+
+def main() -> None:
+    """Print the tables."""
+    recording = co.observe(town(VEHICLES, STEPS), SENSORS, CHANNEL)
+    print(f"{VEHICLES} vehicles, {STEPS} steps, {len(recording.links)} sightings; numba {numba.__version__}, gtsam "
+          f"{version('gtsam')}.\n")  # fmt: skip
+    print("Batch smoother, whole drive:\n")
+    print(table(smoother_rows(recording), GTSAM), "\n")
+    print("What makes a recording, microseconds per vehicle and step:\n")
+    print(growth([(60, 900), (500, 300), (2000, 100)]), "\n")
+    print("Solo filter, all vehicles, whole drive:\n")
+    print(table(solo_rows(recording), "filterpy, KalmanFilter"))
+
+
+if __name__ == "__main__":
+    main()
