@@ -98,8 +98,8 @@ def _table(results: Results) -> Table | None:
         ran = [value for value in found if value is not None]
         if ran:
             name = "Observing" if method == "observe" else look(method).label
-            body.append((name, *found, max(ran) / min(ran)))
-    header = ("Method", *(f"{each * copies:,} vehicles" for copies in sizes), "Most / least")
+            body.append((name, *found, ran[-1] / ran[0]))
+    header = ("Method", *(f"{each * copies:,} vehicles" for copies in sizes), "Largest / smallest")
     return Table(header, tuple(body), _caption(results), decimals=2) if body else None
 
 
@@ -138,12 +138,13 @@ def _findings(results: Results) -> Sequence[str]:
     for method in (*PER_EGO, *DISTRIBUTED):
         ran = [value for copies in COPIES if (value := _us(results, method, copies)) is not None]
         if len(ran) > 1:
-            worst[method] = max(ran) / min(ran)
+            worst[method] = ran[-1] / ran[0]
     if not worst:
         return []
     name = max(worst, key=lambda method: worst[method])
-    verdict = "flat within 1.5 times" if worst[name] <= 1.5 else "NOT flat within 1.5 times"
-    return [f"Cost per vehicle and step is {verdict}: most over least is {worst[name]:.2f} for {name}."]
+    verdict = "grows by less than 1.5 times" if worst[name] <= 1.5 else "grows by MORE than 1.5 times"
+    return [f"Cost per vehicle and step {verdict} from the smallest to the largest fleet: most for {name}, "
+            f"{worst[name]:.2f} times."]  # fmt: skip
 
 
 STUDY = Study(

@@ -34,4 +34,4 @@ def test_copies_do_not_see_each_other_and_cost_is_counted_per_vehicle(tmp_path: 
     results = run("scaling", tmp_path, settings=wanted, progress=False)
     each = [scaling._us(results, "gbp", copies) for copies in (1, 2)]
     assert all(value is not None and np.isfinite(value) and value > 0 for value in each)
-    assert "Most / least" in (tmp_path / "scaling" / "tables" / "cost.md").read_text()
+    assert "Largest / smallest" in (tmp_path / "scaling" / "tables" / "cost.md").read_text()

@@ -72,8 +72,7 @@ class Kalman:
         began = time.perf_counter()
         columns = recording.columns(egos, missing=True)
         known = resolve(self.knowledge, recording)
-        variance = known.process_variance(recording)
-        variance = variance.take(columns, axis=2) if variance.shape[2] > 1 else variance
+        variance = known.process_variance(recording, columns)
         x0 = self.x0
         if x0 is not None and x0.shape[-2:] != (len(columns), 3):
             raise InputError("x0", x0.shape, f"must end in (E, 3) = ({len(columns)}, 3)", "One start per ego.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -77,12 +78,13 @@ class Knowledge:
         gnss = np.sqrt(np.nanmean((recording.gnss - fleet.position) ** 2, axis=(0, 1, 2)))
         return cls("fitted", recording.sensors, _three(process), _three(gnss))
 
-    def process_variance(self, recording: Recording) -> Floats:
-        """Per-axis variance of x_t given x_{t-1}, broadcastable to (R, T, N, 3), m^2."""
+    def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
+        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, N, 3) or to the columns of these."""
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None
         velocity = recording.velocity if self.velocity is None else self.velocity[None]
+        velocity = velocity if columns is None else velocity.take(columns, axis=2)
         floor = 1e-6 if self.velocity is not None else self.sensors.velocity_floor
         variance: Floats = (recording.dt * self.sensors.velocity_std(velocity, floor)) ** 2
         return variance

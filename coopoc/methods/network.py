@@ -143,8 +143,12 @@ def apply(matrix: Floats, vector: Floats) -> Floats:
 
 def collect(values: Floats, to: Ints, n: int) -> Floats:
     """Sums (R, n, ...) of values (R, M, ...) by the place `to` (M,) that each belongs to."""
-    sums = np.equal.outer(np.arange(n), to).astype(float)
-    return np.moveaxis(np.tensordot(sums, values, axes=(1, 1)), 0, 1)
+    sums = np.zeros((len(values), n, *values.shape[2:]))
+    if len(to):
+        order = np.argsort(to, kind="stable")
+        begins = np.flatnonzero(np.diff(to[order], prepend=-1))
+        sums[:, to[order][begins]] = np.add.reduceat(values[:, order], begins, axis=1)
+    return sums
 
 
 def information(n: int, first: Ints, second: Ints, weight: Floats, pull: Floats) -> tuple[Floats, Floats]:

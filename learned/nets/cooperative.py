@@ -46,10 +46,10 @@ class ToldNoise(Knowledge):
         fix, process = tell(model, recording)
         return cls("told", recording.sensors, fix=fix, process=process)
 
-    def process_variance(self, recording: Recording) -> Floats:
-        """(R, T, N, 3) m^2."""
+    def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
+        """(R, T, N, 3) m^2, or the columns of it."""
         assert self.process is not None
-        return self.process
+        return self.process if columns is None else self.process.take(columns, axis=2)
 
     def fix_variance(self, recording: Recording) -> Floats:
         """(R, T, N, 3) m^2."""
