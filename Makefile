@@ -1,5 +1,6 @@
 # make paper   the environment, the training, the studies, the report in runs/paper/
 # make test    the environment, then style, types and tests
+# make benchmark   every benchmark, its ratios against benchmarks/baseline.json
 # make clean   forget the environment (results in runs/ stay)
 #
 # TORCH_INDEX: where the package index serves torch's CUDA build (several GB; it works, too), name an index of CPU builds:
@@ -12,7 +13,7 @@ READY := $(VENV)/.ready
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: paper test clean
+.PHONY: paper test benchmark clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -20,6 +21,9 @@ paper: $(READY)
 test: $(VENV)/.ready-dev
 	$(VENV)/bin/ruff check .
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
+
+benchmark: $(VENV)/.ready-dev
+	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py --gate
 
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "coopoc needs Python 3.11 or later: make PYTHON=python3.11")'

@@ -329,13 +329,38 @@ def stone_soup_drive(drive: Drive) -> np.ndarray:
     return found
 
 
-def table(rows: list[Row], peer: str, floor: float) -> str:
-    """Medians of interleaved rounds, and ratios to a peer and to the floor (s per solve)."""
+def seconds(rows: list[Row]) -> dict[str, float]:
+    """Per solve, medians of interleaved rounds."""
     spent: dict[str, list[float]] = {row.words: [] for row in rows}
     for _ in range(ROUNDS):
         for row in rows:
             spent[row.words].append(timed(row.call) / row.solves)
-    medians = {words: float(np.median(times)) for words, times in spent.items()}
+    return {words: float(np.median(times)) for words, times in spent.items()}
+
+
+def parts() -> list[tuple[str, str, list[Row]]]:
+    """The two jobs, each with the row that it is compared to."""
+    recording = ring()
+    return [("snapshot", GTSAM, snapshot_rows(recording)), ("joint filter", FILTERPY, filter_rows(recording))]
+
+
+def measured(found: list[tuple[str, str, list[Row]]] | None = None) -> list[dict[str, Any]]:
+    """Per row its name, microseconds, the ratio to the peer's time, and whether its answer is right: None where it is
+    another one by construction."""
+    out: list[dict[str, Any]] = []
+    for job, peer, rows in parts() if found is None else found:
+        medians = seconds(rows)
+        for row in rows:
+            right = None if row.words.startswith("Stone Soup, extended") else row.right
+            spent = medians[row.words]
+            ratio = spent / medians[peer]
+            out.append({"name": f"{job}: {row.words}", "us": 1e6 * spent, "ratio": ratio, "right": right})
+    return out
+
+
+def table(rows: list[Row], peer: str, floor: float) -> str:
+    """Medians of interleaved rounds, and ratios to a peer and to the floor (s per solve)."""
+    medians = seconds(rows)
     lines = [[row.words, 1e6 * medians[row.words], medians[peer] / medians[row.words], medians[row.words] / floor,
               row.difference, "yes" if row.right else "NO"] for row in rows]  # fmt: skip
     if stone_soup() is None:

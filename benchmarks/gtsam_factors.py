@@ -143,7 +143,7 @@ def ways(problem: Problem) -> dict[str, tuple[Callable[[], Any], Callable[[Any],
         found["GTSAM's own"] = (lambda: native_graph(problem, forms(problem)).graph,
                                 lambda graph: graph.linearize(at).optimize())  # fmt: skip
     damping = np.zeros((1, len(problem.names), problem.space.dof))
-    found["JacobianFactors from NumPy"] = (lambda: gtsam_.elimination_step(problem),
+    found["JacobianFactors from NumPy"] = (lambda: gtsam_.linear_step(problem),
                                            lambda step: step(problem.linearise(x), damping))  # fmt: skip
     found["CustomFactors, Python's loop"] = (lambda: custom_graph(problem),
                                              lambda graph: graph.linearize(at).optimize())  # fmt: skip

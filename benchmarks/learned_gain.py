@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 from functools import reduce
 from typing import Any, NamedTuple
 
@@ -150,14 +149,49 @@ def inference(net: GainNet, drive: Pieces) -> list[Row]:
     return rows
 
 
-def table(rows: list[Row], flops: float, allowed: float, against: Callable[[Row], Row]) -> str:
-    """Microseconds per trajectory-step (median of interleaved rounds), steps/s, ratios to plain torch and the floor."""
+def seconds(rows: list[Row]) -> dict[str, float]:
+    """Per trajectory-step, medians of interleaved rounds."""
     spent: dict[str, list[float]] = {row.words: [] for row in rows}
     for _ in range(ROUNDS):
         for row in rows:
             with row_threads(row.threads):
                 spent[row.words].append(timed(row.call) / row.steps)
-    medians = {words: float(np.median(times)) for words, times in spent.items()}
+    return {words: float(np.median(times)) for words, times in spent.items()}
+
+
+def parts() -> tuple[GainNet, Pieces, Pieces]:
+    """The net, what it trains on and the drive that it follows."""
+    group = clients(co.load("town10-clients"))
+    pieces = Pieces.join([c.training for c in group])
+    return GainNet(), pieces.take(range(len(pieces) // 12 * 12)), group[0].long.take([0])
+
+
+@one_core()
+def measured(found: tuple[GainNet, Pieces, Pieces] | None = None) -> list[dict[str, Any]]:
+    """Per row its name, microseconds, the ratio to plain torch's time, and whether its answer is right."""
+    net, pieces, drive = parts() if found is None else found
+    out: list[dict[str, Any]] = []
+    for job, allowed, rows in (("training", 1e-4, training(net, pieces)), ("inference", 1e-3, following(net, drive))):
+        medians = seconds(rows)
+        for row in rows:
+            full = job == "training" and row.words.endswith(f"batch {len(pieces)}")
+            words = row.words.replace(f"batch {len(pieces)}", "full batch")
+            words = words.replace(f"batch {len(pieces) // 6}", "a sixth")
+            spent, plain = medians[row.words], medians[rows[full].words]
+            right = row.error <= allowed
+            out.append({"name": f"{job}: {words}", "us": 1e6 * spent, "ratio": spent / plain, "right": right})
+    return out
+
+
+@torch.no_grad()
+def following(net: GainNet, drive: Pieces) -> list[Row]:
+    """`inference`, without gradients also when its calls are timed later."""
+    return [row._replace(call=torch.no_grad()(row.call)) for row in inference(net, drive)]
+
+
+def table(rows: list[Row], flops: float, allowed: float, against: Callable[[Row], Row]) -> str:
+    """Microseconds per trajectory-step (median of interleaved rounds), steps/s, ratios to plain torch and the floor."""
+    medians = seconds(rows)
     lines: list[Iterable[Any]] = []
     for row in rows:
         us = 1e6 * medians[row.words]
@@ -171,11 +205,8 @@ def table(rows: list[Row], flops: float, allowed: float, against: Callable[[Row]
 @one_core()
 def main() -> None:
     """Print the tables."""
-    net, group = GainNet(), clients(co.load("town10-clients"))
-    pieces = Pieces.join([c.training for c in group])
-    count = len(pieces) // 12 * 12
-    pieces = replace(pieces.take(range(count)))
-    drive = group[0].long.take([0])
+    net, pieces, drive = parts()
+    count = len(pieces)
     weights = sum(p.numel() for name, p in net.named_parameters() if "weight" in name)
     speed = peak()
     floor = 2.0 * weights / speed
@@ -185,10 +216,9 @@ def main() -> None:
     rows = training(net, pieces)
     print("Training, AdamW included:\n")
     print(table(rows, 3 * floor, 1e-4, lambda row: rows[1] if row.words.endswith(str(count)) else rows[0]), "\n")
-    with torch.no_grad():
-        drives = inference(net, drive)
-        print(f"Inference, {drives[0].steps} steps a drive:\n")
-        print(table(drives, floor, 1e-3, lambda row: drives[0]))
+    drives = following(net, drive)
+    print(f"Inference, {drives[0].steps} steps a drive:\n")
+    print(table(drives, floor, 1e-3, lambda row: drives[0]))
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from coopoc import V2X, Fleet, InputError, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Factor, Problem, Status, backends, solve, solve_batch
 from coopoc.optimize.backends.gauss_newton import linear_step
-from coopoc.optimize.initial import initial_guess
+from coopoc.optimize.initial import converted, initial_guess
 from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
@@ -314,3 +314,45 @@ def test_a_missing_library_says_how_to_install_it(
     assert backends()["gauss-newton"].installed
     with pytest.raises(MissingLibraryError, match=f"pip install {backend}"):
         solve(Problem.from_snapshot(dense, 0, 0), backend)
+
+
+BATCHED = [("gauss-newton", {}), ("gtsam", {}), ("osqp", {}), ("casadi", {}), ("casadi", {"method": "sqp"})]
+LINEAR_ONLY = [("gtsam", {"optimizer": "lm"}), ("cvxpy", {})]
+
+
+@pytest.mark.parametrize(
+    ("backend", "options", "exact"),
+    [(*given, exact) for given in BATCHED for exact in (True, False)] + [(*given, False) for given in LINEAR_ONLY],
+)
+def test_a_batch_is_what_each_realisation_is_alone(
+    dense: Recording, backend: str, options: dict[str, str], exact: bool
+) -> None:
+    stars = Problem.from_snapshot(dense, 10, 0, run=None)
+    problem = stars if exact else converted(stars)
+    batch = solve_batch(problem, backend, **options)
+    assert batch.converged.all()
+    for b in range(len(batch.x)):
+        alone = solve(problem.pick(b))
+        assert batch.x[b] == pytest.approx(alone.x, abs=1e-6)
+        assert batch.cost[b] == pytest.approx(alone.cost, rel=1e-9)
+        assert batch.covariance[b] == pytest.approx(alone.covariance, abs=1e-6)
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
+def test_a_realisation_that_leaves_a_point_free_does_not_harm_the_others(backend: str) -> None:
+    """Its weighted fixes are by hand: the mean of 0 and 4."""
+    std = np.array([[[1.0] * 3], [[np.inf] * 3], [[1.0] * 3]])
+    problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
+    problem = problem.add("position", [["b"]], np.full((3, 1, 3), 4.0), std=std)
+    batch = solve_batch(problem.add("position", "a", [4, 4, 4], std=1.0), backend)
+    assert batch.converged.tolist() == [True, False, True]
+    assert batch.x[[0, 2]] == pytest.approx(np.array([[[2.0] * 3, [4.0] * 3]] * 2))
+    assert np.isnan(batch.covariance[1]).all()
+
+
+def test_a_batch_refuses_what_a_backend_does_not_have() -> None:
+    problem = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0)
+    with pytest.raises(InputError, match="must be one of"):
+        solve_batch(problem, "gurobi")
+    with pytest.raises(InputError, match="is no option of osqp"):
+        solve_batch(problem, "osqp", method="sqp")

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from .active import Active, active_at
-from .arrowhead import eliminate, marginals, structure
+from .arrowhead import marginals, structure
 from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
 from .problem import Problem
@@ -61,8 +61,7 @@ def assess(problem: Problem, x: Floats) -> Assessment:
             cov, dx, sound = _restricted(problem.jacobian(linear), gradient[0], scheme.still, active)
         else:
             if problem.hub or len(x) <= SMALL:
-                cov = marginals(frame, blocks)[0]
-                dx = eliminate(frame, blocks, gradient, np.zeros_like(gradient))[0]
+                cov, dx = (each[0] for each in marginals(frame, blocks, gradient))
             else:
                 cov, dx = _sparse(problem.jacobian(linear), gradient[0], scheme.still)
             sound = bool(bounded(scheme, blocks, cov[None]).all())

@@ -19,6 +19,9 @@ MAX_ITERATIONS = 500
 """About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
 TOLERANCE = 1e-8
 """m or rad, largest move of a node in the last step."""
+LINEAR = 1e-6
+"""Share by which a step may be off where the problem is linear: one that is not longer than TOLERANCE over it is the
+last."""
 GIVE_UP = 1e12
 """Damping beyond which no step can help."""
 
@@ -57,13 +60,13 @@ def descend(
     best, count = x.copy(), np.zeros(len(x), dtype=np.int64)
     done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
     active, now = np.arange(len(x)), problem
-    linear = problem.linearise(best)
+    linear, near = problem.linearise(best), tolerance / LINEAR if problem.linear else tolerance
     for _ in range(max_iterations):
         dx, solved = _try(step, problem, linear, mu[active])
         count[active] += 1
         with np.errstate(all="ignore"):
             trial = now.linearise(problem.space.retract(linear.x, dx))
-            small = solved & (np.abs(dx).max(axis=(1, 2)) <= tolerance)
+            small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
             better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
         mu[active] = _damping(mu[active], better, linear.cost, trial.cost, _promised(problem, linear, dx))
         best[active[better]] = trial.x[better]
@@ -112,7 +115,7 @@ def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floa
     """The step, and for which realisations it is finite; a singular system counts as none."""
     damping = np.zeros((*linear.x.shape[:2], problem.space.dof))
     if mu.any():
-        damping = mu[:, None, None] * np.maximum(_scale(problem, linear), 1e-9)
+        damping = mu[:, None, None] * np.maximum(diagonal(problem, linear), 1e-9)
     try:
         with np.errstate(all="ignore"):
             dx = step(linear, damping)
@@ -122,7 +125,7 @@ def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floa
     return np.where(finite[:, None, None], dx, 0.0), finite
 
 
-def _scale(problem: Problem, linear: Linear) -> Floats:
+def diagonal(problem: Problem, linear: Linear) -> Floats:
     """(B, n, dof) diagonal of J^T J."""
     total = np.zeros((*linear.x.shape[:2], problem.space.dof))
     for factor, slopes in zip(problem.factors, linear.by_node(problem.factors), strict=True):

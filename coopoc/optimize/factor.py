@@ -93,9 +93,9 @@ class Factor:
     @property
     def informative(self) -> Bools:
         """(M,) or (B, M) True where the measurement says anything at all."""
-        weight = np.abs(self.root).sum(axis=-1)
-        says: Bools = np.broadcast_to((weight > 0).any(axis=-1), (*weight.shape[:-2], len(self.nodes)))
-        return says
+        says = np.isfinite(self.std) if self.std is not None else (self.root != 0).any(axis=-1)
+        informative: Bools = np.broadcast_to(says.any(axis=-1), (*says.shape[:-2], len(self.nodes)))
+        return informative
 
     @property
     def root(self) -> Floats:
@@ -103,7 +103,9 @@ class Factor:
         size = self.size
         if self.std is not None:
             wide = np.broadcast_to(self.std, (*self.std.shape[:-2], len(self.nodes), size))
-            return np.eye(size) / wide[..., None]
+            root = np.zeros((*wide.shape, size))
+            root[..., range(size), range(size)] = 1.0 / wide
+            return root
         assert self.sqrt_information is not None
         return np.broadcast_to(self.sqrt_information, (*self.sqrt_information.shape[:-3], len(self.nodes), size, size))
 

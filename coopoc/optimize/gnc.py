@@ -163,12 +163,12 @@ def graduate_batch(
     """
 
     def inner(weighted: Problem) -> Floats:
-        return solve_batch(weighted, max_iterations, tolerance).x
+        return solve_batch(weighted, max_iterations=max_iterations, tolerance=tolerance).x
 
     marked = mark(problem, suspects, groups)
     end = _sharpen(problem, marked, loss, threshold, inner)
     weighted = reweigh(problem, marked, end.weight, end.x)
-    last = solve_batch(weighted, max_iterations, tolerance)
+    last = solve_batch(weighted, max_iterations=max_iterations, tolerance=tolerance)
     return Graduated(
         last.x, last.covariance, last.cost, last.iterations, last.converged & end.settled,
         end.weight[:, marked.group], end.rounds, end.mu, weighted,

@@ -16,7 +16,7 @@ from .backends.gtsam_forms import forms
 from .backends.gtsam_native import estimate, linearised, native_graph, tangent, values, which_turn
 from .descend import descend
 from .factor import Factor
-from .initial import initial_guess
+from .initial import initial_guess, somewhere
 from .problem import Problem
 from .solve import usable
 from .space import Space
@@ -76,13 +76,13 @@ class FixedLag:
         self._smoother: Any = gtsam.IncrementalFixedLagSmoother(lag, params)
         self._keys: dict[str, int] = {}
         self._shape: dict[str, tuple[int, bool]] = {}
+        self._stamps: dict[str, float] = {}
         self._count = count()
 
     @property
     def stamps(self) -> dict[str, float]:
         """Moment of each node of the window, s."""
-        known = self._smoother.timestamps()
-        return {name: known[key] for name, key in self._keys.items() if key in known}
+        return dict(self._stamps)
 
     def update(self, piece: Problem, stamps: Mapping[str, float], wanted: Sequence[str] | None = None) -> Estimates:
         """The nodes `wanted` after a piece was added.
@@ -98,29 +98,29 @@ class FixedLag:
             InputError: what a piece cannot have (realisations, held nodes, constraints), a new node without a stamp or
                 older than the window, a node that changes its kind, nodes that the measurements leave free.
         """
-        before = self.stamps
+        before = self._stamps
         fresh = self._check(piece, stamps, before)
         said = forms(piece)
         rest = [f for f, form in enumerate(said) if isinstance(form, str)]
-        x = self._geometry(piece, np.setdiff1d(np.arange(len(piece.names)), fresh), rest)
+        old = np.array([i for i, name in enumerate(piece.names) if name in before], dtype=np.int64)
+        x = self._geometry(piece, old, rest)
         posed = which_turn(piece)
         for i in fresh:
             self._keys[piece.names[i]] = next(self._count)
             self._shape[piece.names[i]] = piece.dimension, posed[i]
         keys = [self._keys[name] for name in piece.names]
         graph = native_graph(piece, said, keys).graph
-        for factor in linearised(piece, rest, x, keys):
+        for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
         entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
         moments = {self._keys[name]: float(at) for name, at in stamps.items()}
         self._advance(graph, entering, moments)
-        self._keys = {name: self._keys[name] for name in self.stamps}
-        self._shape = {name: self._shape[name] for name in self._keys}
+        self._forget(stamps)
         return self.estimate(wanted)
 
     def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
         """The nodes `wanted` of the window, by name; default those that have the newest stamp."""
-        stamps = self.stamps
+        stamps = self._stamps
         newest = max(stamps.values(), default=0.0)
         names = tuple(wanted if wanted is not None else (name for name, at in stamps.items() if at == newest))
         for name in names:
@@ -129,11 +129,19 @@ class FixedLag:
         turning = any(self._shape[name][1] for name in names)
         return self._read(names, Space(self._shape[names[0]][0] if names else 3, turning))
 
+    def _forget(self, stamps: Mapping[str, float]) -> None:
+        """What the smoother has marginalised, by its own rule; asking it for all its moments takes longer."""
+        self._stamps.update((name, float(at)) for name, at in stamps.items())
+        last = max(self._stamps.values(), default=0.0) - self.lag
+        for name in [name for name, at in self._stamps.items() if at < last]:
+            del self._stamps[name], self._keys[name], self._shape[name]
+
     def _read(self, names: tuple[str, ...], space: Space) -> Estimates:
         keys, posed = [self._keys[name] for name in names], [self._shape[name][1] for name in names]
         x = estimate(space, posed, self._smoother.calculateEstimate(keys), keys)
-        turn = tangent(space, posed, x)
-        cov = [t @ self._smoother.marginalCovariance(key) @ t.T for t, key in zip(turn, keys, strict=True)]
+        cov = [self._smoother.marginalCovariance(key) for key in keys]
+        if space.turning:
+            cov = [t @ each @ t.T for t, each in zip(tangent(space, posed, x), cov, strict=True)]
         return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
 
     def _check(self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float]) -> list[int]:
@@ -164,10 +172,13 @@ class FixedLag:
         """(n, width) where the piece is linearised: its most probable nodes given the marginals of the `old` ones.
 
         Of converted measurements that is their linear solution; of others, the `rest`, one Gauss-Newton step from x0.
+        Where all is linear any will do.
         """
         x0 = None if piece.x0 is None else np.array(piece.x0)
         if x0 is not None and not rest:
             return x0
+        if piece.linear:
+            return np.asarray(somewhere(piece)[0])
         prior = piece
         if len(old):
             was = self._read(tuple(piece.names[i] for i in old), piece.space)

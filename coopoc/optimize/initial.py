@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from ..arrays import Floats
@@ -30,7 +28,7 @@ def converted(problem: Problem) -> Problem:
     (performance.md section 1.1 of the design notes).
     """
     factors = [_vector(f) if f.kind == "spherical" else unchecked(f, loss=None) for f in problem.factors]
-    return replace(problem, factors=tuple(f for f in factors if f.measurement.linear), x0=None, held=())
+    return problem.having(factors=tuple(f for f in factors if f.measurement.linear), x0=None, held=())
 
 
 def initial_guess(problem: Problem) -> Floats:
@@ -51,6 +49,19 @@ def initial_guess(problem: Problem) -> Floats:
         blocks, gradient = normal_equations(scheme, linear.linearise(x), [f.nodes for f in linear.factors])
         x = eliminate(frame, blocks, gradient, np.full_like(x, RIDGE))
     return _apart(problem, linear, x)
+
+
+def somewhere(problem: Problem) -> Floats:
+    """(B, n, width): x0, or all points in the middle of the fixes, which is near enough for a linear problem.
+
+    Raises:
+        InputError: poses without an x0.
+    """
+    if problem.x0 is not None or problem.poses:
+        return initial_guess(problem)
+    x = np.zeros((problem.batch or 1, len(problem.names), problem.dimension))
+    middle = [f.z.mean(axis=-2, keepdims=True) for f in problem.factors if f.kind == "position"]
+    return x + middle[0] if middle else x
 
 
 def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:

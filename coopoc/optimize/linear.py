@@ -89,17 +89,22 @@ def jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], 
     """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
     from scipy.sparse import csr_array
 
-    n, dof = shape
-    data, rows, cols, top = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)], 0
-    for factor, slopes in zip(factors, linear.by_node(factors), strict=True):
+    data, row, col = entries(linear, factors, shape[1])
+    total = sum(len(factor.nodes) * factor.size for factor in factors)
+    return csr_array((data[which if len(data) > 1 else 0], (row, col)), shape=(total, shape[1] * shape[0]))
+
+
+def entries(linear: Linear, factors: Sequence[Factor], dof: int) -> tuple[Floats, Ints, Ints]:
+    """Values (B, E), rows and columns (E,) of the Jacobian."""
+    batch, top = len(linear.x), 0
+    data: list[Floats] = [np.empty((batch, 0))]
+    rows, cols = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for factor, residual, slopes in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+        count, size = residual.shape[1:]
+        row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
         for column, slope in zip(factor.nodes.T, slopes, strict=True):
-            block = slope[which if len(slope) > 1 else 0]
-            block = np.broadcast_to(block, (len(factor.nodes), *block.shape[1:]))
-            count, size = block.shape[:2]
-            row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
-            data.append(block.ravel())
+            data.append(np.broadcast_to(slope, (*residual.shape, dof)).reshape(batch, -1))
             rows.append(row.ravel())
             cols.append((dof * column[:, None, None] + np.arange(dof) + np.zeros((size, 1), np.int64)).ravel())
-        top += len(factor.nodes) * factor.size
-    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))
-    return csr_array(entries, shape=(top, dof * n))
+        top += count * size
+    return np.concatenate(data, axis=1), np.concatenate(rows), np.concatenate(cols)

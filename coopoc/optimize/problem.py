@@ -175,13 +175,15 @@ class Problem:
 
     def pick(self, which: Ints | int) -> Problem:
         """The realisations `which` of B; an int gives a single problem."""
-        picked = object.__new__(Problem)
         x0 = self.x0 if self._start_batch is None or self.x0 is None else self.x0[which]
-        factors = tuple(f.pick(which) for f in self.factors)
+        return self.having(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
+
+    def having(self, **changes: Any) -> Problem:
+        """The problem with changes that come from checked parts and need not be checked again."""
+        changed = object.__new__(Problem)
         for field in fields(Problem):
-            value = {"factors": factors, "x0": x0}.get(field.name, getattr(self, field.name))
-            object.__setattr__(picked, field.name, value)
-        return picked
+            object.__setattr__(changed, field.name, changes.get(field.name, getattr(self, field.name)))
+        return changed
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (B, n, width)."""

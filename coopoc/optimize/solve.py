@@ -6,6 +6,7 @@ import importlib
 import inspect
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal
 
@@ -89,7 +90,7 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     >>> solve(problem.add("range", ("ego", "b"), 10.0, std=1.0)).x.round(3)[:, 0]
     array([-0.333,  9.333])
     """
-    module = _module(backend, options)
+    module = backend_module(backend, options)
     if problem.batch is not None:
         mend = "Pick one with problem.pick(0), or use solve_batch."
         raise InputError("problem", repr(problem), "must be a single realisation", mend)
@@ -127,14 +128,21 @@ def usable(backend: str) -> Backend:
     return known
 
 
-def _module(backend: str, options: dict[str, Any]) -> Any:
+def backend_module(backend: str, options: dict[str, Any]) -> Any:
+    """The module of a backend that takes the options; errors as `solve`."""
     known = usable(backend)
     module = importlib.import_module(f".backends.{known.module}", __package__)
-    allowed = list(inspect.signature(module.build).parameters)[1:]
+    allowed = _options(module.build)
     for name in options:
         if name not in allowed:
             raise InputError(name, options[name], f"is no option of {backend}, which has {allowed}", "Leave it out.")
     return module
+
+
+@lru_cache(maxsize=64)
+def _options(build: Any) -> list[str]:
+    """Names of what a backend's build takes besides the problem."""
+    return list(inspect.signature(build).parameters)[1:]
 
 
 def _check_constraints(problem: Problem, known: Backend) -> None:

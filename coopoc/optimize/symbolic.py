@@ -82,16 +82,18 @@ def structure_of(problem: Problem) -> Structure:
 
 
 def numbers_of(problem: Problem, x: Floats) -> Floats:
-    """The parameters of `expressions`, flat: the centre x, then z, constants and weights, column by column."""
-    parts = [x]
+    """(B, .) parameters of `expressions`: the centres x (B, n, width), then z, constants, weights, column by column."""
+    parts: list[Floats] = []
     for f in problem.factors:
         weight = 1.0 / f.std if f.std is not None else f.sqrt_information
         assert weight is not None
         assert f.constants is not None
-        shape = (len(f.nodes), *weight.shape[-1 - (f.std is None) :])
-        parts += [f.z, f.constants, np.broadcast_to(weight, shape).reshape(len(f.nodes), -1)]
+        own = weight.shape[-1 - (f.std is None) :]
+        weight = np.broadcast_to(weight, (*weight.shape[: -1 - len(own)], len(f.nodes), *own))
+        parts += [f.z, f.constants, weight.reshape(*weight.shape[: -len(own)], -1)]
     parts += [c.constants for c in problem.constraints if c.constants is not None]
-    return np.concatenate([part.ravel(order="F") for part in parts])
+    wide = (np.broadcast_to(part, (len(x), *part.shape[-2:])) for part in (x, *parts))
+    return np.concatenate([np.swapaxes(part, 1, 2).reshape(len(x), -1) for part in wide], axis=1)
 
 
 def expressions(structure: Structure) -> dict[str, Any]:

@@ -26,7 +26,7 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..active import constraint_rows, steerable
-from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits
+from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..problem import Problem
 from ..symbolic import Structure, expressions, numbers_of, structure_of
 from .run import Ended, Run
@@ -54,6 +54,7 @@ ROUNDS = 10
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """What CasADi says where another chart would not help."""
 METHODS = ("ipopt", "sqp")
+NO_SIDES = np.empty(0), np.empty(0)
 
 
 def build(
@@ -98,6 +99,21 @@ def build(
     return run
 
 
+def each(
+    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE,
+    method: str = "ipopt", codegen: bool = False,
+) -> list[Ended]:  # fmt: skip
+    """`build` of B realisations without constraints, from x (B, n, width): points share all but the solution."""
+    structure = structure_of(problem)
+    if problem.space.turning or not structure.free.any():
+        parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+        return [build(part, max_iterations, tolerance, method, codegen)(a) for part, a in zip(parts, x, strict=True)]
+    build(problem, max_iterations, tolerance, method, codegen)  # checks the options
+    found = programme(structure, method, int(max_iterations), bool(codegen))
+    numbers = _numbers(problem, x)
+    return [_once(found, given, NO_SIDES, a, 0.0)[0] for given, a in zip(numbers, x, strict=True)]
+
+
 @dataclass(frozen=True, eq=False)
 class Programme:
     """What is built once.
@@ -105,13 +121,11 @@ class Programme:
     Args:
         structure: of the problems that it solves. method: "ipopt" or "sqp".
         solvers: CasADi's nlpsol objects, each starts where the one before it ended.
-        curvature: of (x, p), the largest diagonal entry of J^T J, by which the cost is divided.
     """
 
     structure: Structure
     method: str
     solvers: tuple[Any, ...]
-    curvature: Any
 
 
 @lru_cache(maxsize=64)
@@ -123,44 +137,60 @@ def programme(structure: Structure, method: str, max_iterations: int, codegen: b
     flat, scale = found.pop("flat"), ca.SX.sym("scale")
     x, p = found["x"], ca.vertcat(found["p"], scale)
     nlp = {**found, "p": p, "f": scale * found["f"]}
-    curvature = ca.Function("curvature", [x, found["p"]], [ca.mmax(ca.diag(flat))])
     if method == "ipopt":
         options = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
-        return Programme(structure, method, (_compiled("ipopt", nlp, options, codegen),), curvature)
+        return Programme(structure, method, (_compiled("ipopt", nlp, options, codegen),))
     pulls = [ca.SX.sym("lam_f"), ca.SX.sym("lam_g", *found["g"].shape)]
     names = ["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"]
     gauss = ca.Function("gauss", [x, p, *pulls], [pulls[0] * scale * flat], *names)
     coarse = {**QUIET, **SQP, **COARSE, "max_iter": min(max_iterations, ENOUGH), "hess_lag": gauss}
     fine = {**QUIET, **SQP, "max_iter": max_iterations}
     solvers = tuple(_compiled("sqpmethod", nlp, options, codegen) for options in (coarse, fine))
-    return Programme(structure, method, solvers, curvature)
+    return Programme(structure, method, solvers)
 
 
 def _run(found: Programme, problem: Problem, sides: tuple[Floats, Floats], x: Floats, tolerance: float) -> Ended:
     """Solve around x, and for poses again around the answer until it stays."""
-    space, free = found.structure.space, found.structure.free
     multipliers: Any = 0.0
     count = 0
     for rounds in range(1, ROUNDS + 1):
-        numbers = numbers_of(problem, x)
-        numbers = np.append(numbers, 1.0 / max(float(found.curvature(0.0, numbers)), 1e-12))
-        at: Any = 0.0
-        for solver in found.solvers:
-            answer = solver(x0=at, p=numbers, lbg=sides[0], ubg=sides[1], lam_g0=multipliers)
-            at, multipliers = answer["x"], answer["lam_g"]
-            count += int(solver.stats()["iter_count"])
-        said = str(found.solvers[-1].stats()["return_status"])
-        extras = {"method": found.method, "return_status": said, "rounds": rounds}
-        ended = Ended(x, count, extras, said == HOPELESS[0])
-        step = np.zeros(free.shape)
-        step[free] = np.asarray(at).ravel()
-        if not np.isfinite(step).all():
+        ended, multipliers = _once(found, _numbers(problem, x[None])[0], sides, x, multipliers)
+        count += ended.iterations
+        ended = replace(ended, iterations=count, extras=ended.extras | {"rounds": rounds})
+        still = np.abs(ended.x - x).max(initial=0.0) <= tolerance
+        if not found.structure.space.turning or still or ended.extras["return_status"] in HOPELESS:
             break
-        x = space.retract(x, _exponential(step, space.dimension))
-        ended = replace(ended, x=x)
-        if not space.turning or np.abs(step).max(initial=0.0) <= tolerance or said in HOPELESS:
-            break
+        x = ended.x
     return ended
+
+
+def _numbers(problem: Problem, x: Floats) -> Floats:
+    """(B, .) the parameters around x (B, n, width), and last by what the cost is multiplied: 1 / max diag J^T J."""
+    numbers = numbers_of(problem, x)
+    curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
+    return np.append(numbers, 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
+
+
+def _once(
+    found: Programme, numbers: Floats, sides: tuple[Floats, Floats], x: Floats, multipliers: Any
+) -> tuple[Ended, Any]:
+    """Where the solvers end, and the multipliers."""
+    space, free = found.structure.space, found.structure.free
+    at: Any = 0.0
+    count = 0
+    for solver in found.solvers:
+        bounds = {"lbg": sides[0], "ubg": sides[1], "lam_g0": multipliers} if sides[0].size else {}
+        answer = solver(x0=at, p=numbers, **bounds)
+        at, multipliers = answer["x"], answer["lam_g"]
+        stats = solver.stats()
+        count += int(stats["iter_count"])
+    said = str(stats["return_status"])
+    step = np.zeros(free.shape)
+    step[free] = at.full().ravel()
+    if np.isfinite(step).all():
+        x = space.retract(x, _exponential(step, space.dimension) if space.turning else step)
+    extras = {"method": found.method, "return_status": said, "rounds": 1}
+    return Ended(x, count, extras, said == HOPELESS[0]), multipliers
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:

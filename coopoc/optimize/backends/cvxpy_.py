@@ -22,6 +22,7 @@ from ..convex.qcqp import Multipliers, Quadratic
 from ..convex.quadratic import quadratic
 from ..convex.relaxation import first_vectors, framed, in_balls, polished, rounded, small
 from ..convex.schur import Dense
+from ..linear import entries
 from ..problem import Problem
 from .gauss_newton import build as gauss_newton
 from .run import Ended, Run
@@ -45,7 +46,9 @@ def build(problem: Problem, relaxation: str = "auto", refine: bool = True) -> Ru
     if relaxation == "auto":
         relaxation = "qp" if problem.linear and not problem.poses else "sdp"
     if relaxation == "qp":
-        return _linear(problem)
+        if not problem.linear or problem.poses:
+            raise InputError("relaxation", "'qp'", "needs points and only position and displacement", "Use sdp.")
+        return lambda x: _linear(problem, x[None])[0]
     form = small(quadratic(problem))
     relax = _balls(framed(form)) if relaxation == "socp" else _semidefinite(form)
 
@@ -75,25 +78,28 @@ def _semidefinite(form: Quadratic) -> Callable[[Dense], tuple[Floats, float, flo
     return relax
 
 
-def _linear(problem: Problem) -> Run:
-    if not problem.linear or problem.poses:
-        raise InputError("relaxation", "'qp'", "needs points and only position and displacement", "Use sdp.")
-    rows = sum(factor.z.size for factor in problem.factors)
-    free = np.flatnonzero(np.ones(problem.dimension * len(problem.names)) if problem.free is None else problem.free)
+def each(problem: Problem, x: Floats, relaxation: str = "auto", refine: bool = True) -> list[Ended]:
+    """`build` of B realisations from x (B, n, width): linear problems share all but the solution."""
+    if problem.linear and not problem.poses and relaxation in ("auto", "qp"):
+        return _linear(problem, x)
+    parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+    return [build(part, relaxation, refine)(start) for part, start in zip(parts, x, strict=True)]
 
-    def run(x: Floats) -> Ended:
-        moved = x.copy()
-        moved.reshape(-1)[free] = np.broadcast_to(x.mean(axis=0), x.shape).reshape(-1)[free]
-        linear = problem.linearise(moved[None])  # away from the start, which may be the answer
-        J = problem.jacobian(linear)[:, free].tocoo()
-        J.sum_duplicates()
-        step, count = _qp(rows, len(free), J.row.astype(np.int64).tobytes(), J.col.astype(np.int64).tobytes())(
-            J.data, np.concatenate([r.ravel() for r in linear.residual])
-        )
-        moved.reshape(-1)[free] += step
-        return Ended(moved, count, {"relaxation": "qp", "refined": False})
 
-    return run
+def _linear(problem: Problem, x: Floats) -> list[Ended]:
+    """Of x (B, n, width) only what is held counts: the programmes begin away from it, as it may be the answer."""
+    batch, n, d = x.shape
+    free = np.ones((n, d), dtype=bool) if problem.free is None else problem.free
+    moved = np.where(free, x.mean(axis=1, keepdims=True), x)
+    linear = problem.linearise(moved)
+    data, row, col = entries(linear, problem.factors, d)
+    kept, place = free.ravel()[col], np.cumsum(free.ravel()) - 1
+    rest = np.concatenate([r.reshape(batch, -1) for r in linear.residual], axis=1)
+    solve = _qp(rest.shape[1], int(free.sum()), row[kept].tobytes(), place[col[kept]].tobytes())
+    steps = [solve(*given) for given in zip(data[:, kept], rest, strict=True)]
+    moved[:, free] += np.stack([step for step, _ in steps])
+    extras = {"relaxation": "qp", "refined": False}
+    return [Ended(end, count, dict(extras)) for end, (_, count) in zip(moved, steps, strict=True)]
 
 
 def _cvxpy() -> Any:

@@ -2,13 +2,12 @@
 
 GTSAM has no factor for range, azimuth and inclination in the world frame with a std each, and a Python CustomFactor
 inside an optimiser that C++ owns copies all Values at each callback. So the loop that takes every problem is owned
-here: the nonlinear factors are whitened and linearised vectorised in NumPy and handed over as JacobianFactors, in
-absolute coordinates, so that the native ones (PriorFactorPoint3, BetweenFactorPoint3) keep their linearisation.
+here: factors are whitened and linearised in NumPy, all realisations at once, and handed over as JacobianFactors, which
+costs less than GTSAM's own and their noise models.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,9 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
-from ..factor import Factor
 from ..linear import Linear
 from ..problem import Problem
-from .gtsam_forms import form_of, forms
+from .gtsam_forms import forms
 from .gtsam_native import estimate, hold, native_graph, values, which_turn
 from .gtsam_optimizers import OPTIMIZERS, all_native, graduation, levenberg_marquardt
 from .run import Ended, Run
@@ -43,7 +41,7 @@ def build(
     """
     check_limits(max_iterations, tolerance)
     if optimizer == "elimination":
-        step = elimination_step(problem)
+        step = linear_step(problem)
 
         def run(x: Floats) -> Ended:
             end = descend(problem, step, x[None], max_iterations, tolerance)
@@ -84,70 +82,55 @@ def _optimising(problem: Problem, max_iterations: int, tolerance: float, optimiz
     return run
 
 
-def elimination_step(problem: Problem) -> Step:
-    """GTSAM's multifrontal elimination, with an ordering (COLAMD) that is found once."""
+def linear_step(problem: Problem) -> Step:
+    """GTSAM's multifrontal elimination, one realisation after the other, with an ordering (COLAMD) found once."""
     import gtsam
 
-    space, own, n = problem.space, [_is_linear(problem, factor) for factor in problem.factors], len(problem.names)
-    fixed = _constant(problem, own)
     unit = {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 13)}
+    own, nothing = unit[problem.space.dof], np.zeros(problem.space.dof)
     ordering: list[Any] = []
-    still = [] if problem.free is None else np.flatnonzero(~problem.free.all(axis=1)).tolist()
+    held = [] if problem.free is None else [(i, np.diag(1.0 - problem.free[i]))
+                                            for i in np.flatnonzero(~problem.free.all(axis=1)).tolist()]  # fmt: skip
 
     def step(linear: Linear, damping: Floats) -> Floats:
-        graph = gtsam.GaussianFactorGraph()
-        graph.push_back(fixed)
-        at = linear.x[0] if not space.turning else np.zeros((n, space.dof))
-        _add_linearised(graph, problem, linear, at, own, unit)
-        for i in still:
-            graph.add(i, np.diag(1.0 - problem.free[i]), np.zeros(space.dof), unit[space.dof])  # type: ignore[index]
-        if damping.any():
-            for i, (x, root) in enumerate(zip(at, np.sqrt(damping[0]), strict=True)):
-                graph.add(i, np.diag(root), root * x, unit[space.dof])
-        if not ordering:
-            ordering.append(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
-        try:
-            there: Floats = graph.optimize(ordering[0]).vector()
-        except RuntimeError as singular:
-            raise np.linalg.LinAlgError("gtsam: indeterminate linear system") from singular
-        if there.size < at.size:
-            ordering.clear()
-            raise np.linalg.LinAlgError("gtsam: a point without measurements")
-        return (there.reshape(at.shape) - at)[None]
+        dx, rows = np.full_like(damping, np.nan), _rows(problem, linear)
+        damped = [bool(each.any()) for each in damping]
+        for b in range(len(dx)):
+            graph = gtsam.GaussianFactorGraph()
+            _add(graph, rows, b, unit)
+            for i, root in (*held, *(enumerate(map(np.diag, np.sqrt(damping[b]))) if damped[b] else ())):
+                graph.add(i, root, nothing, own)
+            if not ordering:
+                ordering.append(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
+            try:
+                there: Floats = graph.optimize(ordering[0]).vector()
+            except RuntimeError:  # a singular system: the step is not finite
+                continue
+            if there.size < dx[b].size:  # a node without measurements
+                ordering.clear()
+            else:
+                dx[b] = there.reshape(dx[b].shape)
+        return dx
 
     return step
 
 
-def _constant(problem: Problem, own: Sequence[bool]) -> Any:
-    """gtsam.GaussianFactorGraph of GTSAM's own factors whose linearisation is the same everywhere."""
-    said = [form_of(problem, factor) if mine else "" for factor, mine in zip(problem.factors, own, strict=True)]
-    n = len(problem.names)
-    nowhere = values(problem.space, [False] * n, np.zeros((n, problem.dimension)), range(n))
-    return native_graph(problem, said).graph.linearize(nowhere)
+def _rows(problem: Problem, linear: Linear) -> list[tuple[list[list[int]], list[Floats], Floats]]:
+    """Per factor the nodes by place (arity, M), a derivative (B, M, size, dof) by each of them, and -r (B, M, size)."""
+    found = []
+    for factor, residual, slopes in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
+        wide = [np.broadcast_to(slope, (*residual.shape, slope.shape[-1])) for slope in slopes]
+        found.append((factor.nodes.T.tolist(), wide, -residual))
+    return found
 
 
-def _is_linear(problem: Problem, factor: Factor) -> bool:
-    """Whether GTSAM's own factor may be linearised once and for all."""
-    free = problem.free is None or bool(problem.free[factor.nodes].all())
-    return factor.measurement.linear and factor.loss is None and free and not problem.space.turning
-
-
-def _add_linearised(
-    graph: Any, problem: Problem, linear: Linear, at: Floats, own: Sequence[bool], unit: dict[int, Any]
-) -> None:
-    """The other factors as r + J dx with dx = x - `at`: GTSAM's unknowns are absolute where its own factors are."""
-    derivatives = linear.by_node(problem.factors)
-    for factor, residual, slopes, mine in zip(problem.factors, linear.residual, derivatives, own, strict=True):
-        if mine:
-            continue
-        count, model = len(factor.nodes), unit[factor.size]
-        parts = [np.broadcast_to(s[0], (count, *s.shape[2:])) for s in slopes]
-        goal = -residual[0]
-        for part, column in zip(parts, factor.nodes.T, strict=True):
-            goal = goal + (part @ at[column, :, None])[..., 0]
-        if len(parts) == 1:
-            for i, a, rhs in zip(factor.nodes[:, 0].tolist(), parts[0], goal, strict=True):
-                graph.add(i, a, rhs, model)
+def _add(graph: Any, rows: list[tuple[list[list[int]], list[Floats], Floats]], b: int, unit: dict[int, Any]) -> None:
+    """Realisation b of the rows as JacobianFactors."""
+    for nodes, slopes, goal in rows:
+        model = unit[goal.shape[-1]]
+        if len(nodes) == 1:
+            for i, slope, rhs in zip(nodes[0], slopes[0][b], goal[b], strict=True):
+                graph.add(i, slope, rhs, model)
         else:
-            for (i, j), a, b, rhs in zip(factor.nodes.tolist(), *parts, goal, strict=True):
-                graph.add(i, a, j, b, rhs, model)
+            for i, first, j, second, rhs in zip(nodes[0], slopes[0][b], nodes[1], slopes[1][b], goal[b], strict=True):
+                graph.add(i, first, j, second, rhs, model)

@@ -43,17 +43,18 @@ def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | N
     keys = range(len(problem.names)) if keys is None else keys
     posed = which_turn(problem)
     for f, (factor, parts) in enumerate(zip(problem.factors, said, strict=True)):
-        rows = np.flatnonzero(factor.informative).tolist()
+        rows, nodes = np.flatnonzero(factor.informative).tolist(), factor.nodes.tolist()
         for part in () if isinstance(parts, str) else parts:
-            models = _models(part.root, factor)
+            models, given = _models(part.root, factor), part.given
+            classes = {at: getattr(gtsam, name) for at, name in part.names.items()}
             for k in rows:
-                nodes = factor.nodes[k].tolist()
-                name = part.names.get(tuple(posed[i] for i in nodes))
-                if name is None:  # a range from a point to a pose
-                    nodes = nodes[::-1]
-                    name = part.names[tuple(posed[i] for i in nodes)]
-                graph.add(getattr(gtsam, name)(*(keys[i] for i in nodes), *part.given(gtsam, k), models[k]))
-                place.append((f, k))
+                touched = nodes[k]
+                made = classes.get(tuple([posed[i] for i in touched]))
+                if made is None:  # a range from a point to a pose
+                    touched = touched[::-1]
+                    made = classes[tuple([posed[i] for i in touched])]
+                graph.add(made(*[keys[i] for i in touched], *given(gtsam, k), models[k]))
+            place += [(f, k) for k in rows]
     return Native(graph, tuple(place))
 
 
@@ -108,10 +109,13 @@ def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
            [ 1.,  0.,  0.],
            [ 0.,  0.,  1.]])
     """
-    d, rotation, found = space.dimension, space.rotation(x), []
+    d, still, found = space.dimension, np.eye(space.dof, space.dimension), []
+    if not space.turning:
+        return [still] * len(posed)
+    rotation = space.rotation(x)
     for i, turns in enumerate(posed):
         if not turns:
-            found.append(np.eye(space.dof, d))
+            found.append(still)
             continue
         matrix = np.eye(space.dof)
         matrix[:d, :d] = rotation[i]
@@ -142,16 +146,23 @@ def _node(gtsam: Any, d: int, x: Floats, posed: bool) -> Any:
 
 def _models(root: Floats, factor: Factor) -> list[Any]:
     """A noise model per measurement, one object for equal ones."""
+    if len(root) > 1 and (root == root[:1]).all():
+        return _models(root[:1], factor) * len(root)
+    made: dict[bytes, Any] = {}
+    names, full = [row.tobytes() for row in root], set(np.flatnonzero(np.tril(root, -1).any(axis=(1, 2))).tolist())
+    for k, key in enumerate(names):
+        if key not in made:
+            made[key] = _model(root[k], k not in full, factor)
+    return [made[key] for key in names]
+
+
+def _model(root: Floats, diagonal: bool, factor: Factor) -> Any:
+    """Of one measurement; what GTSAM itself takes for diagonal may have entries below."""
     import gtsam
 
-    noise, made = gtsam.noiseModel, {}
-    for row in root:
-        key = row.tobytes()
-        if key not in made:
-            diagonal = not np.tril(row, -1).any()  # what GTSAM takes for diagonal may have entries below
-            model: Any = noise.Gaussian.SqrtInformation(row, diagonal)
-            if factor.loss is not None:
-                shape = getattr(noise.mEstimator, ESTIMATORS[factor.loss.name]).Create(factor.loss.scale)
-                model = noise.Robust.Create(shape, model)
-            made[key] = model
-    return [made[row.tobytes()] for row in root]
+    noise = gtsam.noiseModel
+    model: Any = noise.Gaussian.SqrtInformation(root, diagonal)
+    if factor.loss is None:
+        return model
+    shape = getattr(noise.mEstimator, ESTIMATORS[factor.loss.name]).Create(factor.loss.scale)
+    return noise.Robust.Create(shape, model)

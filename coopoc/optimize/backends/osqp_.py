@@ -13,14 +13,15 @@ With them rho adapts, and a repair solves exactly for the active set that the it
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Bools, Floats
 from ..active import bounded, constraint_rows
 from ..arrowhead import structure
-from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, descend
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
 from ..linear import Linear
 from ..local import local
 from ..normal import Pattern, normal_equations
@@ -67,20 +68,8 @@ def build(
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    scheme, _ = structure(problem)
-    upper, source = _upper(scheme, problem.space.dof)
-    nodes, at_own = [f.nodes for f in problem.factors], np.arange(problem.space.dof)
-    own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
-    at = scheme.pairs[own, 0]
     limits = _limits(problem)
-    programme = _Programme(limits.matrix, kkt_tolerance)
-
-    def step(linear: Linear, damping: Floats) -> Floats:
-        blocks, gradient = normal_equations(scheme, linear, nodes)
-        if damping.any():
-            blocks[:, own[:, None], at_own, at_own] += damping[:, at]
-        upper.data[:] = blocks[0].ravel()[source]
-        return programme.solve(upper, gradient.ravel(), *limits.around(linear.x[0])).reshape(damping.shape)
+    programme, step = _programme(problem, limits, kkt_tolerance)
 
     def run(x: Floats) -> Ended:
         try:
@@ -96,6 +85,33 @@ def build(
         return Ended(end.x[0], int(end.iterations[0]), dict(programme.counts))
 
     return run
+
+
+def linear_step(problem: Problem, kkt_tolerance: float = 1e-9) -> Step:
+    """The quadratic programme without constraints of each realisation, one after the other in one workspace."""
+    return _programme(problem, _limits(problem.having(constraints=())), kkt_tolerance)[1]
+
+
+def _programme(problem: Problem, limits: _Limits, tolerance: float) -> tuple[_Programme, Step]:
+    scheme, _ = structure(problem)
+    pattern, source = _upper(scheme, problem.space.dof)
+    upper = pattern.copy()
+    nodes, at_own = [f.nodes for f in problem.factors], np.arange(problem.space.dof)
+    own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
+    at = scheme.pairs[own, 0]
+    programme = _Programme(limits.matrix, tolerance)
+
+    def step(linear: Linear, damping: Floats) -> Floats:
+        blocks, gradient = normal_equations(scheme, linear, nodes)
+        if damping.any():
+            blocks[:, own[:, None], at_own, at_own] += damping[:, at]
+        values, q = blocks.reshape(len(blocks), -1)[:, source], gradient.reshape(len(gradient), -1)
+        if not len(limits.lower):
+            return programme.each(upper, values, q).reshape(damping.shape)
+        upper.data[:] = values[0]
+        return programme.solve(upper, q[0], *limits.around(linear.x[0])).reshape(damping.shape)
+
+    return programme, step
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,6 +166,7 @@ class _Programme:
     def __init__(self, rows: Any, tolerance: float) -> None:
         self._rows, self._tolerance = rows, tolerance
         self._solver: Any = None
+        self._places: tuple[Any, ...] | None = None
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
 
@@ -159,20 +176,9 @@ class _Programme:
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
         """
-        import osqp
-
-        if self._solver is None:
-            self._solver = osqp.OSQP()
-            settings = {**SETTINGS, **(BOUNDED if self._rows.shape[0] else {})}
-            self._solver.setup(P=half.copy(), q=q, A=self._rows, l=lower, u=upper, **settings)
-        elif self._rows.shape[0]:
-            self._polish(False)
-            self._solver.update(Px=half.data, q=q, l=lower, u=upper)
-        else:
-            self._solver.update(Px=half.data, q=q)
+        self._set(half, q, lower, upper)
         for attempt in range(REPAIRS + 1):
-            answer = self._solver.solve(raise_error=False)
-            self.counts["osqp_iterations"] += int(answer.info.iter)
+            answer = self._answer()
             if answer.info.status.startswith("primal infeasible"):
                 raise Infeasible
             dx, y = np.asarray(answer.x, dtype=np.float64), np.asarray(answer.y, dtype=np.float64)
@@ -183,6 +189,42 @@ class _Programme:
             self._polish(pushed)
         raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
 
+    def each(self, half: Any, values: Floats, q: Floats) -> Floats:
+        """dx (B, n) of programmes without bounds, their P the `values` (B, entries) in the places of `half`.
+
+        The answers are checked together; one that fails is solved again and repaired, and is NaN where that fails too.
+        """
+        dx, nothing = np.empty_like(q), np.empty(0)
+        for b, half.data[:] in enumerate(values):
+            self._set(half, q[b], nothing, nothing)
+            dx[b] = self._answer().x
+        weight, force = self._product(half, values, dx)
+        for b in np.flatnonzero(~self._stationary(force + q, weight, q, dx)).tolist():
+            half.data[:] = values[b]
+            try:
+                dx[b] = self.solve(half, q[b], nothing, nothing)
+            except np.linalg.LinAlgError:
+                dx[b] = np.nan
+        return dx
+
+    def _set(self, half: Any, q: Floats, lower: Floats, upper: Floats) -> None:
+        if self._solver is None:
+            import osqp
+
+            self._solver = osqp.OSQP(algebra="builtin")  # without a name it tries to import every other at each call
+            settings = {**SETTINGS, **(BOUNDED if self._rows.shape[0] else {})}
+            self._solver.setup(P=half.copy(), q=q, A=self._rows, l=lower, u=upper, **settings)
+        elif self._rows.shape[0]:
+            self._polish(False)
+            self._solver.update(Px=half.data, q=q, l=lower, u=upper)
+        else:
+            self._solver.update(Px=half.data, q=q)
+
+    def _answer(self) -> Any:
+        answer = self._solver.solve(raise_error=False)
+        self.counts["osqp_iterations"] += int(answer.info.iter)
+        return answer
+
     def _polish(self, wanted: bool) -> None:
         """Whether OSQP solves for its active set exactly; without one it would print that on stdout."""
         if wanted != self._polishing:
@@ -191,17 +233,49 @@ class _Programme:
 
     def _holds(self, half: Any, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
-        weight = half.diagonal()
-        force = half @ dx + half.T @ dx - weight * dx
-        size = max(np.abs(q).max(), np.abs(weight * dx).max())
-        if not np.all(np.abs(force + q + self._rows.T @ y) <= self._tolerance * size + NEGLIGIBLE * weight):
+        weight, force = self._product(half, half.data[None], dx[None])
+        if not self._stationary(force + q + self._rows.T @ y, weight, q[None], dx[None])[0]:
             return False
-        value, weak = self._rows @ dx, self._tolerance * size
+        weak = self._tolerance * _size(weight, q[None], dx[None])[0]
+        value = self._rows @ dx
         kept = (value >= lower - CLOSE) & (value <= upper + CLOSE)
         pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
         return bool(np.all(kept & pushed))
 
+    def _product(self, half: Any, values: Floats, dx: Floats) -> tuple[Floats, Floats]:
+        """Diagonal of P and P dx, (B, n)."""
+        if self._places is None:
+            self._places = _places(half)
+        own, diagonal, entry, of, into = self._places
+        weight = np.zeros_like(dx)
+        weight[:, own] = values[:, diagonal]
+        return weight, (into @ (values[:, entry] * dx[:, of]).T).T
 
+    def _stationary(self, rest: Floats, weight: Floats, q: Floats, dx: Floats) -> Bools:
+        """(B,) True where |P dx + q + C^T y|, the `rest` (B, n), is small."""
+        allowed = self._tolerance * _size(weight, q, dx)[:, None] + NEGLIGIBLE * weight
+        return np.asarray((np.abs(rest) <= allowed).all(axis=1))
+
+
+def _size(weight: Floats, q: Floats, dx: Floats) -> Floats:
+    """(B,) of what adds up in P dx + q."""
+    return np.asarray(np.maximum(np.abs(q).max(axis=1), np.abs(weight * dx).max(axis=1)))
+
+
+def _places(half: Any) -> tuple[Any, ...]:
+    """Of the upper triangle of P: diagonal rows and entries; of all of P the entries, their columns, and what adds them
+    up by rows."""
+    from scipy.sparse import csr_array
+
+    col = np.repeat(np.arange(half.shape[1]), np.diff(half.indptr))
+    diagonal = np.flatnonzero(half.indices == col)
+    off = np.flatnonzero(half.indices != col)
+    entry, to = np.append(np.arange(len(col)), off), np.append(half.indices, col[off])
+    into = csr_array((np.ones(len(to)), (to, np.arange(len(to)))), shape=(half.shape[1], len(to)))
+    return col[diagonal], diagonal, entry, np.append(col, half.indices[off]), into
+
+
+@lru_cache(maxsize=64)
 def _upper(scheme: Pattern, dof: int) -> tuple[Any, Any]:
     """Upper triangle of J^T J as CSC with its structure, and where each value lies in the flat blocks."""
     from scipy.sparse import csc_array, csc_matrix
