@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import coopoc as co
 from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import read_graph
-from coopoc.formats.edges import RangeEdges
+from coopoc.formats.edges import PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
 from coopoc.optimize.graphs import from_graph
@@ -120,8 +120,11 @@ def test_a_turned_world_turns_the_estimate() -> None:
 def small() -> Graph:
     if PYFG.is_dir():
         return read_graph(PYFG / "factor_graph_small.pyfg")
-    ranges = RangeEdges([[0, 1]], [5.0], [0.01])
-    return Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges)
+    moved = PoseEdges([[0, 1], [1, 2]], [[4, 0], [0, 4]], [[0.5], [0.1]], [0.01 * np.eye(3)] * 2)
+    ranges = RangeEdges([[0, 3], [1, 3], [2, 3]], [5.0, 4.1, 3.2], [0.01] * 3)
+    position, turned = [[0, 0], [4, 0], [4, 4], [3, 4.1]], [[0], [0.5], [0.6], [0]]
+    return Graph(2, ("A0", "A1", "A2", "L0"), [True, True, True, False], position, turned, relative_pose=moved,
+                 ranges=ranges)  # fmt: skip
 
 
 def test_exp_and_log_are_scipys() -> None:
