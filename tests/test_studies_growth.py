@@ -1,4 +1,4 @@
-"""The studies of consistency and of cost as fleets grow, on few cells."""
+"""The studies of consistency, of cost as fleets grow, and of other places, on few cells."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from coopoc import load, run
-from coopoc.studies import scaling, views
+from coopoc.studies import generalisation, scaling, views
 from coopoc.world.sensing import find_links
 
 
@@ -35,3 +35,17 @@ def test_copies_do_not_see_each_other_and_cost_is_counted_per_vehicle(tmp_path: 
     each = [scaling._us(results, "gbp", copies) for copies in (1, 2)]
     assert all(value is not None and np.isfinite(value) and value > 0 for value in each)
     assert "Largest / smallest" in (tmp_path / "scaling" / "tables" / "cost.md").read_text()
+
+
+def test_generalisation_is_relative_to_the_oracle_of_each_place(tmp_path: Path) -> None:
+    wanted = {"runs": 2, "egos": "2", "method": "kalman,kalman-adaptive", "data": "town10,town04", "scenario": "2"}
+    results = run("generalisation", tmp_path, settings=wanted, progress=False)
+    for fleet in ("town10", "town04"):
+        where = {**generalisation.at(fleet, "scenario 2"), "method": "kalman"}
+        oracle, fitted = (
+            generalisation.multiple(results, {**where, "knowledge": known}) for known in ("oracle", "fitted")
+        )
+        assert oracle == 1.0
+        assert fitted is not None
+        assert fitted > 1.05
+    assert "Adaptive KF" in (tmp_path / "generalisation" / "tables" / "multiples.md").read_text()
