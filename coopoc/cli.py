@@ -177,13 +177,16 @@ def report(
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     title: Annotated[str, arg(metavar="TEXT")] = "",
 ) -> None:
-    """Write one self-contained HTML page on one or several studies.
+    """Write one self-contained HTML page on one or several studies, or print it to a PDF.
 
     Example: coopoc report runs/neighbours runs/error_cdf --out report.html
 
+    Example: coopoc report runs/neighbours --out report.pdf
+
     Args:
         folders: of the studies, in the order of the page.
-        out: the file; default report.html in the folder of the first study.
+        out: the file; default report.html in the folder of the first study. A name in .pdf gives a PDF, which needs
+            Chromium (apt-get install chromium).
         title: of the page.
     """
     from .study.report import report as write_report

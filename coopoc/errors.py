@@ -19,11 +19,11 @@ class InputError(ValueError):
 
 
 class MissingLibraryError(ImportError):
-    """An optional library is not installed: the message carries the pip line that installs it."""
+    """An optional library or program is not installed: the message carries the line that installs it."""
 
-    def __init__(self, library: str, needed_for: str, pip: str) -> None:
-        self.args3 = (library, needed_for, pip)
-        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: pip install {pip}")
+    def __init__(self, library: str, needed_for: str, package: str, how: str = "pip install") -> None:
+        self.given = (library, needed_for, package, how)
+        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: {how} {package}")
 
-    def __reduce__(self) -> tuple[type[MissingLibraryError], tuple[str, str, str]]:
-        return type(self), self.args3
+    def __reduce__(self) -> tuple[type[MissingLibraryError], tuple[str, str, str, str]]:
+        return type(self), self.given

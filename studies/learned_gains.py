@@ -128,6 +128,8 @@ def _findings(results: Results) -> Sequence[str]:
 
 
 def _finding(results: Results, name: str) -> str:
+    from coopoc.study.style import look
+
     base, words = reference(results, name)
     trained = [method for method, known in ASSUMED if known == "trained"]
     each = {method: views.rms(results, {**case(name), "method": method, "knowledge": "trained"}) for method in trained}
@@ -135,7 +137,7 @@ def _finding(results: Results, name: str) -> str:
     if not ran or base is None:
         return ""
     best = min(ran, key=lambda method: ran[method])
-    text = f"{name}: best learned solo gain {best} at {ran[best] / base:.3f} times the {words}"
+    text = f"{name}: best learned solo gain {look(best).label} at {ran[best] / base:.3f} times the {words}"
     target = NEAR.get(CASES[name][0])
     if target is not None:
         met = "within" if ran[best] <= (1 + target) * base else "NOT within"

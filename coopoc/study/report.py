@@ -1,4 +1,4 @@
-"""report: one self-contained HTML page from the folders of studies; it needs neither network nor the code that ran."""
+"""report: one self-contained page, HTML or PDF, from folders of studies; it needs neither network nor what ran."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ import markupsafe
 
 from ..errors import InputError
 from . import store
+from .pdf import printed
 from .publish import views
 from .results import Results
-from .style import label, words
+from .style import look, title, words
 
 _MIME = {"csv": "text/csv", "tex": "text/x-tex", "md": "text/markdown", "pdf": "application/pdf", "png": "image/png",
          "svg": "image/svg+xml"}  # fmt: skip
 _LARGEST_SVG = 1_000_000
+KNOWLEDGE = ("identity", "fitted", "nominal", "oracle")
+"""Ends of the names of views that differ in nothing else: the page shows one of them at a time."""
 
 
 def report(
@@ -28,15 +31,16 @@ def report(
     lead: Sequence[str] = (),
     cards: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Path:
-    """Write one HTML page that shows several studies, and return its path.
+    """Write one page that shows several studies, and return its path.
 
     Args:
-        folders: of finished studies, in the order of the page. out: the file.
+        folders: of finished studies, in the order of the page. out: the file; a name in .pdf is printed by Chromium.
         title: of the page. lead: sentences under it, before the first study.
         cards: name -> field -> value of the data that the studies stand on.
 
     Raises:
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
+        MissingLibraryError: a PDF without Chromium.
     """
     if Path(out).is_dir():
         raise InputError("out", str(out), "is a folder", f"Name the file, such as {Path(out) / 'report.html'}.")
@@ -45,10 +49,11 @@ def report(
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
     page = _template().render(
-        title=title or f"coopoc: {', '.join(name.replace('_', ' ') for name in names)}", lead=lead, sections=sections,
+        title=title or f"coopoc: {', '.join(section['title'] for section in sections)}", lead=lead, sections=sections,
         cards=cards or {}, environment=_environment(sections), css=markupsafe.Markup(_own("report.css")),
+        script=markupsafe.Markup(_own("report.js")),
     )  # fmt: skip
-    store.write(Path(out), page)
+    store.write(Path(out), printed(page) if Path(out).suffix.lower() == ".pdf" else page)
     return Path(out)
 
 
@@ -58,10 +63,20 @@ def _section(folder: Path) -> dict[str, Any]:
         **shown, "name": results.study, "title": words(results.study), "question": results.question,
         "settings": results.settings, "environment": results.environment, "pending": results.pending,
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
-        "tables": [_table(folder, view, results.study) for view in shown["tables"]],
-        "figures": [_figure(folder, view, results.study) for view in shown["figures"]],
+        "tables": _blocks([_table(folder, view, results.study) for view in shown["tables"]]),
+        "figures": _blocks([_figure(folder, view, results.study) for view in shown["figures"]]),
         "failures": _failures(results),
     }  # fmt: skip
+
+
+def _blocks(shown: Sequence[Mapping[str, Any]]) -> list[list[dict[str, Any]]]:
+    """Views in their order, those that differ in knowledge alone together, each with its knowledge."""
+    found: dict[tuple[str, bool], list[dict[str, Any]]] = {}
+    for view in shown:
+        stem, _, known = view["name"].rpartition("_")
+        key = (stem, True) if known in KNOWLEDGE else (view["name"], False)
+        found.setdefault(key, []).append({**view, "knowledge": known})
+    return list(found.values())
 
 
 def _table(folder: Path, view: Mapping[str, str], study: str) -> dict[str, Any]:
@@ -85,7 +100,7 @@ def _file(path: Path, form: str, study: str) -> dict[str, str]:
 def _failures(results: Results) -> list[dict[str, str]]:
     found = []
     for _, row in results.failures.iterrows():
-        params = ", ".join(f"{axis} = {label(axis, row[axis])}" for axis in results.axes if axis in row)
+        params = ", ".join(title(axis, row[axis]) for axis in results.axes if axis in row)
         found.append({"cell": params, "reason": str(row["reason"])})
     return found
 
@@ -106,9 +121,15 @@ def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     jinja = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                lstrip_blocks=True)  # fmt: skip
-    jinja.filters["words"] = words
+    jinja.filters["named"] = _named
     jinja.filters["shown"] = _shown
     return jinja.get_template("report.html.j2")
+
+
+def _named(field: str) -> str:
+    """A method by its label, another field in words."""
+    shown = look(field).label
+    return words(field) if shown == field.replace("_", " ") else shown
 
 
 def _shown(value: Any) -> str:

@@ -72,7 +72,13 @@ UNITS = {
     "cap_bytes_per_second": ("Cap", "B/s"), "nees_inside": ("NEES inside its band", ""),
     "neighbour_rt_le_m": ("Error of neighbours", "m"), "loss": ("Message loss", ""), "latency": ("Latency", "s"),
     "heading_std_deg": ("Heading noise", "°"), "heading_bias_deg": ("Heading bias", "°"),
-    "epsilon": ("Epsilon", ""), "auc": ("AUC of the probe", ""),
+    "epsilon": ("Epsilon", ""), "auc": ("AUC of the probe", ""), "radius_m": ("Radius of V2X", "m"),
+    "correlated_gnss": ("Correlated GNSS", ""), "latency_loss": ("Latency and loss", ""),
+    "velocity_ratio": ("Velocity noise, share", ""), "velocity_reading": ("Velocity noise is per", ""),
+    "drift_time_s": ("Time of the GNSS drift", "s"), "offset_m": ("Offset of false data", "m"),
+    "train_seeds": ("Training seeds", ""), "train_seed": ("Training seed", ""),
+    "in_mult": ("Input width of the net, multiple", ""), "out_mult": ("Output width of the net, multiple", ""),
+    "backend": ("Optimisation backend", ""), "attacked_share": ("Share of attacked vehicles", ""),
 }  # fmt: skip
 """Column -> (words, unit)."""
 
@@ -104,7 +110,7 @@ def look(method: str) -> Look:
         shown = METHODS[family]
         return Look(f"{shown.label} {name[len(family) :].strip('-')}", shown.color, shown.marker)
     color, marker = _SPARE[zlib.crc32(method.encode()) % len(_SPARE)]
-    return Look(method, color, marker)
+    return Look(method.replace("_", " "), color, marker)
 
 
 def line(knowledge: object) -> Any:

@@ -94,20 +94,22 @@ class Table:
         return out.getvalue()
 
     def to_latex(self) -> str:
-        r"""A booktabs table that compiles with \usepackage{booktabs}; best in bold, text escaped."""
+        r"""A table for \usepackage{booktabs,graphicx}, not wider than the line; best in bold, text escaped."""
         bold = self._bold()
-        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(' '.join(self.below))}}}",
+        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(' '.join(self.below))}}}", r"\smallskip",
+                 r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
                  rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}", r"\toprule",
                  " & ".join(map(_tex, self.header)) + r" \\", r"\midrule"]  # fmt: skip
         for i, row in enumerate(self.rows):
             entries = [self._latex(e, (i, j) in bold) for j, e in enumerate(row)]
             lines.append(" & ".join(entries) + r" \\")
-        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
+        return "\n".join([*lines, r"\bottomrule", r"\end{tabular}}", r"\end{table}", ""])
 
     def to_html(self) -> str:
         """A <table> without styling of its own."""
         bold = self._bold()
-        head = "".join(f"<th scope=col>{escape(title)}</th>" for title in self.header)
+        titles = [escape(title).replace(" = ", "&nbsp;=&nbsp;") for title in self.header]  # K = 4 stays in one line
+        head = "".join(f"<th scope=col>{title}</th>" for title in titles)
         body = []
         for i, row in enumerate(self.rows):
             cells = [self._html(e, (i, j) in bold) for j, e in enumerate(row)]

@@ -1,0 +1,122 @@
+"use strict";
+// What the page does beyond being read: sort a table, switch the knowledge, mark the place in the contents.
+// Without it every row and every panel is there.
+(() => {
+  const SECONDS = { s: 1, min: 60, h: 3600 };
+  const NUMBER = /^([+\-−]?)(\d[\d,]*\.?\d*(?:e[+-]?\d+)?|inf)(?:\s+(s|min|h)$)?/;
+  const words = new Intl.Collator("en", { numeric: true });
+  document.documentElement.classList.add("js");
+
+  // The first number of a cell, which is the mean of an interval; durations in seconds; undefined for other text.
+  function number(text) {
+    const found = NUMBER.exec(text);
+    if (!found) return undefined;
+    const size = found[2] === "inf" ? Infinity : Number(found[2].replaceAll(",", ""));
+    return (found[1] && found[1] !== "+" ? -size : size) * (SECONDS[found[3]] ?? 1);
+  }
+
+  // The rows in the order of one column; cells without a value stay last in both directions.
+  function ordered(rows, column, sign) {
+    const texts = new Map(rows.map((row) => [row, row.cells[column].textContent.trim()]));
+    const given = rows.filter((row) => !["", "–"].includes(texts.get(row)));
+    const numbers = new Map(given.map((row) => [row, number(texts.get(row))]));
+    const plain = given.every((row) => numbers.get(row) !== undefined);
+    const compare = plain
+      ? (a, b) => (numbers.get(a) === numbers.get(b) ? 0 : numbers.get(a) - numbers.get(b)) // inf - inf is no number
+      : (a, b) => words.compare(texts.get(a), texts.get(b));
+    given.sort((a, b) => sign * compare(a, b));
+    return [...given, ...rows.filter((row) => !numbers.has(row))];
+  }
+
+  // A click sorts upwards, the next one downwards, the third gives the order of the study back.
+  function sortable(table) {
+    const body = table.tBodies[0];
+    const original = [...body.rows];
+    const heads = [...table.tHead.rows[0].cells];
+    heads.forEach((head, column) => {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.className = "sort";
+      button.append(...head.childNodes);
+      head.append(button);
+      button.addEventListener("click", () => {
+        const next = { ascending: "descending", descending: "" }[head.getAttribute("aria-sort")] ?? "ascending";
+        heads.forEach((other) => other.removeAttribute("aria-sort"));
+        if (next) head.setAttribute("aria-sort", next);
+        body.append(...(next ? ordered(original, column, next === "ascending" ? 1 : -1) : original));
+      });
+    });
+  }
+
+  // Tabs over the panels of a block; all blocks that have a panel of the chosen knowledge follow.
+  function tabs(block) {
+    const panels = [...block.children];
+    const list = document.createElement("div");
+    list.className = "tabs";
+    list.setAttribute("role", "tablist");
+    list.setAttribute("aria-label", "Knowledge");
+    const buttons = panels.map((panel) => {
+      const button = document.createElement("button");
+      Object.assign(button, { type: "button", id: `${panel.id}-tab`, textContent: panel.dataset.knowledge });
+      button.setAttribute("role", "tab");
+      button.setAttribute("aria-controls", panel.id);
+      panel.setAttribute("role", "tabpanel");
+      panel.setAttribute("aria-labelledby", button.id);
+      return button;
+    });
+    const show = (knowledge) => {
+      const at = panels.findIndex((panel) => panel.dataset.knowledge === knowledge);
+      if (at < 0) return;
+      panels.forEach((panel, i) => panel.classList.toggle("other", i !== at));
+      buttons.forEach((button, i) => {
+        button.setAttribute("aria-selected", String(i === at));
+        button.tabIndex = i === at ? 0 : -1;
+      });
+    };
+    const choose = (button) => {
+      const before = button.getBoundingClientRect().top;
+      blocks.forEach((each) => each(button.textContent));
+      button.focus({ preventScroll: true });
+      window.scrollBy({ top: button.getBoundingClientRect().top - before, behavior: "instant" });
+    };
+    buttons.forEach((button, i) => {
+      button.addEventListener("click", () => choose(button));
+      button.addEventListener("keydown", (event) => {
+        const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+        if (!step) return;
+        event.preventDefault();
+        choose(buttons[(i + step + buttons.length) % buttons.length]);
+      });
+    });
+    list.append(...buttons);
+    block.prepend(list);
+    show(panels[0].dataset.knowledge);
+    return show;
+  }
+
+  // On a phone a figure fits; this one draws it large enough to read, in a box that scrolls.
+  function enlargeable(figure) {
+    const button = document.createElement("button");
+    Object.assign(button, { type: "button", className: "enlarge", textContent: "Enlarge" });
+    button.addEventListener("click", () => {
+      button.textContent = figure.classList.toggle("large") ? "Fit" : "Enlarge";
+    });
+    figure.querySelector(".files").append(button);
+  }
+
+  // The last section whose head has come past the upper third of the window is the one that is read.
+  function mark() {
+    const links = [...document.querySelectorAll("nav a")];
+    const heads = links.map((link) => document.getElementById(link.hash.slice(1)));
+    const end = window.scrollY > 0 && window.innerHeight + window.scrollY >= document.body.scrollHeight - 2;
+    const passed = heads.findLastIndex((head) => head.getBoundingClientRect().top < window.innerHeight / 3);
+    const here = end ? links.length - 1 : passed;
+    links.forEach((link, i) => (i === here ? link.setAttribute("aria-current", "true") : link.removeAttribute("aria-current")));
+  }
+
+  [...document.querySelectorAll("table")].filter((table) => table.tHead).forEach(sortable);
+  const blocks = [...document.querySelectorAll(".block")].map(tabs);
+  document.querySelectorAll("figure").forEach(enlargeable);
+  document.addEventListener("scroll", mark, { passive: true });
+  mark();
+})();

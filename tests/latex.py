@@ -1,0 +1,23 @@
+"""Compile a table as a paper would; skips, and says why, where there is no LaTeX with booktabs."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+
+def compiled(tables: str, folder: Path) -> str:
+    """What pdflatex says about a page with these tables; t.pdf is in the folder."""
+    if shutil.which("pdflatex") is None:
+        pytest.skip("pdflatex is not installed: apt-get install texlive-latex-base texlive-latex-recommended")
+    if subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True).returncode:
+        pytest.skip("LaTeX has no booktabs: apt-get install texlive-latex-recommended")
+    source = r"\documentclass{article}\usepackage{booktabs,graphicx}\begin{document}" + tables + r"\end{document}"
+    (folder / "t.tex").write_text(source)
+    done = subprocess.run(["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"], cwd=folder,
+                          capture_output=True, text=True, timeout=60)  # fmt: skip
+    assert done.returncode == 0, done.stdout[-2000:]
+    return done.stdout

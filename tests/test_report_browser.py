@@ -1,0 +1,208 @@
+"""The page of a real study in headless Chromium: it works offline, sorts, switches, and fits a desk and a phone."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coopoc.errors import MissingLibraryError
+from coopoc.study import pdf
+from coopoc.study.report import report
+from coopoc.study.results import Results
+from coopoc.study.run import run
+from coopoc.study.tables import Table
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install 'coopoc[dev]'")
+
+WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
+
+
+def _known(known: str) -> Any:
+    """The study's table under a name that ends in a knowledge; its rows are those that this knowledge ran."""
+
+    def table(results: Results) -> Table:
+        return results.table("method", "max_neighbours", "rt_le_m", caption=f"RT-LE [m], {known} knowledge.")
+
+    return table
+
+
+def _numbers(results: Results) -> Table:
+    """Numbers whose order as text is another one, what is missing, intervals, and durations."""
+    wide = results.interval("rt_le_m", method="kalman", max_neighbours=0)
+    narrow = results.interval("rt_le_m", method="joint", max_neighbours=2)
+    rows = (("b 10", -1.0, wide, "2.0 h"), ("a", None, None, "5 s"), ("b 9", 10.25, narrow, "10 min"),
+            ("c", -2.0, 0.5, "inf"))  # fmt: skip
+    return Table(("Name", "Number", "Interval", "Duration"), rows, "Made to be sorted.")
+
+
+def _wide(results: Results) -> Table:
+    """More columns than a screen is wide."""
+    found = results.interval("rt_le_m", method="kalman", max_neighbours=0)
+    return Table(("Method", *(f"Column {i}" for i in range(20))), (("KF", *(found,) * 20),), "Wide.")
+
+
+@pytest.fixture(scope="module")
+def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("browser")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
+        small = importlib.import_module("small_study").STUDY
+    tables = {f"rt_le_{k}": _known(k) for k in ("identity", "fitted", "nominal")}
+    figures = {f"rt_le_{k}": small.figures["rt_le"] for k in ("identity", "fitted")}
+    study = replace(small, tables={**tables, "numbers": _numbers, "wide": _wide, **small.tables}, figures=figures)
+    run(study, out, progress=False)
+    return report([out / "small"], out / "report.html", cards={"circle": {"vehicles": 5, "name": "a" * 120}})
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    try:
+        program = pdf.browser()
+    except MissingLibraryError as missing:
+        pytest.skip(str(missing))
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=program, args=["--no-sandbox", "--disable-gpu"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(params=WIDTHS)
+def page(request: pytest.FixtureRequest, browser: Any, page_file: Path) -> Iterator[Any]:
+    """The page at both widths; nothing may be asked of the network or said in the console, whatever the test does."""
+    width, height = WIDTHS[request.param]
+    context = browser.new_context(viewport={"width": width, "height": height})
+    opened = context.new_page()
+    asked: list[str] = []
+    said: list[str] = []
+    opened.on("request", lambda request: asked.append(request.url))
+    opened.on("console", lambda message: said.append(message.text))
+    opened.on("pageerror", lambda error: said.append(str(error)))
+    opened.goto(page_file.as_uri())
+    yield opened
+    context.close()
+    assert [url for url in asked if not url.startswith("data:")] == [page_file.as_uri()]
+    assert said == []
+
+
+def _column(page: Any, table: str, index: int) -> list[str]:
+    cells = page.locator(f"#small-table-{table} tbody tr td:nth-child({index + 1})").all_inner_texts()
+    return [re.split(r"\s", cell)[0] if index else cell for cell in cells]
+
+
+def _shown(page: Any) -> list[str]:
+    return [panel.get_attribute("data-knowledge") for panel in page.locator(".panel").all() if panel.is_visible()]
+
+
+def test_a_row_under_the_pointer_is_marked(page: Any) -> None:
+    cell = page.locator("#small-table-rt_le tbody td").first
+    color = "cell => getComputedStyle(cell).backgroundColor"
+    before = cell.evaluate(color)
+    cell.hover()
+    assert cell.evaluate(color) != before
+
+
+@pytest.mark.parametrize(
+    ("title", "upwards", "downwards"),
+    [
+        ("Name", ["a", "b 9", "b 10", "c"], ["c", "b 10", "b 9", "a"]),
+        ("Number", ["c", "b 10", "b 9", "a"], ["b 9", "b 10", "c", "a"]),  # what has no number is last both times
+        ("Duration", ["a", "b 9", "b 10", "c"], ["c", "b 10", "b 9", "a"]),
+    ],
+)
+def test_a_click_on_a_header_sorts(page: Any, title: str, upwards: list[str], downwards: list[str]) -> None:
+    head = page.locator("#small-table-numbers th", has_text=title)
+    button = head.get_by_role("button")
+    orders = []
+    for direction in ("ascending", "descending", None):
+        button.click()
+        assert head.get_attribute("aria-sort") == direction
+        orders.append(_column(page, "numbers", 0))
+    assert orders == [upwards, downwards, ["b 10", "a", "b 9", "c"]]
+
+
+def test_intervals_sort_by_their_mean_from_the_keyboard(page: Any) -> None:
+    heads = page.locator("#small-table-rt_le thead th")
+    for index, key in ((1, "Enter"), (2, "Space")):
+        heads.nth(index).get_by_role("button").focus()
+        page.keyboard.press(key)
+        means = [float(cell) for cell in _column(page, "rt_le", index)]
+        assert means == sorted(means)
+    assert [head.get_attribute("aria-sort") for head in heads.all()] == [None, None, "ascending", None]
+
+
+def test_the_switch_holds_for_the_whole_page(page: Any) -> None:
+    tabs = page.locator("#small-table-rt_le_identity-panel").locator("xpath=..").get_by_role("tab")
+    assert tabs.all_inner_texts() == ["Identity", "Fitted", "Nominal"]
+    assert _shown(page) == ["identity", "identity"]
+    tabs.nth(1).click()
+    assert _shown(page) == ["fitted", "fitted"]
+    page.keyboard.press("ArrowRight")  # no figure has it: that block keeps what it shows
+    assert _shown(page) == ["fitted", "nominal"]
+    assert [tab.get_attribute("aria-selected") for tab in tabs.all()] == ["false", "false", "true"]
+    page.emulate_media(media="print")
+    assert _shown(page) == ["identity", "fitted", "identity", "fitted", "nominal"]
+
+
+def test_nothing_is_wider_than_the_page(page: Any) -> None:
+    for tab in page.get_by_role("tab").all():
+        tab.click()
+        wide, window = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+        assert wide <= window
+        for image in page.locator("figure img:visible").all():
+            box = image.bounding_box()
+            assert box["width"] > 300
+            assert box["x"] + box["width"] <= window
+    beyond = """[...document.querySelectorAll("body *")].filter(e => !e.closest(".wide") && e.getClientRects().length
+        && e.getBoundingClientRect().right > innerWidth + 1).map(e => e.outerHTML.slice(0, 80))"""
+    assert page.evaluate(beyond) == []
+
+
+def test_a_figure_can_be_enlarged_on_a_phone(page: Any) -> None:
+    figure = page.locator("figure:visible")
+    button = figure.get_by_role("button", name="Enlarge")
+    if page.viewport_size["width"] > 640:
+        assert button.count() == 0
+        return
+    fits = figure.locator("img").bounding_box()["width"]
+    button.click()
+    assert figure.locator("img").bounding_box()["width"] > 2 * fits
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    figure.get_by_role("button", name="Fit").click()
+    assert figure.locator("img").bounding_box()["width"] == fits
+
+
+def test_the_contents_stay_in_sight_on_a_wide_screen(page: Any) -> None:
+    page.evaluate("document.getElementById('data').scrollIntoView({behavior: 'instant'})")
+    page.wait_for_function("document.querySelector('nav [aria-current]')")
+    top = page.locator("nav").bounding_box()["y"]
+    assert (top >= 0) == (page.viewport_size["width"] > 1200)
+
+
+def test_without_javascript_everything_is_there(browser: Any, page_file: Path) -> None:
+    context = browser.new_context(java_script_enabled=False)
+    plain = context.new_page()
+    plain.goto(page_file.as_uri())
+    assert _shown(plain) == ["identity", "fitted", "identity", "fitted", "nominal"]
+    assert plain.locator("button").count() == 0
+    context.close()
+
+
+def test_pdf(browser: Any, page_file: Path) -> None:
+    out = report([page_file.parent / "small"], page_file.parent / "report.pdf")
+    content = out.read_bytes()
+    assert content.startswith(b"%PDF-")
+    assert content.rstrip().endswith(b"%%EOF")
+    assert len(re.findall(rb"/Type\s*/Page\b", content)) >= 2
+
+
+def test_without_chromium_the_mend_is_named(page_file: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(MissingLibraryError, match=r"a PDF of the report needs chromium.*apt-get install chromium"):
+        report([page_file.parent / "small"], tmp_path / "report.pdf")
+    assert not (tmp_path / "report.pdf").exists()
