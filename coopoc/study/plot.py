@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, StrMethodFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator
 
 from . import store
 from .results import Results
@@ -112,20 +113,28 @@ def legend(
 
 
 def plain_log(axis: Axis) -> None:
-    """Logarithmic axis with plain numbers at 1, 2 and 5 of each decade, and at more where it spans less than one."""
+    """Logarithmic axis with plain numbers at 1, 2 and 5 of each decade; at more where it spans less than one, at the
+    decades alone where it spans many."""
     if axis is axis.axes.xaxis:
         axis.axes.set_xscale("log")
     else:
         axis.axes.set_yscale("log")
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axis.set_minor_locator(LogLocator(subs=(1.2, 1.5, 3.0, 4.0, 7.0), numticks=50))
 
-    def number(value: float, _: int | None = None) -> str:
+    def spans() -> float:
         low, high = axis.get_view_interval()
-        return f"{value:g}" if high < 5 * low else ""
+        return float(high / low)
 
-    axis.set_minor_formatter(FuncFormatter(number))
+    def decade(value: float, _: int | None = None) -> str:
+        whole = abs(np.log10(value) % 1.0 - 0.5) > 0.499
+        return f"{value:g}" if whole or spans() < 1e3 else ""
+
+    def between(value: float, _: int | None = None) -> str:
+        return f"{value:g}" if spans() < 5 else ""
+
+    axis.set_major_formatter(FuncFormatter(decade))
+    axis.set_minor_formatter(FuncFormatter(between))
 
 
 def apart(heights: Mapping[str, float], gap: float) -> dict[str, float]:
