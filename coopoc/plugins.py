@@ -16,10 +16,14 @@ GROUPS = {"coopoc.datasets": "data set", "coopoc.methods": "method", "coopoc.stu
 
 
 def points(group: str) -> Mapping[str, metadata.EntryPoint]:
-    """Entry points of a group by name, none of them loaded; InputError if two distributions claim one name."""
+    """Entry points of a group by name, none of them loaded; InputError if two distributions claim one name.
+
+    They are made anew as Python's own: once the backport importlib_metadata is imported, as Dask does, Python's finder
+    gives entry points of a class of its own.
+    """
     found: dict[str, metadata.EntryPoint] = {}
     for point in sorted(metadata.entry_points(group=group), key=lambda p: p.name):
-        other = found.setdefault(point.name, point)
+        other = found.setdefault(point.name, metadata.EntryPoint(point.name, point.value, point.group))
         if other.value != point.value:
             claims = f"is claimed by {other.value} and {point.value}"
             raise InputError(group, repr(point.name), claims, "Uninstall one of the two.")

@@ -1,5 +1,7 @@
 """Entry points: names, mappings, clashes, and distributions that are broken."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -45,3 +47,16 @@ def test_two_distributions_may_not_claim_one_name(site: Path) -> None:
     install(site, "second", "[some.group]\nx = math:tau\n")
     with pytest.raises(InputError, match=r"'x': is claimed by math:\w+ and math:\w+\. Uninstall one"):
         plugins.find("some.group", "x")
+
+
+def test_entry_points_are_pythons_own_after_the_backport_was_imported() -> None:
+    """importlib_metadata, which Dask imports, replaces the finder of the whole process."""
+    code = (
+        "import importlib_metadata\nfrom importlib.metadata import EntryPoint\nfrom coopoc.plugins import points\n"
+        "assert all(type(p) is EntryPoint for p in points('coopoc.commands').values())\n"
+        "from coopoc.cli import main\nmain(['solve', '--help'])"
+    )
+    pytest.importorskip("importlib_metadata")
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert found.returncode == 0, found.stderr
+    assert "coopoc solve" in found.stdout
