@@ -146,8 +146,8 @@ STUDY = Study(
         "A Gauss-Markov error with one correlation time stands for multipath and atmosphere; real ones depend on the "
         "place and on the satellites in view.",
         "What lasts for all alike is shared by the whole map: over some hundred metres that is nearly so.",
-        "A neighbour that comes back is new to the drift filter and to the bound, although its error was met before: the "
-        "filter is somewhat over-confident, the bound lower than it need be.",
+        "A neighbour that comes back is new to the drift filter and to the bound, although its error was met before: "
+        "the filter is somewhat over-confident, the bound lower than it need be.",
         "Learned gains were trained with white noise.",
     ),
     minutes=12,
