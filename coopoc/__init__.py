@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .evaluate.metrics import max_error as max_error
     from .evaluate.metrics import nees as nees
     from .evaluate.metrics import rt_le as rt_le
+    from .evaluate.statistics import paired_difference as paired_difference
     from .fleets import load as load
     from .methods.adaptive import AdaptiveKalman as AdaptiveKalman
     from .methods.admm import ConsensusADMM as ConsensusADMM
@@ -69,6 +70,7 @@ _HOME = {
     "AdaptiveKalman": "methods.adaptive", "VariationalKalman": "methods.variational",
     "Sighting": "methods.star_stream",
     "JointFilter": "methods.joint_filter", "LaplacianKalman": "methods.lkf_sa", "Msmv": "methods.msmv",
+    "paired_difference": "evaluate.statistics",
     "max_error": "evaluate.metrics", "nees": "evaluate.metrics", "rt_le": "evaluate.metrics",
     "CovarianceIntersection": "methods.covariance_intersection", "Mds": "methods.mds", "QcqpSdr": "methods.qcqp_sdr",
     "FixedLagSmoother": "methods.fixed_lag", "MovingHorizon": "methods.moving_horizon",

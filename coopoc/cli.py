@@ -54,7 +54,7 @@ def run(
     Example: coopoc run neighbours --jobs 2 --set runs=100 max_neighbours=0,4
 
     Args:
-        name: of the study; coopoc list shows them.
+        name: of the study; coopoc list shows them. Your own: FILE.py:NAME.
         data: a data set instead of the study's own.
         out: of all studies; this one goes to FOLDER/NAME.
         jobs: worker processes. Results do not depend on it.

@@ -8,6 +8,7 @@ from importlib import metadata
 from typing import Any
 
 from .errors import InputError
+from .one_file import from_file, in_file
 
 GROUPS = {"coopoc.datasets": "data set", "coopoc.methods": "method", "coopoc.studies": "study",
           "coopoc.backends": "backend", "coopoc.recipes": "recipe", "coopoc.nets": "net",
@@ -44,7 +45,7 @@ def find(group: str, name: str) -> Any:
 
     Args:
         group: one of GROUPS, or a third party's own.
-        name: an entry point, or a key of an entry point that holds a mapping.
+        name: an entry point, a key of an entry point that holds a mapping, or "folder/mine.py:NAME", a name in a file.
 
     Raises:
         InputError: no such name (lists the names and the nearest one), or two distributions claim it.
@@ -54,6 +55,8 @@ def find(group: str, name: str) -> Any:
     ...
     coopoc.errors.InputError: nothing = 'x': must be one of (there is none). There is none to use.
     """
+    if in_file(name):
+        return from_file(name, GROUPS.get(group, group))
     registered = points(group)
     loaded = registered[name].load() if name in registered else None
     if loaded is not None and not isinstance(loaded, Mapping):

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from coopoc.errors import InputError
+from coopoc.one_file import in_file
+from coopoc.plugins import find, names
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 
@@ -65,7 +67,9 @@ def load(name_or_path: str | Path, *, format: str | None = None, **options: Any)
     """Fleet of a bundled dataset or of a file or folder.
 
     Args:
-        name_or_path: a key of DATASETS, or a path: CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder.
+        name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
+            `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
+            CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder.
         format: table, tum, fcd, carla or mrclam, instead of what the name and the contents tell.
         options: of the reader, for example dt (s), columns, vehicle_length, handedness.
 
@@ -76,14 +80,14 @@ def load(name_or_path: str | Path, *, format: str | None = None, **options: Any)
     array([1550, 4600, 1450, 1420])
     """
     name = str(name_or_path)
-    if name in DATASETS and format is None:
-        return _resampled(DATASETS[name].load(), **options)
+    if format is None and (in_file(name) or name in names("coopoc.datasets")):
+        return _resampled(_made(find("coopoc.datasets", name), name), **options)
     path = Path(name_or_path)
     if not path.exists():
         raise InputError(
             "data",
             repr(name),
-            f"must be one of {', '.join(DATASETS)} or the path of a file or folder",
+            f"must be one of {', '.join(names('coopoc.datasets'))} or the path of a file or folder",
             "List the bundled fleets with coopoc data list, or check the path.",
         )
     chosen = detect(path) if format is None else format
@@ -95,6 +99,14 @@ def load(name_or_path: str | Path, *, format: str | None = None, **options: Any)
         if "unexpected keyword argument" not in str(error):
             raise
         raise InputError("options", sorted(options), f"not all known to the {chosen} reader", str(error)) from None
+
+
+def _made(found: Any, name: str) -> Fleet:
+    """A Fleet, what loads one as a Dataset does, or what makes one when it is called."""
+    fleet = found if isinstance(found, Fleet) else found.load() if hasattr(found, "load") else found()
+    if not isinstance(fleet, Fleet):
+        raise InputError("data", repr(name), f"gives a {type(fleet).__name__}, no Fleet", "Return coopoc.Fleet(...).")
+    return fleet
 
 
 def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable[..., Recording] | None:

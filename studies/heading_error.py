@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.study.study import Params, Row, Study
 
 from . import lineup, scene, views
@@ -36,11 +35,7 @@ def _grid() -> list[dict[str, Any]]:
 
 def cell(p: Params) -> list[Row]:
     """Rows of one method; of the bound for an exact heading, one row per ego."""
-    if p["method"] != "bound":
-        return lineup.rows(p)
-    drive, acting, v2x = scene.fleet(p["data"]), scene.sensors(p), scene.channel(p)
-    egos = scene.egos(p["data"], str(p["egos"]))
-    return [{"run": 0, "ego": ego, "rt_le_m": bound_rt_le(posterior_bound(drive, acting, ego, v2x))} for ego in egos]
+    return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
 
 
 def at(kind: str, size: float, method: str, known: str, k: int) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import errors, max_error, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
@@ -18,6 +19,8 @@ from coopoc.plugins import find
 from coopoc.study.study import Params, Row
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
+from coopoc.world.sensing import find_links
+from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
 
@@ -98,6 +101,20 @@ def rows(p: Params, *, quantiles: int = 0) -> list[Row]:
     for seed, method in methods(p, recording):
         track = method(recording, who)
         found += _rows(track, drive, recording, who, quantiles, {} if seed is None else {"train_seed": seed})
+    return found
+
+
+def bound_rows(p: Params) -> list[Row]:
+    """The bound of each ego over an ideal channel, which needs no draws, with what the ego would receive."""
+    drive, v2x = scene.fleet(p["data"]), scene.channel(p)
+    acting, rate = scene.sensors(p), min(v2x.rate or np.inf, 1 / drive.dt)
+    found: list[Row] = []
+    for ego in scene.egos(p["data"], str(p["egos"])):
+        column = drive.index(ego)
+        level = bound_rt_le(posterior_bound(drive, acting, column, v2x))
+        near = len(find_links(drive, [column], v2x.max_neighbours, v2x.radius, acting.min_range)) / len(drive.t)
+        received = near * FIX_AND_VELOCITY.payload * rate
+        found.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, "bytes_per_second": received})
     return found
 
 

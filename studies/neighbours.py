@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.study.study import Params, Row, Study
-from coopoc.world.sensing import find_links
-from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import lineup, scene, views, weights
 from .claims import IDEAL, findings, ks
@@ -55,18 +52,7 @@ def _meaningful(p: Params) -> bool:
 
 def cell(p: Params) -> list[Row]:
     """Rows of one method at one K and budget; of the bound, one row per ego."""
-    if p["method"] != "bound":
-        return lineup.rows(p)
-    drive, acting = scene.fleet(p["data"]), scene.sensors(p)
-    found = []
-    for ego in scene.egos(p["data"], str(p["egos"])):
-        column = drive.index(ego)
-        bound = bound_rt_le(posterior_bound(drive, acting, column, scene.channel(p)))
-        links = find_links(drive, [column], p["max_neighbours"], float(p["radius_m"]), acting.min_range)
-        near = len(links) / len(drive.t)
-        received = near * FIX_AND_VELOCITY.payload * min(p["rate_hz"], 1 / drive.dt)
-        found.append({"run": 0, "ego": ego, "rt_le_m": bound, "neighbours_mean": near, "bytes_per_second": received})
-    return found
+    return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
 
 
 def _of(*knowledge: str, **more: Any) -> dict[str, Any]:

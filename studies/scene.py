@@ -13,7 +13,7 @@ import numpy as np
 
 from coopoc.data.registry import load, recorder
 from coopoc.errors import InputError
-from coopoc.methods.catalogue import WHOLE_FLEET
+from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.environment import revision
 from coopoc.study.study import Params
 from coopoc.world.attack import attacked
@@ -172,11 +172,16 @@ def channel(p: Params) -> V2X:
         found,
         radius=float(p.get("radius_m", 30.0)),
         rate=p.get("rate_hz") or found.rate,
-        loss=float(p.get("loss", found.loss)),
-        burst=float(p.get("burst", found.burst)),
-        latency=float(p.get("latency_s", found.latency)),
+        loss=_given(p, "loss", found.loss),
+        burst=_given(p, "burst", found.burst),
+        latency=_given(p, "latency_s", found.latency),
         bytes_per_second=cap or float("inf"),
     )
+
+
+def _given(p: Params, name: str, default: float) -> float:
+    value = p.get(name)
+    return default if value is None else float(value)
 
 
 def facts(p: Params) -> Mapping[str, str]:
@@ -199,7 +204,7 @@ def _digests(data: str) -> Mapping[str, str]:
 def recording(p: Params) -> Recording:
     """What the vehicles of the cell see; the real measurements where there are any."""
     who = egos(p["data"], str(p["egos"]))
-    observers = None if p.get("method") in WHOLE_FLEET else who
+    observers = None if needs_whole_fleet(str(p.get("method"))) else who
     seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
     share = float(p.get("attacked_share", 0.0))
     return attacked(seen, share, seed=int(p["seed"]), honest=who) if share else seen

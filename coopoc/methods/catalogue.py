@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from ..one_file import in_file
+from ..plugins import find, names
 from .adaptive import AdaptiveKalman
 from .admm import ConsensusADMM
 from .batch_smoother import BatchSmoother
@@ -60,3 +62,15 @@ METHODS: Mapping[str, Factory] = {
 
 WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"})
 """Methods that need what every vehicle measured, not only the egos."""
+
+
+def needs_whole_fleet(name: str) -> bool:
+    """Whether a method needs what every vehicle measured; one from elsewhere says so by `whole_fleet = True`.
+
+    >>> needs_whole_fleet("gbp"), needs_whole_fleet("joint")
+    (True, False)
+    """
+    if name in METHODS:
+        return name in WHOLE_FLEET
+    registered = in_file(name) or name in names("coopoc.methods")
+    return registered and bool(getattr(find("coopoc.methods", name), "whole_fleet", False))

@@ -26,7 +26,8 @@ Where = Mapping[str, Any] | None
 def sweep(
     results: Results, x: str, y: str = "rt_le_m", where: Where = None, caption: str = "", log: bool = False
 ) -> Plot:
-    """A metric against an axis: one line per method and knowledge with its 95 % band; "bound" is dashed.
+    """A metric against an axis: one line per method and knowledge with its 95 % band; "bound" is dashed. Without a
+    column `method`, one line per combination of the other axes.
 
     Args:
         x: column of the horizontal axis. y: metric. where: column -> value or values. log: vertical axis.
@@ -34,7 +35,7 @@ def sweep(
     Raises:
         InputError: as `Results.summary`.
     """
-    by = line_names(results)
+    by = line_names(results, x)
     summary = results.summary([*by, x], y, where)
     drawn = []
     with canvas() as (figure, axes):

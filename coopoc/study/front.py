@@ -33,7 +33,7 @@ def pareto(
     Raises:
         InputError: as `Results.summary`.
     """
-    by = [*line_names(results), *along[1:]]
+    by = [*line_names(results, *along), *along[1:]]
     summary = results.summary([*by, along[0]], y, where)
     summary["bytes"] = results.summary([*by, along[0]], x, where)["mean"]
     panels = [1.0, 6.0, 2.4][: 3 if training else 2]

@@ -47,6 +47,13 @@ class Plot:
                 store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
         return self.caption
 
+    def _repr_png_(self) -> bytes:
+        """What a notebook shows."""
+        buffer = BytesIO()
+        with mpl.rc_context(RC):
+            self.figure.savefig(buffer, format="png")
+        return buffer.getvalue()
+
 
 def _settle(figure: Figure) -> None:
     """Lay the panels out and round their places: the solver of constrained layout differs in its last digits."""
@@ -57,13 +64,21 @@ def _settle(figure: Figure) -> None:
         axes.set_position((x, y, width, height))
 
 
-def line_names(results: Results) -> list[str]:
-    """Columns that tell the lines of a figure apart."""
-    return [name for name in ("method", "knowledge") if name in results.frame]
+def line_names(results: Results, *across: str) -> list[str]:
+    """Columns that tell the lines of a figure apart: method and knowledge, or all axes but those of the figure."""
+    usual = [name for name in ("method", "knowledge") if name in results.frame]
+    return usual if "method" in usual else [name for name in results.axes if name not in across]
+
+
+def _line(names: Mapping[str, Any]) -> str:
+    """The method of a line; without one, what else it is called."""
+    return str(names["method"]) if "method" in names else ", ".join(map(str, names.values()))
 
 
 def groups(frame: pd.DataFrame, by: Sequence[str]) -> list[tuple[dict[str, Any], pd.DataFrame]]:
     """Rows of each combination of the columns `by`, with its names, in order of first appearance."""
+    if not by:
+        return [({}, frame)]
     return [(dict(zip(by, k, strict=True)), g) for k, g in frame.groupby(list(by), sort=False, dropna=False)]
 
 
@@ -81,8 +96,8 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
 
 def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
     """Line options of a method (colour, marker) under a knowledge (line style); the bound is dashed."""
-    shown = look(str(names["method"]))
-    dashes = "--" if names["method"] == "bound" else line(names.get("knowledge"))
+    shown = look(_line(names))
+    dashes = "--" if _line(names) == "bound" else line(names.get("knowledge"))
     width = {"linewidth": 0.8} if thin else {}
     return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8, **width}
 
@@ -97,17 +112,20 @@ def legend(
         inside: in the panel; else at its right.
     """
     handles = []
-    for method in dict.fromkeys(str(names["method"]) for names in lines):
-        options = strokes({"method": method})
+    for method, names in {_line(names): names for names in lines}.items():
+        options = strokes({"method": method} if "method" in names else names)
         text = look(method).label + (words or {}).get(method, "")
         handles.append(Line2D([], [], **options, label=text))
     styles: dict[Any, list[str]] = {}
-    for known in dict.fromkeys(str(n["knowledge"]) for n in lines if "knowledge" in n and n["method"] != "bound"):
+    told = [n for n in lines if "knowledge" in n and "method" in n and n["method"] != "bound"]
+    for known in dict.fromkeys(str(n["knowledge"]) for n in told):
         if known == "none":
             continue
         styles.setdefault(line(known), []).append(known)
     if len(styles) > 1:
         handles += [Line2D([], [], color="#555555", linestyle=k, label=" / ".join(v)) for k, v in styles.items()]
+    if not any(lines):
+        return
     place: dict[str, Any] = {} if inside else {"bbox_to_anchor": (1.02, 1.0), "borderaxespad": 0}
     axes.legend(handles=handles, loc="upper right" if inside else "upper left", handlelength=2.6, **place)
 

@@ -12,9 +12,11 @@ from tqdm import tqdm
 
 from .. import plugins
 from ..errors import InputError
+from ..one_file import in_file
 from . import store
 from .cluster import Cluster, connected
 from .compute import Outcome, compute, schedule
+from .file_study import file_study
 from .manifest import alone, held, manifest
 from .publish import publish
 from .results import Results
@@ -39,7 +41,7 @@ def run(
     again, until a run is told to repeat it.
 
     Args:
-        study: a Study, or the name of one that an installed distribution registers.
+        study: a Study, the name of one that an installed distribution registers, or "folder/mine.py:STUDY".
         out: folder of all studies. jobs: worker processes; 1 computes here. Results do not depend on it.
         settings: changes of the study's settings or axes, see `Study.override`.
         progress: show a bar on stderr.
@@ -139,9 +141,14 @@ def _keep(folder: Path, outcome: Outcome) -> bool:
 
 
 def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:
-    found: Study = plugins.find("coopoc.studies", study) if isinstance(study, str) else study
+    found = _found(study) if isinstance(study, str) else study
     found = found.override(settings or {})
     return found, found.cells(), Path(out) / found.name
+
+
+def _found(name: str) -> Study:
+    study: Study = file_study(name) if in_file(name) else plugins.find("coopoc.studies", name)
+    return study
 
 
 def _part(study: Study, cells: list[Cell], shard: str) -> list[Cell]:

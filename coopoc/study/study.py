@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from ..errors import InputError
+from ..one_file import file_digest, in_file
 from ..plugins import unknown
 from .parse import parse
 
@@ -152,6 +153,7 @@ def _named(study: Study, params: Mapping[str, Scalar]) -> Cell:
             raise InputError(name, repr(value), "must be a number, a word, a bool or None", "Pass a name instead.")
     given = {**study.settings, **params}
     content = {"study": study.name, "given": given, "axes": sorted(params), "key": study.key(given)}
+    content["files"] = {name: file_digest(v, name) for name, v in given.items() if isinstance(v, str) and in_file(v)}
     return Cell(params, given, digest({**content, "coopoc": metadata.version("coopoc")}))
 
 

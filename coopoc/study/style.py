@@ -99,8 +99,8 @@ RC: Any = {
 def look(method: str) -> Look:
     """The look of a method; a number at its end is a client; an unknown one has a look that its name alone decides.
 
-    >>> look("okf").label, look("individual2").label
-    ('OKF', 'Individual KalmanNet 2')
+    >>> look("okf").label, look("individual2").label, look("mine.py:Alpha").label
+    ('OKF', 'Individual KalmanNet 2', 'Alpha')
     """
     name = method.replace("_", "-")
     if name in METHODS:
@@ -109,6 +109,7 @@ def look(method: str) -> Look:
     if family in METHODS:
         shown = METHODS[family]
         return Look(f"{shown.label} {name[len(family) :].strip('-')}", shown.color, shown.marker)
+    method = method.rpartition(".py:")[2]  # of a file: its name there
     color, marker = _SPARE[zlib.crc32(method.encode()) % len(_SPARE)]
     return Look(method.replace("_", " "), color, marker)
 

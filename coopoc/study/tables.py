@@ -117,6 +117,10 @@ class Table:
         caption = f"<caption>{escape(' '.join(self.below))}</caption>"
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        return self.to_html()
+
     def text(self, entry: Entry) -> str:
         """One entry as text."""
         if isinstance(entry, Interval):

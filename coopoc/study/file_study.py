@@ -1,0 +1,45 @@
+"""A study in one file of somebody's own: the file's contents name its cells, and workers load it by its path."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..one_file import file_digest, from_file
+from .study import Params, Row, Study
+
+
+@dataclass(frozen=True)
+class _FileCell:
+    """The study's cell, for processes that cannot import the file: by path, as long as its contents are these."""
+
+    name: str
+    contents: str
+
+    def __call__(self, params: Params) -> list[Row]:
+        if file_digest(self.name, "study") != self.contents:
+            raise InputError("study", repr(self.name), "has changed since the run began", "Repeat the command.")
+        study: Study = from_file(self.name, "study")
+        return study.cell(params)
+
+
+def file_study(name: str) -> Study:
+    """The study that a file holds, as "folder/mine.py:STUDY".
+
+    Raises:
+        InputError: no such file or name, or what it names is no Study.
+    """
+    study = from_file(name, "study")
+    if not isinstance(study, Study):
+        mend = "Give STUDY = coopoc.Study(...) in the file."
+        raise InputError("study", repr(name), f"is a {type(study).__name__}, no Study", mend)
+    path, _, held = name.rpartition(":")
+    contents, own = file_digest(name, "study"), study.key
+
+    def key(params: Params) -> Mapping[str, Any]:
+        return {**own(params), "study file": contents}
+
+    return replace(study, cell=_FileCell(f"{Path(path).resolve()}:{held}", contents), key=key)

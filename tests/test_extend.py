@@ -1,0 +1,124 @@
+"""docs/extend.md as it stands: its files are written, its Python and its commands are run, in a folder of their own."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from coopoc.errors import InputError
+from coopoc.fleets import load
+from coopoc.methods.catalogue import needs_whole_fleet
+from coopoc.one_file import from_file
+from coopoc.plugins import find
+from coopoc.study.run import plan, run
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "extend.md"
+COOPOC = f"{sys.executable} -W error -m coopoc.cli"
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+
+
+def shell(command: str, folder: Path, **env: str) -> str:
+    """What a command prints; the test fails with its complaint if it fails."""
+    script = command.replace("coopoc ", f"{COOPOC} ", 1)
+    done = subprocess.run(script.split(), cwd=folder, env={**os.environ, **env}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page's files: a block that begins with the name of a file is that file."""
+    out = tmp_path_factory.mktemp("own")
+    for text in blocks("python"):
+        named = re.match(r"# (\w+\.py)\n", text)
+        if named:
+            (out / named[1]).write_text(text)
+    return out
+
+
+def commands(word: str) -> list[str]:
+    return [line for block in blocks("sh") for line in block.splitlines() if word in line]
+
+
+def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
+    (command,) = commands("alpha.py:Alpha")
+    table = shell(command, folder)
+    alpha, *_, bound = re.findall(r"^\| (\S.*?) +\| \w+ +\| +\**([\d.]+)\**", table, flags=re.MULTILINE)[:4]
+    assert (alpha[0], bound[0]) == ("Alpha", "Cramér-Rao bound")
+    assert float(alpha[1]) > float(bound[1])
+
+
+def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (command,) = commands("--data ring.py:ring")
+    assert "egos of ring.py:ring" in shell(command, folder)
+    monkeypatch.chdir(folder)
+    assert len(load("ring.py:ring").ids) == 12
+
+
+def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:
+    ran, report = commands("rates")[:2]
+    assert "| Every" in shell(ran, folder)
+    assert (folder / shell(report, folder).strip()).is_file()
+
+
+def test_a_notebook_gets_a_frame_and_a_table(folder: Path) -> None:
+    (block,) = [text for text in blocks("python") if "results.frame" in text]
+    script = folder / "notebook.py"
+    script.write_text(f"if __name__ == '__main__':\n{re.sub('^', '    ', block, flags=re.MULTILINE)}\n"
+                      "    assert gain.low > 0, gain\n    assert '<table>' in table._repr_html_()\n")  # fmt: skip
+    subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, check=True)
+
+
+def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
+    (toml,) = blocks("toml")
+    info = tmp_path / "my_coopoc-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my-coopoc\nVersion: 1.0\n")
+    declared = toml[toml.index("[project.entry") : toml.index("[tool")].replace('"', "")
+    (info / "entry_points.txt").write_text(re.sub(r"\[project\.entry-points\.(.*?)\]", r"[\1]", declared))
+    env = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{folder}"}
+    listed, ran = (command for command in blocks("sh")[-1].splitlines())
+    names = shell(listed, tmp_path, **env)
+    groups = {"methods": "alpha", "datasets": "ring", "backends": "least-squares", "studies": "rates"}
+    for group, name in groups.items():
+        assert re.search(rf"^{group}: .*\b{name}\b", names, flags=re.MULTILINE), names
+    assert "egos of ring" in shell(ran, tmp_path, **env)
+
+
+def test_cells_follow_the_contents_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = ("import coopoc as co\nSCALE = 1\ndef cell(p):\n"
+            "    return [{'run': 0, 'ego': 'a', 'rt_le_m': SCALE * p['x']}]\n"
+            "STUDY = co.Study('own', 'What?', cell, {'x': (1.0, 2.0)})\n")  # fmt: skip
+    (tmp_path / "own.py").write_text(text)
+    assert run("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 3.0
+    assert plan("own.py:STUDY")["to_compute"] == 0
+    (tmp_path / "own.py").write_text(text.replace("SCALE = 1", "SCALE = 5"))
+    assert plan("own.py:STUDY")["to_compute"] == 2
+    assert run("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 15.0
+
+
+def test_a_method_may_ask_for_the_whole_fleet(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("class All:\n    whole_fleet = True\nclass Some:\n    pass\n")
+    assert needs_whole_fleet(f"{tmp_path}/own.py:All")
+    assert not needs_whole_fleet(f"{tmp_path}/own.py:Some")
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("import math\nALPHA = 1\n")
+    with pytest.raises(InputError, match=r"own\.py:ALPHAS'.* has ALPHA\. Did you mean .*own\.py:ALPHA\?"):
+        from_file(f"{tmp_path}/own.py:ALPHAS")
+    with pytest.raises(InputError, match=r"method = 'gone\.py:X': names a file that is not there"):
+        find("coopoc.methods", "gone.py:X")
+    with pytest.raises(InputError, match=r"is a int, no Study"):
+        run(f"{tmp_path}/own.py:ALPHA")
+    with pytest.raises(TypeError):
+        load(f"{tmp_path}/own.py:ALPHA")
