@@ -93,12 +93,16 @@ def _together(name: str, p: Params, seed: int, known: Floats | None) -> Method:
     return CooperativeGain(model, sums=scene.channel(p).latency == 0, name=name)
 
 
-def rows(p: Params, *, quantiles: int = 0) -> list[Row]:
-    """Rows of a cell, one per training seed, ego and run: errors, consistency, bytes, neighbours' errors."""
+def rows(p: Params, *, quantiles: int = 0, own: Method | None = None) -> list[Row]:
+    """Rows of a cell, one per training seed, ego and run: errors, consistency, bytes, neighbours' errors.
+
+    Args:
+        quantiles: of the distances, how many in each row. own: instead of the method that the cell names.
+    """
     drive, recording = scene.fleet(p["data"]), scene.recording(p)
     who = scene.egos(p["data"], str(p["egos"]))
     found: list[Row] = []
-    for seed, method in methods(p, recording):
+    for seed, method in [(None, own)] if own else methods(p, recording):
         track = method(recording, who)
         found += _rows(track, drive, recording, who, quantiles, {} if seed is None else {"train_seed": seed})
     return found

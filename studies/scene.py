@@ -154,7 +154,8 @@ def conditions(p: Params) -> str:
     labels = "" if real is None else f" ({'; '.join(real.notes)})"
     who = egos(p["data"], str(p["egos"]))
     size = f"{_count(p['runs'], 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
-    return f"{heading(p)}{labels}; {size}, {_count(p['train_seeds'], 'training seed')}."
+    trained = f", {_count(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
+    return f"{heading(p)}{labels}; {size}{trained}."
 
 
 def _count(number: int, noun: str) -> str:
