@@ -181,4 +181,6 @@ STUDY = Study(
         "Fitted knowledge comes from vehicles that drive alone: of neighbours it assumes what the sensors' card says.",
     ),
     minutes=8,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("ablation"),
 )  # fmt: skip

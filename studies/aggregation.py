@@ -206,4 +206,6 @@ STUDY = Study(
         "Intervals of the differences are not corrected for the number of rules that are compared.",
     ),
     minutes=25,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("aggregation"),
 )  # fmt: skip

@@ -204,4 +204,6 @@ STUDY = Study(
         "Times are of one call at a time and of this machine.",
     ),
     minutes=2,
+    metrics={"solved": "higher", "same": "higher"},
+    reference=views.reference("backends"),
 )  # fmt: skip

@@ -257,4 +257,6 @@ STUDY = Study(
         "Numbers count as float32; CAMs quantise positions and velocities instead.",
     ),
     minutes=10,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("budget"),
 )  # fmt: skip

@@ -119,4 +119,6 @@ STUDY = Study(
     recipe=weights.described,
     limitations=("White noise over an ideal channel: what late messages, biases and lies do is in other studies.",),
     minutes=10,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("consistency"),
 )  # fmt: skip

@@ -178,4 +178,6 @@ STUDY = Study(
         "The centralised net has no rounds: its schedule is cut into equal parts, as many as the federated net has.",
     ),
     minutes=2,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("convergence"),
 )  # fmt: skip

@@ -287,4 +287,6 @@ STUDY = Study(
         "Numbers count as float32; sums of long drives would be restarted before they need more.",
     ),
     minutes=12,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("cooperative_gain"),
 )  # fmt: skip

@@ -134,4 +134,6 @@ STUDY = Study(
         "The nets and the fitted noise come from vehicles with 1.5 m and 10 %; the noise of the test is another one.",
     ),
     minutes=3,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("error_cdf"),
 )  # fmt: skip

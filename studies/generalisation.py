@@ -115,4 +115,6 @@ STUDY = Study(
         "docs/streaming.md.",
     ),
     minutes=4,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("generalisation"),
 )  # fmt: skip

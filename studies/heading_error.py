@@ -133,4 +133,6 @@ STUDY = Study(
         "Heading and velocity err apart: a real odometer turns its velocity by the same wrong heading.",
     ),
     minutes=5,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("heading_error"),
 )  # fmt: skip

@@ -124,4 +124,6 @@ STUDY = Study(
     findings=_findings,
     limitations=("Latency is the same for all messages of a cell, in whole steps of the drive.",),
     minutes=15,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("latency_loss"),
 )  # fmt: skip

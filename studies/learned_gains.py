@@ -174,4 +174,6 @@ STUDY = Study(
         "What was trained at 5 to 20 % and 1 to 6 m saw the noise of the tests among others; the paper's nets saw one.",
     ),
     minutes=6,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("learned_gains"),
 )  # fmt: skip

@@ -199,4 +199,6 @@ STUDY = Study(
         "is another one.",
     ),
     minutes=5,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("neighbours"),
 )  # fmt: skip

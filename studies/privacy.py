@@ -19,7 +19,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.methods.track import Method
 from coopoc.study.study import Params, Row, Study
 
-from . import scene, weights
+from . import scene, views, weights
 from .privacy_views import FIGURES, TABLES, findings
 
 if TYPE_CHECKING:
@@ -251,4 +251,6 @@ STUDY = Study(
         "discrete Gaussian.",
     ),
     minutes=15,
+    metrics={"rt_le_m": "lower"},
+    reference=views.reference("privacy"),
 )  # fmt: skip

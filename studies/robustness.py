@@ -119,4 +119,6 @@ STUDY = Study(
         "Nobody conspires: each attacked vehicle has an offset of its own.",
     ),
     minutes=20,
+    metrics={"rt_le_m": "lower", "nees": 3.0},
+    reference=views.reference("robustness"),
 )  # fmt: skip

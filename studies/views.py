@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,11 @@ from coopoc.evaluate.statistics import Interval, over_seeds, paired_difference
 if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
+
+
+def reference(name: str) -> Path:
+    """The file with a study's reference numbers."""
+    return Path(__file__).parent / "reference" / f"{name}.json"
 
 
 def present(results: Results, where: Mapping[str, Any], value: str = "rt_le_m") -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from ..errors import InputError
 from ..plugins import unknown
-from . import store
+from . import reference, store
 from .results import Results
 from .study import Study
 from .tables import FORMATS, Table
@@ -41,7 +41,8 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
     findings = _made(study.findings, results, missing, "findings") if study.findings else None
     recipe = _made(study.recipe, results, missing, "recipe") if study.recipe else None
     content = {
-        **made, "findings": list(findings or ()), "recipe": dict(recipe or {}), "missing": missing,
+        **made, "findings": [*(findings or ()), *_reference(study, results)],
+        "recipe": dict(recipe or {}), "missing": missing,
         "limitations": list(study.limitations), "minutes": study.minutes,
     }  # fmt: skip
     _forget(folder, made)
@@ -56,6 +57,17 @@ def _made(view: Callable[[Results], Any], results: Results, missing: dict[str, s
     except Exception as error:
         missing[name] = f"{type(error).__name__}: {error}"
         return None
+
+
+def _reference(study: Study, results: Results) -> list[str]:
+    """How the numbers stand to those that were committed; nothing for a run of other settings."""
+    if study.reference is None or not Path(study.reference).is_file():
+        return []
+    known = reference.Reference.load(study.reference)
+    if reference.differing(results, known):
+        return []
+    found = reference.hold(results, known)
+    return [f"{reference.summary(found)[:-1]} (coopoc reference)."] if found else []
 
 
 def _forget(folder: Path, made: Mapping[str, list[dict[str, str]]]) -> None:

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -60,6 +61,8 @@ class Study:
             findings: Results -> sentences for the top of the report.
         recipe: Results -> what the report says about the training.
         limitations: sentences. minutes: expected on one core.
+        metrics: of which reference numbers are kept -> "lower" or "higher", which is better, or the best value.
+        reference: the file that holds them, see `coopoc.study.reference`; its absence is no error.
 
     Raises:
         InputError: an empty grid, a cell twice, a parameter that is no scalar, or a name that is both axis and setting.
@@ -83,6 +86,8 @@ class Study:
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
     limitations: tuple[str, ...] = ()
     minutes: float | None = None
+    metrics: Mapping[str, str | float] = field(default_factory=dict)
+    reference: str | Path | None = None
 
     def __post_init__(self) -> None:
         both = sorted(set(self.axes) & set(self.settings))

@@ -1,0 +1,151 @@
+"""Reference numbers: verdicts by hand, and cheap cells of each study at full size against what was committed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coopoc.cli import main
+from coopoc.errors import InputError
+from coopoc.plugins import find, names
+from coopoc.study.reference import Reference, differing, hold, measure, summary, table
+from coopoc.study.results import Results
+from coopoc.study.run import run
+from coopoc.study.study import Params, Row, Study
+
+WITHOUT: frozenset[str] = frozenset(
+    {"ablation", "backends", "budget", "consistency", "latency_loss", "robustness"}
+)
+"""Studies that have not run at full size since they were last changed."""
+CHEAP: Mapping[str, dict[str, Any]] = {
+    "heading_error": {"method": "kalman,joint", "heading_std_deg": "0,2", "heading_bias_deg": "0",
+                      "max_neighbours": "0,2"},
+    "correlated_gnss": {"method": "kalman", "max_neighbours": "0", "own_share": "0.5"},
+    "neighbours": {"method": "kalman,joint,msmv-r", "max_neighbours": "1", "knowledge": "nominal"},
+    "generalisation": {"method": "kalman-adaptive", "data": "town04", "scenario": "2"},
+}  # fmt: skip
+"""Cells that need no training and take a second or two each."""
+
+
+def cell(p: Params) -> list[Row]:
+    """Two egos, three runs: known means and deviations."""
+    return [{"run": r, "ego": ego, "rt_le_m": p["x"] * p["scale"] * (1 + 0.1 * r), "nees": 3.0 + p["shift"]}
+            for r in range(p["runs"]) for ego in "ab"]  # fmt: skip
+
+
+STUDY = Study("made", "What?", cell, {"x": (1.0, 2.0)}, {"scale": 1.0, "shift": 0.0, "runs": 3, "weights": "here"})
+METRICS: dict[str, str | float] = {"rt_le_m": "lower", "nees": 3.0}
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Results:
+    return run(STUDY, tmp_path, progress=False)
+
+
+def verdicts(now: Results, known: Reference) -> dict[tuple[float, str], str]:
+    return {(h.was.where["x"], h.was.metric): h.verdict for h in hold(now, known)}
+
+
+def changed(tmp_path: Path, **settings: float) -> Results:
+    """Rows of other settings, as if the code had changed under the same ones."""
+    now = run(STUDY, tmp_path / "now", settings=settings, progress=False)
+    return replace(now, settings={**STUDY.settings, "runs": now.settings["runs"]})
+
+
+def test_a_number_is_the_mean_and_its_runs_spread(results: Results, tmp_path: Path) -> None:
+    known = measure(results, METRICS)
+    first = known.numbers[0]
+    assert (first.where, first.metric, first.value, first.runs) == ({"x": 1.0}, "rt_le_m", pytest.approx(1.1), 3)
+    assert first.run_std == pytest.approx(0.1)  # of 1.0, 1.1, 1.2
+    known.save(tmp_path / "numbers.json")
+    assert Reference.load(tmp_path / "numbers.json") == known
+    assert json.loads((tmp_path / "numbers.json").read_text())["numbers"][0]["better"] == "lower"
+
+
+def test_verdicts_know_the_direction(results: Results, tmp_path: Path) -> None:
+    known = measure(results, METRICS)
+    assert set(verdicts(results, known).values()) == {"as before"}
+    assert set(verdicts(changed(tmp_path / "0", scale=1.009), known).values()) == {"as before"}
+    worse, better = (verdicts(changed(tmp_path / str(s), scale=s), known) for s in (1.02, 0.98))
+    assert worse == {(1.0, "rt_le_m"): "worse", (2.0, "rt_le_m"): "worse", (1.0, "nees"): "as before",
+                     (2.0, "nees"): "as before"}  # fmt: skip
+    assert better[1.0, "rt_le_m"] == "better"
+    off = changed(tmp_path / "off", shift=-0.5)
+    assert verdicts(off, known)[1.0, "nees"] == "worse"
+    assert verdicts(results, measure(off, METRICS))[1.0, "nees"] == "better"  # nearer to 3
+    found = hold(off, known)
+    assert summary(found) == "2 of 4 reference numbers hold; 2 worse."
+    shown = table(found)
+    assert shown is not None
+    assert len(shown.rows) == 2
+    assert table(hold(results, known)) is None
+
+
+def test_other_runs_are_allowed_their_standard_errors(results: Results, tmp_path: Path) -> None:
+    """3 runs against 12 whose mean is 1.55: 0.45 away, 2 x 0.1 sqrt(1/3 + 1/12) + 0.011 = 0.14 allowed."""
+    known = measure(results, METRICS)
+    more = changed(tmp_path, runs=12)
+    first = hold(more, known)[0]
+    assert first.allowed == pytest.approx(0.01 * 1.1 + 2 * 0.1 * (1 / 3 + 1 / 12) ** 0.5, rel=1e-5)
+    assert first.verdict == "worse"
+    fewer = changed(tmp_path / "2", runs=2)  # mean 1.05
+    assert hold(fewer, known)[0].verdict == "as before"
+
+
+def test_numbers_of_other_settings_are_refused(results: Results, tmp_path: Path) -> None:
+    known = measure(results, METRICS)
+    other = run(STUDY, tmp_path / "other", settings={"scale": 2.0, "weights": "there"}, progress=False)
+    assert differing(other, known) == ["scale"]
+    with pytest.raises(InputError, match=r"is not the reference's in scale\. Run it with its own settings"):
+        hold(other, known)
+    with pytest.raises(InputError, match="must be 'lower', 'higher' or a number"):
+        measure(results, {"rt_le_m": "small"})
+
+
+def test_the_command_says_what_is_worse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = {"method": "kalman", "max_neighbours": "0", "runs": "2"}
+    run("heading_error", tmp_path, settings=few, progress=False)
+    folder, file = str(tmp_path / "heading_error"), str(tmp_path / "own.json")
+    assert "reference numbers hold" in (tmp_path / "heading_error" / "views.json").read_text()
+    for words, status in ((["--write", "--file", file], 0), (["--file", file], 0)):
+        with pytest.raises(SystemExit) as ended:
+            main(["reference", folder, *words])
+        assert ended.value.code == status
+    assert "2 of 2 reference numbers hold." in capsys.readouterr().out
+    known = Reference.load(file)
+    lower = replace(known, numbers=tuple(replace(n, value=0.5 * n.value) for n in known.numbers[:1]))
+    lower.save(file)
+    with pytest.raises(SystemExit) as ended:
+        main(["reference", folder, "--file", file])
+    assert ended.value.code == 1
+    assert "worse" in capsys.readouterr().out
+
+
+def test_every_study_that_names_metrics_has_numbers_of_its_own_settings() -> None:
+    for name in names("coopoc.studies"):
+        study: Study = find("coopoc.studies", name)
+        if study.metrics and name not in WITHOUT:
+            assert study.reference is not None
+            known = Reference.load(study.reference)
+            assert known.study == name
+            assert {k: v for k, v in known.settings.items() if k != "weights"} == {
+                k: list(v) if isinstance(v, tuple) else v for k, v in study.settings.items() if k != "weights"
+            }
+            points = {json.dumps(dict(cell.params), sort_keys=True) for cell in study.cells()}
+            assert {json.dumps(dict(n.where), sort_keys=True) for n in known.numbers} <= points
+
+
+@pytest.mark.parametrize("name", CHEAP)
+def test_committed_numbers_come_out_again(name: str, tmp_path: Path) -> None:
+    study: Study = find("coopoc.studies", name)
+    results = run(study, tmp_path, settings=CHEAP[name], progress=False)
+    assert results.failed == 0
+    assert study.reference is not None
+    found = hold(results, Reference.load(study.reference))
+    assert found
+    assert not table(found), table(found)
