@@ -26,13 +26,14 @@ def _grid() -> list[dict[str, Any]]:
     ways = [PERFECT, *({**PERFECT, "latency_s": late} for late in LATENCIES[1:])]
     ways += [{**PERFECT, "loss": loss, "burst": burst} for burst in BURSTS for loss in LOSSES[1:]]
     grid: list[dict[str, Any]] = [{**PERFECT, "max_neighbours": 0, "method": "kalman", "knowledge": "nominal"}]
+    grid += [{**PERFECT, "max_neighbours": 6, "method": "bound", "knowledge": "bound"}]
     together = {"max_neighbours": 6, "knowledge": "nominal"}
     return grid + [{**way, **together, "method": method} for way in ways for method in METHODS[1:]]
 
 
 def cell(p: Params) -> list[Row]:
-    """Rows of one method over one channel."""
-    return lineup.rows(p)
+    """Rows of one method over one channel; of the bound, one row per ego."""
+    return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
 
 
 def _lines() -> list[tuple[str, str, list[tuple[float, dict[str, Any]]]]]:
@@ -77,6 +78,7 @@ def _figure(results: Results) -> Plot | None:
     lines = _lines()
     with canvas(1, len(lines), width=8.2, height=3.2, sharey=True, squeeze=False) as (figure, (panels,)):
         drawn: list[dict[str, Any]] = []
+        bound = views.mean(results, {"method": "bound"})
         for panel, (title, label, ways) in zip(panels, lines, strict=True):
             for method in METHODS:
                 found = {value: views.mean(results, _at(method, way)) for value, way in ways}
@@ -84,12 +86,14 @@ def _figure(results: Results) -> Plot | None:
                 if ran:
                     panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": "fitted"}))
                     drawn.append({"method": method})
+            if bound is not None:
+                panel.axhline(bound, **strokes({"method": "bound"}))
             panel.set(title=title, xlabel=label)
         if not drawn:
             return None
         panels[0].set(ylabel="RT-LE [m]", ylim=(0, None))
-        legend(panels[-1], drawn)
-    return Plot(figure, _caption(results, "RT-LE against latency and loss."))
+        legend(panels[-1], [*drawn, *([{"method": "bound"}] if bound is not None else [])])
+    return Plot(figure, _caption(results, "RT-LE against latency and loss; dashed: the bound of a perfect channel."))
 
 
 def _findings(results: Results) -> Sequence[str]:
@@ -100,12 +104,23 @@ def _findings(results: Results) -> Sequence[str]:
                              (("kalman", none), ("joint", none), ("joint", worst)))  # fmt: skip
         if alone is not None and best is not None and left is not None:
             kept = (alone - left) / (alone - best)
+            told = f"keeps {100 * kept:.0f} % of what six neighbours bring" if kept > 0 else "is worse than alone"
             unit = label.partition("[")[2].rstrip("]")
             found.append(
-                f"{most:g} {unit} {title}: the joint filter keeps {100 * kept:.0f} % of what six neighbours bring "
-                f"({left:.2f} m; alone {alone:.2f}, perfect {best:.2f} m)."
+                f"{most:g} {unit} {title}: the joint filter {told} ({left:.2f} m; alone {alone:.2f}, perfect "
+                f"{best:.2f} m){_best(results, worst)}."
             )
     return found
+
+
+def _best(results: Results, way: dict[str, Any]) -> str:
+    """Who does best there, if it is not the joint filter."""
+    from coopoc.study.style import look
+
+    each = {method: views.mean(results, _at(method, way)) for method in METHODS}
+    ran = {method: value for method, value in each.items() if value is not None}
+    best = min(ran, key=lambda method: round(ran[method], 4), default="joint")
+    return "" if best == "joint" else f"; best is {look(best).label}, {ran[best]:.2f} m"
 
 
 STUDY = Study(

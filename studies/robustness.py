@@ -21,15 +21,16 @@ NEIGHBOURS = (4, 10)
 
 def _grid() -> list[dict[str, Any]]:
     alone = {"max_neighbours": 0, "attacked_share": 0.0, "method": "kalman", "knowledge": "nominal"}
-    return [alone] + [
+    bounds = [{**alone, "max_neighbours": k, "method": "bound", "knowledge": "bound"} for k in NEIGHBOURS]
+    return [alone, *bounds] + [
         {"max_neighbours": k, "attacked_share": share, "method": method, "knowledge": "nominal"}
         for k in NEIGHBOURS for share in SHARES for method in METHODS[1:]
     ]  # fmt: skip
 
 
 def cell(p: Params) -> list[Row]:
-    """Rows of one method at one K and share of attacked vehicles."""
-    return lineup.rows(p)
+    """Rows of one method at one K and share of attacked vehicles; of the bound, one row per ego."""
+    return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
 
 
 def at(method: str, k: int, share: float) -> dict[str, Any]:
@@ -77,11 +78,15 @@ def _figure(results: Results) -> Plot | None:
                 if ran:
                     panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": "fitted"}))
                     drawn.append({"method": method})
+            bound = views.mean(results, {"method": "bound", "max_neighbours": k})
+            if bound is not None:
+                panel.axhline(bound, **strokes({"method": "bound"}))
+                drawn.append({"method": "bound"})
             plain_log(panel.yaxis)
             panel.set(title=f"K = {k}", xlabel="Attacked vehicles [%]", xticks=[100 * share for share in SHARES])
         panels[0].set(ylabel="RT-LE [m]")
         legend(panels[-1], drawn)
-    return Plot(figure, _caption(results, "RT-LE against the share of attacked vehicles."))
+    return Plot(figure, _caption(results, "RT-LE against the share of attacked vehicles; dashed: the bound if nobody lies."))
 
 
 def _findings(results: Results) -> Sequence[str]:
