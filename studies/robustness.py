@@ -86,7 +86,8 @@ def _figure(results: Results) -> Plot | None:
             panel.set(title=f"K = {k}", xlabel="Attacked vehicles [%]", xticks=[100 * share for share in SHARES])
         panels[0].set(ylabel="RT-LE [m]")
         legend(panels[-1], drawn)
-    return Plot(figure, _caption(results, "RT-LE against the share of attacked vehicles; dashed: the bound if nobody lies."))
+    text = "RT-LE against the share of attacked vehicles; dashed: the bound without an attack."
+    return Plot(figure, _caption(results, text))
 
 
 def _findings(results: Results) -> Sequence[str]:
