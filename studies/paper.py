@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from .survey import ended, stages
 
 
 def paper(
@@ -24,23 +25,14 @@ def paper(
     """
     from coopoc.data.registry import DATASETS
     from coopoc.study.report import report
-    from coopoc.study.run import run
 
-    began, failed = time.perf_counter(), 0
-    names = ("convergence", "error_cdf", "neighbours")
-    for number, name in enumerate(names, start=1):
-        print(f"coopoc: stage {number} of {len(names) + 1}: {name}", file=sys.stderr)
-        changes = {"weights": str(out / "weights"), "data": data}
-        results = run(name, out=out, jobs=jobs, settings=changes, retry_failed=True)
-        failed += results.failed
-    print(f"coopoc: stage {len(names) + 1} of {len(names) + 1}: report", file=sys.stderr)
+    began, names = time.perf_counter(), ("convergence", "error_cdf", "neighbours")
+    found = stages(names, out, jobs, {"data": data})
     cards = {
         name: DATASETS[name].card().fields() for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS
     }
     page = report([out / name for name in names], out / "report.html", title=TITLE, lead=lead(data), cards=cards)
-    took = (time.perf_counter() - began) / 60
-    print(f"coopoc: done in {took:.1f} min, {failed} failed cells. The report is {page}", file=sys.stderr)
-    return int(failed > 0)
+    return ended(began, found, page)
 
 
 TITLE = "Collaborative training against collaborative decision"
