@@ -54,7 +54,7 @@ def stages(names: Sequence[str], out: Path, jobs: int, changes: Mapping[str, Any
         print(f"coopoc: stage {number} of {len(names) + 1}: {name}", file=sys.stderr)
         study = find("coopoc.studies", name)
         given = {key: value for key, value in {"weights": str(out / "weights"), **changes}.items()
-                 if key in study.settings}  # fmt: skip
+                 if key in study.settings or key in study.axes}  # fmt: skip
         found[name] = run(study, out=out, jobs=jobs, settings=given, retry_failed=True)
     print(f"coopoc: stage {len(names) + 1} of {len(names) + 1}: report", file=sys.stderr)
     return found
@@ -70,20 +70,22 @@ def ended(began: float, found: Mapping[str, Results], page: Path) -> int:
 def answers(found: Mapping[str, Results]) -> list[str]:
     """Question and answer, one sentence each, from what was run."""
     said = [f"Which method with {words}? {answer}" for limit, words in LIMITS.items()
-            if (answer := _under(found["budget"], limit))]  # fmt: skip
-    for name, question in QUESTIONS.items():
-        sentences = _findings(name, found[name])
-        if sentences:
-            said.append(f"{question} {sentences[0]}")
+            if "budget" in found and (answer := _under(found["budget"], limit))]  # fmt: skip
+    for name, (question, begins) in QUESTIONS.items():
+        told = [s for s in _findings(name, found[name]) if s.startswith(begins)] if name in found else []
+        said += [f"{question} {' '.join(told[:2])}"] if told else []
     return said
 
 
 LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
-QUESTIONS = {
-    "correlated_gnss": "And if errors of GNSS last?", "latency_loss": "If messages are late?",
-    "heading_error": "If the heading is wrong?", "robustness": "If neighbours lie?",
-    "consistency": "Whose covariance can be believed?",
-}  # fmt: skip
+QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "correlated_gnss": ("And if errors of GNSS last?", ("own:", "common:")),
+    "latency_loss": ("If messages are late or lost?", ("",)),
+    "heading_error": ("If the heading is wrong?", ("",)),
+    "robustness": ("If neighbours lie?", ("",)),
+    "consistency": ("Whose covariance can be believed?", ("",)),
+}
+"""Study -> question, and how the findings begin that answer it."""
 
 
 def _findings(name: str, results: Results) -> Sequence[str]:
