@@ -33,18 +33,22 @@ from coopoc.world.spherical import to_vector
 from coopoc.world.v2x import NO_MESSAGE
 
 VEHICLES, STEPS, BLOCK = 60, 900, 60.0
+SHORT, SEARCHED = 200, ((60, 60), (1000, 4))
+"""Of the common report, which should take half a minute: steps of the drive; vehicles and steps of the searches."""
+SAYS = {True: "yes", False: "NO", None: "one step"}
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=10)
 KNOWN = co.Knowledge.nominal(SENSORS)
 ROUNDS = 3
 
 
 class Row(NamedTuple):
-    """One way to do the job: its words, the call, the distance from its reference in metres, if it is right."""
+    """One way to do the job: its words, the call, the distance from its reference in metres, if it is right; None where
+    it is another answer by construction."""
 
     words: str
     call: Callable[[], Any]
     difference: float | None
-    right: bool
+    right: bool | None
 
 
 def town(vehicles: int, steps: int, seed: int = 0) -> co.Fleet:
@@ -146,21 +150,18 @@ def cost(problem: Linear, x: np.ndarray) -> float:
 
 def smoother_rows(recording: co.Recording) -> list[Row]:
     """Linear ones against GTSAM's, exact ones against converged Gauss-Newton."""
-    problem, everyone = linear(recording), range(VEHICLES)
+    problem, everyone, steps = linear(recording), range(VEHICLES), len(recording.t)
     wanted, least = by_gtsam(problem)
     once, exact, two = co.BatchSmoother(exact_steps=0), co.BatchSmoother(), co.BatchSmoother(settle=np.inf)
 
     def ours(method: co.BatchSmoother) -> Any:
         return method(recording, everyone)
 
-    def row(words: str, method: co.BatchSmoother, reference: np.ndarray, in_numpy: bool = False) -> Row:
-        def call() -> Any:
-            return plain(lambda: ours(method)) if in_numpy else ours(method)
-
-        x = call().x[0]
+    def row(words: str, method: co.BatchSmoother, reference: np.ndarray) -> Row:
+        x = ours(method).x[0]
         away = float(np.abs(x - reference).max())
         right = away < 1e-3 and (method is not once or cost(problem, x) / least - 1 < 1e-6)
-        return Row(words, call, away, right)
+        return Row(words, lambda: ours(method), away, None if method is two else right)
 
     converged = ours(co.BatchSmoother(exact_steps=8, settle=1e-7)).x[0]
     size = 3 * VEHICLES
@@ -168,7 +169,7 @@ def smoother_rows(recording: co.Recording) -> list[Row]:
     full, work = np.asfortranarray(root @ root.T), np.empty((size, size), order="F")
 
     def floor() -> None:
-        for _ in range(2 * STEPS):
+        for _ in range(2 * steps):
             work[:] = full
             dpotrf(work, lower=1, overwrite_a=1, clean=0)
             dpotri(work, lower=1, overwrite_c=1)
@@ -177,27 +178,43 @@ def smoother_rows(recording: co.Recording) -> list[Row]:
         row("BatchSmoother, converted problem, all marginals", once, wanted),
         row("BatchSmoother, one exact step, all marginals", two, converged),
         row("BatchSmoother, exact and settled, all marginals", exact, converged),
-        row("the same in NumPy", exact, converged, in_numpy=True),
         Row(GTSAM, lambda: by_gtsam(problem), 0.0, True),
         Row("floor: LAPACK's factors and inverses of two sweeps", floor, None, True),
     ]
 
 
-GTSAM = "GTSAM Levenberg-Marquardt, converted problem, no marginals"
+def smoother_in_numpy(recording: co.Recording) -> Row:
+    """The exact one, as it is without compiled kernels."""
+    method, everyone = co.BatchSmoother(), range(VEHICLES)
+    wanted = method(recording, everyone).x[0]
+
+    def ours() -> Any:
+        return plain(lambda: method(recording, everyone))
+
+    away = float(np.abs(ours().x[0] - wanted).max())
+    return Row("the same in NumPy", ours, away, away < 1e-3)
 
 
-def table(rows: Sequence[Row], peer: str) -> str:
-    """Medians of interleaved rounds, and ratios to a peer and to the last row, the floor."""
+def seconds(rows: Sequence[Row]) -> dict[str, float]:
+    """Per call, medians of interleaved rounds."""
     spent: dict[str, list[float]] = {row.words: [] for row in rows}
     for _ in range(ROUNDS):
         for row in rows:
             spent[row.words].append(timed(row.call))
-    medians = {words: float(np.median(times)) for words, times in spent.items()}
+    return {words: float(np.median(times)) for words, times in spent.items()}
+
+
+def table(rows: Sequence[Row], peer: str) -> str:
+    """Times, and ratios to a peer and to the last row, the floor."""
+    medians = seconds(rows)
     lines = [[row.words, medians[row.words], medians[peer] / medians[row.words],
-              medians[row.words] / medians[rows[-1].words], row.difference, "yes" if row.right else "NO"]
+              medians[row.words] / medians[rows[-1].words], row.difference, SAYS[row.right]]
              for row in rows]  # fmt: skip
     header = ["", "s", "x peer", "x floor", "difference m", "same answer"]
     return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", ".3g", ".3g", ".1e", ""))
+
+
+GTSAM, FILTERPY = "GTSAM Levenberg-Marquardt, converted problem, no marginals", "filterpy, KalmanFilter"
 
 
 def by_pairs(fleet: co.Fleet, most: int, radius: float, least: float) -> np.ndarray:
@@ -211,6 +228,37 @@ def by_pairs(fleet: co.Fleet, most: int, radius: float, least: float) -> np.ndar
         observer, rank = np.nonzero(np.isfinite(np.take_along_axis(gap, order, axis=1)))
         found.append(np.column_stack([np.full(len(observer), t), observer, order[observer, rank]]))
     return np.concatenate(found)
+
+
+def search_rows(sizes: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
+    """Neighbour search of whole fleets: microseconds per vehicle and step, their ratio to a table of all pairs."""
+    out, args = [], (CHANNEL.max_neighbours, CHANNEL.radius, SENSORS.min_range)
+    for vehicles, steps in sizes:
+        fleet, everyone = town(vehicles, steps), range(vehicles)
+        found = sensing.find_links(fleet, everyone, *args)
+        same = np.array_equal(by_pairs(fleet, *args), np.column_stack([found.step, found.observer, found.neighbour]))
+        spent = [(timed(lambda f=fleet, e=everyone: sensing.find_links(f, e, *args)),
+                  timed(lambda f=fleet: by_pairs(f, *args))) for _ in range(ROUNDS)]  # fmt: skip
+        ours, table_of_all = np.median(spent, axis=0)
+        out.append({"name": f"neighbours, {vehicles} vehicles", "us": 1e6 * float(ours) / (vehicles * steps),
+                    "ratio": float(ours / table_of_all), "right": same})  # fmt: skip
+    return out
+
+
+def parts() -> list[tuple[str, str, list[Row]]]:
+    """The jobs of a short drive, each with the row that it is compared to."""
+    recording = co.observe(town(VEHICLES, SHORT), SENSORS, CHANNEL)
+    return [("smoother", GTSAM, smoother_rows(recording)), ("solo", FILTERPY, solo_rows(recording))]
+
+
+def measured() -> list[dict[str, Any]]:
+    """Per row its name, microseconds per vehicle and step, the ratio to the peer's time, and whether it is right."""
+    out = []
+    for job, peer, rows in parts():
+        medians = seconds(rows)
+        out += [{"name": f"{job}: {row.words}", "us": 1e6 * medians[row.words] / (VEHICLES * SHORT),
+                 "ratio": medians[row.words] / medians[peer], "right": row.right} for row in rows]  # fmt: skip
+    return [*out, *search_rows(SEARCHED)]
 
 
 def growth(sizes: Sequence[tuple[int, int]]) -> str:
@@ -269,7 +317,7 @@ def solo_rows(recording: co.Recording) -> list[Row]:
         row("solo filter, NumPy", lambda: plain(ours), plain(ours)[0][0]),
         row("Kalman, compiled", lambda: co.Kalman()(recording, range(vehicles)),
             co.Kalman()(recording, range(vehicles)).x[0]),
-        Row("filterpy, KalmanFilter", lambda: [peer(k) for k in range(vehicles)], 0.0, True),
+        Row(FILTERPY, lambda: [peer(k) for k in range(vehicles)], 0.0, True),
         Row("floor: a copy of what is read and written",
             lambda: [a.copy() for a in (recording.gnss, recording.velocity, variance, recording.gnss, variance)],
             None, True),
@@ -282,11 +330,12 @@ def main() -> None:
     print(f"{VEHICLES} vehicles, {STEPS} steps, {len(recording.links)} sightings; numba {numba.__version__}, gtsam "
           f"{version('gtsam')}.\n")  # fmt: skip
     print("Batch smoother, whole drive:\n")
-    print(table(smoother_rows(recording), GTSAM), "\n")
+    rows = smoother_rows(recording)
+    print(table([*rows[:3], smoother_in_numpy(recording), *rows[3:]], GTSAM), "\n")
     print("What makes a recording, microseconds per vehicle and step:\n")
     print(growth([(60, 900), (500, 300), (2000, 100)]), "\n")
     print("Solo filter, all vehicles, whole drive:\n")
-    print(table(solo_rows(recording), "filterpy, KalmanFilter"))
+    print(table(solo_rows(recording), FILTERPY))
 
 
 if __name__ == "__main__":

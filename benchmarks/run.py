@@ -23,12 +23,12 @@ from typing import Any
 from tabulate import tabulate
 
 HERE = Path(__file__).parent
-BENCHMARKS = ("classical", "learned_gain", "backends", "growth")
+BENCHMARKS = ("classical", "learned_gain", "backends", "fleet", "growth")
 """Modules beside this one; each has measured() -> rows {name, us, ratio, right}."""
 BASELINE, RESULTS = HERE / "baseline.json", HERE / "results.json"
 TOLERANCE = 1.5
 """Of a new baseline's rows: two runs on a shared machine differ by less."""
-OURS = ("compiled", "JointFilter", "CooperativeMAP", "engine", "ours", "import", "vehicles")
+OURS = ("compiled", "JointFilter", "CooperativeMAP", "BatchSmoother", "engine", "ours", "import", "vehicles")
 """Words of the rows that a new baseline names: a peer's time is not ours to keep."""
 
 Rows = Sequence[Mapping[str, Any]]

@@ -95,13 +95,17 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     found |= {"growth: import coopoc"}
     for name in ("gtsam", "casadi", "osqp", "cvxpy", "filterpy"):
         pytest.importorskip(name)
-    backends, classical = load("backends"), load("classical")
+    backends, classical, fleet = load("backends"), load("classical"), load("fleet")
     monkeypatch.setattr(backends, "RUNS", 22)
     monkeypatch.setattr(backends, "STEPS", 22)
     found |= {f"backends: {each.job}: {each.words}" for job in backends.jobs() for each in job.rows}
     monkeypatch.setattr(classical, "RUNS", 2)
     monkeypatch.setattr(classical, "STEPS", 21)
     found |= {f"classical: {job}: {each.words}" for job, _, rows in classical.parts() for each in rows}
+    monkeypatch.setattr(fleet, "VEHICLES", 20)
+    monkeypatch.setattr(fleet, "SHORT", 12)
+    found |= {f"fleet: {job}: {each.words}" for job, _, rows in fleet.parts() for each in rows}
+    found |= {f"fleet: neighbours, {vehicles} vehicles" for vehicles, _ in fleet.SEARCHED}
     named = {name for name in baseline if not name.startswith("learned_gain: ")}
     assert named <= found
     assert {name for name in found if name.endswith((": ours", ", compiled"))} <= named

@@ -13,26 +13,27 @@ from typing import Any
 from numpy import uint64
 
 from ..arrays import AnyArray
-from .compile import compiled
+from .abreast import less, plus
+from .compile import as_written
 from .lanes import LANES, minus_product, subtract
 
 
-@compiled
+@as_written
 def inverse3(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> Any:
     """Upper triangle of the inverse of a symmetric (3, 3), row by row, from the upper triangle."""
-    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
-    scale = 1.0 / (xx * a + xy * b + xz * c)
-    return (a * scale, b * scale, c * scale, (xx * zz - xz * xz) * scale, (xy * xz - xx * yz) * scale,
-            (xx * yy - xy * xy) * scale)  # fmt: skip
+    a, b, c = less(yy * zz, yz, yz), less(xz * yz, xy, zz), less(xy * yz, xz, yy)
+    scale = 1.0 / plus(plus(xx * a, xy, b), xz, c)
+    return (a * scale, b * scale, c * scale, less(xx * zz, xz, xz) * scale, less(xy * xz, xx, yz) * scale,
+            less(xx * yy, xy, xy) * scale)  # fmt: skip
 
 
-@compiled
+@as_written
 def width(n: int) -> int:
     """Stride of a matrix (n, n) with its right-hand side."""
     return (n + LANES) // LANES * LANES
 
 
-@compiled
+@as_written
 def eliminate(a: AnyArray, n: int, stride: int, factor: AnyArray, pivots: AnyArray) -> None:
     """Upper triangle of `a`, which is used up, to R and the right-hand side in `factor`, -D^-1 in `pivots` (3n,).
 
@@ -49,14 +50,14 @@ def eliminate(a: AnyArray, n: int, stride: int, factor: AnyArray, pivots: AnyArr
                 _pivot(a, i, stride, pivots)
 
 
-@compiled
+@as_written
 def _pivot(a: AnyArray, k: int, stride: int, pivots: AnyArray) -> None:
     at, step, one, two = uint64(k * (stride + 1)), uint64(stride), uint64(1), uint64(2)
     xx, xy, xz, yy, yz = a[at], a[at + one], a[at + two], a[at + step + one], a[at + step + two]
     _minus_inverse(xx, xy, xz, yy, yz, a[at + step + step + two], pivots, 3 * k)
 
 
-@compiled
+@as_written
 def _minus_inverse(
     xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, pivots: AnyArray, place: int
 ) -> None:  # fmt: skip
@@ -68,7 +69,7 @@ def _minus_inverse(
         at += one
 
 
-@compiled
+@as_written
 def substitute(factor: AnyArray, n: int, stride: int, x: AnyArray) -> None:
     """Solution x (n,) of what was eliminated."""
     for k in range(n - 3, -1, -3):
@@ -76,13 +77,13 @@ def substitute(factor: AnyArray, n: int, stride: int, x: AnyArray) -> None:
         a, b, c = factor[row + end], factor[row + step + end], factor[row + step + step + end]
         for j in range(uint64(k + 3), end):
             known = x[j]
-            a -= factor[row + j] * known
-            b -= factor[row + step + j] * known
-            c -= factor[row + step + step + j] * known
+            a = less(a, factor[row + j], known)
+            b = less(b, factor[row + step + j], known)
+            c = less(c, factor[row + step + step + j], known)
         x[k], x[k + 1], x[k + 2] = a, b, c
 
 
-@compiled
+@as_written
 def loosen(a: AnyArray, n: int, stride: int, stiffness: AnyArray, memory: AnyArray) -> None:
     """Information (A^-1 + Q)^-1 in place of A, Q the inverse of the diagonal `stiffness` (n,); zero marginalises.
 

@@ -47,9 +47,18 @@ def compiled(function: Function) -> Function:
     The machine code is kept beside the source, or in the user's cache where that is read-only. It is made anew after a
     change of any file of the kernels or of the function's own folder, since it holds what it calls.
     """
+    return _compiled(function, {"contract"})
+
+
+def as_written(function: Function) -> Function:
+    """Compiled, each product and sum rounded as it stands, so that numbers and vectors of them get the same digits."""
+    return _compiled(function, set())
+
+
+def _compiled(function: Function, liberties: set[str]) -> Function:
     import numba
 
-    made: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function)
+    made: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=liberties)(function)
     folders = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
     made._cache._cache_file._source_stamp = _stamp(tuple(sorted(folders)))
     return cast(Function, made)

@@ -16,7 +16,14 @@ LANES = 4
 """Numbers in one vector: 256 bits."""
 _INDEX = types.intp
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
-_FUSED = ("contract",)
+
+
+def fused(build: Any, a: Any, b: Any, total: Any) -> Any:
+    """a b + total of numbers or vectors, rounded once."""
+    kind = total.type
+    name = f"llvm.fma.v{kind.count}f64" if isinstance(kind, ir.VectorType) else "llvm.fma.f64"
+    function = cgutils.get_or_insert_function(build.module, ir.FunctionType(kind, [kind] * 3), name)
+    return build.call(function, [a, b, total])
 
 
 class _Code:
@@ -46,8 +53,8 @@ class _Code:
         return self.build.shuffle_vector(self.build.insert_element(none, number, first), none, everywhere)
 
     def plus_product(self, total: Any, a: Any, b: Any) -> Any:
-        """total + a b in one instruction."""
-        return self.build.fadd(total, self.build.fmul(a, b, flags=_FUSED), flags=_FUSED)
+        """total + a b, rounded once."""
+        return fused(self.build, a, b, total)
 
 
 def _three_rows(begins: bool) -> Any:

@@ -6,63 +6,116 @@ import math
 from typing import Any
 
 import numpy as np
+from numba.extending import overload
 
-from ..arrays import Floats
-from .compile import compiled
+from ..arrays import AnyArray, Floats, Ints
+from .abreast import Abreast, lane, less, pack, plus
+from .compile import as_written
 
-
-def unfolded(relative: Floats) -> Floats:
-    """(..., 5) range, sin and cos of azimuth and of inclination, of (..., 3) measurements: no angle is met twice."""
-    d, azimuth, inclination = np.moveaxis(relative, -1, 0)
-    parts = [d, np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination)]
-    return np.stack(parts, axis=-1)
+QUARTER = (math.pi / 2, 6.123233995736766e-17)
+"""Of a turn, rad: the nearest number, and what it lacks."""
 
 
-@compiled
+@as_written
+def unfolded(relative: AnyArray, links: Ints) -> Floats:
+    """(R, M, 5) range, sin and cos of azimuth and of inclination, of some of (R, L, 3) measurements: no angle is met
+    twice."""
+    seen = np.empty((relative.shape[0], len(links), 5))
+    for run in range(len(seen)):
+        for k, link in enumerate(links):
+            seen[run, k, 0] = relative[run, link, 0]
+            seen[run, k, 1], seen[run, k, 2] = sine_and_cosine(relative[run, link, 1])
+            seen[run, k, 3], seen[run, k, 4] = sine_and_cosine(relative[run, link, 2])
+    return seen
+
+
+@as_written
+def sine_and_cosine(turn: float) -> tuple[float, float]:
+    """By their Taylor series within an eighth of a turn of a multiple of a quarter, exact to the last bit there."""
+    quarters = math.floor(turn * (2.0 / math.pi) + 0.5)
+    x = less(less(turn, quarters, QUARTER[0]), quarters, QUARTER[1])
+    s = x * x
+    sine = less(1 / 6227020800, s, less(1 / 1307674368000, s, 1 / 355687428096000))
+    sine = less(1 / 6, s, less(1 / 120, s, less(1 / 5040, s, less(1 / 362880, s, less(1 / 39916800, s, sine)))))
+    cosine = less(1 / 479001600, s, less(1 / 87178291200, s, 1 / 20922789888000))
+    cosine = less(1 / 24, s, less(1 / 720, s, less(1 / 40320, s, less(1 / 3628800, s, cosine))))
+    sine, cosine = less(x, x * s, sine), less(1.0, s, less(0.5, s, cosine))
+    rest = quarters - 4.0 * math.floor(0.25 * quarters)
+    odd = abs(rest - 2.0) == 1.0
+    one, other = cosine if odd else sine, sine if odd else cosine
+    return -one if rest >= 2.0 else one, -other if abs(rest - 1.5) < 1.0 else other
+
+
+@as_written
 def vector(seen: Any) -> Any:
     """The measured vector, m."""
     ground = seen[0] * seen[3]
     return ground * seen[2], ground * seen[1], seen[0] * seen[4]
 
 
-@compiled
+@as_written
 def angle(sine: float, cosine: float) -> float:
     """atan2; within 14 degrees by its Taylor series, whose 13 terms are exact to the last bit there."""
-    if not abs(sine) <= 0.25 * cosine:
-        return math.atan2(sine, cosine)
+    return series(sine, cosine) if abs(sine) <= 0.25 * cosine else math.atan2(sine, cosine)
+
+
+@as_written
+def series(sine: float, cosine: float) -> float:
+    """atan2 of a small angle."""
     t = sine / cosine
     s = t * t
-    tail = 1 / 17 - s * (1 / 19 - s * (1 / 21 - s * (1 / 23 - s * (1 / 25))))
-    tail = 1 / 9 - s * (1 / 11 - s * (1 / 13 - s * (1 / 15 - s * tail)))
-    return t * (1.0 - s * (1 / 3 - s * (1 / 5 - s * (1 / 7 - s * tail))))
+    tail = less(1 / 17, s, less(1 / 19, s, less(1 / 21, s, less(1 / 23, s, 1 / 25))))
+    tail = less(1 / 9, s, less(1 / 11, s, less(1 / 13, s, less(1 / 15, s, tail))))
+    small: float = t * less(1.0, s, less(1 / 3, s, less(1 / 5, s, less(1 / 7, s, tail))))
+    return small
 
 
-@compiled
+@as_written
+def one_angle(sine: Any, cosine: Any, which: int) -> float:
+    """The `angle` of one run of those abreast."""
+    y, x = lane(sine, which), lane(cosine, which)
+    return series(y, x) if abs(y) <= 0.25 * x else math.atan2(y, x)
+
+
+@overload(math.atan2)
+def _of_runs_abreast(sine: Any, cosine: Any) -> Any:
+    """Where not all are small, one by one."""
+    if not isinstance(sine, Abreast):
+        return None
+
+    def each(sine: Any, cosine: Any) -> Any:
+        return pack(one_angle(sine, cosine, 0), one_angle(sine, cosine, 1), one_angle(sine, cosine, 2),
+                    one_angle(sine, cosine, 3))  # fmt: skip
+
+    return each
+
+
+@as_written
 def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
     """Information, upper triangle, of a converted sighting along (x, y, z): C^-1 of `vector_cov`, whose axes are the
     range's, the azimuth's and the inclination's."""
-    flat2 = x * x + y * y
-    r2 = flat2 + z * z
+    flat2 = plus(x * x, y, y)
+    r2 = plus(flat2, z, z)
     d = max(math.sqrt(r2), least)
     along = 1.0 / (std[0] * std[0] * r2)
-    side = r2 / (flat2 * flat2 * (std[1] * d) ** 2)
-    up = 1.0 / (r2 * flat2 * (std[2] * d) ** 2)
-    tilt = up * z * z
-    return (along * x * x + side * y * y + tilt * x * x, (along - side + tilt) * x * y, (along - up * flat2) * x * z,
-            along * y * y + side * x * x + tilt * y * y, (along - up * flat2) * y * z,
-            along * z * z + up * flat2 * flat2)  # fmt: skip
+    turn, raise_ = std[1] * d, std[2] * d
+    side = r2 / (flat2 * flat2 * turn * turn)
+    up = 1.0 / (r2 * flat2 * raise_ * raise_)
+    level, slope = plus(along, up * z, z), less(along, up, flat2)
+    return (plus(level * x * x, side * y, y), (level - side) * x * y, slope * x * z, plus(level * y * y, side * x, x),
+            slope * y * z, plus(along * z * z, up * flat2, flat2))  # fmt: skip
 
 
-@compiled
+@as_written
 def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> Any:
     """J^T J, upper triangle, and J^T r of the whitened range, azimuth and inclination at the vector (x, y, z).
 
     An angle's residual is that between the measured direction and the vector's, which never needs wrapping.
     """
-    flat2 = x * x + y * y
-    flat, r = math.sqrt(flat2), math.sqrt(flat2 + z * z)
-    turned = angle(seen[1] * x - seen[2] * y, seen[2] * x + seen[1] * y)
-    raised = angle(seen[3] * z - seen[4] * flat, seen[4] * z + seen[3] * flat)
+    flat2 = plus(x * x, y, y)
+    flat, r = math.sqrt(flat2), math.sqrt(plus(flat2, z, z))
+    turned = angle(less(seen[1] * x, seen[2], y), plus(seen[2] * x, seen[1], y))
+    raised = angle(less(seen[3] * z, seen[4], flat), plus(seen[4] * z, seen[3], flat))
     d = max(r, least)
     ground = max(flat, 1e-3 * d)
     a = 1.0 / (r * std[0])
@@ -71,6 +124,13 @@ def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> An
     bx, by, br = -b * y, b * x, turned / std[1]
     c = 1.0 / (ground * d * d * std[2])
     cx, cy, cz, cr = c * x * z, c * y * z, -c * ground * ground, raised / std[2]
-    return (ax * ax + bx * bx + cx * cx, ax * ay + bx * by + cx * cy, ax * az + cx * cz, ay * ay + by * by + cy * cy,
-            ay * az + cy * cz, az * az + cz * cz,
-            ax * ar + bx * br + cx * cr, ay * ar + by * br + cy * cr, az * ar + cz * cr)  # fmt: skip
+    return (dot(ax, ax, bx, bx, cx, cx), dot(ax, ay, bx, by, cx, cy), plus(ax * az, cx, cz),
+            dot(ay, ay, by, by, cy, cy), plus(ay * az, cy, cz), plus(az * az, cz, cz),
+            dot(ax, ar, bx, br, cx, cr), dot(ay, ar, by, br, cy, cr), plus(az * ar, cz, cr))  # fmt: skip
+
+
+@as_written
+def dot(a: float, x: float, b: float, y: float, c: float, z: float) -> float:
+    """a x + b y + c z."""
+    total: float = plus(plus(a * x, b, y), c, z)
+    return total

@@ -2,7 +2,7 @@
 
 A neighbour meets only the ego: H_k = G_k + E_k is eliminated, with G its fix and E its edge, and the ego remains,
 S = G_0 + sum E_k - E_k H_k^-1 E_k. Its covariance is S^-1. The tuples `measured` and `assumed` are those of
-`coopoc.kernels.star_filter`, `fresh` being where a message is held.
+`coopoc.kernels.star_messages`, `fresh` being where a message is held.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..arrays import AnyArray, Floats, Ints
 from .blocks import inverse3
 from .compile import compiled
 from .sighting import exact, vector
-from .star_filter import hear
+from .star_messages import hear
 
 SOLVED, MET, LOST = 0, 1, 2
 """Solved exactly; solved converted, since two vehicles met; not solved: Gauss-Newton did not settle."""

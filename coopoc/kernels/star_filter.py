@@ -2,13 +2,8 @@
 
 The filter of `coopoc.methods.joint_filter` with the gather of `coopoc.methods.star`, kept in information form: a step
 adds process noise to it block by block, then fixes and sightings, and no matrix is ever inverted. The ego's block is
-the last, so that elimination ends with its covariance. One run after the other, so that its matrices stay in the
-nearest cache. Arguments travel in plain tuples, which numba's cache can name:
-
-    measured: gnss, velocity (R, T, N, 3) m, m/s; seen (R, M, 5) of `unfolded`; neighbour (M,); start (T+1,); newest and
-        fresh (R, M), of the ego's inbox; ego; dt s.
-    assumed: variance of the motion and of a fix, broadcastable to (R, T, N, 3) m^2; std (3,) m, rad, rad, of no length
-        for unit matrices; least range m; variance of who joins m^2; acceleration m/s^2.
+the last, so that elimination ends with its covariance. LANES runs go abreast, and one that is left over alone, with the
+same digits: a run's numbers do not depend on who runs beside it. Arguments are those of `star_messages`.
 """
 
 from __future__ import annotations
@@ -20,19 +15,33 @@ from numpy import uint64
 
 from ..arrays import AnyArray, Floats
 from .blocks import eliminate, loosen, substitute, width
-from .compile import compiled
+from .compile import as_written
+from .lanes import LANES
 from .sighting import converted, exact, vector
+from .star_abreast import block, follow_abreast
+from .star_messages import LEAST_PROCESS, hear
 
-LEAST_PROCESS = 1e-90
-"""m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
 
-
-@compiled
+@as_written
 def follow(measured: Any, assumed: Any, refine: bool) -> tuple[Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; one Gauss-Newton step more to `refine`."""
-    gnss, _, seen, _, start = measured[:5]
-    runs, steps = gnss.shape[0], gnss.shape[1]
-    x, cov, others = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.shape[1], 3))
+    runs, steps = measured[0].shape[:2]
+    x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
+    others = np.empty((runs, measured[2].shape[1], 3))
+    for first in range(0, runs, LANES):
+        last = min(first + LANES, runs) - 1
+        if first < last:
+            follow_abreast(measured, assumed, refine, first, last, (x, cov, others))
+        else:
+            follow_one(measured, assumed, refine, first, (x, cov, others))
+    return x, cov, others
+
+
+@as_written
+def follow_one(measured: Any, assumed: Any, refine: bool, run: int, out: Any) -> None:
+    """Fill x, covariance and neighbours, as `follow` does, of one run."""
+    seen, start = measured[2], measured[4]
+    x, cov, others = out
     most = 1 + np.diff(start).max()
     size = 3 * most * width(3 * most)
     information, last, a, factor = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
@@ -40,73 +49,29 @@ def follow(measured: Any, assumed: Any, refine: bool) -> tuple[Floats, Floats, F
     state, before, stiffness = np.zeros((most, 3)), np.zeros((most, 3)), np.zeros(3 * most)
     who, was = np.zeros((4, most), np.int64), np.zeros((3, most), np.int64)
     motion = np.zeros((4, most, 3))
-    for run in range(runs):
-        old = 0
-        for t in range(steps):
-            n = 1 + start[t + 1] - start[t]
-            hear(measured, assumed, run, t, who[:, :n], was[:, :old], motion)
-            here = seen[run, start[t] : start[t + 1]]
-            stiffness[: 3 * old] = 0.0
-            predict(before[:old], who[3, :n], motion, here, state, stiffness)
-            loosen(last, 3 * old, width(3 * old), stiffness, scratch)
-            rearrange(last, old, who[3, :n], 1.0 / assumed[4], information)
-            update(state[:n], motion, here, assumed, refine, (information, a, factor, pivots, move))
+    old = 0
+    for t in range(len(start) - 1):
+        n = 1 + start[t + 1] - start[t]
+        hear(measured, assumed, run, t, who[:, :n], was[:, :old], motion)
+        here = seen[run, start[t] : start[t + 1]]
+        stiffness[: 3 * old] = 0.0
+        predict(before[:old], who[3, :n], motion, here, state, stiffness)
+        loosen(last, 3 * old, width(3 * old), stiffness, scratch)
+        rearrange(last, old, who[3, :n], 1.0 / assumed[4], information)
+        update(state[:n], motion, here, assumed, refine, (information, a, factor, pivots, move))
+        for i in range(3):
+            x[run, t, i] = state[0, i]
+            for j in range(3):
+                cov[run, t, i, j] = -pivots[9 * (n - 1) + 3 * i + j]
+        for k in range(n):
             for i in range(3):
-                x[run, t, i] = state[0, i]
-                for j in range(3):
-                    cov[run, t, i, j] = -pivots[9 * (n - 1) + 3 * i + j]
-            for k in range(n):
-                for i in range(3):
-                    before[k, i], was[i, k] = state[k, i], who[i, k]
-                    if k > 0:
-                        others[run, start[t] + k - 1, i] = state[k, i]
-            old, information, last = n, last, information
-    return x, cov, others
+                before[k, i], was[i, k] = state[k, i], who[i, k]
+                if k > 0:
+                    others[run, start[t] + k - 1, i] = state[k, i]
+        old, information, last = n, last, information
 
 
-@compiled
-def hear(measured: Any, assumed: Any, run: int, t: int, who: AnyArray, was: AnyArray, motion: AnyArray) -> None:
-    """Who is in the star, in `who`: column, step of the message held, uses of it, place in the last star; what their
-    messages say, in `motion`: moved m, its variance m^2, innovation-free fix m, and the weight of that 1/m^2."""
-    gnss, velocity, _, neighbour, start, newest, fresh, ego, dt = measured
-    variance, fixes, _, _, forgotten, acceleration = assumed
-    for k in range(who.shape[1]):
-        link = start[t] + k - 1
-        member, sent = (ego, t) if k == 0 else (neighbour[link], newest[run, link])
-        place = -1
-        for i in range(was.shape[1]):
-            if was[0, i] == member:
-                place = i
-        again = place >= 0 and was[1, place] == sent
-        who[0, k], who[1, k], who[2, k], who[3, k] = member, sent, was[2, place] + 1 if again else 1, place
-        at = sent if sent >= 0 else t
-        age = t - at
-        row, fix_row = one_of(variance, run, at, member), one_of(fixes, run, at, member)
-        for c in range(3):
-            one = row[c] + (dt * dt * age * acceleration) ** 2
-            moved = dt * velocity[run, at, member, c] if sent >= 0 else 0.0
-            motion[0, k, c] = moved
-            motion[1, k, c] = (2 * who[2, k] - 1) * one if sent >= 0 else forgotten
-            motion[2, k, c] = gnss[run, at, member, c] + age * moved
-            heard = k == 0 or fresh[run, link]
-            motion[3, k, c] = 1.0 / (fix_row[c] + age * age * one) if heard else 0.0
-
-
-@compiled
-def one_of(values: AnyArray, run: int, t: int, member: int) -> AnyArray:
-    """(3,) of what is broadcastable to (R, T, N, 3)."""
-    i, j, k = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
-    row: AnyArray = values[i, j, k]
-    return row
-
-
-@compiled
-def block(k: int, n: int) -> int:
-    """First row of member k among n: the ego's is the last block."""
-    return 3 * (k - 1) if k > 0 else 3 * (n - 1)
-
-
-@compiled
+@as_written
 def predict(
     before: AnyArray, kept: AnyArray, motion: AnyArray, seen: AnyArray, state: AnyArray, stiffness: AnyArray
 ) -> None:  # fmt: skip
@@ -119,13 +84,13 @@ def predict(
             for c in range(3):
                 state[k, c] = origin[c] + ahead[c]
             continue
-        row = block(place, len(before))
+        row = 3 * block(place, len(before))
         for c in range(3):
             state[k, c] = before[place, c] + motion[0, k, c]
             stiffness[row + c] = 1.0 / max(motion[1, k, c], LEAST_PROCESS)
 
 
-@compiled
+@as_written
 def rearrange(last: AnyArray, old: int, kept: AnyArray, forgotten: float, information: AnyArray) -> None:
     """Information of the new star from that of the last one, which lacks who left; `forgotten` of who joins."""
     n = len(kept)
@@ -133,17 +98,17 @@ def rearrange(last: AnyArray, old: int, kept: AnyArray, forgotten: float, inform
     for i in range(uint64(3 * n) * step):
         information[i] = 0.0
     for k in range(n):
-        row = block(k, n)
+        row = 3 * block(k, n)
         if kept[k] < 0:
             for c in range(3):
                 information[uint64(row + c) * (step + uint64(1))] = forgotten
             continue
-        from_row = block(kept[k], old)
+        from_row = 3 * block(kept[k], old)
         for j in range(n):
-            column = block(j, n)
+            column = 3 * block(j, n)
             if kept[j] < 0 or column < row:
                 continue
-            from_column = block(kept[j], old)
+            from_column = 3 * block(kept[j], old)
             down, across = from_step, uint64(1)
             source = uint64(from_row) * from_step + uint64(from_column)
             if from_column < from_row:
@@ -154,7 +119,7 @@ def rearrange(last: AnyArray, old: int, kept: AnyArray, forgotten: float, inform
                     information[target + c * step + d] = last[source + c * down + d * across]
 
 
-@compiled
+@as_written
 def update(state: AnyArray, motion: AnyArray, seen: AnyArray, assumed: Any, refine: bool, memory: Any) -> None:
     """State and information given the fixes and the sightings."""
     information, a, factor, pivots, move = memory
@@ -177,32 +142,32 @@ def update(state: AnyArray, motion: AnyArray, seen: AnyArray, assumed: Any, refi
     eliminate(a, n, stride, factor, pivots)
     substitute(factor, n, stride, move)
     for k in range(len(state)):
-        row = block(k, len(state))
+        row = 3 * block(k, len(state))
         for c in range(3):
             state[k, c] += move[row + c]
             information[(row + c) * stride + n] = 0.0
 
 
-@compiled
+@as_written
 def copy(source: AnyArray, target: AnyArray, count: int) -> None:
     """A loop, since a slice would first be looked at for overlap."""
     for i in range(uint64(count)):
         target[i] = source[i]
 
 
-@compiled
+@as_written
 def add_fixes(information: AnyArray, stride: int, state: AnyArray, motion: AnyArray) -> None:
     """The fixes that are new, and in the column beside what they pull."""
     n = 3 * len(state)
     for k in range(len(state)):
-        row = block(k, len(state))
+        row = 3 * block(k, len(state))
         for c in range(3):
             if motion[3, k, c] > 0.0:
                 information[(row + c) * (stride + 1)] += motion[3, k, c]
                 information[(row + c) * stride + n] = motion[3, k, c] * (motion[2, k, c] - state[k, c])
 
 
-@compiled
+@as_written
 def add_converted(a: AnyArray, stride: int, n: int, k: int, state: AnyArray, seen: AnyArray, assumed: Any) -> None:
     """The converted sighting of member k, with its covariance at the predicted geometry."""
     x, y, z = state[k, 0] - state[0, 0], state[k, 1] - state[0, 1], state[k, 2] - state[0, 2]
@@ -214,7 +179,7 @@ def add_converted(a: AnyArray, stride: int, n: int, k: int, state: AnyArray, see
     add_edge(a, stride, n, k, (xx, xy, xz, yy, yz, zz), pull)
 
 
-@compiled
+@as_written
 def add_exact(
     a: AnyArray, stride: int, n: int, k: int, state: AnyArray, move: AnyArray, seen: AnyArray, assumed: Any
 ) -> None:
@@ -229,7 +194,7 @@ def add_exact(
     add_edge(a, stride, n, k, (xx, xy, xz, yy, yz, zz), pull)
 
 
-@compiled
+@as_written
 def add_edge(a: AnyArray, stride: int, n: int, k: int, weight: Any, pull: Any) -> None:
     """Information and pull of a measured x_k - x_0, in the upper triangle and the column beside it."""
     xx, xy, xz, yy, yz, zz = weight

@@ -151,12 +151,13 @@ def _by_kernels(
     least = known.sensors.min_range if known.sensors else 0.0
     variance = np.broadcast_to(known.process_variance(recording), recording.gnss.shape)
     at, _ = solo_filter(recording.gnss, recording.velocity, variance, known.gnss_variance, recording.dt)
+    seen = unfolded(recording.relative, np.arange(len(recording.links)))
     found = []
     for run, moved in enumerate(recording.dt * recording.velocity):
         alive = contacts.to_first[run] | contacts.to_second[run]
         pairs = (contacts.first, contacts.second, contacts.sight, contacts.sight_back)
         start = np.searchsorted(contacts.step[alive], np.arange(len(there) + 1))
-        graph = (place, *(column[alive] for column in pairs), start, unfolded(recording.relative[run]), std, least)
+        graph = (place, *(column[alive] for column in pairs), start, seen[run], std, least)
         own = (1.0 / known.gnss_variance, recording.gnss[run], 1.0 / variance[run], moved)
         found.append(smooth(at[run], graph, own, steps, settling[run], memory, tick))
     return found

@@ -86,8 +86,9 @@ class Knowledge:
         velocity = recording.velocity if self.velocity is None else self.velocity[None]
         velocity = velocity if columns is None else velocity.take(columns, axis=2)
         floor = 1e-6 if self.velocity is not None else self.sensors.velocity_floor
-        variance: Floats = (recording.dt * self.sensors.velocity_std(velocity, floor)) ** 2
-        return variance
+        std = self.sensors.velocity_std(velocity, floor)
+        std *= recording.dt
+        return np.square(std, out=std)
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""

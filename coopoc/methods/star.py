@@ -78,19 +78,19 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
 
 
 def measured_arrays(recording: Recording, ego: int, box: Inbox) -> tuple[Any, ...]:
-    """What `star_steps` gathers from, as the tuple `measured` of `coopoc.kernels.star_filter`."""
+    """What `star_steps` gathers from, as the tuple `measured` of `coopoc.kernels.star_messages`."""
     from ..kernels.sighting import unfolded
 
     neighbour, start, newest = (
         np.ascontiguousarray(numbers, dtype=np.int64)
         for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
     )
-    seen, fresh = np.ascontiguousarray(unfolded(recording.relative[:, box.link])), np.ascontiguousarray(box.fresh)
+    seen, fresh = unfolded(recording.relative, box.link), np.ascontiguousarray(box.fresh)
     return recording.gnss, recording.velocity, seen, neighbour, start, newest, fresh, int(ego), recording.dt
 
 
 def assumed_arrays(recording: Recording, known: Knowledge) -> tuple[Any, ...]:
-    """What is assumed of it, as the tuple `assumed` of `coopoc.kernels.star_filter`."""
+    """What is assumed of it, as the tuple `assumed` of `coopoc.kernels.star_messages`."""
     variance = np.ascontiguousarray(known.process_variance(recording))
     fixes = np.ascontiguousarray(known.fix_variance(recording))
     sensors = known.sensors

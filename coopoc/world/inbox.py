@@ -54,14 +54,8 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     link = recording.links.of(ego)
     at = recording.links.step[link]
     size = message.size(recording.v2x.overhead)
-    arrival = within_cap(recording.arrival[:, link], np.full(len(link), size), recording)
-    newest = np.full(arrival.shape, -1, dtype=np.int64)
-    fresh = np.zeros(arrival.shape, dtype=bool)
-    for neighbour in np.unique(recording.links.neighbour[link]):
-        pair = np.flatnonzero(recording.links.neighbour[link] == neighbour)
-        held = _newest_held(arrival[:, pair], at[pair], steps)[:, at[pair]]
-        newest[:, pair] = held
-        fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0
+    arrival = within_cap(recording.arrival.take(link, axis=1), np.full(len(link), size), recording)
+    newest, fresh = _held(arrival, at, recording.links.neighbour[link], steps)
     too_old = at - newest > recording.v2x.max_age / recording.dt + 1e-9
     newest[too_old] = -1
     broadcasts = recording.broadcasts[:, ego].sum() if recording.v2x.max_neighbours else 0
@@ -70,6 +64,19 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
         link, np.searchsorted(at, np.arange(steps + 1)), newest, fresh & ~too_old,
         received_bytes=arrived.sum(axis=1) * float(size), sent_bytes=float(broadcasts * size),
     )  # fmt: skip
+
+
+def _held(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Ints, Bools]:
+    """Newest sending step held and whether that is new, (R, M) both, of messages of several neighbours."""
+    if (arrival == sent).all():
+        return np.broadcast_to(sent, arrival.shape).copy(), np.ones(arrival.shape, dtype=bool)
+    newest, fresh = np.empty(arrival.shape, dtype=np.int64), np.empty(arrival.shape, dtype=bool)
+    for one in np.unique(neighbour):
+        pair = np.flatnonzero(neighbour == one)
+        held = _newest_held(arrival[:, pair], sent[pair], steps)[:, sent[pair]]
+        newest[:, pair] = held
+        fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0
+    return newest, fresh
 
 
 def _newest_held(arrival: Ints, sent: Ints, steps: int) -> Ints:

@@ -94,6 +94,10 @@ class Recording:
         """Whether every vehicle has a fix wherever it is."""
         return bool((np.isfinite(self.gnss) | np.isnan(self.velocity)).all())
 
+    @cached_property
+    def _observing(self) -> frozenset[int]:
+        return frozenset(self.observers)
+
     def require_complete(self) -> None:
         """InputError, which names the vehicle and the step, if a fix is missing."""
         if not self.complete:
@@ -117,18 +121,23 @@ class Recording:
             if isinstance(col, str) or not 0 <= col < len(self.ids):
                 known = f"0..{len(self.ids) - 1} or an id"
                 raise InputError("egos", repr(ego), f"must be one of {known}", "See recording.ids.")
-            if col not in self.observers:
+            if col not in self._observing:
                 raise InputError("egos", repr(ego), f"has no links here, only {list(self.observers)} have",
                                  "Name it in observe(..., observers=[...]).")  # fmt: skip
-            if not np.isfinite(self.velocity[:, :, col]).all():
+            cols.append(int(col))
+        moves, seen = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss))
+        if moves.all() and (seen[:, 0] if missing else seen).all():
+            return cols
+        there: Bools = np.asarray(moves.all(axis=(0, 1, 3)))
+        fixes: Bools = np.asarray(seen.all(axis=(0, 3)))
+        for ego, present, fix in zip(egos, there, fixes.T, strict=True):
+            if not present:
                 mend = "Choose another ego or cut the drive with fleet.between(...)."
                 raise InputError("egos", repr(ego), "is absent at some steps", mend)
-            fixes: Bools = np.asarray(np.isfinite(self.gnss[:, :, col]).all(axis=-1))
-            if not (fixes[:, 0] if missing else fixes).all():
-                step = int(np.argwhere(~fixes)[0, 1])
+            if not (fix[0] if missing else fix.all()):
+                step = int(np.argmin(fix))
                 mend = "Cut the drive with fleet.between(...)." if step == 0 else "Take a method that does without."
                 raise InputError("egos", repr(ego), f"has no fix at step {step}, where this method needs one", mend)
-            cols.append(int(col))
         return cols
 
     def __repr__(self) -> str:

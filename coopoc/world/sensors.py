@@ -105,7 +105,8 @@ class Sensors:
         size = np.abs(velocity)
         if self.velocity_reading == "speed":
             size = np.broadcast_to(np.linalg.norm(velocity, axis=-1, keepdims=True), velocity.shape)
-        return np.maximum(self.velocity_std_ratio * size, floor or 0.0)
+        std: Floats = self.velocity_std_ratio * size
+        return np.maximum(std, floor or 0.0, out=std)
 
     def assumed_velocity_std(self, velocity: Floats) -> Floats:
         """Noise std (..., 3) m/s that a method assumes at a *measured* velocity: never below `velocity_floor`."""
