@@ -176,6 +176,7 @@ def channel(p: Params) -> V2X:
         burst=float(p.get("burst", found.burst)),
         latency=float(p.get("latency_s", found.latency)),
         bytes_per_second=cap or float("inf"),
+        schedule=p.get("schedule", found.schedule),
     )
 
 
