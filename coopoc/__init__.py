@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from .evaluate.bounds import bound_rt_le as bound_rt_le
     from .evaluate.bounds import fleet_bound as fleet_bound
     from .evaluate.bounds import posterior_bound as posterior_bound
+    from .evaluate.ledger import Ledger as Ledger
+    from .evaluate.ledger import break_even as break_even
     from .evaluate.metrics import max_error as max_error
     from .evaluate.metrics import nees as nees
     from .evaluate.metrics import rt_le as rt_le
@@ -54,6 +56,7 @@ if TYPE_CHECKING:
     from .study.results import Results as Results
     from .study.run import run as run
     from .study.study import Study as Study
+    from .world.channel_load import channel_load as channel_load
     from .world.fleet import Fleet as Fleet
     from .world.recording import Links as Links
     from .world.recording import Recording as Recording
@@ -77,6 +80,7 @@ _HOME = {
     "GaussianBeliefPropagation": "methods.gbp", "ConsensusADMM": "methods.admm", "Diffusion": "methods.diffusion",
     "CentralFilter": "methods.central_filter", "BatchSmoother": "methods.batch_smoother",
     "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds", "fleet_bound": "evaluate.bounds",
+    "Ledger": "evaluate.ledger", "break_even": "evaluate.ledger", "channel_load": "world.channel_load",
     "CooperativeMAP": "methods.cooperative_map", "Factor": "optimize.factor", "Problem": "optimize.problem",
     "Solution": "optimize.solution", "backends": "optimize.solve", "solve": "optimize.solve",
     "Constraint": "optimize.constraint", "Loss": "optimize.losses", "pose": "optimize.space", "read": "optimize.graphs",

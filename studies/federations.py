@@ -112,7 +112,7 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
 
 def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
     from coopoc.learned.federation.compression import Float16, Quantised, TopK
-    from coopoc.learned.federation.federated import federate_many, ledger
+    from coopoc.learned.federation.federated import federate_many
     from coopoc.learned.federation.topology import Ring, V2XGraph
 
     name = p["method"]
@@ -124,10 +124,11 @@ def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]
     )  # fmt: skip
     found = []
     for fed in done:
-        sent, received = np.mean(list(ledger(fed).values()), axis=0)
+        sent, received = (sum(getattr(row, way) for row in fed.history) / len(fed.names)
+                          for way in ("sent_bytes", "received_bytes"))  # fmt: skip
         rejected, idle = sum(len(row.rejected) for row in fed.history), sum(row.note != "" for row in fed.history)
         last = fed.after(len(fed.history) - 1)
-        found.append(Trained(fed.model, last, float(sent), float(received), rejected, idle, fed.seconds))
+        found.append(Trained(fed.model, last, sent, received, rejected, idle, fed.seconds))
     return tuple(found)
 
 

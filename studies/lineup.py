@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
+from coopoc.evaluate.ledger import Kind, Ledger, Way, of_track
 from coopoc.evaluate.metrics import errors, max_error, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
@@ -24,6 +26,11 @@ from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
 
+BYTES: Mapping[str, tuple[Kind, Way]] = {
+    "bytes_per_second": ("on air", "per receiver"), "sent_bytes_per_second": ("on air", "broadcast"),
+    "payload_bytes_per_second": ("payload", "per receiver"), "sent_payload_bytes_per_second": ("payload", "broadcast"),
+}  # fmt: skip
+"""Columns of rows that hold what is moved to decide, as a ledger counts it."""
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 
 
@@ -104,7 +111,8 @@ def rows(p: Params, *, quantiles: int = 0, own: Method | None = None) -> list[Ro
     found: list[Row] = []
     for seed, method in [(None, own)] if own else methods(p, recording):
         track = method(recording, who)
-        found += _rows(track, drive, recording, who, quantiles, {} if seed is None else {"train_seed": seed})
+        account = of_track(track, recording, method.message)
+        found += _rows(track, drive, recording, account, quantiles, {} if seed is None else {"train_seed": seed})
     return found
 
 
@@ -118,20 +126,20 @@ def bound_rows(p: Params) -> list[Row]:
         level = bound_rt_le(posterior_bound(drive, acting, column, v2x))
         near = len(find_links(drive, [column], v2x.max_neighbours, v2x.radius, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
-        found.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, "bytes_per_second": received})
+        sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
+        found.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
     return found
 
 
 def _rows(
-    track: Track, drive: Fleet, recording: Recording, who: tuple[str, ...], quantiles: int, extra: dict[str, Any]
+    track: Track, drive: Fleet, recording: Recording, account: Ledger, quantiles: int, extra: dict[str, Any]
 ) -> list[Row]:
-    duration = len(track.t) * recording.dt
+    who = account.names
     columns: dict[str, Floats] = {
         "rt_le_m": rt_le(track, drive),
         "max_error_m": max_error(track, drive),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        "bytes_per_second": track.received_bytes / duration,
-        "sent_bytes_per_second": track.sent_bytes / duration,
+        **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
     }
     fixes = np.sqrt(((recording.gnss - drive.position) ** 2).sum(axis=-1).mean(axis=1))[:, list(track.egos)]
     columns["worse_than_gnss"] = (columns["rt_le_m"] > 1.001 * fixes).astype(float)

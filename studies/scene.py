@@ -177,6 +177,7 @@ def channel(p: Params) -> V2X:
         burst=_given(p, "burst", found.burst),
         latency=_given(p, "latency_s", found.latency),
         bytes_per_second=cap or float("inf"),
+        schedule=p.get("schedule", found.schedule),
     )
 
 

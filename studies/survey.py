@@ -99,17 +99,14 @@ def _under(results: Results, limit: float) -> str:
     """The best on an ideal channel within a limit of bytes per second, for each kind of knowledge, beside the bound."""
     from coopoc.study.style import look
 
-    from . import budget, views
+    from . import budget
 
-    parts = []
+    parts, ran = [], budget.choices(results)
     for words, known in PRIOR.items():
-        best = budget.best_under(results, limit, known)
-        if best is None:
-            continue
-        error, size, where = best
-        place = {"max_neighbours": where["max_neighbours"], "method": "bound"}
-        bound, rms = views.rms(results, place), views.rms(results, where)
-        gap = f", {rms / bound:.2f} times the bound" if bound and rms else ""
-        use = f" with K = {where['max_neighbours']} and {size:.0f} B/s" if where["max_neighbours"] else ""
-        parts.append(f"{words}, {look(where['method']).label}{use}: {error:.2f} m{gap}")
+        best = budget.best_under([one for one in ran if one.where["knowledge"] in known], limit)
+        if best is not None:
+            k = best.where["max_neighbours"]
+            use = f" with K = {k} and {best.size:.0f} B/s" if k else ""
+            far = budget.gap(results, best.where)
+            parts.append(f"{words}, {look(best.where['method']).label}{use}: {best.error:.2f} m{far}")
     return f"{'; '.join(parts)}." if parts else ""

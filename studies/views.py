@@ -30,20 +30,20 @@ def present(results: Results, where: Mapping[str, Any], value: str = "rt_le_m") 
     rows = results.frame
     if not {*where, value} <= set(rows):
         return None
-    rows = rows[rows[value].notna()]
     lists = {name: wanted if isinstance(wanted, list) else [wanted] for name, wanted in where.items()}
+    kept = rows[value].notna().to_numpy()
     for name, wanted in lists.items():
-        rows = rows[rows[name].isin(wanted)]
-    if rows.empty:
+        kept = kept & rows[name].isin(wanted).to_numpy()
+    if not kept.any():
         return None
-    ran = {name: set(rows[name]) for name in lists}
+    ran = {name: set(rows[name][kept]) for name in lists}
     return {name: [v for v in wanted if v in ran[name]] for name, wanted in lists.items()}
 
 
 def mean(results: Results, where: Mapping[str, Any], value: str = "rt_le_m") -> float | None:
     """Mean of a metric over egos, runs and training seeds; None where it was not run."""
     kept = present(results, where, value)
-    return None if kept is None else results.interval(value, kept).mean
+    return None if kept is None else float(results.values(value, kept).mean())
 
 
 def rms(results: Results, where: Mapping[str, Any]) -> float | None:

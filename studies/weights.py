@@ -19,6 +19,7 @@ from coopoc.world.v2x import V2X
 from .scene import Start, fleet, start
 
 if TYPE_CHECKING:
+    from coopoc.evaluate.ledger import Ledger
     from coopoc.learned.checkpoint import Checkpoint
     from coopoc.study.results import Results
 
@@ -119,21 +120,16 @@ def trained(results: Results) -> list[str]:
     return [name for name in LEARNED if name in ran]
 
 
-def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
-    """Bytes that one vehicle sends and receives in training, on average over the clients.
+def ledger(p: Params, name: str) -> Ledger:
+    """The bytes of a training, from the card of the first seed."""
+    from coopoc.learned.federation.history import card_ledger
 
-    A federation moves the weights both ways in every round. What is trained in one place needs the raw drives, six
-    float32 per step (noisy fixes and velocities; the reference drive comes on top), and sends the weights back once.
-    """
-    upload = 4 * 6 * float(fleet(p["clients"]).present.sum(axis=0).mean())
-    found = {}
-    for name in names:
-        card = checkpoint(name, p, 0).card
-        found[name] = upload + 4.0 * card["parameters"]
-        if card["settings"]["kind"] == "federated":
-            moved = sum(row["sent_bytes"] + row["received_bytes"] for row in card["history"][1:])
-            found[name] = moved / len(card["clients"])
-    return found
+    return card_ledger(checkpoint(name, p, 0).card, fleet(p["clients"]))
+
+
+def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
+    """Payload bytes that one vehicle sends and receives in training, on average over the clients."""
+    return {name: ledger(p, name).per_vehicle("training") for name in names}
 
 
 def described(results: Results) -> Mapping[str, str]:

@@ -5,18 +5,44 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopoc import V2X, InputError, Results, load, run
+from coopoc import V2X, InputError, JointFilter, Results, load, observe, run
+from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.metrics import rt_le
+from coopoc.evaluate.statistics import Interval, paired_difference
+from coopoc.learned import Checkpoint, save
+from coopoc.learned import load as load_weights
+from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of
 from coopoc.studies import budget as study
+from coopoc.studies import budget_tables as tables
 from coopoc.studies import scene, views
+from coopoc.study.tables import Table
 from coopoc.world.sensing import find_links
 
 QUICK = {"runs": 2, "egos": "2", "max_neighbours": "0,2", "method": "kalman,joint,split-ci,bound"}
+SIZES = ("payload_bytes_per_second", "bytes_per_second")
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
     wanted = {**QUICK, "data": short_town}
     return run("budget", tmp_path_factory.mktemp("budget"), settings=wanted, progress=False)
+
+
+@pytest.fixture(scope="module")
+def tight(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
+    """Under caps and schedules, and a training: the shipped weights."""
+    folder, shipped = tmp_path_factory.mktemp("weights"), load_weights(WEIGHTS / "fedokf.safetensors")
+    drives = load("town10-clients")
+    (job,) = jobs_of("fedokf", Setting(), drives)
+    save(folder / f"{job.label}.safetensors", Checkpoint(shipped.model, {**shipped.card, "key": job.key(drives)}))
+    wanted = {"data": short_town, "runs": 2, "egos": "2", "max_neighbours": "0,10", "method": "joint,fedokf",
+              "knowledge": "nominal,trained", "weights": str(folder), "train_seeds": 1}  # fmt: skip
+    return run("budget", tmp_path_factory.mktemp("tight"), settings=wanted, progress=False)
+
+
+def rows(table: Table | None) -> list[tuple[object, ...]]:
+    assert table is not None
+    return list(table.rows)
 
 
 def at(**where: object) -> dict[str, object]:
@@ -28,9 +54,9 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
     drive = load(short_town)
     egos = [drive.index(ego) for ego in scene.egos(short_town, "2")]
     near = len(find_links(drive, egos, 2, 30.0, 2.0)) / len(egos) / len(drive.t)
-    ideal = [views.mean(results, at(channel="ideal"), kind) for kind in study.BYTES]
+    ideal = [views.mean(results, at(channel="ideal"), kind) for kind in SIZES]
     assert ideal == pytest.approx([near * 320, near * 320])
-    payload, air = (views.mean(results, at(channel="cam"), kind) for kind in study.BYTES)
+    payload, air = (views.mean(results, at(channel="cam"), kind) for kind in SIZES)
     assert payload is not None
     assert air == pytest.approx(payload * 382 / 32)
     assert payload < 0.3 * near * 320  # 2.2 Hz and 2 % lost
@@ -43,12 +69,13 @@ def test_channels_keep_their_order(results: Results) -> None:
 
 
 def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None:
-    found = [study.best_under(results, limit) for limit in (0.0, 300.0, 600.0, 5000.0)]
-    errors = [one[0] for one in found if one is not None]
+    ran = study.choices(results)
+    found = [study.best_under(ran, limit) for limit in (0.0, 300.0, 600.0, 5000.0)]
+    errors = [one.error for one in found if one is not None]
     assert len(errors) == 4
     assert (np.diff(errors) <= 0).all()
     assert found[0] is not None
-    assert found[0][2]["max_neighbours"] == 0
+    assert found[0].where["max_neighbours"] == 0
 
 
 def test_a_channel_that_is_not_there_is_named() -> None:
@@ -57,3 +84,53 @@ def test_a_channel_that_is_not_there_is_named() -> None:
     assert scene.channel({"channel": "bsm", "max_neighbours": 4, "radius_m": 50.0}) == V2X(
         4, 50.0, rate=10.0, latency=0.06, loss=0.03, burst=5.0, overhead=212
     )
+
+
+def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_town: str) -> None:
+    """The row of a cap, by hand."""
+    fleet = load(short_town)
+    egos, errors = scene.egos(short_town, "2"), []
+    for schedule in tables.SCHEDULES:
+        channel = V2X(10, bytes_per_second=200.0, schedule=schedule)
+        seen = observe(fleet, scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
+        errors.append(rt_le(JointFilter()(seen, egos), fleet).T)
+    table = tables.schedules(tight)
+    assert [row[0] for row in rows(table)] == list(tables.CAPS)
+    (row,) = [row for row in rows(table) if row[0] == 200]
+    found = [entry for entry in row if isinstance(entry, Interval)]
+    assert [entry.mean for entry in found[:3]] == pytest.approx([error.mean() for error in errors])
+    gaps = [paired_difference(error, errors[0]) for error in errors[1:]]
+    for gap, wanted in zip(found[3:], gaps, strict=True):
+        assert [gap.mean, gap.low, gap.high] == pytest.approx([wanted.mean, wanted.low, wanted.high])
+        assert gap.mean != 0.0
+    (said,) = [sentence for sentence in study._findings(tight) if sentence.startswith("Heard first")]
+    for schedule, error in zip(tables.SCHEDULES, errors, strict=True):
+        assert f"{schedule} {error.mean():.3g} m" in said
+
+
+def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short_town: str) -> None:
+    """From the card and a track, by hand: 20 rounds of 9 numbers and a loss up and 9 down; a CAM of 350 B and 32 B."""
+    egos = scene.egos(short_town, "2")
+    channel = scene.channel({"channel": "cam", "max_neighbours": 10})
+    seen = observe(load(short_town), scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
+    account = of_track(JointFilter()(seen, egos), seen, JointFilter().message)
+    card = load_weights(WEIGHTS / "fedokf.safetensors").card
+    once = (len(card["history"]) - 1) * 4 * (2 * card["parameters"] + 1)
+    (row,) = [row for row in rows(tables.even(tight)) if row[0] == tables.WORDS["cam"]]
+    assert row[2:] == (round(account.rate()), tables.spoken(once / account.rate()))
+    body = {row[:2]: row[2:] for row in rows(tables.ledger(tight))}
+    assert body["a training, once", "payload, per receiver"] == (None, f"{once / 1e3:,.0f} kB")
+    for kind, way in tables.COUNTS:
+        assert body[tables.WORDS["cam"], f"{kind}, {way}"][0] == round(account.rate(kind, way))
+    assert (tables.WORDS["ideal"], "on air, broadcast") not in body  # it has no air of its own
+
+
+def test_the_load_of_a_channel(tight: Results) -> None:
+    """By hand: 300 x 8 x 350 B x 2.2 Hz of 6 Mb/s."""
+    found = {row[:2]: row[2:] for row in rows(tables.load(tight))}
+    size, town, crowd = found[tables.WORDS["cam"], "alone"]
+    assert size == 350
+    assert crowd == pytest.approx(100 * 300 * 8 * 350 * 2.2 / 6e6)
+    assert town == pytest.approx(crowd * 60 / 300)  # 60 vehicles, none farther than 300 m
+    assert found[tables.WORDS["bsm"], "and a fix"][0] == 244
+    assert (tables.WORDS["ideal"], "alone") not in found

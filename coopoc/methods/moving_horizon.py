@@ -18,7 +18,7 @@ from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .slice import estimate
 from .track import Track
-from .true_time import Seen, arrivals, known_by, seen_steps
+from .true_time import Seen, known_by, seen_steps
 from .window import Window, advance, settle, sweep
 from .window_problem import Road, heights, limited, solution_of, violated, window_problem
 
@@ -86,7 +86,7 @@ class MovingHorizon:
         self, recording: Recording, ego: int, box: Inbox, known: Knowledge, counts: Counter[str]
     ) -> Iterator[Estimate]:
         exact, length = self.exact and known.exact_relative, self.horizon + 1
-        arrival, variance = arrivals(recording, box, self.message), known.process_variance(recording)
+        arrival, variance = box.arrival, known.process_variance(recording)
         counts["fixes came later than the horizon and were dropped"] += self._dropped(recording, box, arrival)
         recent: list[Seen] = []
         window: Window | None = None

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..world.inbox import Inbox, within_cap
+from ..world.inbox import Inbox
 from ..world.recording import Recording
-from ..world.v2x import Message
 from .knowledge import Knowledge
 from .star import StarStep, held_motion, star_steps
 
@@ -30,13 +29,6 @@ class Seen:
     joined: Ints
     arrival: Ints
     sent: Ints
-
-
-def arrivals(recording: Recording, box: Inbox, message: Message) -> Ints:
-    """(R, M) step at which the message of each link of the inbox arrives, -1 if that is never."""
-    size = np.full(len(box.link), message.size(recording.v2x.overhead))
-    arrival = within_cap(recording.arrival[:, box.link], size, recording)
-    return np.where(arrival < len(recording.t), arrival, -1)
 
 
 def seen_steps(recording: Recording, ego: int, box: Inbox, arrival: Ints, known: Knowledge) -> Iterator[Seen]:

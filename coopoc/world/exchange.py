@@ -8,8 +8,8 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from .inbox import within_cap
 from .recording import Recording
+from .schedules import Nearest, Order, RoundRobin, within_cap
 from .v2x import Message
 
 
@@ -46,13 +46,15 @@ class Exchange:
 def exchange(recording: Recording, message: Message) -> Exchange:
     """Contacts of all vehicles when each sends `message` to those that it is in contact with.
 
-    A cap on bytes acts on each receiver as in its inbox: nearest first, those that it does not see itself last.
+    A cap on bytes acts on each receiver as in its inbox: nearest first, those that it does not see itself last, or in
+    turns.
 
     Args:
         recording: observed by all vehicles. message: its size counts against `v2x.bytes_per_second`.
 
     Raises:
-        InputError: the links of some vehicles were not recorded.
+        InputError: the links of some vehicles were not recorded; a cap whose schedule is "most informative": what a
+            belief is worth depends on what others say in the same round.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> from coopoc.world.v2x import Message
@@ -116,12 +118,25 @@ def _receive(recording: Recording, pairs: tuple[Ints, ...], arrivals: tuple[Ints
     vehicles, count = len(recording.ids), len(step)
     arrival, receiver = np.concatenate(arrivals, axis=1), np.concatenate([first, second])
     sizes = np.concatenate([size[step, second], size[step, first]])
-    if np.isfinite(recording.v2x.bytes_per_second):
+    if np.isfinite(recording.v2x.bytes_per_second) and sizes.any():
         own, other = np.concatenate([sight, back]), np.concatenate([back, sight])
         rank = np.where(own >= 0, own, len(recording.links) + other)
-        order = np.lexsort((rank, np.tile(step, 2), receiver))
+        both, sender = np.tile(step, 2), np.concatenate([second, first])
+        order = np.lexsort((rank, both, receiver))
         for mine in np.split(order, np.searchsorted(receiver[order], np.arange(1, vehicles))):
-            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], recording)
+            start = np.searchsorted(both[mine], np.arange(len(recording.t) + 1))
+            heard_by = _order(recording, sender[mine])
+            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], start, recording, heard_by)
         arrivals[0][:], arrivals[1][:] = arrival[:, :count], arrival[:, count:]
     there = (arrival >= 0) & (arrival < len(recording.t))
     return np.stack([np.bincount(receiver, row * sizes, minlength=vehicles) for row in there]).astype(float)
+
+
+def _order(recording: Recording, sender: Ints) -> Order:
+    """The schedule of one receiver of beliefs."""
+    if recording.v2x.schedule == "most informative":
+        raise InputError("schedule", repr(recording.v2x.schedule), "must be 'nearest' or 'round robin' in an exchange",
+                         "Take it with a method of a star, such as the joint filter.")  # fmt: skip
+    if recording.v2x.schedule == "nearest":
+        return Nearest()
+    return RoundRobin(sender, np.full((recording.runs, len(recording.ids)), -1))

@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from .recording import Recording
+from .schedules import order, within_cap
 from .v2x import Message
 
 
@@ -19,6 +20,8 @@ class Inbox:
     Args:
         link: (M,) indices of its links in the Recording, in time order.
         start: (T+1,) link[start[t]:start[t+1]] are the links of step t.
+        arrival: (R, M) step at which the message sent at the link's step arrives, -1 if it is lost, turned away by the
+            cap, or still on its way at the end.
         newest: (R, M) step at which the newest message held was sent, -1 for none.
         fresh: (R, M) True where that message is new since the pair was last linked: a fix may be used once only.
         received_bytes: (R,) over the drive. sent_bytes: bytes that this vehicle broadcasts over the drive.
@@ -26,6 +29,7 @@ class Inbox:
 
     link: Ints
     start: Ints
+    arrival: Ints
     newest: Ints
     fresh: Bools
     received_bytes: Floats
@@ -53,16 +57,18 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     steps = len(recording.t)
     link = recording.links.of(ego)
     at = recording.links.step[link]
-    size = message.size(recording.v2x.overhead)
-    arrival = within_cap(recording.arrival.take(link, axis=1), np.full(len(link), size), recording)
+    start, size = np.searchsorted(at, np.arange(steps + 1)), message.size(recording.v2x.overhead)
+    heard_by = order(recording, ego, link, message)
+    sent = np.full(len(link), size)
+    arrival = within_cap(recording.arrival.take(link, axis=1), sent, start, recording, heard_by)
+    arrival = np.where(arrival < steps, arrival, -1)
     newest, fresh = _held(arrival, at, recording.links.neighbour[link], steps)
     too_old = at - newest > recording.v2x.max_age / recording.dt + 1e-9
     newest[too_old] = -1
     broadcasts = recording.broadcasts[:, ego].sum() if recording.v2x.max_neighbours else 0
-    arrived = (arrival >= 0) & (arrival < steps)
     return Inbox(
-        link, np.searchsorted(at, np.arange(steps + 1)), newest, fresh & ~too_old,
-        received_bytes=arrived.sum(axis=1) * float(size), sent_bytes=float(broadcasts * size),
+        link, start, arrival, newest, fresh & ~too_old,
+        received_bytes=(arrival >= 0).sum(axis=1) * float(size), sent_bytes=float(broadcasts * size),
     )  # fmt: skip
 
 
@@ -82,31 +88,7 @@ def _held(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Ints,
 def _newest_held(arrival: Ints, sent: Ints, steps: int) -> Ints:
     """(R, T) newest sending step among the messages of one pair that have arrived by each step."""
     held = np.full((len(arrival), steps), -1, dtype=np.int64)
-    run, k = np.nonzero((arrival >= 0) & (arrival < steps))
+    run, k = np.nonzero(arrival >= 0)
     np.maximum.at(held, (run, arrival[run, k]), sent[k])
     newest: Ints = np.maximum.accumulate(held, axis=1)
     return newest
-
-
-def within_cap(arrival: Ints, size: Ints, recording: Recording) -> Ints:
-    """Arrivals (R, M) with -1 for what a token bucket of one second's worth turns away.
-
-    Args:
-        arrival: (R, M) steps at one receiver, in order of time and then of preference (nearest first).
-        size: (M,) bytes on air.
-    """
-    cap = recording.v2x.bytes_per_second
-    if not np.isfinite(cap) or not size.any():
-        return arrival
-    kept = arrival.copy()
-    tokens, last = np.zeros(len(arrival)), 0
-    for k in range(arrival.shape[1]):
-        now = int(arrival[:, k].max())
-        if now < 0:
-            continue
-        tokens = np.minimum(tokens + cap * recording.dt * (now - last), max(cap, size[k]))
-        last = now
-        taken = (arrival[:, k] >= 0) & (tokens >= size[k])
-        kept[~taken, k] = -1
-        tokens = tokens - size[k] * taken
-    return kept

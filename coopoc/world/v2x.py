@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ..arrays import AnyArray, Bools, Floats
 from ..errors import InputError
+
+Schedule = Literal["nearest", "round robin", "most informative"]
 
 
 @dataclass(frozen=True)
@@ -30,21 +32,26 @@ class V2X:
     max_age: float = 1.0
     """s, older messages are forgotten: their sender is seen, but nothing is assumed of it."""
     bytes_per_second: float = float("inf")
-    """Cap on what one vehicle receives: messages beyond it are dropped, farthest neighbour first."""
+    """Cap on what one vehicle receives: a token bucket, full at first, that holds one second's worth; messages beyond
+    it are dropped."""
     overhead: int = 0
     """Bytes per message on air beyond the payload (headers, signature)."""
+    schedule: Schedule = "nearest"
+    """Whom a receiver hears first under the cap: "nearest"; "round robin", who waited longest for it; "most
+    informative", whose message lowers the bound of its position most (`coopoc.world.informative`)."""
 
     def __post_init__(self) -> None:
         limits = {"max_neighbours": (0, 1e6, ">= 0"), "radius": (0, np.inf, ">= 0 m"), "rate": (1e-3, 1e4, "> 0 Hz"),
                   "latency": (0, 3600, ">= 0 s"), "loss": (0, 1, "in [0, 1]"), "burst": (1, 1e6, ">= 1 message"),
                   "max_age": (0, 3600, ">= 0 s"),
                   "bytes_per_second": (0, np.inf, ">= 0"), "overhead": (0, 1e6, ">= 0 bytes")}  # fmt: skip
-        for field in fields(self):
-            low, high, words = limits[field.name]
-            value = getattr(self, field.name)
+        if self.schedule not in get_args(Schedule):
+            raise InputError("schedule", repr(self.schedule), f"must be one of {get_args(Schedule)}", "Pick one.")
+        for name, (low, high, words) in limits.items():
+            value = getattr(self, name)
             if value is not None and not low <= value <= high:
-                mend = "Use 0 for no neighbours." if field.name == "max_neighbours" else f"Give V2X({field.name}=...)."
-                raise InputError(field.name, value, f"must be {words}", mend)
+                mend = "Use 0 for no neighbours." if name == "max_neighbours" else f"Give V2X({name}=...)."
+                raise InputError(name, value, f"must be {words}", mend)
         if self.max_neighbours != int(self.max_neighbours):
             raise InputError("max_neighbours", self.max_neighbours, "must be a whole number", "Use an int.")
         object.__setattr__(self, "max_neighbours", int(self.max_neighbours))
@@ -90,6 +97,7 @@ class Message:
         opening: numbers that ride with the first round only, such as the measurements that all rounds work on.
         per_neighbour: numbers more in each round for each neighbour of the sender: a list as long as its neighbourhood.
         unicast: True for a message of its own to each neighbour; False for one broadcast that all neighbours receive.
+        cumulative: True if it sums up the sender's fixes so far, as an estimate does; False for the newest fix.
 
     >>> Message("fix and velocity", 8).payload
     32
@@ -103,6 +111,7 @@ class Message:
     opening: int = 0
     per_neighbour: int = 0
     unicast: bool = False
+    cumulative: bool = False
 
     def __post_init__(self) -> None:
         for field in ("numbers", "rounds", "opening", "per_neighbour"):
@@ -127,9 +136,9 @@ class Message:
 NO_MESSAGE = Message("none", 0, rounds=0)
 FIX_AND_VELOCITY = Message("fix and velocity", 8)
 """GNSS fix (3), velocity (3), id and time (2): LKF-SA's star and the joint filter (methods.md section 3.3)."""
-ESTIMATE = Message("estimate", 8)
+ESTIMATE = Message("estimate", 8, cumulative=True)
 """Position estimate (3), the receiver's own relative measurement is on board; velocity (3), id and time (2)."""
-ESTIMATE_AND_COV = Message("estimate and covariance", 14)
+ESTIMATE_AND_COV = Message("estimate and covariance", 14, cumulative=True)
 """As ESTIMATE with the six numbers of a symmetric covariance (methods.md section 2.2)."""
 
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from coopoc.errors import InputError
+from coopoc.evaluate.ledger import Ledger, of_training
+from coopoc.world.fleet import Fleet
 
 from ..nets.gain import Gain
 from ..nets.stack import unflatten
-from .server import SERVER
+from .server import NUMBER, SERVER
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,23 +90,45 @@ class Federation:
         return unflatten(self.history[number].weights[None], self.model)[0]
 
 
-class Bytes(NamedTuple):
-    """What a client sent and received in a training, bytes."""
+def ledger(federation: Federation, overhead: int = 0) -> Ledger:
+    """Bytes of every client, and of the server if there is one, over all rounds.
 
-    sent: int
-    received: int
-
-
-def ledger(federation: Federation, overhead: int = 0) -> dict[str, Bytes]:
-    """Bytes of every client over all rounds, as `Track.sent_bytes` and `Track.received_bytes` count decisions.
+    What a sender tells several receivers in a round it sends once, the longest; each of them receives its copy.
 
     Args:
         overhead: bytes per message on air beyond the payload, as in `V2X`.
     """
-    found = dict.fromkeys(federation.names, Bytes(0, 0))
+    ends = {name for row in federation.history for pair in row.traffic for name in pair}
+    names = [*federation.names, *sorted(ends - set(federation.names))]
+    moved, messages = np.zeros((2, 2, len(names)))
     for row in federation.history:
+        once: dict[str, int] = {}
         for (sender, receiver), size in row.traffic.items():
-            for name, moved in ((sender, Bytes(size + overhead, 0)), (receiver, Bytes(0, size + overhead))):
-                if name in found:
-                    found[name] = Bytes(found[name].sent + moved.sent, found[name].received + moved.received)
-    return found
+            once[sender] = max(size, once.get(sender, 0))
+            moved[1, names.index(receiver)] += size
+            messages[1, names.index(receiver)] += 1
+        for sender, size in once.items():
+            moved[0, names.index(sender)] += size
+            messages[0, names.index(sender)] += 1
+    servers = [name for name in names if name == SERVER]
+    return of_training(names, moved[0], moved[1], servers, messages, overhead)
+
+
+def card_ledger(card: Mapping[str, Any], drives: Fleet) -> Ledger:
+    """The same of trained weights, from their card: payload, on average over the clients.
+
+    A federation moves the weights both ways in every round; its server may broadcast its own. What is trained in one
+    place needs the raw drives, six float32 per step (noisy fixes and velocities; the reference drive comes on top), and
+    sends the weights back once.
+
+    Args:
+        card: of a `Checkpoint`. drives: of the clients.
+    """
+    if card["settings"]["kind"] == "federated":
+        names, rounds = card["clients"], card["history"][1:]
+        up, down = (np.full(len(names), sum(row[way] for row in rounds) / len(names))
+                    for way in ("sent_bytes", "received_bytes"))  # fmt: skip
+    else:
+        names, up = drives.ids, NUMBER * 6.0 * drives.present.sum(axis=0)
+        down = np.full(len(names), float(NUMBER * card["parameters"]))
+    return of_training([*names, SERVER], [*up, down[0]], [*down, up.sum()], [SERVER])

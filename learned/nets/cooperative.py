@@ -24,7 +24,7 @@ from .noise_net import NoiseNet, tell
 
 NEWEST = Message("fix, velocity and noise", 14)
 """Fix (3), velocity (3), the variance of each (6), id and time (2)."""
-SUMS = Message("sums since departure", 14)
+SUMS = Message("sums since departure", 14, cumulative=True)
 """Motion (3), its variance (3), 1/r (3) and (fix - motion)/r (3), each summed since departure; id and time (2)."""
 
 

@@ -1,0 +1,197 @@
+"""Ledger: the bytes of training and of deciding on one axis, as payload and on air, sent once or per receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import Floats, frozen
+from ..errors import InputError
+from ..methods.track import Track
+from ..world.recording import Recording
+from ..world.v2x import Message
+
+Purpose = Literal["training", "deciding"]
+Kind = Literal["payload", "on air"]
+Way = Literal["broadcast", "per receiver"]
+"""What goes out, each message once; or what comes in, one copy for each receiver, as unicast would carry it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ledger:
+    """Bytes of V participants in R runs, by purpose ("training", "deciding") and kind ("payload", "on air").
+
+    Args:
+        names: (V,) of the participants. servers: those among them that are no vehicles.
+        seconds: (V,) of driving that the bytes of deciding are for; 0 for who has only trained, and for servers.
+        sent: (2, 2, R, V) bytes, purposes x kinds: a message once, whoever hears it.
+        received: (2, 2, R, V) bytes: a message in the account of each receiver.
+
+    Raises:
+        InputError: shapes that do not fit together, a name twice, a server that does not take part.
+
+    >>> both = of_training(["a", "b"], [400.0, 400.0], [200.0, 200.0]) + Ledger.empty(["b"], [10.0])
+    >>> both.per_vehicle("training"), both.seconds.tolist()
+    (200.0, [0.0, 10.0])
+    """
+
+    names: tuple[str, ...]
+    seconds: Floats
+    sent: Floats
+    received: Floats
+    servers: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("seconds", "sent", "received"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        shape = (2, 2, *self.sent.shape[2:3], len(self.names))
+        for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):
+            found = getattr(self, name).shape
+            if found != wanted:
+                raise InputError(name, found, f"must have shape {wanted}", "See the Args of Ledger.")
+        if len(set(self.names)) < len(self.names) or not set(self.servers) <= set(self.names):
+            raise InputError("names", self.names, f"must differ and hold the servers {self.servers}", "Rename them.")
+
+    @classmethod
+    def empty(cls, names: Sequence[str], seconds: npt.ArrayLike = 0.0, runs: int = 1) -> Ledger:
+        """Participants that have moved nothing, in so many seconds of driving."""
+        nothing, drive = np.zeros((2, 2, runs, len(names))), np.broadcast_to(np.asarray(seconds, float), len(names))
+        return cls(tuple(names), drive, nothing, nothing)
+
+    def of(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> Floats:
+        """(R, V) bytes."""
+        array = self.sent if _place(Way, "way", way) == 0 else self.received
+        found: Floats = array[_place(Purpose, "purpose", purpose), _place(Kind, "kind", kind)]
+        return found
+
+    def per_vehicle(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> float:
+        """Bytes of all, servers included, for each vehicle: the mean over runs."""
+        vehicles = len(self.names) - len(self.servers)
+        return float(self.of(purpose, kind, way).sum(axis=1).mean()) / max(vehicles, 1)
+
+    def rate(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
+        """Bytes of deciding per second of driving and vehicle; InputError if nobody has driven."""
+        if not self.seconds.sum() > 0:
+            raise InputError("seconds", self.seconds.tolist(), "must be > 0 for some vehicle", "Add a drive.")
+        return float(self.of("deciding", kind, way).sum(axis=1).mean() / self.seconds.sum())
+
+    def __add__(self, other: Ledger) -> Ledger:
+        """All that both hold, by name: drives of one vehicle come one after the other; one run stands for all."""
+        names = tuple(dict.fromkeys([*self.names, *other.names]))
+        servers = tuple(dict.fromkeys([*self.servers, *other.servers]))
+        runs = {ledger.sent.shape[2] for ledger in (self, other)} - {1}
+        if len(runs) > 1:
+            raise InputError("runs", sorted(runs), "must be the same in both, or one", "Average one of them first.")
+        seconds, moved = np.zeros(len(names)), np.zeros((2, 2, 2, max(runs, default=1), len(names)))
+        for ledger in (self, other):
+            place = [names.index(name) for name in ledger.names]
+            seconds[place] += ledger.seconds
+            moved[0][..., place] += ledger.sent
+            moved[1][..., place] += ledger.received
+        return Ledger(names, seconds, moved[0], moved[1], servers)
+
+
+def of_training(
+    names: Sequence[str], sent: npt.ArrayLike, received: npt.ArrayLike, servers: Sequence[str] = (),
+    messages: npt.ArrayLike = 0.0, overhead: int = 0,
+) -> Ledger:  # fmt: skip
+    """The ledger of a training from payload bytes (V,) sent once and received.
+
+    Args:
+        names: of the participants. servers: those that are no vehicles. messages: (2, V) that each sent and received.
+        overhead: bytes per message on air.
+
+    >>> ledger = of_training(["a", "hub"], [80.0, 40.0], [40.0, 80.0], ["hub"], messages=np.ones((2, 2)), overhead=10)
+    >>> ledger.per_vehicle("training"), ledger.per_vehicle("training", "on air")
+    (120.0, 140.0)
+    """
+    payload = np.array([np.asarray(sent, float), np.asarray(received, float)])
+    kinds = np.stack([payload, payload + overhead * np.asarray(messages, float)], axis=1)[:, :, None]
+    moved = np.stack([kinds, np.zeros_like(kinds)], axis=1)
+    return Ledger(tuple(names), np.zeros(len(names)), moved[0], moved[1], tuple(servers))
+
+
+def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
+    """The ledger of a drive: what the egos of a track broadcast and received.
+
+    Args:
+        track: with its bytes on air. recording: that the track is of. message: of the method.
+
+    Raises:
+        InputError: a message as long as the neighbourhood under an overhead: its payload has no one share of the air.
+
+    >>> from coopoc import Fleet, Gnss, Sensors, observe
+    >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
+    >>> seen = observe(fleet, Sensors())
+    >>> of_track(Gnss()(seen, ["a"]), seen, Gnss().message).rate()
+    0.0
+    """
+    names, overhead = [recording.ids[ego] for ego in track.egos], recording.v2x.overhead
+    return of_drive(names, len(track.t) * recording.dt, track.sent_bytes, track.received_bytes, message, overhead)
+
+
+def break_even(
+    training: Ledger, deciding: Ledger, kind: Kind = "payload", way: Way = "per receiver"
+) -> float:  # fmt: skip
+    """Seconds of driving after which deciding has moved as many bytes per vehicle as the training did; inf for never.
+
+    Args:
+        training, deciding: ledgers; the bytes of the one and the rate of the other are taken. kind, way: counted so in
+            both.
+
+    Raises:
+        InputError: a training without bytes, or a drive of no time.
+
+    >>> drive = of_drive(["a"], 10.0, np.array([[320.0]]), np.array([[1280.0]]), Message("fix", 8), 0)
+    >>> break_even(of_training(["a", "b"], [400.0, 0.0], [0.0, 400.0]), drive)
+    1.5625
+    """
+    bytes_ = training.per_vehicle("training", kind, way)
+    if not bytes_ > 0:
+        raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
+    rate = deciding.rate(kind, way)
+    return bytes_ / rate if rate else float("inf")
+
+
+def payload(on_air: Floats, message: Message, overhead: int) -> Floats:
+    """Of bytes on air, those that the method adds: all messages are of one size.
+
+    Raises:
+        InputError: a message as long as the neighbourhood under an overhead.
+
+    >>> payload(np.array([382.0]), Message("fix", 8), 350)
+    array([32.])
+    """
+    if message.per_neighbour and overhead:
+        raise InputError("message", message.name, "must have one size under an overhead", "Use overhead = 0.")
+    size = message.size(overhead)
+    return on_air * (message.size() / size) if size else on_air
+
+
+def of_drive(
+    names: Sequence[str], seconds: npt.ArrayLike, sent: Floats, received: Floats, message: Message, overhead: int
+) -> Ledger:  # fmt: skip
+    """The ledger of deciding from bytes on air.
+
+    Args:
+        names: of V vehicles. seconds: of driving, one number or (V,). sent, received: (1 or R, V) and (R, V) bytes.
+        message, overhead: what they carry.
+
+    Raises:
+        InputError: as in `of_track`.
+    """
+    moved = np.zeros((2, 2, 2, len(received), len(names)))
+    for k, on_air in enumerate((sent, received)):
+        moved[k, 1] = payload(on_air, message, overhead), on_air
+    return Ledger(tuple(names), np.broadcast_to(np.asarray(seconds, float), len(names)), moved[0], moved[1])
+
+
+def _place(allowed: object, name: str, value: str) -> int:
+    known = get_args(allowed)
+    if value not in known:
+        raise InputError(name, repr(value), f"must be one of {known}", "Pick one.")
+    return known.index(value)

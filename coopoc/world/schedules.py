@@ -1,0 +1,114 @@
+"""Schedules: whom a receiver hears first when its token bucket does not hold enough for all that arrives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from .informative import MostInformative
+from .recording import Recording
+from .v2x import Message
+
+
+class Order(Protocol):
+    """What one receiver thinks of the messages (R, M) that are sent to it, as it hears one after the other."""
+
+    def see(self, step: int, span: slice) -> None:
+        """Take note of a step, before any message of it; `span` are the messages sent at it."""
+
+    def worth(self, step: int, span: slice) -> Floats:
+        """(R, n) of the messages of a step: the largest is heard next, of equals the first."""
+
+    def hear(self, step: int, run: Ints, message: Ints) -> None:
+        """Take note that `message[i]` of this step is heard in `run[i]`."""
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """In the order in which messages are given: nearest first."""
+
+    def see(self, step: int, span: slice) -> None:
+        """Nothing changes."""
+
+    def worth(self, step: int, span: slice) -> Floats:
+        """The first is worth most."""
+        return -np.arange(span.stop - span.start, dtype=float)[None]
+
+    def hear(self, step: int, run: Ints, message: Ints) -> None:
+        """Nothing changes."""
+
+
+@dataclass(frozen=True, eq=False)
+class RoundRobin:
+    """In turns: who has waited longest for this receiver is next; who was never heard comes first.
+
+    Args:
+        sender: (M,) columns. last: (R, N) step at which each was heard last, -1 for never.
+    """
+
+    sender: Ints
+    last: Ints
+
+    def see(self, step: int, span: slice) -> None:
+        """Nothing changes."""
+
+    def worth(self, step: int, span: slice) -> Floats:
+        """Steps since each was heard."""
+        return (step - self.last[:, self.sender[span]]).astype(float)
+
+    def hear(self, step: int, run: Ints, message: Ints) -> None:
+        """Those that are heard go to the end of the queue."""
+        self.last[run, self.sender[message]] = step
+
+
+def order(recording: Recording, ego: int, link: Ints, message: Message) -> Order:
+    """The schedule of one receiver before it has heard anything.
+
+    Args:
+        ego: its column. link: (M,) links of the recording over which messages come, by step, nearest first.
+        message: what they are.
+    """
+    if recording.v2x.schedule == "nearest":
+        return Nearest()
+    runs, vehicles = recording.runs, len(recording.ids)
+    last = np.full((runs, vehicles), -1)
+    if recording.v2x.schedule == "round robin":
+        return RoundRobin(recording.links.neighbour[link], last)
+    return MostInformative.at_first(recording, ego, link, message.cumulative)
+
+
+def within_cap(arrival: Ints, size: Ints, start: Ints, recording: Recording, heard_by: Order) -> Ints:
+    """Arrivals (R, M) with -1 for what a token bucket turns away.
+
+    The bucket holds what one second brings, or the largest message if that is more; it is full at the first step, as in
+    RFC 2697 (section 3), and it fills by `bytes_per_second` times dt a step. A message that arrives is heard if there
+    are tokens for all of it; of those that arrive together the schedule takes one after the other.
+
+    Args:
+        arrival: (R, M) steps at one receiver, by sending step and then nearest first; those of one sending step arrive
+            together. size: (M,) bytes on air. start: (T+1,) start[t]:start[t+1] are sent at step t.
+        heard_by: the schedule of this receiver.
+    """
+    cap = recording.v2x.bytes_per_second
+    if not np.isfinite(cap) or not size.any():
+        return arrival
+    kept, depth = np.full_like(arrival, -1), max(cap, int(size.max())) if cap else 0.0
+    tokens, last = np.full(len(arrival), float(depth)), 0
+    for t, span in enumerate(map(slice, start[:-1].tolist(), start[1:].tolist())):
+        heard_by.see(t, span)
+        left = arrival[:, span] >= 0
+        if not left.any():
+            continue
+        now = int(arrival[:, span].max())
+        tokens, last = np.minimum(tokens + cap * recording.dt * (now - last), depth), now
+        while (fits := left & (size[span] <= tokens[:, None] + 1e-9)).any():
+            run = np.flatnonzero(fits.any(axis=1))
+            best = np.where(fits, heard_by.worth(t, span), -np.inf)[run].argmax(axis=1)
+            heard_by.hear(t, run, span.start + best)
+            left[run, best] = False
+            kept[run, span.start + best] = arrival[run, span.start + best]
+            tokens[run] -= size[span.start + best]
+    return kept
