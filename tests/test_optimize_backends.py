@@ -282,13 +282,23 @@ def test_no_backend_can_flatter_itself(monkeypatch: pytest.MonkeyPatch, dense: R
     assert solution.gradient > 0.01
 
 
+def test_osqp_ends_the_same_whatever_it_solved_before(dense: Recording) -> None:
+    """A workspace belongs to one call, and what the structures share is not written to."""
+    near, far = (Problem.from_snapshot(dense, step, 0, run=None) for step in (10, 11))
+    first = solve_batch(near, "osqp")
+    solve_batch(far, "osqp")
+    again = solve_batch(near, "osqp")
+    assert np.array_equal(first.x, again.x)
+    assert np.array_equal(first.covariance, again.covariance)
+
+
 def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
     problem = Problem.from_window(dense, 20, 0, 5)
-    from coopoc.optimize.backends import osqp_
+    from coopoc.optimize.backends import osqp_programme
 
-    loose = {**osqp_.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
+    loose = {**osqp_programme.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(osqp_, "SETTINGS", loose)
+        patch.setattr(osqp_programme, "SETTINGS", loose)
         solution = solve(problem, "osqp", throw=False)
     assert solution.extras["repairs"] > 0
 

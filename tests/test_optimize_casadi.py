@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, measurement, pose, solve
-from coopoc.optimize.backends import casadi_
-from coopoc.optimize.backends.casadi_ import programme
+from coopoc.optimize.backends import casadi_programme
+from coopoc.optimize.backends.casadi_programme import programme
 from coopoc.world.recording import Recording
 
 METHODS = ["ipopt", "sqp"]
@@ -175,6 +176,16 @@ def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
         assert programme.cache_info().misses == before + 1
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_threads_that_share_a_programme_do_not_disturb_each_other(dense: Recording, method: str) -> None:
+    """Each solve has its own memory of CasADi's solver: the bits are those of one after the other."""
+    problems = [Problem.from_snapshot(dense, step, 0, run) for step in (10, 11, 12, 13) for run in (0, 1)]
+    alone = [solve(problem, "casadi", method=method).x for problem in problems]
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda problem: solve(problem, "casadi", method=method).x, problems * 3)
+        assert all(np.array_equal(x, alone[k % len(problems)]) for k, x in enumerate(found))
+
+
 def test_a_kind_of_the_same_name_is_another_structure() -> None:
     """A formula that is registered anew must not meet the programme of the old one."""
     found = []
@@ -241,7 +252,7 @@ def test_compiled_and_interpreted_programmes_agree(monkeypatch: pytest.MonkeyPat
     compiled = solve(problem, "casadi", method=method, codegen=True)
     assert compiled.x == pytest.approx(solve(problem, "casadi", method=method).x, abs=1e-12)
     assert programme.cache_info().misses == 2
-    monkeypatch.setattr(casadi_.shutil, "which", lambda name: None)
+    monkeypatch.setattr(casadi_programme.shutil, "which", lambda name: None)
     programme.cache_clear()
     with pytest.raises(InputError, match="needs gcc"):
         solve(problem, "casadi", method=method, codegen=True)

@@ -7,14 +7,29 @@ group per neighbour's chain. One Schur complement serves both, batched in LAPACK
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..kernels.compile import use_kernels
 from .linear import opposite
 from .normal import Pattern, pattern
 from .problem import Problem
+
+Part: TypeAlias = tuple[tuple[Ints, ...], tuple[Ints, ...]]
+
+
+class Star(NamedTuple):
+    """A hub of one point and groups of one: what `coopoc.kernels.star` takes."""
+
+    hub: int
+    others: Ints
+    corner: int
+    head: Ints
+    arm: Ints
+    turned: Bools
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,15 +38,28 @@ class Arrow:
 
     Args:
         hub: (h,) points. group: (G, s) points, -1 where a group is smaller.
-        corner, arm, head: source block and destination (group, row, column) of the three parts; block (j, i) is that of
-            (i, j) turned over, the last of the numbers says so.
+        corner, arm, head: source block and destination (group, row, column) of the three parts, first of the blocks
+            (i, j) that are taken as they are, then of those (j, i) that are turned over.
     """
 
     hub: Ints
     group: Ints
-    corner: tuple[Ints, ...]
-    arm: tuple[Ints, ...]
-    head: tuple[Ints, ...]
+    corner: Part
+    arm: Part
+    head: Part
+
+    @cached_property
+    def star(self) -> Star | None:
+        """The same in short, if it is one whose nodes are all measured."""
+        own = len(self.corner[0][0]), len(self.head[0][0])
+        if len(self.hub) != 1 or self.group.shape[1] != 1 or own != (1, len(self.group)):
+            return None
+        head, arm = np.empty(len(self.group), np.int64), np.full(len(self.group), -1)
+        turned = np.zeros(len(self.group), bool)
+        head[self.head[0][1]] = self.head[0][0]
+        for over, (source, group, *_) in enumerate(self.arm):
+            arm[group], turned[group] = source, bool(over)
+        return Star(int(self.hub[0]), self.group[:, 0].copy(), int(self.corner[0][0][0]), head, arm, turned)
 
 
 def structure(problem: Problem) -> tuple[Pattern, Arrow]:
@@ -66,14 +94,14 @@ def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
     i, j = scheme.pairs.T
     row, col = np.concatenate([scheme.pairs, scheme.pairs[i != j][:, ::-1]]).T
     source = np.concatenate([np.arange(len(i)), np.flatnonzero(i != j)])
-    turned = (np.arange(len(source)) >= len(i)).astype(np.int64)
-    in_hub = label < 0
+    turned, in_hub = np.arange(len(source)) >= len(i), label < 0
 
-    def part(chosen: Bools) -> tuple[Ints, ...]:
-        return source[chosen], label[row[chosen]], place[row[chosen]], place[col[chosen]], turned[chosen]
+    def part(chosen: Bools) -> Part:
+        kept = [np.flatnonzero(chosen & over) for over in (~turned, turned)]
+        straight, over = ((source[k], np.maximum(label[row[k]], 0), place[row[k]], place[col[k]]) for k in kept)
+        return straight, over
 
-    corner = part(in_hub[row] & in_hub[col])
-    return Arrow(hub, group, (corner[0], 0 * corner[1], *corner[2:]),
+    return Arrow(hub, group, part(in_hub[row] & in_hub[col]),
                  part(~in_hub[row] & in_hub[col]), part(~in_hub[row] & ~in_hub[col]))  # fmt: skip
 
 
@@ -96,13 +124,13 @@ def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Float
     """Corner (B, dh, dh), arms (B, G, ds, dh) and heads (B, G, ds, ds), damping added to the diagonal; d is dof."""
     batch, d, h, (count, size) = len(blocks), blocks.shape[-1], len(frame.hub), frame.group.shape
 
-    def fill(part: tuple[Ints, ...], groups: int, rows: int, cols: int) -> Floats:
+    def fill(part: Part, groups: int, rows: int, cols: int) -> Floats:
         out = np.zeros((batch, groups, rows, d, cols, d))
-        source, group, row, col, turned = part
-        inside = np.swapaxes(out, 3, 4)
-        straight, over = turned == 0, turned == 1
-        inside[:, group[straight], row[straight], col[straight]] = blocks[:, source[straight]]
-        inside[:, group[over], row[over], col[over]] = np.swapaxes(blocks[:, source[over]], -1, -2)
+        (source, group, row, col), (turned, *over) = part
+        inside = out.swapaxes(3, 4)
+        inside[:, group, row, col] = blocks[:, source]
+        if len(turned):
+            inside[:, over[0], over[1], over[2]] = blocks[:, turned].swapaxes(-1, -2)
         return out.reshape(batch, groups, d * rows, d * cols)
 
     corner = fill(frame.corner, 1, h, h)[:, 0]
@@ -131,7 +159,7 @@ def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -
     there = frame.group >= 0
     side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
     reduced = np.linalg.solve(head, np.concatenate([arm, side], axis=-1))
-    taken = np.swapaxes(arm, -1, -2) @ reduced
+    taken = arm.swapaxes(-1, -2) @ reduced
     schur = corner - taken[..., :-1].sum(axis=1)
     hub = np.linalg.solve(schur, taken[..., -1:].sum(axis=1) - pull)
     rest = -(reduced[..., -1:] + reduced[..., :-1] @ hub[:, None])
@@ -140,26 +168,31 @@ def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -
     return dx
 
 
-def marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+def marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool = False) -> tuple[Floats, Floats]:
     """(B, n, dof, dof) diagonal blocks of (J^T J)^-1, and dx (B, n, dof) of J^T J dx = -gradient.
+
+    Args:
+        many: as of a Linear.
 
     Raises:
         numpy.linalg.LinAlgError: a singular block.
     """
     batch, d, n = len(blocks), blocks.shape[-1], len(frame.hub) + int((frame.group >= 0).sum())
+    if many and frame.star is not None and use_kernels():
+        return _compiled(frame.star, blocks, gradient)
     corner, arm, head = _parts(frame, blocks, np.zeros((batch, n, d)))
     cov = np.empty((batch, n, d, d))
     dx, pull = np.empty_like(gradient), gradient[:, frame.hub].reshape(batch, -1, 1)
     if not frame.group.size:
-        hub = _inverse(corner)
+        hub = _inverse(corner, many)
         cov[:, frame.hub], dx[:, frame.hub] = _own(hub, d), -(hub @ pull).reshape(batch, -1, d)
         return cov, dx
     there = frame.group >= 0
     side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
-    inverse = _inverse(head)
+    inverse = _inverse(head, many)
     reduced = inverse @ arm
-    hub = _inverse(corner - (np.swapaxes(arm, -1, -2) @ reduced).sum(axis=1))
-    turned = np.swapaxes(reduced, -1, -2)
+    hub = _inverse(corner - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1), many)
+    turned = reduced.swapaxes(-1, -2)
     step = hub @ ((turned @ side).sum(axis=1) - pull)
     cov[:, frame.hub], dx[:, frame.hub] = _own(hub, d), step.reshape(batch, -1, d)
     rest = inverse @ side + reduced @ step[:, None]
@@ -169,13 +202,24 @@ def marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, F
     return cov, dx
 
 
-def _inverse(matrix: Floats) -> Floats:
-    """Of symmetric (..., m, m); 3x3 by cofactors, which are found for all at once: twenty times faster than by LAPACK.
+def _compiled(star: Star, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+    """`marginals` of a star by the kernel; LinAlgError as there."""
+    from ..kernels.star import star_marginals
+
+    d = blocks.shape[-1]
+    cov, dx = np.empty((*gradient.shape, d)), np.empty_like(gradient)
+    if not star_marginals(*star, blocks, gradient, cov, dx, (0,) * d).all():
+        raise np.linalg.LinAlgError("a block is not positive definite")
+    return cov, dx
+
+
+def _inverse(matrix: Floats, many: bool) -> Floats:
+    """Of symmetric (..., m, m); many 3x3 by cofactors, found for all at once: twenty times faster than by LAPACK.
 
     Raises:
         numpy.linalg.LinAlgError: a singular one.
     """
-    if matrix.shape[-1] != 3:
+    if matrix.shape[-1] != 3 or not many:
         return np.linalg.inv(matrix)
     (a, b, c), (_, d, e), (*_, f) = np.moveaxis(matrix, (-2, -1), (0, 1))
     first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
@@ -189,6 +233,8 @@ def _inverse(matrix: Floats) -> Floats:
 def _own(matrix: Floats, d: int) -> Floats:
     """(..., m, d, d) diagonal blocks of (..., dm, dm)."""
     m = matrix.shape[-1] // d
+    if m == 1:
+        return matrix[..., None, :, :]
     split = matrix.reshape(*matrix.shape[:-2], m, d, m, d)
     at = np.arange(m)
     return np.moveaxis(split[..., at, :, at, :], 0, -3)

@@ -68,7 +68,7 @@ def solve_batch(problem: Problem, backend: str = "gauss-newton", **options: Any)
         end = run(part)
         linear = part.linearise(end.x)
         blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in part.factors])
-        cov, left = _marginals(frame, blocks, gradient)
+        cov, left = _marginals(frame, blocks, gradient, linear.many)
         sound = bounded(scheme, blocks, cov)
         cov[~sound] = np.nan
         there = end.converged | (np.abs(left).max(axis=(1, 2)) <= POSITION_TOLERANCE)
@@ -107,12 +107,12 @@ def _claimed(module: Any, part: Problem, options: dict[str, Any]) -> Descent:
     return Descent(found, np.array([each.iterations for each in ended]), np.zeros(len(found), dtype=bool))
 
 
-def _marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
+def _marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool) -> tuple[Floats, Floats]:
     """Marginals and Gauss-Newton steps of the realisations, NaN where one is singular."""
     try:
-        return marginals(frame, blocks, gradient)
+        return marginals(frame, blocks, gradient, many)
     except np.linalg.LinAlgError:
         if len(blocks) == 1:
             return np.full((*gradient.shape, blocks.shape[-1]), np.nan), np.full_like(gradient, np.nan)
-        each = [_marginals(frame, *(a[None] for a in pair)) for pair in zip(blocks, gradient, strict=True)]
+        each = [_marginals(frame, a[None], b[None], many) for a, b in zip(blocks, gradient, strict=True)]
         return np.concatenate([cov for cov, _ in each]), np.concatenate([dx for _, dx in each])

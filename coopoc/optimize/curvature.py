@@ -15,6 +15,8 @@ from .problem import Problem
 
 STEP = 1e-4
 """Of the vector's length: the second derivative is a central difference of the exact first."""
+SMALL = 60
+"""Nodes up to which a dense factorisation tells faster."""
 SLACK = 1e-6
 """Share of the diagonal by which the curvature may be negative: a flat minimum is one, whatever the rounding."""
 
@@ -33,7 +35,13 @@ def is_minimum(problem: Problem, x: Floats) -> bool:
     true = true_blocks(problem, linear)
     own = scheme.pairs[:, 0] == scheme.pairs[:, 1]
     true[own] += SLACK * flat[own] * np.eye(problem.space.dof)
-    return pivots(matrix(scheme, true)) is not None
+    if len(x) > SMALL:
+        return pivots(matrix(scheme, true)) is not None
+    try:
+        np.linalg.cholesky(dense(scheme, true))
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(true).all())
 
 
 def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
@@ -71,18 +79,19 @@ def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats
     count, dof = len(factor.nodes), problem.space.dof
     local, bare = x[factor.nodes], unchecked(factor, loss=None)
     reach = STEP * np.maximum(np.linalg.norm(problem.space.position(local[:, -1] - local[:, 0] * pair), axis=-1), 1e-3)
-    columns = [np.empty((count, len(slopes) * dof, dof)) for _ in slopes]
-    for node in range(len(slopes)):
-        moved = factor.nodes.shape[1] - len(slopes) + node
+    size = np.where(np.arange(dof)[:, None] < problem.dimension, reach, STEP)
+    arity, columns = factor.nodes.shape[1], []
+    for moved in range(arity - len(slopes), arity):
+        step = np.zeros((2, dof, count, arity, dof))
         for c in range(dof):
-            size = np.where(c < problem.dimension, reach, STEP)
-            up, down = (_pulls(problem, bare, local, moved, c, sign * size) for sign in (1.0, -1.0))
-            moves = 1.0 if problem.free is None else problem.free[factor.nodes[:, moved], c][:, None]
-            columns[node][:, :, c] = moves * (up - down) / (2.0 * size[:, None])
-    whole: Floats = np.concatenate(columns, axis=2)
+            step[:, c, :, moved, c] = size[c], -size[c]
+        up, down = _pulls(problem, bare, local, step.reshape(2 * dof, count, arity, dof)).reshape(2, dof, count, -1)
+        by = (up - down) / (2.0 * size[:, :, None])
+        columns.append(by if problem.free is None else by * problem.free[factor.nodes[:, moved]].T[:, :, None])
+    whole: Floats = np.concatenate(columns).transpose(1, 2, 0)
     whole = 0.5 * (whole + np.swapaxes(whole, 1, 2))
     if factor.loss is not None:
-        whole = _bent(problem, factor, whole, x, _pulls(problem, bare, local, 0, 0, np.zeros(count)))
+        whole = _bent(problem, factor, whole, x, _pulls(problem, bare, local, np.zeros((1, count, arity, dof)))[0])
     if not pair or opposed:
         return [whole[None]]
     first, second, between = whole[:, :dof, :dof], whole[:, dof:, dof:], whole[:, :dof, dof:]
@@ -102,23 +111,22 @@ def _bent(problem: Problem, factor: Factor, whole: Floats, x: Floats, pull: Floa
     return factor.loss.weight(square)[:, None, None] * whole + 2.0 * factor.loss.bend(square)[:, None, None] * outer
 
 
-def _pulls(problem: Problem, factor: Factor, local: Floats, node: int, coordinate: int, size: Floats) -> Floats:
-    """(M, nodes * dof) gradient of each measurement's own cost when one coordinate of one of its nodes is moved.
+def _pulls(problem: Problem, factor: Factor, local: Floats, step: Floats) -> Floats:
+    """(S, M, nodes * dof) gradient of each measurement's own cost after S steps (S, M, arity, dof) of its nodes.
 
     Every measurement gets nodes of its own, so that one call moves them all.
     """
     space, (count, arity) = problem.space, factor.nodes.shape
-    step = np.zeros((count, arity, space.dof))
-    step[:, node, coordinate] = size
     nodes = np.arange(count * arity).reshape(count, arity)
     free = None if problem.free is None else problem.free[factor.nodes].reshape(count * arity, -1)
     alone = unchecked(factor, nodes=nodes)
     with np.errstate(all="ignore"):
-        moved = linearise(space, [alone], free, space.retract(local, step).reshape(1, count * arity, -1))
+        moved = linearise(space, [alone], free, space.retract(local, step).reshape(len(step), count * arity, -1))
     slopes, residual = moved.slope[0], moved.residual[0]
     if len(slopes) > 1 and opposite(factor, problem.free):
         slopes = slopes[1:]
-    return np.concatenate([(np.swapaxes(s, -1, -2) @ residual[..., None])[0, :, :, 0] for s in slopes], axis=1)
+    pulls = [(np.swapaxes(s, -1, -2) @ residual[..., None])[..., 0] for s in slopes]
+    return np.concatenate(pulls, axis=-1)
 
 
 def pivots(matrix: Any) -> Any:
@@ -134,6 +142,16 @@ def pivots(matrix: Any) -> Any:
         return None
     symmetric = np.array_equal(factored.perm_r, factored.perm_c)
     return factored if symmetric and (factored.U.diagonal() > 0).all() else None
+
+
+def dense(scheme: Pattern, blocks: Floats) -> Floats:
+    """The matrix (n dof, n dof) of symmetric blocks (P, dof, dof)."""
+    n, dof = scheme.nodes, blocks.shape[-1]
+    whole = np.zeros((n, n, dof, dof))
+    i, j = scheme.pairs.T
+    whole[j, i] = blocks.swapaxes(-1, -2)
+    whole[i, j] = blocks
+    return whole.swapaxes(1, 2).reshape(n * dof, n * dof)
 
 
 def matrix(scheme: Pattern, blocks: Floats) -> Any:

@@ -68,7 +68,8 @@ def descend(
             trial = now.linearise(problem.space.retract(linear.x, dx))
             small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
             better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
-        mu[active] = _damping(mu[active], better, linear.cost, trial.cost, _promised(problem, linear, dx))
+        promised = trial.cost if problem.linear else _promised(problem, linear, dx)
+        mu[active] = _damping(mu[active], better, linear.cost, trial.cost, promised)
         best[active[better]] = trial.x[better]
         done[active[better & small]] = True
         going = ~(better & small) & (mu[active] < GIVE_UP)

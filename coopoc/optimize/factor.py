@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import InitVar, dataclass, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -71,17 +72,17 @@ class Factor:
         """What the factor measures."""
         return lookup(self.kind)
 
-    @property
+    @cached_property
     def dimension(self) -> int | None:
         """2 or 3, or None if the kind's z looks the same in both."""
         return fitting(self.measurement, self.z.shape[-1])
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Residuals per measurement."""
         return self.measurement.size(self.dimension or 3)
 
-    @property
+    @cached_property
     def batch(self) -> int | None:
         """B, or None for a single realisation."""
         sizes = {len(a) for a, rank in ((self.z, 3), (self.std, 3), (self.sqrt_information, 4))
@@ -93,21 +94,26 @@ class Factor:
     @property
     def informative(self) -> Bools:
         """(M,) or (B, M) True where the measurement says anything at all."""
-        says = np.isfinite(self.std) if self.std is not None else (self.root != 0).any(axis=-1)
-        informative: Bools = np.broadcast_to(says.any(axis=-1), (*says.shape[:-2], len(self.nodes)))
-        return informative
+        if self.std is not None:
+            says = np.isfinite(self.std).any(axis=-1)
+        else:
+            assert self.sqrt_information is not None
+            says = (self.sqrt_information != 0).any(axis=(-2, -1))
+        return np.asarray(says if says.shape[-1] == len(self.nodes) else says.repeat(len(self.nodes), axis=-1))
 
     @property
     def root(self) -> Floats:
         """W as (M, size, size), or (B, M, size, size)."""
         size = self.size
         if self.std is not None:
-            wide = np.broadcast_to(self.std, (*self.std.shape[:-2], len(self.nodes), size))
-            root = np.zeros((*wide.shape, size))
-            root[..., range(size), range(size)] = 1.0 / wide
-            return root
+            root = np.zeros((*self.std.shape[:-2], len(self.nodes), size * size))
+            root[..., :: size + 1] = 1.0 / self.std
+            return root.reshape(*root.shape[:-1], size, size)
         assert self.sqrt_information is not None
-        return np.broadcast_to(self.sqrt_information, (*self.sqrt_information.shape[:-3], len(self.nodes), size, size))
+        root = self.sqrt_information
+        if root.shape[-3] == len(self.nodes):
+            return root
+        return np.broadcast_to(root, (*root.shape[:-3], len(self.nodes), size, size))
 
     def whiten(self, residual: Floats) -> Floats:
         """W residual (..., M, size)."""

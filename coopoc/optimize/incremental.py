@@ -75,8 +75,9 @@ class FixedLag:
         self.lag, self.passes = lag, passes
         self._smoother: Any = gtsam.IncrementalFixedLagSmoother(lag, params)
         self._keys: dict[str, int] = {}
-        self._shape: dict[str, tuple[int, bool]] = {}
+        self._turns: dict[str, bool] = {}
         self._stamps: dict[str, float] = {}
+        self._dimension: int | None = None
         self._count = count()
 
     @property
@@ -99,77 +100,78 @@ class FixedLag:
                 older than the window, a node that changes its kind, nodes that the measurements leave free.
         """
         before = self._stamps
-        fresh = self._check(piece, stamps, before)
+        posed = which_turn(piece)
+        fresh = self._check(piece, stamps, before, posed)
         said = forms(piece)
         rest = [f for f, form in enumerate(said) if isinstance(form, str)]
-        old = np.array([i for i, name in enumerate(piece.names) if name in before], dtype=np.int64)
-        x = self._geometry(piece, old, rest)
-        posed = which_turn(piece)
+        x = self._geometry(piece, rest)
+        self._dimension = piece.dimension
         for i in fresh:
             self._keys[piece.names[i]] = next(self._count)
-            self._shape[piece.names[i]] = piece.dimension, posed[i]
+            self._turns[piece.names[i]] = posed[i]
         keys = [self._keys[name] for name in piece.names]
         graph = native_graph(piece, said, keys).graph
         for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
         entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
-        moments = {self._keys[name]: float(at) for name, at in stamps.items()}
-        self._advance(graph, entering, moments)
-        self._forget(stamps)
+        moved = {name: float(at) for name, at in stamps.items()}
+        self._advance(graph, entering, {self._keys[name]: at for name, at in moved.items()})
+        self._stamps |= moved
+        self._forget()
         return self.estimate(wanted)
 
     def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
         """The nodes `wanted` of the window, by name; default those that have the newest stamp."""
         stamps = self._stamps
-        newest = max(stamps.values(), default=0.0)
-        names = tuple(wanted if wanted is not None else (name for name, at in stamps.items() if at == newest))
+        if wanted is None:
+            newest = max(stamps.values(), default=0.0)
+            wanted = [name for name, at in stamps.items() if at == newest]
+        names = tuple(wanted)
         for name in names:
             if name not in stamps:
                 raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", "See stamps.")
-        turning = any(self._shape[name][1] for name in names)
-        return self._read(names, Space(self._shape[names[0]][0] if names else 3, turning))
+        return self._read(names, Space(self._dimension or 3, any(self._turns[name] for name in names)))
 
-    def _forget(self, stamps: Mapping[str, float]) -> None:
+    def _forget(self) -> None:
         """What the smoother has marginalised, by its own rule; asking it for all its moments takes longer."""
-        self._stamps.update((name, float(at)) for name, at in stamps.items())
         last = max(self._stamps.values(), default=0.0) - self.lag
         for name in [name for name, at in self._stamps.items() if at < last]:
-            del self._stamps[name], self._keys[name], self._shape[name]
+            del self._stamps[name], self._keys[name], self._turns[name]
 
     def _read(self, names: tuple[str, ...], space: Space) -> Estimates:
-        keys, posed = [self._keys[name] for name in names], [self._shape[name][1] for name in names]
+        keys, posed = [self._keys[name] for name in names], [self._turns[name] for name in names]
         x = estimate(space, posed, self._smoother.calculateEstimate(keys), keys)
         cov = [self._smoother.marginalCovariance(key) for key in keys]
         if space.turning:
             cov = [t @ each @ t.T for t, each in zip(tangent(space, posed, x), cov, strict=True)]
         return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
 
-    def _check(self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float]) -> list[int]:
+    def _check(
+        self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float], posed: Sequence[bool]
+    ) -> list[int]:
         """Indices of the new nodes; InputError as `update`."""
         for field, given in (("batch", piece.batch), ("held", piece.held), ("constraints", piece.constraints)):
             if given:
                 mend = "Pick one realisation; hold a node with a position or pose factor of small std."
                 raise InputError("piece", f"with {field} {given}", f"must have no {field}", mend)
-        dimensions = {shape[0] for shape in self._shape.values()} | {piece.dimension}
-        if len(dimensions) > 1:
+        if self._dimension not in (None, piece.dimension):
             mend = "Use one smoother per dimension."
             raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", mend)
-        known = {*piece.names, *before}
-        newest = max([*before.values(), *stamps.values()], default=0.0)
+        own, newest = {*piece.names}, max([*before.values(), *stamps.values()], default=0.0)
         for name, at in stamps.items():
-            if name not in known or not newest - self.lag <= at < np.inf:
+            if not (name in own or name in before) or not newest - self.lag <= at < np.inf:
                 mend = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
                 raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", mend)
-        for i, name in enumerate(piece.names):
-            if name not in before and name not in stamps:
-                mend = "Give a new node its moment; a node that has left the window cannot be measured any more."
-                raise InputError("stamps", f"none of {name!r}", "must have every new node", mend)
-            if name in before and self._shape[name] != (piece.dimension, i in piece.poses):
+        for name in [name for name in piece.names if name not in before and name not in stamps]:
+            mend = "Give a new node its moment; a node that has left the window cannot be measured any more."
+            raise InputError("stamps", f"none of {name!r}", "must have every new node", mend)
+        for name, turns in zip(piece.names, posed, strict=True):
+            if self._turns.get(name, turns) != turns:
                 raise InputError("piece", repr(name), "must stay the point or pose that it was", "Name it in poses.")
         return [i for i, name in enumerate(piece.names) if name not in before]
 
-    def _geometry(self, piece: Problem, old: Ints, rest: Sequence[int]) -> Floats:
-        """(n, width) where the piece is linearised: its most probable nodes given the marginals of the `old` ones.
+    def _geometry(self, piece: Problem, rest: Sequence[int]) -> Floats:
+        """(n, width) where the piece is linearised: its most probable nodes given the marginals of those of the window.
 
         Of converted measurements that is their linear solution; of others, the `rest`, one Gauss-Newton step from x0.
         Where all is linear any will do.
@@ -180,6 +182,7 @@ class FixedLag:
         if piece.linear:
             return np.asarray(somewhere(piece)[0])
         prior = piece
+        old = np.array([i for i, name in enumerate(piece.names) if name in self._stamps], dtype=np.int64)
         if len(old):
             was = self._read(tuple(piece.names[i] for i in old), piece.space)
             if x0 is not None:

@@ -52,7 +52,7 @@ def initial_guess(problem: Problem) -> Floats:
 
 
 def somewhere(problem: Problem) -> Floats:
-    """(B, n, width): x0, or all points in the middle of the fixes, which is near enough for a linear problem.
+    """(B, n, width): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
 
     Raises:
         InputError: poses without an x0.
@@ -60,8 +60,12 @@ def somewhere(problem: Problem) -> Floats:
     if problem.x0 is not None or problem.poses:
         return initial_guess(problem)
     x = np.zeros((problem.batch or 1, len(problem.names), problem.dimension))
-    middle = [f.z.mean(axis=-2, keepdims=True) for f in problem.factors if f.kind == "position"]
-    return x + middle[0] if middle else x
+    fixes = [f for f in problem.factors if f.kind == "position"]
+    if fixes:
+        x[:] = fixes[0].z[..., :1, :]
+    for f in fixes:
+        x[:, f.nodes[:, 0]] = f.z
+    return x
 
 
 def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 import numpy.typing as npt
 
@@ -36,6 +38,7 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(array)))
 
 
+@lru_cache(maxsize=256)
 def fitting(known: Measurement, given: int) -> int | None:
     """The dimension whose z has `given` numbers; None if both have; InputError if none has."""
     fits = [d for d in (2, 3) if (d == 3 or known.plane is not None) and known.given(d) == given]

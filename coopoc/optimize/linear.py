@@ -23,18 +23,20 @@ class Linear:
 
     Args:
         x: (B, n, width). residual: per factor (B, M, size). slope: per factor and node (B or 1, M or 1, size, dof).
-        cost: (B,) 1/2 sum of rho.
+        cost: (B,) 1/2 sum of rho. many: of a problem with realisations, whose normal equations kernels may compute; how
+            many take part must not decide that, since a realisation's digits shall not depend on the others.
     """
 
     x: Floats
     residual: tuple[Floats, ...]
     slope: tuple[tuple[Floats, ...], ...]
     cost: Floats
+    many: bool = False
 
     def pick(self, which: Bools | Ints) -> Linear:
         """The realisations `which` of B."""
         slope = tuple(tuple(s[which] if len(s) > 1 else s for s in nodes) for nodes in self.slope)
-        return Linear(self.x[which], tuple(r[which] for r in self.residual), slope, self.cost[which])
+        return Linear(self.x[which], tuple(r[which] for r in self.residual), slope, self.cost[which], self.many)
 
     def by_node(self, factors: Sequence[Factor]) -> list[tuple[Floats, ...]]:
         """Per factor one derivative for each of its nodes."""
@@ -42,7 +44,9 @@ class Linear:
                 for factor, slope in zip(factors, self.slope, strict=True)]  # fmt: skip
 
 
-def linearise(space: Space, factors: Sequence[Factor], free: Bools | None, x: Floats) -> Linear:
+def linearise(
+    space: Space, factors: Sequence[Factor], free: Bools | None, x: Floats, many: bool = False
+) -> Linear:  # fmt: skip
     """Factors around x (B, n, width); what is not `free` (n, dof) has no derivative."""
     residuals, slopes, cost = [], [], np.zeros(len(x))
     for factor in factors:
@@ -57,15 +61,20 @@ def linearise(space: Space, factors: Sequence[Factor], free: Bools | None, x: Fl
             slope = _masked(factor, slope, free)
         residuals.append(residual)
         slopes.append(slope)
-    return Linear(x, tuple(residuals), tuple(slopes), cost)
+    return Linear(x, tuple(residuals), tuple(slopes), cost, many)
 
 
 def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
     known = factor.measurement
     assert factor.constants is not None
     seen = local(space, known, x, factor.nodes)
-    gap, slope = known.differentiate(*seen, factor.z, factor.constants)
-    slope = factor.whiten_slope(slope)
+    gap: Floats
+    slope: Floats
+    if known.linear:
+        gap, slope = seen[0] - factor.z, factor.root
+    else:
+        gap, slope = known.differentiate(*seen, factor.z, factor.constants)
+        slope = factor.whiten_slope(slope)
     slope = slope.reshape(*(1,) * (4 - slope.ndim), *slope.shape)
     return factor.whiten(gap), chain(space, known, x, factor.nodes, seen, slope)
 

@@ -98,23 +98,24 @@ class Measurement:
         if self.linear:
             return local - z, np.eye(local.shape[-1])
         numbers = _seed(local, rotation)
-        parts = self.residual(numbers, np.moveaxis(z, -1, 0), np.moveaxis(given, -1, 0), dual)
+        parts = self.residual(numbers, columns(z), columns(given), dual)
         shape, coordinates = local.shape[:-1], len(numbers[0].slope)
         value = np.empty((*shape, len(parts)))
         slope = np.empty((*shape, len(parts), coordinates))
+        by_part = slope.transpose(len(shape), len(shape) + 1, *range(len(shape)))
         for k, part in enumerate(parts):
             value[..., k] = part.value
-            slope[..., k, :] = np.moveaxis(np.broadcast_to(part.slope, (coordinates, *shape)), 0, -1)
+            by_part[k] = part.slope
         return self.wrapped(value), slope
 
     def difference(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> Floats:
         """(..., size) residuals h(x) - z, angles in [-pi, pi); arguments as `differentiate`."""
         if self.linear:
             return local - z
-        numbers = [*np.moveaxis(local, -1, 0)]
+        numbers = columns(local)
         if rotation is not None:
-            numbers += [*np.moveaxis(rotation.reshape(*rotation.shape[:-2], -1), -1, 0)]
-        parts = self.residual(numbers, np.moveaxis(z, -1, 0), np.moveaxis(given, -1, 0), np)
+            numbers += columns(rotation.reshape(*rotation.shape[:-2], -1))
+        parts = self.residual(numbers, columns(z), columns(given), np)
         return self.wrapped(np.stack(np.broadcast_arrays(*parts), axis=-1))
 
     def wrapped(self, gap: Floats) -> Floats:
@@ -124,6 +125,11 @@ class Measurement:
             if self.components[component] == "angle":
                 gap[..., k] = polar.wrap(gap[..., k])
         return gap
+
+
+def columns(array: Floats) -> list[Floats]:
+    """The components of (..., k), views (...)."""
+    return [array[..., k] for k in range(array.shape[-1])]
 
 
 def embed(numbers: Sequence[Any], dimension: int) -> list[Any]:

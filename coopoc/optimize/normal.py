@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..kernels.compile import use_kernels
 from .linear import Linear
 
 
@@ -22,6 +23,7 @@ class Pattern:
         nodes: n. pairs: (P, 2). rows, starts: products of each block, one block after the other.
         negated: (P,) blocks between nodes that only subtract. minus: rows that subtract in blocks that also add.
         pull_rows, pull_signs, pull_starts, pull_nodes: the same for the gradient, by node.
+        places: per factor (M, 1 or 3) the blocks of its node, or of the first, the second and the two.
         still: (n, dof) True where a node cannot move, or None.
     """
 
@@ -35,6 +37,7 @@ class Pattern:
     pull_signs: Floats
     pull_starts: Ints
     pull_nodes: Ints
+    places: tuple[Ints, ...]
     still: Bools | None
 
 
@@ -74,8 +77,16 @@ def pattern(n: int, factors: Sequence[tuple[Ints, bool]], still: Bools | None = 
     return Pattern(
         n, np.stack([blocks // n, blocks % n], axis=1), np.concatenate(rows)[order], starts, negated,
         np.flatnonzero(mixed), np.concatenate(end_rows)[pull_order], np.concatenate(end_signs)[pull_order][:, None],
-        pull_starts, pull_nodes, still,
+        pull_starts, pull_nodes, tuple(_places(n, blocks, nodes) for nodes, _ in factors), still,
     )  # fmt: skip
+
+
+def _places(n: int, blocks: Ints, nodes: Ints) -> Ints:
+    """Where the blocks of measurements of nodes (M, arity) are among the `blocks`, sorted keys i n + j."""
+    keys = [(n + 1) * column for column in nodes.T]
+    if nodes.shape[1] == 2:
+        keys.append(nodes.min(axis=1) * n + nodes.max(axis=1))
+    return np.searchsorted(blocks, np.stack(keys, axis=1))
 
 
 def normal_equations(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> tuple[Floats, Floats]:
@@ -84,7 +95,9 @@ def normal_equations(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> 
     Args:
         nodes: (M, arity) of each factor.
     """
-    pulls = [(np.swapaxes(slope, -1, -2) @ residual[..., None])[..., 0]
+    if linear.many and use_kernels():
+        return _compiled(scheme, linear, nodes)
+    pulls = [(slope.swapaxes(-1, -2) @ residual[..., None])[..., 0]
              for residual, slopes in zip(linear.residual, linear.slope, strict=True) for slope in slopes]  # fmt: skip
     gradient = np.zeros((len(linear.x), scheme.nodes, pulls[0].shape[-1]))
     signed = np.concatenate(pulls, axis=1)[:, scheme.pull_rows] * scheme.pull_signs
@@ -92,16 +105,35 @@ def normal_equations(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> 
     return assemble(scheme, squares(linear, nodes)), gradient
 
 
+def _compiled(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> tuple[Floats, Floats]:
+    """The same by the kernels, measurement by measurement."""
+    from ..kernels.normal import add_products, add_squares
+
+    d = linear.slope[0][0].shape[-1]
+    blocks = np.zeros((len(linear.x), len(scheme.pairs), d, d))
+    gradient = np.zeros((len(linear.x), scheme.nodes, d))
+    for residual, slopes, touched, place in zip(linear.residual, linear.slope, nodes, scheme.places, strict=True):
+        sizes = (0,) * residual.shape[2], (0,) * d
+        each = [np.ascontiguousarray(slope) for slope in slopes]
+        opposed = len(each) < touched.shape[1]
+        for k, slope in enumerate(each):
+            add_squares(touched, place, k + opposed, opposed, residual, slope, blocks, gradient, sizes)
+        if len(each) == 2:
+            add_products(touched, place, each[0], each[1], blocks, sizes)
+    return _stilled(scheme, blocks), gradient
+
+
 def squares(linear: Linear, nodes: Sequence[Ints]) -> list[Floats]:
     """Per factor the products of its derivatives (B, M, dof, dof): S_i^T S_i, S_j^T S_j, S_i^T S_j (i the smaller)."""
     found: list[Floats] = []
     for residual, slopes, touched in zip(linear.residual, linear.slope, nodes, strict=True):
-        products = [np.swapaxes(slope, -1, -2) @ slope for slope in slopes]
+        products = [slope.swapaxes(-1, -2) @ slope for slope in slopes]
         if len(slopes) == 2:
-            cross = np.swapaxes(slopes[0], -1, -2) @ slopes[1]
+            cross = slopes[0].swapaxes(-1, -2) @ slopes[1]
             swapped = (touched[:, 0] > touched[:, 1])[:, None, None]
-            products.append(np.where(swapped, np.swapaxes(cross, -1, -2), cross))
-        found += [np.broadcast_to(p, (*residual.shape[:2], *p.shape[-2:])) for p in products]
+            products.append(np.where(swapped, cross.swapaxes(-1, -2), cross))
+        shape = residual.shape[:2]
+        found += [p if p.shape[:2] == shape else np.broadcast_to(p, (*shape, *p.shape[-2:])) for p in products]
     return found
 
 
@@ -114,8 +146,12 @@ def assemble(scheme: Pattern, parts: Sequence[Floats]) -> Floats:
         gathered[:, scheme.minus] *= -1.0
     blocks: Floats = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(len(every), -1, dof, dof)
     blocks[:, scheme.negated] *= -1.0
+    return _stilled(scheme, blocks)
+
+
+def _stilled(scheme: Pattern, blocks: Floats) -> Floats:
     if scheme.still is not None:
         own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
-        at = np.arange(dof)
+        at = np.arange(blocks.shape[-1])
         blocks[:, own[:, None], at, at] += scheme.still[scheme.pairs[own, 0]]
     return blocks

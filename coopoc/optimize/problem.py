@@ -187,7 +187,7 @@ class Problem:
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (B, n, width)."""
-        return linearise(self.space, self.factors, self.free, x)
+        return linearise(self.space, self.factors, self.free, x, self.batch is not None)
 
     def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
         """Residual r (rows,) and sparse Jacobian J (rows, n dof) of a single problem at x (n, width): cost = 1/2 r.r.

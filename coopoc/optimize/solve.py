@@ -19,7 +19,7 @@ from .assess import Assessment, assess
 from .backends.run import Ended
 from .curvature import is_minimum
 from .descend import MAX_ITERATIONS
-from .initial import initial_guess
+from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
 from .problem import Problem
 from .solution import Solution, SolveError, Status
@@ -98,8 +98,7 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     _check_constraints(problem, BACKENDS[backend])
     began = time.perf_counter()
-    start = initial_guess(problem)[0]
-    _check_start(problem, start)
+    start = _start(problem)
     run = module.build(problem, **options)
     built = time.perf_counter()
     ended = run(start)
@@ -156,8 +155,11 @@ def _check_constraints(problem: Problem, known: Backend) -> None:
         raise InputError("constraints", kinds, f"cannot be held by {known.name}, only by {able}", "Name one of those.")
 
 
-def _check_start(problem: Problem, start: Floats) -> None:
-    """InputError if a measurement or a constraint has no derivative at the start."""
+def _start(problem: Problem) -> Floats:
+    """(n, width); InputError if a measurement or a constraint has no derivative there."""
+    if problem.linear and not problem.constraints:
+        return np.asarray(somewhere(problem)[0])
+    start: Floats = initial_guess(problem)[0]
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])
     for factor, residual, slope in zip(problem.factors, linear.residual, linear.slope, strict=True):
@@ -173,6 +175,7 @@ def _check_start(problem: Problem, start: Floats) -> None:
         if bad.any():
             k, row, _ = rows.place[np.flatnonzero(bad)[0]]
             raise _without_direction(problem, problem.constraints[k].kind, problem.constraints[k].nodes[row])
+    return start
 
 
 def _without_direction(problem: Problem, kind: str, nodes: Ints) -> InputError:

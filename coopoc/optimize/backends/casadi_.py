@@ -12,14 +12,8 @@ the same twice, it hands over to ipopt.
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import time
-from dataclasses import dataclass, replace
-from functools import lru_cache
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,25 +22,10 @@ from ...errors import InputError
 from ..active import constraint_rows, steerable
 from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..problem import Problem
-from ..symbolic import Structure, expressions, numbers_of, structure_of
+from ..symbolic import numbers_of, structure_of
+from .casadi_programme import Programme, Solver, programme
 from .run import Ended, Run
 
-QUIET = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
-IPOPT = {
-    "print_level": 0, "sb": "yes", "nlp_scaling_method": "none", "bound_relax_factor": 0.0,
-    "tol": 1e-12, "constr_viol_tol": 1e-9, "compl_inf_tol": 1e-18,
-    "acceptable_tol": 1e-8, "acceptable_iter": 3, "acceptable_constr_viol_tol": 1e-8, "acceptable_compl_inf_tol": 1e-17,
-}  # fmt: skip
-"""For a cost scaled to a curvature of 1; what `tol` asks may lie below rounding, hence the acceptable level."""
-SQP = {
-    "print_header": False, "print_iteration": False, "print_status": False, "qpsol": "qrqp",
-    "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False},
-    "tol_pr": 1e-10, "tol_du": 1e-12,
-}  # fmt: skip
-COARSE = {"tol_pr": 1e-6, "tol_du": 1e-3}
-"""How near the steps with J^T J come before the exact Hessian takes over."""
-ENOUGH = 60
-"""Of them: where residuals are large they creep."""
 MISSED = 1e-7
 """m, rad or m/s, a violation with which sqp has not found a feasible point."""
 ROUNDS = 10
@@ -110,51 +89,16 @@ def each(
         return [build(part, max_iterations, tolerance, method, codegen)(a) for part, a in zip(parts, x, strict=True)]
     build(problem, max_iterations, tolerance, method, codegen)  # checks the options
     found = programme(structure, method, int(max_iterations), bool(codegen))
-    numbers = _numbers(problem, x)
-    return [_once(found, given, NO_SIDES, a, 0.0)[0] for given, a in zip(numbers, x, strict=True)]
-
-
-@dataclass(frozen=True, eq=False)
-class Programme:
-    """What is built once.
-
-    Args:
-        structure: of the problems that it solves. method: "ipopt" or "sqp".
-        solvers: CasADi's nlpsol objects, each starts where the one before it ended.
-    """
-
-    structure: Structure
-    method: str
-    solvers: tuple[Any, ...]
-
-
-@lru_cache(maxsize=64)
-def programme(structure: Structure, method: str, max_iterations: int, codegen: bool) -> Programme:
-    """The programme of a structure, kept for the next problems that share it."""
-    import casadi as ca
-
-    found = expressions(structure)
-    flat, scale = found.pop("flat"), ca.SX.sym("scale")
-    x, p = found["x"], ca.vertcat(found["p"], scale)
-    nlp = {**found, "p": p, "f": scale * found["f"]}
-    if method == "ipopt":
-        options = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
-        return Programme(structure, method, (_compiled("ipopt", nlp, options, codegen),))
-    pulls = [ca.SX.sym("lam_f"), ca.SX.sym("lam_g", *found["g"].shape)]
-    names = ["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"]
-    gauss = ca.Function("gauss", [x, p, *pulls], [pulls[0] * scale * flat], *names)
-    coarse = {**QUIET, **SQP, **COARSE, "max_iter": min(max_iterations, ENOUGH), "hess_lag": gauss}
-    fine = {**QUIET, **SQP, "max_iter": max_iterations}
-    solvers = tuple(_compiled("sqpmethod", nlp, options, codegen) for options in (coarse, fine))
-    return Programme(structure, method, solvers)
+    numbers, solvers = _numbers(problem, x), found.ready()
+    return [_once(found, solvers, given, NO_SIDES, a, NO_SIDES[0])[0] for given, a in zip(numbers, x, strict=True)]
 
 
 def _run(found: Programme, problem: Problem, sides: tuple[Floats, Floats], x: Floats, tolerance: float) -> Ended:
     """Solve around x, and for poses again around the answer until it stays."""
-    multipliers: Any = 0.0
-    count = 0
+    multipliers: Floats = np.zeros(len(sides[0]))
+    solvers, count = found.ready(), 0
     for rounds in range(1, ROUNDS + 1):
-        ended, multipliers = _once(found, _numbers(problem, x[None])[0], sides, x, multipliers)
+        ended, multipliers = _once(found, solvers, _numbers(problem, x[None])[0], sides, x, multipliers)
         count += ended.iterations
         ended = replace(ended, iterations=count, extras=ended.extras | {"rounds": rounds})
         still = np.abs(ended.x - x).max(initial=0.0) <= tolerance
@@ -172,21 +116,18 @@ def _numbers(problem: Problem, x: Floats) -> Floats:
 
 
 def _once(
-    found: Programme, numbers: Floats, sides: tuple[Floats, Floats], x: Floats, multipliers: Any
-) -> tuple[Ended, Any]:
+    found: Programme, solvers: Sequence[Solver], numbers: Floats, sides: tuple[Floats, Floats], x: Floats,
+    multipliers: Floats,
+) -> tuple[Ended, Floats]:  # fmt: skip
     """Where the solvers end, and the multipliers."""
     space, free = found.structure.space, found.structure.free
-    at: Any = 0.0
-    count = 0
-    for solver in found.solvers:
-        bounds = {"lbg": sides[0], "ubg": sides[1], "lam_g0": multipliers} if sides[0].size else {}
-        answer = solver(x0=at, p=numbers, **bounds)
-        at, multipliers = answer["x"], answer["lam_g"]
-        stats = solver.stats()
-        count += int(stats["iter_count"])
-    said = str(stats["return_status"])
+    at: Floats = np.zeros(int(free.sum()))
+    count, said = 0, ""
+    for solver in solvers:
+        at, multipliers, iterations, said = solver(at, numbers, sides, multipliers)
+        count += iterations
     step = np.zeros(free.shape)
-    step[free] = at.full().ravel()
+    step[free] = at
     if np.isfinite(step).all():
         x = space.retract(x, _exponential(step, space.dimension) if space.turning else step)
     extras = {"method": found.method, "return_status": said, "rounds": 1}
@@ -208,37 +149,3 @@ def _exponential(step: Floats, dimension: int) -> Floats:
     half = 0.5 * np.linalg.norm(w, axis=-1, keepdims=True)
     ratio = np.where(half > 1e-9, np.arctan(half) / np.where(half > 1e-9, half, 1.0), 1.0)
     return np.concatenate([step[:, :dimension], ratio * w], axis=-1)
-
-
-def _compiled(name: str, nlp: dict[str, Any], options: dict[str, Any], codegen: bool) -> Any:
-    """CasADi's solver, its functions interpreted or compiled."""
-    import casadi as ca
-
-    solver = ca.nlpsol("solver", name, nlp, options)
-    if not codegen:
-        return solver
-    code = ca.CodeGenerator("nlp")
-    code.add(solver.oracle())
-    for function in solver.get_function():
-        code.add(solver.get_function(function))
-    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        code.generate(f"{folder}/")
-        return ca.nlpsol("solver", name, _compile(Path(folder) / "nlp.c"), options)
-
-
-def _compile(source: Path) -> str:
-    """The shared library of a C file."""
-    from tqdm import tqdm
-
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        raise InputError("codegen", True, "needs gcc on the PATH", "Install gcc, or leave codegen out: it buys little.")
-    library = str(source.with_suffix(".so"))
-    command = [gcc, "-O1", "-fPIC", "-shared", str(source), "-o", library, "-lm"]
-    with subprocess.Popen(command) as compiler, tqdm(bar_format="gcc: {elapsed}", delay=2.0) as bar:
-        while compiler.poll() is None:
-            time.sleep(0.05)
-            bar.update()
-        if compiler.returncode:
-            raise subprocess.CalledProcessError(compiler.returncode, command)
-    return library

@@ -44,6 +44,9 @@ def build(
         step = linear_step(problem)
 
         def run(x: Floats) -> Ended:
+            if problem.linear and max_iterations:
+                dx = step(problem.linearise(x[None]), np.zeros((1, len(x), problem.space.dof)))[0]
+                return Ended(problem.space.retract(x, dx) if np.isfinite(dx).all() else x, 1)
             end = descend(problem, step, x[None], max_iterations, tolerance)
             return Ended(end.x[0], int(end.iterations[0]))
 

@@ -54,14 +54,16 @@ def form_of(problem: Problem, factor: Factor) -> Form:
     """Its parts in GTSAM, or why it has none."""
     if factor.kind not in FORMS:
         return "GTSAM has no such factor"
-    posed = np.isin(factor.nodes, problem.poses) if problem.poses else np.zeros(factor.nodes.shape, dtype=bool)
-    form = OF_POSES.get(factor.kind, FORMS[factor.kind]) if posed.all() else FORMS[factor.kind]
+    kinds = [[False] * factor.nodes.shape[1]]
+    if problem.poses:
+        kinds = np.unique(np.isin(factor.nodes, problem.poses), axis=0).tolist()
+    form = OF_POSES.get(factor.kind, FORMS[factor.kind]) if all(map(all, kinds)) else FORMS[factor.kind]
     parts = form(factor, factor.root, problem.dimension)
     if isinstance(parts, str):
         return parts
     if len(parts) > 1 and factor.loss is not None:
         return "it takes two factors in GTSAM, which no robust loss can join"
-    for row in np.unique(posed, axis=0).tolist() if posed.any() else posed[:1].tolist():
+    for row in kinds:
         if not all(tuple(row) in part.names or tuple(row[::-1]) in part.names for part in parts):
             return f"GTSAM has none from {' to '.join('a pose' if turns else 'a point' for turns in row)}"
     return parts

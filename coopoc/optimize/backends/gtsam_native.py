@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import chain
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from ...arrays import Floats
 from ..factor import Factor
 from ..linear import linearise
+from ..losses import Loss
 from ..problem import Problem
 from ..space import Space
 from .gtsam_forms import Form, pose_of
@@ -40,20 +42,23 @@ def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | N
     import gtsam
 
     graph, place = gtsam.NonlinearFactorGraph(), []
-    keys = range(len(problem.names)) if keys is None else keys
-    posed = which_turn(problem)
+    named = np.arange(len(problem.names)) if keys is None else np.array(keys)
+    posed = which_turn(problem) if problem.poses else []
     for f, (factor, parts) in enumerate(zip(problem.factors, said, strict=True)):
         rows, nodes = np.flatnonzero(factor.informative).tolist(), factor.nodes.tolist()
+        called = named[factor.nodes].tolist()
         for part in () if isinstance(parts, str) else parts:
             models, given = _models(part.root, factor), part.given
-            classes = {at: getattr(gtsam, name) for at, name in part.names.items()}
+            classes: dict[tuple[bool, ...], Any] = {at: getattr(gtsam, name) for at, name in part.names.items()}
+            made: Any = classes.get((False,) * factor.nodes.shape[1])
             for k in rows:
-                touched = nodes[k]
-                made = classes.get(tuple([posed[i] for i in touched]))
-                if made is None:  # a range from a point to a pose
-                    touched = touched[::-1]
-                    made = classes[tuple([posed[i] for i in touched])]
-                graph.add(made(*[keys[i] for i in touched], *given(gtsam, k), models[k]))
+                touched = called[k]
+                if posed:
+                    turns = tuple([posed[i] for i in nodes[k]])
+                    made = classes.get(turns)
+                    if made is None:  # a range from a point to a pose
+                        touched, made = touched[::-1], classes[turns[::-1]]
+                graph.add(made(*touched, *given(gtsam, k), models[k]))
             place += [(f, k) for k in rows]
     return Native(graph, tuple(place))
 
@@ -93,6 +98,8 @@ def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Iterable[int
 
 def which_turn(problem: Problem) -> list[bool]:
     """Of each node whether it is a pose."""
+    if not problem.poses:
+        return [False] * len(problem.names)
     poses = set(problem.poses)
     return [i in poses for i in range(len(problem.names))]
 
@@ -145,24 +152,20 @@ def _node(gtsam: Any, d: int, x: Floats, posed: bool) -> Any:
 
 
 def _models(root: Floats, factor: Factor) -> list[Any]:
-    """A noise model per measurement, one object for equal ones."""
-    if len(root) > 1 and (root == root[:1]).all():
-        return _models(root[:1], factor) * len(root)
-    made: dict[bytes, Any] = {}
-    names, full = [row.tobytes() for row in root], set(np.flatnonzero(np.tril(root, -1).any(axis=(1, 2))).tolist())
-    for k, key in enumerate(names):
-        if key not in made:
-            made[key] = _model(root[k], k not in full, factor)
-    return [made[key] for key in names]
+    """A noise model per measurement (M, k, k), one object for equal ones."""
+    size, loss = root.shape[-1], factor.loss
+    return [_model(row.tobytes(), size, loss) for row in root]
 
 
-def _model(root: Floats, diagonal: bool, factor: Factor) -> Any:
-    """Of one measurement; what GTSAM itself takes for diagonal may have entries below."""
+@lru_cache(maxsize=1024)
+def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
+    """Of one measurement, kept for the next equal ones; what GTSAM itself takes for diagonal may have entries below."""
     import gtsam
 
-    noise = gtsam.noiseModel
+    noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)
+    diagonal = not any(entry for i, row in enumerate(root.tolist()) for entry in row[:i])
     model: Any = noise.Gaussian.SqrtInformation(root, diagonal)
-    if factor.loss is None:
+    if loss is None:
         return model
-    shape = getattr(noise.mEstimator, ESTIMATORS[factor.loss.name]).Create(factor.loss.scale)
+    shape = getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale)
     return noise.Robust.Create(shape, model)

@@ -1,0 +1,69 @@
+"""CasADi's rows of backends.py."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi
+import numpy as np
+from backends_star import Job, Row, as_good, ours
+from classical import KNOWN, NEIGHBOURS, SENSORS
+
+from coopoc.optimize import Problem
+from coopoc.optimize.initial import initial_guess
+
+
+def casadi_exact(problem: Problem) -> Job:
+    """IPOPT on one programme whose measurements are parameters."""
+    (fixes, edges), runs = problem.factors, problem.batch or 1
+    start = initial_guess(problem)
+    std, fix_std = np.array(SENSORS.relative_std), np.array(KNOWN.gnss_std)
+    quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes"}}
+
+    def cost(x: Any, fix: Any, seen: Any) -> Any:
+        """Of x and fix (3, n) and seen (3, K)."""
+        gap = x[:, 1:] - casadi.repmat(x[:, 0], 1, NEIGHBOURS)
+        flat = casadi.sqrt(gap[0, :] ** 2 + gap[1, :] ** 2)
+        across = gap[1, :] * casadi.cos(seen[1, :]) - gap[0, :] * casadi.sin(seen[1, :])
+        along = gap[0, :] * casadi.cos(seen[1, :]) + gap[1, :] * casadi.sin(seen[1, :])
+        rest = casadi.vertcat((casadi.sqrt(flat**2 + gap[2, :] ** 2) - seen[0, :]) / std[0],
+                              casadi.atan2(across, along) / std[1],
+                              (casadi.atan2(flat, gap[2, :]) - seen[2, :]) / std[2])  # fmt: skip
+        return 0.5 * (casadi.sumsqr((x - fix) / casadi.repmat(fix_std, 1, NEIGHBOURS + 1)) + casadi.sumsqr(rest))
+
+    x, fix, sight = (casadi.SX.sym(name, 3, n) for name, n in
+                     (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS)))  # fmt: skip
+    nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, sight), "f": cost(x, fix, sight)}
+    solver = casadi.nlpsol("solver", "ipopt", nlp, quiet)
+
+    def batch() -> Any:
+        numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
+        return np.stack([np.asarray(solver(x0=a.ravel(), p=p)["x"]).reshape(-1, 3)
+                         for a, p in zip(start, numbers, strict=True)])  # fmt: skip
+
+    def opti() -> Any:
+        found = []
+        for b in range(2):
+            model = casadi.Opti()
+            nodes = [model.variable(3) for _ in range(NEIGHBOURS + 1)]
+            total = sum(casadi.sumsqr((node - fix) / fix_std) for node, fix in zip(nodes, fixes.z[b], strict=True))
+            for node, (r, azimuth, inclination) in zip(nodes[1:], edges.z[b], strict=True):
+                gap = node - nodes[0]
+                flat = casadi.sqrt(gap[0] ** 2 + gap[1] ** 2)
+                turn = casadi.atan2(gap[1], gap[0]) - azimuth
+                turn = casadi.atan2(casadi.sin(turn), casadi.cos(turn))
+                total += ((casadi.norm_2(gap) - r) / std[0]) ** 2 + (turn / std[1]) ** 2
+                total += ((casadi.atan2(flat, gap[2]) - inclination) / std[2]) ** 2
+            model.minimize(0.5 * total)
+            for node, at in zip(nodes, start[b], strict=True):
+                model.set_initial(node, at)
+            model.solver("ipopt", {"print_time": False}, quiet["ipopt"])
+            answer = model.solve()
+            found.append([answer.value(node) for node in nodes])
+        return np.stack(found)
+
+    job = "casadi, snapshot, exact"
+    return Job([Row(job, "ours", runs, ours(problem, "casadi", runs)), Row(job, "hand-written", runs, batch),
+                Row(job, "Opti, rebuilt", 2, opti),
+                Row(job, "ours, sqp", runs, ours(problem, "casadi", runs, method="sqp"))],
+               as_good(problem))  # fmt: skip

@@ -1,0 +1,104 @@
+"""OSQP's and CVXPY's rows of backends.py."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cvxpy
+import numpy as np
+import osqp
+from backends_star import Job, Row, as_good, ours, single
+from classical import KNOWN, NEIGHBOURS
+from scipy.sparse import csc_matrix, triu
+
+from coopoc.optimize import Problem
+
+SIZE = 3 * (NEIGHBOURS + 1)
+
+
+def osqp_linear(problem: Problem) -> Job:
+    """One workspace; P and q are ready before the clock starts. `update` writes into the P of `setup`."""
+    runs = problem.batch or 1
+    rows = [problem.pick(b).whiten(np.zeros((NEIGHBOURS + 1, 3))) for b in range(runs)]
+    matrices = [csc_matrix(triu(J.T @ J, format="csc")) for _, J in rows]
+    pulls = [np.asarray(J.T @ r) for r, J in rows]
+    settings = {"scaling": 0, "rho": 1e-4, "alpha": 1.0, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 200,
+                "check_termination": 1, "adaptive_rho": 0, "verbose": False}  # fmt: skip
+    nothing = csc_matrix((0, SIZE)), np.empty(0), np.empty(0)
+
+    def workspace(b: int) -> Any:
+        made = osqp.OSQP()
+        made.setup(matrices[b].copy(), pulls[b], *nothing, **settings)
+        return made
+
+    persistent = workspace(0)
+
+    def batch() -> Any:
+        found = []
+        for matrix, pull in zip(matrices, pulls, strict=True):
+            persistent.update(Px=matrix.data, q=pull)
+            found.append(persistent.solve(raise_error=False).x)
+        return np.stack(found).reshape(runs, -1, 3)
+
+    def bare() -> Any:
+        """By the extension module that osqp's Python class calls."""
+        found, core = [], persistent._solver
+        for matrix, pull in zip(matrices, pulls, strict=True):
+            core.update_data_vec(pull, None, None)
+            core.update_data_mat(matrix.data, None, None, None)
+            core.solve()
+            found.append(core.solution.x)
+        return np.stack(found).reshape(runs, -1, 3)
+
+    def setups() -> Any:
+        return np.stack([workspace(b).solve(raise_error=False).x for b in range(10)]).reshape(10, -1, 3)
+
+    job = "osqp, snapshot, converted"
+    return Job([Row(job, "ours", runs, ours(problem, "osqp", runs)), Row(job, "hand-written", runs, batch),
+                Row(job, "hand-written, without osqp's Python class", runs, bare),
+                Row(job, "setup at each solve", 10, setups),
+                Row(job, "ours, solve() one by one", 4, single(problem, "osqp", 4))], as_good(problem))  # fmt: skip
+
+
+def cvxpy_linear(problem: Problem) -> Job:
+    """Weights and measurements as parameters, so that CVXPY canonicalises once."""
+    fixes, edges = problem.factors
+    weight, root = 1.0 / np.array(KNOWN.gnss_std), edges.root
+    whitened = np.einsum("bkij,bkj->bki", root, edges.z)
+    options = {"solver": "CLARABEL", "max_threads": 1}
+
+    def programme(weights: Any, fix: Any, pull: Any) -> tuple[Any, Any]:
+        """x (n, 3) and the programme; the weights (9, K), row by row, with the whitened vectors (K, 3)."""
+        x = cvxpy.Variable((NEIGHBOURS + 1, 3))
+        gap = (x[1:] - np.ones((NEIGHBOURS, 1)) @ x[:1]).T
+        parts = [cvxpy.sum(cvxpy.multiply(weights[3 * i : 3 * i + 3], gap), axis=0) - pull[:, i] for i in range(3)]
+        terms = [cvxpy.sum_squares(part) for part in (cvxpy.multiply(x - fix, np.tile(weight, (NEIGHBOURS + 1, 1))),
+                                                      *parts)]  # fmt: skip
+        return x, cvxpy.Problem(cvxpy.Minimize(sum(terms)))
+
+    given = [cvxpy.Parameter(shape) for shape in ((9, NEIGHBOURS), (NEIGHBOURS + 1, 3), (NEIGHBOURS, 3))]
+    held = programme(*given)
+
+    def numbers(b: int) -> tuple[Any, Any, Any]:
+        return root[b].reshape(NEIGHBOURS, 9).T, fixes.z[b], whitened[b]
+
+    def batch() -> Any:
+        found = []
+        for b in range(10):
+            for parameter, value in zip(given, numbers(b), strict=True):
+                parameter.value = value
+            held[1].solve(**options)
+            found.append(held[0].value)
+        return np.stack(found)
+
+    def rebuilt() -> Any:
+        found = []
+        for b in range(4):
+            x, model = programme(*numbers(b))
+            model.solve(**options)
+            found.append(x.value)
+        return np.stack(found)
+
+    job = "cvxpy, snapshot, converted"
+    return Job([Row(job, "ours", 10, ours(problem, "cvxpy", 10)), Row(job, "hand-written", 10, batch),
+                Row(job, "rebuilt", 4, rebuilt)], as_good(problem))  # fmt: skip

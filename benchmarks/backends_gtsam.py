@@ -1,0 +1,174 @@
+"""GTSAM's rows of backends.py."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gtsam
+import numpy as np
+from backends_star import TOLERANCE, Job, Row, as_good, ours, single
+from classical import KNOWN, NEIGHBOURS, SENSORS
+
+from coopoc.optimize import Problem, solve
+from coopoc.optimize.incremental import FixedLag
+from coopoc.optimize.initial import initial_guess
+from coopoc.world.spherical import spherical, wrap
+
+
+def gtsam_linear(problem: Problem) -> Job:
+    """Prior and Between factors of the converted problem."""
+    (fixes, edges), runs = problem.factors, problem.batch or 1
+    model = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
+    zero, keys = gtsam.Values(), range(NEIGHBOURS + 1)
+    for k in keys:
+        zero.insert(k, np.zeros(3))
+
+    def one(fix: Any, vector: Any, root: Any) -> Any:
+        graph = gtsam.NonlinearFactorGraph()
+        for k in keys:
+            graph.add(gtsam.PriorFactorPoint3(k, fix[k], model))
+        for k in range(NEIGHBOURS):
+            edge = gtsam.noiseModel.Gaussian.SqrtInformation(root[k], False)
+            graph.add(gtsam.BetweenFactorPoint3(0, k + 1, vector[k], edge))
+        return graph.linearize(zero).optimize().vector().reshape(-1, 3)
+
+    def batch() -> Any:
+        return np.stack([one(*given) for given in zip(fixes.z, edges.z, edges.root, strict=True)])
+
+    def custom() -> Any:
+        return np.stack([custom_factors(fixes.z[b], edges.z[b], edges.root[b]) for b in range(4)])
+
+    job = "gtsam, snapshot, converted"
+    return Job([Row(job, "ours", runs, ours(problem, "gtsam", runs)), Row(job, "hand-written", runs, batch),
+                Row(job, "CustomFactors and Levenberg-Marquardt", 4, custom),
+                Row(job, "ours, solve() one by one", 4, single(problem, "gtsam", 4))], as_good(problem))  # fmt: skip
+
+
+def custom_factors(fix: Any, vector: Any, root: Any) -> Any:
+    """The same by Python's callbacks, derivatives by hand."""
+    graph, at, unit = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel.Unit.Create(3)
+    model = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
+
+    def edge(k: int) -> Callable[..., Any]:
+        def error(factor: Any, found: Any, slopes: Any) -> Any:
+            if slopes is not None:
+                slopes[0], slopes[1] = -root[k], root[k]
+            return root[k] @ (found.atPoint3(k + 1) - found.atPoint3(0) - vector[k])
+
+        return error
+
+    for k, z in enumerate(fix):
+        graph.add(gtsam.PriorFactorPoint3(k, z, model))
+        at.insert(k, z)
+    for k in range(len(vector)):
+        graph.add(gtsam.CustomFactor(unit, [0, k + 1], edge(k)))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, at, params).optimize()
+    return np.stack([found.atPoint3(k) for k in range(len(fix))])
+
+
+def fixed_lag(problem: Problem, count: int) -> Job:
+    """The star that drives on for `count` steps, realisation by realisation one step later; a lag of ten steps."""
+    fixes, edges = problem.factors
+    n, lag, moved = NEIGHBOURS + 1, 1.05, np.tile([1.0, 0.0, 0.0], (NEIGHBOURS + 1, 1))
+    odometry = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.process_std))
+    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
+    z, roots = fixes.z[:count] + np.arange(count)[:, None, None] * moved, edges.root
+
+    def piece(names: list[str], first: int, steps: int) -> Problem:
+        """The steps from `first` on, and the odometry from the nodes before them where the names have those."""
+        found, each = Problem(names), np.arange(n)
+        before = len(names) - n * steps
+        for k in range(steps):
+            at = before + n * k + each
+            found = found.add("position", at.tolist(), z[first + k], std=KNOWN.gnss_std)
+            if before or k:
+                found = found.add("displacement", np.stack([at - n, at], 1).tolist(), moved, std=KNOWN.process_std)
+            star = np.stack([np.full(NEIGHBOURS, at[0]), at[1:]], 1).tolist()
+            found = found.add("displacement", star, edges.z[first + k], sqrt_information=roots[first + k])
+        return found
+
+    def called(t: int) -> list[str]:
+        return [f"{i}@{t}" for i in range(n)]
+
+    pieces = [piece([*(called(t - 1) if t else []), *called(t)], t, 1) for t in range(count)]
+    whole = {t: piece([name for s in range(t + 1) for name in called(s)], 0, t + 1) for t in (20, count - 1)}
+    best = {t: solve(problem).x[-n] for t, problem in whole.items()}
+
+    def mine() -> Any:
+        smoother = FixedLag(lag, threshold=1e6)  # what is linear is never linearised again
+        return np.stack([smoother.update(part, dict.fromkeys(called(t), 0.1 * t), [f"0@{t}"]).x
+                         for t, part in enumerate(pieces)])  # fmt: skip
+
+    def hand() -> Any:
+        params = gtsam.ISAM2Params()
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
+        smoother, found = gtsam.IncrementalFixedLagSmoother(lag, params), []
+        for t in range(count):
+            graph, fresh, key = gtsam.NonlinearFactorGraph(), gtsam.Values(), n * t
+            for k in range(n):
+                graph.add(gtsam.PriorFactorPoint3(key + k, z[t, k], prior))
+                fresh.insert(key + k, z[t, k])
+                if t:
+                    graph.add(gtsam.BetweenFactorPoint3(key - n + k, key + k, moved[k], odometry))
+            for k in range(NEIGHBOURS):
+                model = gtsam.noiseModel.Gaussian.SqrtInformation(roots[t, k], False)
+                graph.add(gtsam.BetweenFactorPoint3(key, key + k + 1, edges.z[t, k], model))
+            smoother.update(graph, fresh, dict.fromkeys(range(key, key + n), 0.1 * t))
+            found.append(smoother.calculateEstimate().atPoint3(key))
+            smoother.marginalCovariance(key)
+        return np.stack(found)[:, None]
+
+    def right(x: Any) -> bool:
+        return all(float(np.abs(x[t, 0] - wanted).max()) < 1e-3 for t, wanted in best.items())
+
+    job = "gtsam, fixed lag, converted"
+    return Job([Row(job, "ours", count, mine), Row(job, "hand-written", count, hand)], right)
+
+
+def seen(x: Any, z: Any, std: Any) -> tuple[Any, Any]:
+    """Whitened residuals (B, K, 3) of ranges and angles at x (B, n, 3), and derivatives (B, K, 3, 3)."""
+    dx, dy, dz = np.moveaxis(x[:, 1:] - x[:, :1], 2, 0)
+    flat2 = dx**2 + dy**2
+    flat, r2 = np.sqrt(flat2), flat2 + dz**2
+    r = np.sqrt(r2)
+    slope = np.stack([np.stack([dx / r, dy / r, dz / r], -1), np.stack([-dy / flat2, dx / flat2, 0 * r], -1),
+                      np.stack([dx * dz / (flat * r2), dy * dz / (flat * r2), -flat / r2], -1)], -2)  # fmt: skip
+    return wrap(np.stack(spherical(dx, dy, dz), -1) - z) / std, slope / std[..., None]
+
+
+def gtsam_exact(problem: Problem) -> Job:
+    """Gauss-Newton whose JacobianFactors come from NumPy, all realisations at once."""
+    (fixes, edges), runs = problem.factors, problem.batch or 1
+    start, keys = initial_guess(problem), range(NEIGHBOURS + 1)
+    unit = gtsam.noiseModel.Unit.Create(3)
+    weight, std = 1.0 / np.array(KNOWN.gnss_std), np.array(SENSORS.relative_std)
+    eye = np.diag(weight)
+
+    def one(prior: Any, residual: Any, slope: Any, order: Any) -> Any:
+        graph = gtsam.GaussianFactorGraph()
+        for k in keys:
+            graph.add(k, eye, prior[k], unit)
+        for k, (a, b, c) in enumerate(zip(-slope, slope, -residual, strict=True), 1):
+            graph.add(0, a, k, b, c, unit)
+        return graph.optimize(order).vector().reshape(-1, 3)
+
+    def batch() -> Any:
+        x, going = start.copy(), np.arange(runs)
+        order = gtsam.Ordering()
+        for k in [*keys[1:], 0]:
+            order.push_back(k)
+        while len(going):
+            near = x[going]
+            residual, slope = seen(near, edges.z[going], std)
+            prior = (fixes.z[going] - near) * weight
+            step = np.stack([one(*given, order) for given in zip(prior, residual, slope, strict=True)])
+            x[going] += step
+            going = going[np.abs(step).max(axis=(1, 2)) > TOLERANCE]
+        return x
+
+    job = "gtsam, snapshot, exact"
+    return Job([Row(job, "ours", runs, ours(problem, "gtsam", runs, tolerance=TOLERANCE)),
+                Row(job, "hand-written", runs, batch)], as_good(problem))  # fmt: skip

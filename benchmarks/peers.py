@@ -1,0 +1,105 @@
+"""Peers that are no part of the project's environment, on the same problems: pyceres.
+
+    pip install pyceres                                        # into an environment that has the project
+    OMP_NUM_THREADS=1 python benchmarks/peers.py               # a Markdown table on stdout, a few seconds
+
+The exact star of ten neighbours of backends.py. Ceres has no factor for range, azimuth and inclination in the world
+frame with a std each, so its users write one in Python; the fixes are its own NormalPrior, and its Schur complement
+eliminates the neighbours. "x pyceres" is a row's time over that of pyceres; a row counts only if its answer is that of
+gauss-newton. Where pyceres is not installed a line says so. What the index has as jaxls is a language server for JAX,
+not the solver of that name.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+from backends import measured as measure
+from backends_star import Job, Row, as_good, ours, star
+from classical import KNOWN, NEIGHBOURS, SENSORS
+from tabulate import tabulate
+
+from coopoc.optimize import Problem
+from coopoc.optimize.initial import initial_guess
+
+RUNS, FEW = 200, 40
+
+
+def sighting(z: Any, std: Any) -> Any:
+    """A cost function of the ego's and a neighbour's position, derivatives by hand."""
+    import pyceres
+
+    class Sighting(pyceres.CostFunction):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__()
+            self.set_num_residuals(3)
+            self.set_parameter_block_sizes([3, 3])
+
+        def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+            (ax, ay, az), (bx, by, bz) = parameters[0].tolist(), parameters[1].tolist()
+            x, y, up = bx - ax, by - ay, bz - az
+            flat2 = x * x + y * y
+            flat, r2 = math.sqrt(flat2), flat2 + up * up
+            r = math.sqrt(r2)
+            residuals[0] = (r - z[0]) / std[0]
+            residuals[1] = math.remainder(math.atan2(y, x) - z[1], math.tau) / std[1]
+            residuals[2] = (math.atan2(flat, up) - z[2]) / std[2]
+            if jacobians is None:
+                return True
+            a, b, c = 1.0 / (r * std[0]), 1.0 / (flat2 * std[1]), 1.0 / (flat * r2 * std[2])
+            slope = np.array([a * x, a * y, a * up, -b * y, b * x, 0.0, c * x * up, c * y * up, -c * flat2])
+            for jacobian, sign in zip(jacobians, (-1.0, 1.0), strict=True):
+                if jacobian is not None:
+                    jacobian[:] = sign * slope
+            return True
+
+    return Sighting()
+
+
+def ceres_exact(problem: Problem) -> Job:
+    """One Ceres problem per realisation: priors of its own, Python's cost functions, a dense Schur complement."""
+    import pyceres
+
+    fixes, edges = problem.factors
+    start, spread = initial_guess(problem), np.diag(np.square(KNOWN.gnss_std))
+    z, std = edges.z.tolist(), list(SENSORS.relative_std)
+    options = pyceres.SolverOptions()
+    options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
+    options.logging_type = pyceres.LoggingType.SILENT
+    options.function_tolerance = options.gradient_tolerance = options.parameter_tolerance = 1e-10
+
+    def one(b: int) -> Any:
+        model, points = pyceres.Problem(), [each.copy() for each in start[b]]
+        for point, fix in zip(points, fixes.z[b], strict=True):
+            model.add_residual_block(pyceres.factors.NormalPrior(fix, spread), None, [point])
+        for k in range(NEIGHBOURS):
+            model.add_residual_block(sighting(z[b][k], std), None, [points[0], points[k + 1]])
+        pyceres.solve(options, model, pyceres.SolverSummary())
+        return points
+
+    job = "snapshot, exact"
+    return Job([Row(job, "solve_batch, gauss-newton", RUNS, ours(problem, "gauss-newton", RUNS)),
+                Row(job, "pyceres", FEW, lambda: np.stack([one(b) for b in range(FEW)]))],
+               as_good(problem))  # fmt: skip
+
+
+def measured() -> list[dict[str, Any]]:
+    """As `backends.measured`; nothing, and a line on stderr, without pyceres."""
+    if find_spec("pyceres") is None:
+        print("peers: pyceres is not installed, its rows are left out", file=sys.stderr)
+        return []
+    return measure([ceres_exact(star(RUNS))])
+
+
+def main() -> None:
+    """Print the table."""
+    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
+    print(tabulate(lines, ["", "us", "x pyceres", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
+
+
+if __name__ == "__main__":
+    main()

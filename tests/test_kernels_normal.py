@@ -1,0 +1,115 @@
+"""Compiled normal equations and marginals of stars against numpy.linalg on the dense Jacobian."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopoc.kernels.compile import SWITCH
+from coopoc.optimize import Factor, Problem, pose, solve_batch
+from coopoc.optimize.arrowhead import marginals, structure
+from coopoc.optimize.initial import initial_guess
+from coopoc.optimize.normal import normal_equations
+
+pytest.importorskip("numba")
+RUNS = 9
+
+
+def star(dimension: int = 3, reverse: bool = False) -> Problem:
+    """An ego that ranges its neighbours, or is ranged by them; realisations differ in their fixes."""
+    rng = np.random.default_rng(1)
+    truth = rng.uniform(-20, 20, (5, dimension))
+    z = truth + rng.normal(0, 0.5, (RUNS, 5, dimension))
+    problem = Problem([f"v{k}" for k in range(5)], hub=(2,), dimension=dimension)
+    problem = problem.add("position", range(5), z, std=np.arange(1.0, 1.0 + dimension))
+    pairs = [(2, k) if not reverse else (k, 2) for k in (0, 1, 4)]  # nobody sees v3
+    gaps = [np.linalg.norm(truth[i] - truth[j]) for i, j in pairs]
+    shift = [truth[j] - truth[i] for i, j in pairs]
+    full = np.eye(dimension) + 0.1 * np.tri(dimension)
+    return problem.add("range", pairs, np.array(gaps)[:, None], std=0.5).add(
+        "displacement", pairs, shift, sqrt_information=full
+    )
+
+
+def drive() -> Problem:
+    """Poses in the plane, a point among them, one held; measured forwards and backwards."""
+    rng = np.random.default_rng(2)
+    at, angle = np.cumsum(rng.uniform(2, 4, (4, 2)), axis=0), rng.uniform(-1, 1, 4)
+    x0 = np.broadcast_to(pose(at, angle), (RUNS, 4, 6)).copy()
+    x0[:, 3] = pose(at, 0.0)[3]
+    problem = Problem("abcd", x0=x0, dimension=2, poses="abc", held="a")
+    problem = problem.add("relative_pose", [("a", "b"), ("c", "b")], pose(np.array([[2.0, 1], [-2, 1]]), 0.1), std=0.2)
+    problem = problem.add("range", [("d", "a"), ("c", "d")], [[6.0], [4.0]], std=0.3)
+    return problem.add("position", "b", at[1], std=1.0)
+
+
+@pytest.mark.parametrize("problem", [star(), star(2), star(reverse=True), drive()], ids=["3d", "2d", "seen", "poses"])
+def test_blocks_and_gradient_are_those_of_the_dense_jacobian(problem: Problem) -> None:
+    linear = problem.linearise(initial_guess(problem))
+    scheme, _ = structure(problem)
+    blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
+    d = problem.space.dof
+    for b in range(RUNS):
+        J = problem.jacobian(linear, b).toarray()
+        r = np.concatenate([each[b].ravel() for each in linear.residual])
+        square = J.T @ J
+        if problem.free is not None:
+            square += np.diag(~problem.free.ravel())
+        for (i, j), block in zip(scheme.pairs.tolist(), blocks[b], strict=True):
+            wanted = square[d * i : d * i + d, d * j : d * j + d]
+            assert np.allclose(block, wanted, rtol=1e-12, atol=1e-12)
+        assert np.allclose(gradient[b].ravel(), J.T @ r, rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.parametrize("problem", [star(), star(2), star(reverse=True)], ids=["3d", "2d", "seen"])
+def test_marginals_of_a_star_are_those_of_the_dense_inverse(problem: Problem) -> None:
+    linear = problem.linearise(initial_guess(problem))
+    scheme, frame = structure(problem)
+    assert frame.star is not None
+    blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
+    cov, dx = marginals(frame, blocks, gradient, many=True)
+    for b in range(RUNS):
+        J = problem.jacobian(linear, b).toarray()
+        inverse = np.linalg.inv(J.T @ J)
+        n, d = cov.shape[1:3]
+        own = inverse.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
+        assert np.allclose(cov[b], own, rtol=1e-10)
+        assert np.allclose(dx[b].ravel(), -inverse @ gradient[b].ravel(), rtol=1e-9, atol=1e-12)
+
+
+def test_a_realisation_that_lacks_a_fix_does_not_spoil_the_others() -> None:
+    problem = star()
+    fixes, *rest = problem.factors
+    std = np.ones((RUNS, 5, 3))
+    std[4, 3] = np.inf
+    problem = Problem(problem.names, (Factor("position", fixes.nodes, fixes.z, std=std), *rest), hub=(2,))
+    batch = solve_batch(problem)
+    assert batch.converged.tolist() == [b != 4 for b in range(RUNS)]
+    assert np.isnan(batch.covariance[4]).all()
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_node_that_nothing_measures_is_found_free(lost: int) -> None:
+    z = np.arange(RUNS * 6.0).reshape(RUNS, 2, 3)
+    problem = Problem("abc", hub=(0,)).add("position", [k for k in range(3) if k != lost], z, std=1.0)
+    assert structure(problem)[1].star is None
+    batch = solve_batch(problem)
+    assert not batch.converged.any()
+    assert np.isnan(batch.covariance).all()
+
+
+@pytest.mark.parametrize("problem", [star(), star(2), drive()], ids=["3d", "2d", "poses"])
+def test_the_digits_of_a_realisation_do_not_depend_on_the_others(problem: Problem) -> None:
+    many, one = solve_batch(problem), solve_batch(problem.pick(np.array([4])))
+    assert np.array_equal(many.x[4:5], one.x)
+    assert np.array_equal(many.covariance[4:5], one.covariance)
+
+
+@pytest.mark.parametrize("problem", [star(), star(2), drive()], ids=["3d", "2d", "poses"])
+def test_a_batch_ends_where_the_numpy_reference_ends(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
+    fast = solve_batch(problem)
+    monkeypatch.setenv(SWITCH, "numpy")
+    plain = solve_batch(problem)
+    assert np.abs(fast.x - plain.x).max() < 1e-9
+    assert np.allclose(fast.covariance, plain.covariance, rtol=1e-8, atol=1e-14)
+    assert fast.converged.all()
