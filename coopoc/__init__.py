@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from .optimize.losses import Loss as Loss
     from .optimize.problem import Problem as Problem
     from .optimize.solution import Solution as Solution
+    from .optimize.solve import Backend as Backend
     from .optimize.solve import backends as backends
     from .optimize.solve import solve as solve
     from .optimize.space import pose as pose
@@ -82,7 +83,8 @@ _HOME = {
     "posterior_bound": "evaluate.bounds", "bound_rt_le": "evaluate.bounds", "fleet_bound": "evaluate.bounds",
     "Ledger": "evaluate.ledger", "break_even": "evaluate.ledger", "channel_load": "world.channel_load",
     "CooperativeMAP": "methods.cooperative_map", "Factor": "optimize.factor", "Problem": "optimize.problem",
-    "Solution": "optimize.solution", "backends": "optimize.solve", "solve": "optimize.solve",
+    "Solution": "optimize.solution",
+    "Backend": "optimize.solve", "backends": "optimize.solve", "solve": "optimize.solve",
     "Constraint": "optimize.constraint", "Loss": "optimize.losses", "pose": "optimize.space", "read": "optimize.graphs",
     "Results": "study.results", "Study": "study.study", "run": "study.run",
     "load": "fleets", "Method": "methods.track", "Track": "methods.track",

@@ -14,6 +14,7 @@ from coopoc.errors import InputError
 from coopoc.fleets import load
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file
+from coopoc.optimize import Problem, Status, solve
 from coopoc.plugins import find
 from coopoc.study.run import plan, run
 
@@ -61,6 +62,25 @@ def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert "egos of ring.py:ring" in shell(command, folder)
     monkeypatch.chdir(folder)
     assert len(load("ring.py:ring").ids) == 12
+
+
+def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (block,) = [text for text in blocks("python") if "least_squares.py:BACKEND" in text]
+    script = folder / "own_backend.py"
+    script.write_text(block)
+    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    assert done.stdout.startswith("SOLVED"), done.stderr
+    monkeypatch.chdir(folder)
+    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    problem = problem.add("range", ("ego", "b"), 10.0, std=1.0)
+    mine, ours = solve(problem, "least_squares.py:BACKEND"), solve(problem, "gtsam")
+    assert mine.x == pytest.approx(ours.x, abs=1e-8)
+    early = solve(problem, "least_squares.py:BACKEND", throw=False, max_iterations=1)
+    assert early.status is not Status.SOLVED  # it may claim what it likes
+    with pytest.raises(InputError, match=r"rounds = 3: is no option of least_squares\.py:BACKEND"):
+        solve(problem, "least_squares.py:BACKEND", rounds=3)
+    with pytest.raises(InputError, match=r"is a function, no Backend"):
+        solve(problem, "least_squares.py:build")
 
 
 def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:

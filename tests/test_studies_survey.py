@@ -13,7 +13,8 @@ def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: 
     few = {"data": short_town, "runs": 2, "egos": "2", "method": "gnss,kalman,joint,bound", "max_neighbours": "0,4",
            "train_seeds": 1}  # fmt: skip
     found = survey.stages(("budget",), tmp_path, 1, {**few, "channel": "ideal"})
-    found |= survey.stages(("heading_error",), tmp_path, 1, {**few, "method": "kalman,joint,bound", "max_neighbours": "0,2"})
+    two = {**few, "method": "kalman,joint,bound", "max_neighbours": "0,2"}
+    found |= survey.stages(("heading_error",), tmp_path, 1, two)
     assert "stage 1 of 2: heading_error" in capsys.readouterr().err
     said = survey.answers(found)
     alone, together, bound = (

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 from .graphs import Objective, read
 from .problem import Problem
 from .solution import Solution, Status
-from .solve import BACKENDS, solve
+from .solve import backends, solve
 
 
 def solve_file(
@@ -88,7 +88,7 @@ def check() -> int:
     """
     reference, failed = solve(tiny()), 0
     print(f"{'backend':<14} {'holds constraints':<18} {'status':<10} {'cost':>12} {'off by [m]':>11} {'ms':>8}")
-    for name, known in BACKENDS.items():
+    for name, known in backends().items():
         if not known.installed:
             print(f"{name:<14} {known.constraints:<18} not installed: pip install {known.library}")
             continue
@@ -101,7 +101,7 @@ def check() -> int:
         good = found.status is Status.SOLVED and off < 1e-6
         failed += not good
         print(f"{name:<14} {known.constraints:<18} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}")
-    print(f"coopoc: {len(BACKENDS)} backends, {failed} disagree with gauss-newton", file=sys.stderr)
+    print(f"coopoc: {len(backends())} backends, {failed} disagree with gauss-newton", file=sys.stderr)
     return int(failed > 0)
 
 

@@ -5,18 +5,22 @@ from __future__ import annotations
 import importlib
 import inspect
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError, MissingLibraryError
+from ..one_file import in_file
+from ..plugins import find, names
 from .active import constraint_rows
 from .assess import Assessment, assess
-from .backends.run import Ended
+from .backends.run import Ended, Run
 from .curvature import is_minimum
 from .descend import MAX_ITERATIONS
 from .initial import initial_guess, somewhere
@@ -32,14 +36,16 @@ FEASIBLE = 1e-6
 
 @dataclass(frozen=True)
 class Backend:
-    """A solver by name: what it is for, the library that it needs (None: ours) and whether that is installed.
+    """A solver by name: what it is for, the library that it needs (None: none but ours) and whether that is installed.
 
     Args:
+        solver: `build(problem, **options)`, which returns a Run: a function from a start (n, width) to an Ended, see
+            `coopoc.optimize.backends.run`; or the name of one of our modules that has it.
         constraints: which it can hold: "none", "linear" (of kinds position and displacement) or "all".
     """
 
     name: str
-    module: str
+    solver: str | Callable[..., Run]
     purpose: str
     library: str | None = None
     constraints: Literal["none", "linear", "all"] = "none"
@@ -63,12 +69,12 @@ BACKENDS = {
 
 
 def backends() -> dict[str, Backend]:
-    """The backends by name, with what each is for and whether its library is installed.
+    """The backends by name, those of other distributions too, with what each is for and whether it is installed.
 
     >>> backends()["gauss-newton"].installed
     True
     """
-    return dict(BACKENDS)
+    return {name: BACKENDS[name] if name in BACKENDS else usable(name) for name in [*BACKENDS, *_others()]}
 
 
 def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, **options: Any) -> Solution:
@@ -77,7 +83,8 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     Cost, gradient, covariance, status and times are computed here from x alone, so that no backend can flatter itself.
 
     Args:
-        problem: a single one; `solve_batch` takes B realisations. backend: a name of `backends()`.
+        problem: a single one; `solve_batch` takes B realisations. backend: a name of `backends()`, or
+            "folder/mine.py:BACKEND".
         throw: raise unless SOLVED; otherwise failure is data.
         options: of the backend, such as max_iterations and tolerance (m).
 
@@ -96,7 +103,7 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
         raise InputError("problem", repr(problem), "must be a single realisation", mend)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
-    _check_constraints(problem, BACKENDS[backend])
+    _check_constraints(problem, usable(backend))
     began = time.perf_counter()
     start = _start(problem)
     run = module.build(problem, **options)
@@ -119,18 +126,34 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
 
 def usable(backend: str) -> Backend:
     """The backend of a name; InputError that lists the names, MissingLibraryError with the line that installs it."""
-    if backend not in BACKENDS:
-        raise InputError("backend", repr(backend), f"must be one of {sorted(BACKENDS)}", "See backends().")
-    known = BACKENDS[backend]
+    known = BACKENDS[backend] if backend in BACKENDS else _other(backend)
     if not known.installed:
         raise MissingLibraryError(str(known.library), f"backend {backend!r}", str(known.library))
     return known
 
 
+def _others() -> list[str]:
+    return [name for name in names("coopoc.backends") if name not in BACKENDS]
+
+
+def _other(backend: str) -> Backend:
+    """A backend from elsewhere, by its name or its file."""
+    found = find("coopoc.backends", backend) if in_file(backend) or backend in _others() else None
+    if found is None:
+        known = sorted([*BACKENDS, *_others()])
+        raise InputError("backend", repr(backend), f"must be one of {known}", "See backends().")
+    if not isinstance(found, Backend):
+        mend = "Give coopoc.Backend(name, build, purpose)."
+        raise InputError("backend", repr(backend), f"is a {type(found).__name__}, no Backend", mend)
+    return found
+
+
 def backend_module(backend: str, options: dict[str, Any]) -> Any:
     """The module of a backend that takes the options; errors as `solve`."""
     known = usable(backend)
-    module = importlib.import_module(f".backends.{known.module}", __package__)
+    given = known.solver
+    module: Any = importlib.import_module(f".backends.{given}", __package__) if isinstance(given, str) else (
+        SimpleNamespace(build=given))  # fmt: skip
     allowed = _options(module.build)
     for name in options:
         if name not in allowed:
@@ -149,7 +172,7 @@ def _check_constraints(problem: Problem, known: Backend) -> None:
     if not problem.constraints:
         return
     needed = "linear" if all(c.measurement.linear for c in problem.constraints) else "all"
-    able = [b.name for b in BACKENDS.values() if b.constraints in (needed, "all")]
+    able = [b.name for b in backends().values() if b.constraints in (needed, "all")]
     if known.name not in able:
         kinds = sorted({c.kind for c in problem.constraints})
         raise InputError("constraints", kinds, f"cannot be held by {known.name}, only by {able}", "Name one of those.")
