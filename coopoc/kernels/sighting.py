@@ -7,15 +7,48 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import AnyArray, Floats, Ints
 from .compile import compiled
 
 
-def unfolded(relative: Floats) -> Floats:
-    """(..., 5) range, sin and cos of azimuth and of inclination, of (..., 3) measurements: no angle is met twice."""
-    d, azimuth, inclination = np.moveaxis(relative, -1, 0)
-    parts = [d, np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination)]
-    return np.stack(parts, axis=-1)
+def unfolded(relative: Floats, links: Ints | None = None) -> Floats:
+    """(R, M, 5) range, sin and cos of azimuth and of inclination, of (R, L, 3) measurements, all or those of M links.
+
+    No angle is met twice.
+    """
+    found = unfold(relative, np.arange(relative.shape[1]) if links is None else links)
+    return np.asarray(found)
+
+
+@compiled
+def unfold(relative: AnyArray, links: AnyArray) -> Floats:
+    """`unfolded`."""
+    out = np.empty((relative.shape[0], len(links), 5))
+    for run in range(relative.shape[0]):
+        for k in range(len(links)):
+            out[run, k, 0] = relative[run, links[k], 0]
+            out[run, k, 1], out[run, k, 2] = sine_cosine(relative[run, links[k], 1])
+            out[run, k, 3], out[run, k, 4] = sine_cosine(relative[run, links[k], 2])
+    return out
+
+
+@compiled
+def sine_cosine(x: float) -> Any:
+    """Sine and cosine by their Taylor series around the nearest multiple of pi/2, to the last bit but one.
+
+    Within 3.9 rad, so that pi/2 and what its number lacks can be subtracted without loss.
+    """
+    if not abs(x) < 3.9:
+        return math.sin(x), math.cos(x)
+    quarter = np.rint(x * (2 / math.pi))
+    r = (x - quarter * (math.pi / 2)) - quarter * 6.123233995736766e-17
+    z = r * r
+    s = 1 - z * (1 / 156) * (1 - z * (1 / 210) * (1 - z * (1 / 272) * (1 - z * (1 / 342))))
+    s = r * (1 - z * (1 / 6) * (1 - z * (1 / 20) * (1 - z * (1 / 42) * (1 - z * (1 / 72) * (1 - z * (1 / 110) * s)))))
+    c = 1 - z * (1 / 132) * (1 - z * (1 / 182) * (1 - z * (1 / 240) * (1 - z * (1 / 306))))
+    c = 1 - z * (1 / 2) * (1 - z * (1 / 12) * (1 - z * (1 / 30) * (1 - z * (1 / 56) * (1 - z * (1 / 90) * c))))
+    even = 1.0 - abs(quarter)
+    return quarter * c if even == 0.0 else even * s, -quarter * s if even == 0.0 else even * c
 
 
 @compiled

@@ -156,7 +156,8 @@ def _by_kernels(
         alive = contacts.to_first[run] | contacts.to_second[run]
         pairs = (contacts.first, contacts.second, contacts.sight, contacts.sight_back)
         start = np.searchsorted(contacts.step[alive], np.arange(len(there) + 1))
-        graph = (place, *(column[alive] for column in pairs), start, unfolded(recording.relative[run]), std, least)
+        seen = unfolded(recording.relative[run : run + 1])[0]
+        graph = (place, *(column[alive] for column in pairs), start, seen, std, least)
         own = (1.0 / known.gnss_variance, recording.gnss[run], 1.0 / variance[run], moved)
         found.append(smooth(at[run], graph, own, steps, settling[run], memory, tick))
     return found

@@ -59,5 +59,7 @@ def follow_egos(
                 x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
                 neighbours[:, found.links] = found.neighbours
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
+    for array in (x, cov, neighbours):  # nobody else holds them: the track need not copy
+        array.flags.writeable = False
     seconds = time.perf_counter() - began
     return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes)
