@@ -12,7 +12,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.ledger import Kind, Ledger, Way, of_track
-from coopoc.evaluate.metrics import errors, max_error, nees, nees_inside, neighbour_rt_le, rt_le
+from coopoc.evaluate.metrics import errors, max_error, nees, neighbour_rt_le, rt_le, share_inside
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.knowledge import Knowledge
@@ -141,11 +141,13 @@ def _rows(
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
         **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
     }
-    fixes = np.sqrt(((recording.gnss - drive.position) ** 2).sum(axis=-1).mean(axis=1))[:, list(track.egos)]
+    mine = list(track.egos)
+    fixes = np.sqrt(((recording.gnss[:, :, mine] - drive.position[:, mine]) ** 2).sum(axis=-1).mean(axis=1))
     columns["worse_than_gnss"] = (columns["rt_le_m"] > 1.001 * fixes).astype(float)
     if track.covariance is not None:
-        columns["nees"] = np.nanmean(nees(track, drive), axis=1)
-        columns["nees_inside"] = np.broadcast_to(nees_inside(track, drive), columns["nees"].shape)
+        found_nees = nees(track, drive)
+        columns["nees"] = np.nanmean(found_nees, axis=1)
+        columns["nees_inside"] = np.broadcast_to(share_inside(found_nees), columns["nees"].shape)
     links = [len(recording.links.of(column)) / len(track.t) for column in track.egos]
     distance = errors(track, drive) if quantiles else None
     served = len(drive.ids) if recording.observers == tuple(range(len(drive.ids))) else len(who)

@@ -186,7 +186,7 @@ def test_what_does_not_settle_goes_to_the_damped_reference(monkeypatch: pytest.M
 
     monkeypatch.setattr(snapshot, "snapshots", lossy)
     found = method(recording, [0])
-    np.testing.assert_allclose(found.x[:, 7:9], wanted.x[:, 7:9], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(found.x[1, 7:9], wanted.x[1, 7:9], rtol=0, atol=1e-10)
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-6)
 
 

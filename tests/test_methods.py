@@ -230,3 +230,14 @@ def test_absent_neighbour_is_left_out_and_absent_ego_refused(crossing: Fleet) ->
         assert np.isfinite(method(recording, [0]).x).all()
     with pytest.raises(InputError, match="absent"):
         Kalman()(recording, [1])
+
+
+def test_nees_is_that_of_numpy_linalg(crossing: Fleet) -> None:
+    track = JointFilter()(observe(crossing, S2, V2X(max_neighbours=3), runs=3), [0, 2])
+    assert track.covariance is not None
+    error = track.x - crossing.position[:, [0, 2]]
+    wanted = np.einsum("...i,...i->...", error, np.linalg.solve(track.covariance, error[..., None])[..., 0])
+    assert nees(track, crossing) == pytest.approx(wanted, rel=1e-10)
+    flat = replace(track, covariance=track.covariance * [1.0, 1.0, 0.0])
+    with pytest.raises(np.linalg.LinAlgError, match="Singular"):
+        nees(flat, crossing)

@@ -19,8 +19,8 @@ def errors(track: Track, fleet: Fleet) -> Floats:
             "track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps",
             "Score a track against the fleet that its recording was observed from.",
         )  # fmt: skip
-    distance: Floats = np.linalg.norm(track.x - fleet.position[:, list(track.egos)], axis=-1)
-    return distance
+    x, y, z = np.moveaxis(track.x - fleet.position[:, list(track.egos)], -1, 0)
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
@@ -49,11 +49,15 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
         return out
     links = recording.links
     truth = fleet.position[links.step, links.neighbour]
-    square = ((track.neighbours - truth) ** 2).sum(axis=-1)
-    for e, ego in enumerate(track.egos):
-        mine = square[:, links.of(ego)]
-        known = np.isfinite(mine).any(axis=1)
-        out[known, e] = np.sqrt(np.nanmean(mine[known], axis=1))
+    mine = [links.of(ego) for ego in track.egos]
+    for run, theirs in enumerate(track.neighbours):  # a run at a time stays in the cache
+        x, y, z = (theirs - truth).T
+        square = x * x + y * y + z * z
+        for e, which in enumerate(mine):
+            known = square[which]
+            known = known[np.isfinite(known)]
+            if len(known):
+                out[run, e] = np.sqrt(known.mean())
     return out
 
 
@@ -66,10 +70,29 @@ def nees(track: Track, fleet: Fleet) -> Floats:
         raise InputError(
             "covariance", None, "this method claims none", "NEES needs a method that reports a covariance."
         )
-    error = track.x - fleet.position[:, list(track.egos)]
-    certain = np.asarray((track.covariance == 0).all(axis=(-2, -1)))
-    cov = np.where(certain[..., None, None], np.eye(3), track.covariance)
-    found = np.einsum("rtei,rtei->rte", error, np.linalg.solve(cov, error[..., None])[..., 0])
+    truth, found = fleet.position[:, list(track.egos)], np.empty(track.x.shape[:-1])
+    for run, (x, cov) in enumerate(zip(track.x, track.covariance, strict=True)):  # a run at a time stays in the cache
+        found[run] = _normalised(x - truth, cov)
+    return found
+
+
+def _normalised(error: Floats, cov: Floats) -> Floats:
+    """e^T P^-1 e (...,) of errors (..., 3) and covariances (..., 3, 3) by P = L D L^T; NaN where P is zero.
+
+    Raises:
+        LinAlgError: a P that is singular.
+    """
+    xx, xy, xz, yy, yz, zz = (cov[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    a, b, c = np.moveaxis(error, -1, 0)
+    certain = (cov == 0).all(axis=(-2, -1)) if (xx == 0).any() else np.zeros(xx.shape, dtype=bool)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = xy / xx, xz / xx
+        yy, yz = yy - first * xy, yz - first * xz
+        third, b = yz / yy, b - first * a
+        zz, c = zz - second * xz - third * yz, c - second * a - third * b
+        found = a * a / xx + b * b / yy + c * c / zz
+    if not (np.isfinite(found) | certain).all():
+        raise np.linalg.LinAlgError("Singular covariance")
     return np.asarray(np.where(certain, np.nan, found))
 
 
@@ -87,7 +110,12 @@ def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, flo
 
 def nees_inside(track: Track, fleet: Fleet, level: float = 0.99) -> Floats:
     """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
-    low, high = nees_band(len(track.x), level)
-    average = nees(track, fleet).mean(axis=0)
+    return share_inside(nees(track, fleet), level)
+
+
+def share_inside(found: Floats, level: float = 0.99) -> Floats:
+    """`nees_inside` of what `nees` has found, (R, T, E)."""
+    low, high = nees_band(len(found), level)
+    average = found.mean(axis=0)
     inside = np.where(np.isnan(average), np.nan, (average >= low) & (average <= high))
     return np.asarray(np.nanmean(inside, axis=0))

@@ -104,20 +104,26 @@ def convert(weight: AnyArray, seen: AnyArray, std: AnyArray, least: float, edges
         if weight[k, 0] == 0.0:
             continue
         one = seen[k - 1]
-        xx, xy, xz, yy, yz, zz = 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
-        if len(std):
-            s0, s1, s2 = widened(one, std, least)
-            sa, ca, si, ci = one[1], one[2], one[3], one[4]
-            d = max(one[0], LEAST_RANGE)
-            a, b, c = 1.0 / s0**2, 1.0 / (s1 * d * max(abs(si), LEAST_SINE)) ** 2, 1.0 / (s2 * d) ** 2
-            flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
-            xx, xy, xz = flat * ca * ca + b * sa * sa, (flat - b) * sa * ca, cross * ca
-            yy, yz, zz = flat * sa * sa + b * ca * ca, cross * sa, a * ci * ci + c * si * si
+        xx, xy, xz, yy, yz, zz = as_measured(one, std, least)
         x, y, z = vector(one)
         x, y, z = x - point[k, 0] + point[0, 0], y - point[k, 1] + point[0, 1], z - point[k, 2] + point[0, 2]
         e = edges[k]
         e[0], e[1], e[2], e[3], e[4], e[5] = xx, xy, xz, yy, yz, zz
         e[6], e[7], e[8] = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
+
+
+@compiled
+def as_measured(seen: Any, std: Any, least: float) -> Any:
+    """Information, upper triangle, of a converted sighting where it was measured; the unit matrix without `std`."""
+    if len(std) == 0:
+        return 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
+    s0, s1, s2 = widened(seen, std, least)
+    sa, ca, si, ci = seen[1], seen[2], seen[3], seen[4]
+    d = max(seen[0], LEAST_RANGE)
+    a, b, c = 1.0 / s0**2, 1.0 / (s1 * d * max(abs(si), LEAST_SINE)) ** 2, 1.0 / (s2 * d) ** 2
+    flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
+    return (flat * ca * ca + b * sa * sa, (flat - b) * sa * ca, cross * ca, flat * sa * sa + b * ca * ca, cross * sa,
+            a * ci * ci + c * si * si)  # fmt: skip
 
 
 @compiled

@@ -9,13 +9,14 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .knowledge import Knowledge, resolve
 from .network import Network, apply, collect
 from .track import Track
-from .whole_fleet import brought_forward, fleet_track, follow_fleet
+from .whole_fleet import brought_forward, fleet_track, follow_compiled, follow_fleet
 
 OWN = "ADMM exchanges positions only: its covariance is that of each vehicle's own filter, without the neighbours' gain"
 
@@ -67,7 +68,10 @@ class ConsensusADMM:
         known = resolve(self.knowledge, recording)
 
         def solve(contacts: Exchange) -> tuple[Floats, Floats]:
-            x, cov = follow_fleet(self, recording, contacts, known, self.cooperate)
+            if use_kernels():
+                x, cov = follow_compiled(recording, contacts, known, self.rounds, rho=self.rho)
+            else:
+                x, cov = follow_fleet(self, recording, contacts, known, self.cooperate)
             return brought_forward(x, cov, recording, known, contacts.delay)
 
         return fleet_track(self, recording, egos, lambda: exchange(recording, self.message), solve, (OWN,))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -84,8 +84,8 @@ class CooperativeMAP:
         known = resolve(self.knowledge, recording)
         replaced: list[tuple[int, int]] = []
 
-        def follow(ego: int, box: Inbox, steps: Ints | None = None) -> Iterator[Estimate]:
-            for windows in alike(_windows(recording, ego, box, known, self.window, steps)):
+        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
+            for windows in alike(_windows(recording, ego, box, known, self.window)):
                 points, spread, counts = self._solve(windows, known)
                 replaced.append(counts)
                 for k, window in enumerate(windows):
@@ -95,16 +95,36 @@ class CooperativeMAP:
                     yield Estimate(star.step, points[k, :, 0], spread[k], star.links, theirs)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            whole, lost, met = _snapshots(recording, ego, box, assumed)
+            whole, lost, met = _solved(recording, ego, box, assumed, self.window)
             replaced.append((met, 0))
+            if lost.any():
+                replaced.extend(self._mend(recording, ego, box, known, lost, whole))
             yield whole
-            if len(lost):
-                yield from follow(ego, box, lost)
 
-        kernels = self.window == 1 and self.robust is None and self.backend == "gauss-newton" and use_kernels()
+        kernels = self.robust is None and self.backend == "gauss-newton" and use_kernels()
         assumed = assumed_arrays(recording, known) if kernels else ()
         track = follow_egos(self, recording, egos, drive if kernels else follow)
         return replace(track, notes=self._notes(*np.sum(replaced, axis=0)))
+
+    def _mend(
+        self, recording: Recording, ego: int, box: Inbox, known: Knowledge, lost: Bools, whole: Estimate
+    ) -> Iterator[tuple[int, int]]:
+        """Put the answers of `_solve` where runs and steps (R, T) were lost, and count as that does."""
+        runs = np.flatnonzero(lost.any(axis=1))
+        few = replace(recording, gnss=recording.gnss[runs], velocity=recording.velocity[runs],
+                      relative=recording.relative[runs], arrival=recording.arrival[runs])  # fmt: skip
+        mine = replace(box, newest=box.newest[runs], fresh=box.fresh[runs])
+        for window in _windows(few, ego, mine, known, self.window):
+            step = window[-1].star.step
+            which = np.flatnonzero(lost[runs, step])
+            if len(which):
+                window = tuple(_runs_of(seen, which) for seen in window)
+                points, spread, counts = self._solve([window], known)
+                rank = np.argsort(np.argsort(vehicles(window)[-1]))
+                whole.x[runs[which], step], whole.covariance[runs[which], step] = points[0, :, 0], spread[0]
+                theirs = np.where(window[-1].held[:, 1:, None], points[0][:, rank[1:]], np.nan)
+                whole.neighbours[runs[which], box.start[step] : box.start[step + 1]] = theirs
+                yield counts
 
     def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, tuple[int, int]]:
         """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were solved
@@ -171,29 +191,42 @@ class Seen:
 Window = tuple[Seen, ...]
 
 
-def _snapshots(recording: Recording, ego: int, box: Inbox, assumed: tuple[Any, ...]) -> tuple[Estimate, Ints, int]:
-    """All snapshots of a drive by compiled code, the steps at which one did not settle, and how many of the other
-    problems were solved converted."""
+def _solved(
+    recording: Recording, ego: int, box: Inbox, assumed: tuple[Any, ...], length: int
+) -> tuple[Estimate, Bools, int]:
+    """All windows of a drive by compiled code, (R, T) True where one did not settle, and how many of the others were
+    solved converted."""
     from ..kernels.snapshot import LOST, MET, snapshots
+    from ..kernels.window import windows
 
     measured = measured_arrays(recording, ego, replace(box, fresh=box.newest >= 0))
-    x, cov, neighbours, ended = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
-    lost = np.flatnonzero((ended == LOST).any(axis=0))
-    return Estimate(slice(None), x, cov, box.link, neighbours), lost, int((np.delete(ended, lost, axis=1) == MET).sum())
+    if length == 1:
+        x, cov, neighbours, ended = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
+    else:
+        fresh = np.ascontiguousarray(box.fresh)
+        x, cov, neighbours, ended = windows(measured, assumed, fresh, length, TOLERANCE, LEAST_GROUND)
+    return Estimate(slice(None), x, cov, box.link, neighbours), ended == LOST, int((ended == MET).sum())
 
 
-def _windows(
-    recording: Recording, ego: int, box: Inbox, known: Knowledge, length: int, steps: Ints | None = None
-) -> Iterator[Window]:
-    """The last `length` steps at every step, or at these, fewer at the start."""
+def _runs_of(seen: Seen, runs: Ints) -> Seen:
+    """The same step in some of the runs."""
+    picked: dict[str, Any] = {
+        field.name: values[runs]
+        for field in fields(seen.star)
+        if isinstance(values := getattr(seen.star, field.name), np.ndarray) and values.ndim > 1 and len(values) > 1
+    }
+    return replace(seen, star=replace(seen.star, **picked), held=seen.held[runs])
+
+
+def _windows(recording: Recording, ego: int, box: Inbox, known: Knowledge, length: int) -> Iterator[Window]:
+    """The last `length` steps at every step, fewer at the start."""
     recent: deque[Seen] = deque(maxlen=length)
     for star in star_steps(recording, ego, box, known):
         members = np.concatenate([[ego], recording.links.neighbour[star.links]])
         span = slice(box.start[star.step], box.start[star.step + 1])
         held = np.concatenate([np.ones((recording.runs, 1), dtype=bool), box.newest[:, span] >= 0], axis=1)
         recent.append(Seen(star, members, held))
-        if steps is None or star.step in steps:
-            yield tuple(recent)
+        yield tuple(recent)
 
 
 def alike(windows: Iterator[Window]) -> Iterator[list[Window]]:

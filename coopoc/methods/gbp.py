@@ -10,13 +10,14 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .knowledge import Knowledge, resolve
 from .network import Network, apply, collect
 from .track import Track
-from .whole_fleet import brought_forward, fleet_track, follow_fleet
+from .whole_fleet import brought_forward, fleet_track, follow_compiled, follow_fleet
 
 LOOPS = "GBP's covariance of a step leaves out the loops of the network, which makes it over-confident"
 
@@ -72,7 +73,10 @@ class GaussianBeliefPropagation:
         known = resolve(self.knowledge, recording)
 
         def solve(contacts: Exchange) -> tuple[Floats, Floats]:
-            x, cov = follow_fleet(self, recording, contacts, known, self.cooperate, carry_own=self.carry == "own")
+            if self.carry == "own" and use_kernels():
+                x, cov = follow_compiled(recording, contacts, known, self.rounds, damping=self.damping)
+            else:
+                x, cov = follow_fleet(self, recording, contacts, known, self.cooperate, carry_own=self.carry == "own")
             return brought_forward(x, cov, recording, known, contacts.delay)
 
         return fleet_track(self, recording, egos, lambda: exchange(recording, self.message), solve, (LOOPS,))

@@ -86,9 +86,10 @@ class Knowledge:
         velocity = recording.velocity if self.velocity is None else self.velocity[None]
         velocity = velocity if columns is None else velocity.take(columns, axis=2)
         floor = 1e-6 if self.velocity is not None else self.sensors.velocity_floor
-        std = self.sensors.velocity_std(velocity, floor)
-        std *= recording.dt
-        return np.square(std, out=std)
+        variance = np.empty(velocity.shape)
+        for run, one in enumerate(velocity):  # a run at a time stays in the cache
+            np.square(recording.dt * self.sensors.velocity_std(one, floor), out=variance[run])
+        return variance
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats
+from ..kernels.compile import use_kernels
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import to_vector
@@ -15,6 +16,7 @@ from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, Message
 from .egos import Estimate, follow_egos
 from .kalman import solo_filter
 from .knowledge import Knowledge, resolve
+from .star import measured_arrays, sighting_noise
 from .track import Track
 
 FLAT = 1e6
@@ -49,6 +51,16 @@ class Msmv:
         known = resolve(self.knowledge, recording)
         process = known.process_variance(recording)
         solo = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
+
+        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
+            from ..kernels.pseudo_fix import follow as compiled
+
+            x, cov, theirs = compiled(measured_arrays(recording, ego, box), assumed, solo, known.gnss_variance, FLAT)
+            yield Estimate(slice(None), x, cov, box.link, theirs)
+
+        if use_kernels():
+            assumed = (np.ascontiguousarray(process), *sighting_noise(known))
+            return follow_egos(self, recording, egos, drive, (RECONSTRUCTION,))
         process = np.broadcast_to(process, recording.gnss.shape)
 
         def follow(ego: int, box: Inbox) -> Iterator[Estimate]:

@@ -93,9 +93,12 @@ def assumed_arrays(recording: Recording, known: Knowledge) -> tuple[Any, ...]:
     """What is assumed of it, as the tuple `assumed` of `coopoc.kernels.star_messages`."""
     variance = np.ascontiguousarray(known.process_variance(recording))
     fixes = np.ascontiguousarray(known.fix_variance(recording))
-    sensors = known.sensors
-    std, least = (np.empty(0), 0.0) if sensors is None else (sensors.relative_std, sensors.min_range)
-    return variance, fixes, std, least, FORGOTTEN, ACCELERATION_STD
+    return variance, fixes, *sighting_noise(known), FORGOTTEN, ACCELERATION_STD
+
+
+def sighting_noise(known: Knowledge) -> tuple[Floats, float]:
+    """(3,) m, rad, rad and the least range m of sightings, or nothing for unit matrices."""
+    return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
 
 
 def _prompt(

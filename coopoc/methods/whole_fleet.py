@@ -14,6 +14,7 @@ from ..world.recording import Recording
 from .kalman import solo_filter
 from .knowledge import Knowledge
 from .network import Network, network
+from .star import sighting_noise
 from .track import Method, Track
 
 Solve = Callable[[Exchange], tuple[Floats, Floats | None]]
@@ -69,6 +70,23 @@ def follow_fleet(
         if len(graph.first):
             x[:, t, graph.here], cov[:, t, graph.here] = cooperate(graph)
         carried = carried if carry_own else cov[:, t].copy()
+    return x, cov
+
+
+def follow_compiled(
+    recording: Recording, contacts: Exchange, known: Knowledge, rounds: int, damping: float = 0.0, rho: float = 0.0
+) -> tuple[Floats, Floats]:
+    """What `follow_fleet` finds of belief propagation, or with rho > 0 of ADMM, from compiled code."""
+    from ..kernels.gossip import follow
+    from ..kernels.sighting import unfolded
+
+    numbers = (contacts.first, contacts.second, contacts.sight, contacts.sight_back, contacts.start)
+    pairs = (*(np.ascontiguousarray(n, dtype=np.int64) for n in numbers), contacts.to_first & contacts.to_second)
+    seen = unfolded(recording.relative, np.arange(len(recording.links)))
+    measured = (recording.gnss, recording.velocity, seen, recording.dt)
+    variance = np.ascontiguousarray(known.process_variance(recording))
+    assumed = (variance, known.gnss_variance, *sighting_noise(known))
+    x, cov = follow(measured, pairs, assumed, int(rounds), float(damping), float(rho))
     return x, cov
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import AnyArray, Bools, Floats, Ints
 from ..errors import InputError
 from .fleet import Fleet
 from .noise import stream
@@ -19,6 +21,8 @@ PAIRS = 2_000_000
 """Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
 GRID = 1000
 """Cells along each side of the ground, at most."""
+_alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()
+"""Draws of recordings that still exist, by all that they depend on: the next K or channel need not draw them again."""
 
 
 def observe(
@@ -58,10 +62,12 @@ def observe(
     columns = list(range(len(fleet.ids))) if observers is None else sorted({fleet.index(o) for o in observers})
     links = find_links(fleet, columns, v2x.max_neighbours, v2x.radius, sensors.min_range)
     broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
+    drawn, key = (fleet, sensors, runs, seed), (fleet, repr(sensors), runs, seed)
     return Recording(
         ids=fleet.ids, t=fleet.t,
-        gnss=_gnss(fleet, sensors, runs, seed), velocity=_velocity(fleet, sensors, runs, seed),
-        links=links, relative=_relative(fleet, links, sensors, runs, seed),
+        gnss=_once(("gnss", *key), lambda: _gnss(*drawn)),
+        velocity=_once(("velocity", *key), lambda: _velocity(*drawn)),
+        links=links, relative=_relative(links, tuple(columns), v2x, *drawn),
         broadcasts=broadcasts, arrival=arrival,
         sensors=assumed or sensors.without_bias(), v2x=v2x, observers=tuple(columns),
     )  # fmt: skip
@@ -113,25 +119,32 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
     return np.repeat(here[looks], (end - begin).sum(axis=1)), here[order[place]]
 
 
-def _normals(fleet: Fleet, sensor: str, runs: int, seed: int) -> Floats:
-    """(R, T, N, 3) standard normals, one stream per run and vehicle."""
-    shape = (len(fleet.t), 3)
-    return np.stack(
-        [np.stack([stream(seed, sensor, r, i).standard_normal(shape) for i in fleet.ids], axis=1) for r in range(runs)]
-    )
+def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:
+    """What was drawn for the key, if anyone still holds it, or drawn now; read-only, so that many may hold it."""
+    found = _alive.get(key)
+    if found is None:
+        found = draw()
+        found.flags.writeable = False
+        _alive[key] = found
+    return found
+
+
+def _normals(fleet: Fleet, sensor: str, run: int, seed: int) -> Floats:
+    """(T, N, 3) standard normals, one stream per vehicle."""
+    return np.stack([stream(seed, sensor, run, i).standard_normal((len(fleet.t), 3)) for i in fleet.ids], axis=1)
 
 
 def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    fixes: Floats = fleet.position + _normals(fleet, "gnss", runs, seed) * np.array(sensors.gnss_std)
+    fixes = np.empty((runs, *fleet.position.shape))
     low, high = sensors.gnss_bias
-    if high > 0:
-        steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
-        for r in range(runs):
-            for column, name in enumerate(fleet.ids):
-                fixes[r, :, column] += stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3))
-    for std, names in ((sensors.gnss_drift_std, fleet.ids), (sensors.gnss_common_std, ("",))):
-        if std > 0:  # the common error is that of nobody in particular
-            for r in range(runs):
+    steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
+    for r in range(runs):  # one after the other stays in the cache
+        fixes[r] = fleet.position + _normals(fleet, "gnss", r, seed) * np.array(sensors.gnss_std)
+        if high > 0:
+            bias = [stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3)) for name in fleet.ids]
+            fixes[r] += np.stack(bias, axis=1)
+        for std, names in ((sensors.gnss_drift_std, fleet.ids), (sensors.gnss_common_std, ("",))):
+            if std > 0:  # the common error is that of nobody in particular
                 draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
                 fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
     return fixes
@@ -155,7 +168,9 @@ def gauss_markov(normals: Floats, steps: float) -> Floats:
 
 
 def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    velocity: Floats = fleet.velocity + _normals(fleet, "velocity", runs, seed) * sensors.velocity_std(fleet.velocity)
+    velocity, std = np.empty((runs, *fleet.velocity.shape)), sensors.velocity_std(fleet.velocity)
+    for r in range(runs):
+        velocity[r] = fleet.velocity + _normals(fleet, "velocity", r, seed) * std
     return velocity
 
 
@@ -167,20 +182,41 @@ def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
     return [(fleet.ids[links.observer[g[0]]], fleet.ids[links.neighbour[g[0]]], g) for g in groups]
 
 
-def _relative(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
+def _relative(
+    links: Links, columns: tuple[int, ...], v2x: V2X, fleet: Fleet, sensors: Sensors, runs: int, seed: int
+) -> Floats:  # fmt: skip
+    """(R, L, 3), from a recording of as many or more neighbours where one still exists."""
+    drawn, most = ("relative", fleet, repr(sensors), runs, seed, columns, v2x.radius), v2x.max_neighbours
+
+    def draw() -> Floats:
+        for key, wider in list(_alive.items()):
+            if key[:-1] == drawn and key[-1] > most:
+                whole = find_links(fleet, columns, key[-1], v2x.radius, sensors.min_range)
+                return wider.take(np.flatnonzero(np.isin(_code(fleet, whole), _code(fleet, links))), axis=1)
+        return _sightings(fleet, links, sensors, runs, seed)
+
+    return _once((*drawn, most), draw)
+
+
+def _code(fleet: Fleet, links: Links) -> Ints:
+    """One number for each link."""
+    size = len(fleet.ids)
+    return np.asarray((links.step * size + links.observer) * size + links.neighbour)
+
+
+def _sightings(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
-    relative = np.empty((runs, *exact.shape))
-    for observer, neighbour, index in _pairs(fleet, links):
-        step = links.step[index]
-        for r in range(runs):
+    pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet, links)]
+    relative, turned = np.empty((runs, *exact.shape)), _heading(fleet, links, sensors, runs, seed)
+    for r in range(runs):  # one after the other stays in the cache
+        for observer, neighbour, index, step in pairs:
             draws = stream(seed, "relative", r, observer, neighbour).standard_normal((step[-1] + 1, 3))
             relative[r, index] = draws[step]
-    relative = exact + relative * sensors.relative_std
-    relative[..., 1] += _heading(fleet, links, sensors, runs, seed)
-    relative[..., 0] = np.abs(relative[..., 0])
-    relative[..., 1] = wrap(relative[..., 1])
+        relative[r] = exact + relative[r] * sensors.relative_std
+        relative[r, :, 0] = np.abs(relative[r, :, 0])
+        relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
     return relative
 
 

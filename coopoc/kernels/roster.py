@@ -1,0 +1,94 @@
+"""Who is in the star at each step and what their messages say, several runs beside each other.
+
+Who is linked is the same in all runs: only what was heard, and when, differs. A row of numbers holds one for each axis
+and run of a block, `axis * runs + run`. The tuples `measured` and `assumed` are those of
+`coopoc.kernels.star_messages`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy import uint64
+
+from ..arrays import AnyArray, Ints
+from .compile import compiled
+
+MOVED, PROCESS, FIX, WEIGHT, AHEAD = range(5)
+"""Rows of what is said of a member: motion m, its variance m^2, fix m, its information 1/m^2 where it is new, and the
+vector m from the ego to it as measured."""
+
+
+@compiled
+def places(neighbour: AnyArray, start: AnyArray) -> Ints:
+    """(M,) place that the neighbour of each link has in the star before, the ego's being 0, or -1 if it has joined."""
+    kept = np.full(len(neighbour), -1, np.int64)
+    for t in range(1, len(start) - 1):
+        for link in range(start[t], start[t + 1]):
+            for before in range(start[t - 1], start[t]):
+                if neighbour[before] == neighbour[link]:
+                    kept[link] = 1 + before - start[t - 1]
+    return kept
+
+
+@compiled
+def stay(t: int, start: AnyArray, kept: AnyArray, place: AnyArray) -> int:
+    """How many are in the star of step t, and the place of each in the star before, (n,)."""
+    n = 1 + start[t + 1] - start[t]
+    place[0] = 0 if t > 0 else -1
+    for k in range(1, n):
+        place[k] = kept[start[t] + k - 1]
+    return int(n)
+
+
+@compiled
+def tell(
+    measured: Any, assumed: Any, first: int, t: int, place: AnyArray, held: AnyArray, was: AnyArray, said: AnyArray
+) -> None:  # fmt: skip
+    """What the members of step t say in the runs from `first` on, as in `coopoc.methods.star.star_steps`.
+
+    Args:
+        place: (n,). held, was: (2, n or more, runs), the step of the message in use and its uses in a row, now and at
+            the step before. said: (5, n or more, 3 runs), filled.
+    """
+    gnss, velocity, seen, neighbour, start, newest, fresh, ego, dt = measured
+    variance, fixes, _, _, forgotten, acceleration = assumed
+    runs = held.shape[2]
+    for k in range(len(place)):
+        link = start[t] + k - 1
+        member = ego if k == 0 else neighbour[link]
+        for r in range(runs):
+            run = first + r
+            sent = t if k == 0 else newest[run, link]
+            again = place[k] >= 0 and was[0, place[k], r] == sent
+            uses = was[1, place[k], r] + 1 if again else 1
+            held[0, k, r], held[1, k, r] = sent, uses
+            at = sent if sent >= 0 else t
+            age = t - at
+            new = k == 0 or fresh[run, link]
+            i, j, m = min(run, len(variance) - 1), min(at, variance.shape[1] - 1), min(member, variance.shape[2] - 1)
+            f, g, h = min(run, len(fixes) - 1), min(at, fixes.shape[1] - 1), min(member, fixes.shape[2] - 1)
+            for c in range(3):
+                one = variance[i, j, m, c] + (dt * dt * age * acceleration) ** 2
+                moved = dt * velocity[run, at, member, c] if sent >= 0 else 0.0
+                lane = c * runs + r
+                said[MOVED, k, lane] = moved
+                said[PROCESS, k, lane] = (2 * uses - 1) * one if sent >= 0 else forgotten
+                said[FIX, k, lane] = gnss[run, at, member, c] + age * moved
+                said[WEIGHT, k, lane] = 1.0 / (fixes[f, g, h, c] + age * age * one) if new else 0.0
+            if k > 0:
+                d, sine, cosine, up, level = seen[run, link]
+                said[AHEAD, k, r], said[AHEAD, k, runs + r] = d * up * cosine, d * up * sine
+                said[AHEAD, k, 2 * runs + r] = d * level
+
+
+@compiled
+def expect(before: AnyArray, place: AnyArray, said: AnyArray, state: AnyArray) -> None:
+    """State (n, lanes) m of the new star from that of the last one: who joins stands where the ego sees it."""
+    for k in range(len(place)):
+        for lane in range(uint64(state.shape[1])):
+            if place[k] >= 0:
+                state[k, lane] = before[place[k], lane] + said[MOVED, k, lane]
+            else:
+                state[k, lane] = state[0, lane] + said[AHEAD, k, lane] if k > 0 else said[FIX, 0, lane]
