@@ -14,7 +14,7 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.compute import WorkerDiedError, schedule
+from coopoc.study.compute import WorkerDiedError, compute, schedule
 from coopoc.study.publish import views
 from coopoc.study.results import Results
 from coopoc.study.run import plan, run
@@ -279,3 +279,11 @@ def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study: Stud
 def test_results_of_a_folder_that_holds_none(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds no manifest\.json"):
         Results.load(tmp_path)
+
+
+def test_a_worker_may_hold_a_large_recording(study: Study) -> None:
+    """loky would end a worker that has grown by 300 MB, and what it holds for the next cell would be made again."""
+    grow = importlib.import_module("small_study").grow
+    cells = Study("large", "What?", grow, {"x": tuple(range(6))}).cells()
+    rows = [outcome.rows[0] for outcome in compute(grow, cells, 2)]
+    assert len({row["process"] for row in rows}) <= 2

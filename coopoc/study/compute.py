@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import time
 import traceback
 from collections.abc import Callable, Generator, Sequence
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky import process_executor
 from threadpoolctl import threadpool_limits
 
 from ..errors import InputError
@@ -89,6 +91,8 @@ def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[O
 
 def _in_worker(function: Function, cell: Cell, parent: int) -> Outcome:
     leave_with(parent)
+    process_executor._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+    # loky would end a worker that has grown by 300 MB; that is no leak here, but a recording that the next cell shares
     return attempt(function, cell)
 
 
