@@ -20,7 +20,7 @@ paper: $(READY)
 
 test: $(VENV)/.ready-dev
 	$(VENV)/bin/ruff check .
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile
 
 benchmark: $(VENV)/.ready-dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py --gate
