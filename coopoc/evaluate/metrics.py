@@ -47,14 +47,14 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     out = np.full((len(track.x), len(track.egos)), np.nan)
     if track.neighbours is None:
         return out
-    links = recording.links
-    truth = fleet.position[links.step, links.neighbour]
-    mine = [links.of(ego) for ego in track.egos]
+    mine = [recording.links.of(ego) for ego in track.egos]
+    links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
+    truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
     for run, theirs in enumerate(track.neighbours):  # a run at a time stays in the cache
         x, y, z = (theirs - truth).T
         square = x * x + y * y + z * z
-        for e, which in enumerate(mine):
-            known = square[which]
+        for e in range(len(mine)):
+            known = square[ends[e] : ends[e + 1]]
             known = known[np.isfinite(known)]
             if len(known):
                 out[run, e] = np.sqrt(known.mean())

@@ -49,7 +49,8 @@ def follow_egos(
         recording.require_complete()
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
-    neighbours = np.full_like(recording.relative, np.nan)
+    ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])
+    neighbours = np.full((recording.runs, ends[-1], 3), np.nan)
     received, sent = np.zeros((2, recording.runs, len(columns)))
     with tqdm(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
         for e, ego in enumerate(columns):
@@ -57,7 +58,8 @@ def follow_egos(
             received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
             for found in follow(ego, box):
                 x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
-                neighbours[:, found.links] = found.neighbours
+                here = slice(None) if len(found.links) == len(box.link) else np.searchsorted(box.link, found.links)
+                neighbours[:, ends[e] : ends[e + 1]][:, here] = found.neighbours
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them

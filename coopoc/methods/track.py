@@ -25,6 +25,7 @@ class Track:
         received_bytes, sent_bytes: (R, E) bytes over the drive, payload and overhead.
         seconds: wall time of the method.
         neighbours: (R, L, 3) m estimate of each link's neighbour at the link's step, NaN where there is none; or None.
+            The links are those of the egos, `recording.links.of(ego)` ego by ego, and no others of the fleet.
         notes: labels for tables and figures, such as "reconstruction".
     """
 
