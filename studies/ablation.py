@@ -81,7 +81,7 @@ def _choices(results: Results) -> Table | None:
     header = ("Method", "Choice", "Value", "RT-LE [m]", "Less the default's [m]", "NEES", "Time [µs]")
     text = (
         "Nominal knowledge. Differences are paired: the same noise draws. Time: wall microseconds per ego, step and "
-        f"run on one thread of this machine. {_conditions(results)}"
+        f"run on one thread of this machine, with the compiling where it is the first call. {_conditions(results)}"
     )
     return Table(header, tuple(body), text, decimals=3) if body else None
 
@@ -115,7 +115,7 @@ PANELS = {"window, lag or horizon [steps]": ("window", "lag", "horizon"), "round
 
 def _figure(results: Results) -> Plot | None:
     """RT-LE against the steps of a window, and against rounds of messages."""
-    from coopoc.study.plot import Plot, canvas, legend, strokes
+    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
 
     if views.present(results, {"choice": [choice for _, choice in CHOICES]}) is None:
         return None
@@ -135,7 +135,8 @@ def _figure(results: Results) -> Plot | None:
         panels[1].set_xscale("log")
         panels[1].set_xticks([1, 2, 3, 5, 10, 30], labels=["1", "2", "3", "5", "10", "30"])
         panels[1].minorticks_off()
-        panels[0].set(ylabel="RT-LE [m]", ylim=(0, None))
+        plain_log(panels[0].yaxis)
+        panels[0].set(ylabel="RT-LE [m]")
         legend(panels[1], [*drawn, *([{"method": "bound"}] if bound is not None else [])])
     return Plot(figure, f"RT-LE against what is spent on a step; horizontal: the bound. {_conditions(results)}")
 

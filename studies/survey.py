@@ -81,7 +81,7 @@ LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
 QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "correlated_gnss": ("And if errors of GNSS last?", ("own:", "common:")),
     "latency_loss": ("If messages are late or lost?", ("",)),
-    "heading_error": ("If the heading is wrong?", ("",)),
+    "heading_error": ("If the heading is wrong?", ("4° of bias",)),
     "robustness": ("If neighbours lie?", ("",)),
     "consistency": ("Whose covariance can be believed?", ("",)),
 }

@@ -94,9 +94,8 @@ def test_the_track_is_the_problems_solution(recording: Recording, window: int) -
         solution = solve(problem)
         assert track.x[run, step, 0] == pytest.approx(solution.x[problem.hub[-1]], abs=2e-5)
         assert track.covariance[run, step, 0] == pytest.approx(solution.covariance[problem.hub[-1]], abs=1e-5)
-        links = recording.links.of(0)
-        links = links[recording.links.step[links] == step]
-        assert track.neighbours[run, links] == pytest.approx(solution.x[problem.hub[-1] + 1 :], abs=2e-5)
+        here = recording.links.step[recording.links.of(0)] == step
+        assert track.neighbours[run, here] == pytest.approx(solution.x[problem.hub[-1] + 1 :], abs=2e-5)
 
 
 @pytest.mark.parametrize("backend", ["gtsam", "osqp"])

@@ -130,7 +130,7 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
         np.testing.assert_allclose(cov, track.covariance[1, t, 0], atol=1e-12)
         assert list(stream.neighbours) == [s.id for s in seen]
         for k, s in enumerate(seen, start=int(box.start[t])):
-            np.testing.assert_allclose(stream.neighbours[s.id], track.neighbours[1, box.link[k]], atol=1e-9)
+            np.testing.assert_allclose(stream.neighbours[s.id], track.neighbours[1, k], atol=1e-9)
 
 
 def peer(x: Floats, known: Knowledge) -> Any:
