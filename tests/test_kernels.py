@@ -244,7 +244,7 @@ def test_without_numba_the_reference_serves_and_says_so_once(crossing: Fleet, mo
     recording, method = observe(crossing, S2, V2X(max_neighbours=3), runs=1), JointFilter()
     wanted = method(recording, [0])
     monkeypatch.setitem(sys.modules, "numba", None)
-    kernels._numba_is_there.cache_clear()
+    kernels.numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match=r"pip install 'coopoc\[fast\]'"):
             found = method(recording, [0])
@@ -253,7 +253,7 @@ def test_without_numba_the_reference_serves_and_says_so_once(crossing: Fleet, mo
             warnings.simplefilter("error")
             CooperativeMAP()(recording, [0])
     finally:
-        kernels._numba_is_there.cache_clear()
+        kernels.numba_is_there.cache_clear()
 
 
 def test_a_wrong_switch_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

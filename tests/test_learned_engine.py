@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from coopoc import InputError
+from coopoc.kernels.compile import numba_is_there, part
 from coopoc.learned import GainNet
 from coopoc.learned.engine import rollout as engine
-from coopoc.learned.engine.arithmetic import compiled, sigmoid, tanh
-from coopoc.learned.nets import gain_net as net_module
+from coopoc.learned.engine.arithmetic import sigmoid, tanh
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training import schedule as schedule_module
 from coopoc.learned.training.clients import Batch
@@ -64,7 +64,7 @@ def grad(leaf: Tensor) -> Tensor:
 
 
 def test_tanh_and_sigmoid_against_numpy() -> None:
-    @compiled
+    @part
     def both(x: np.ndarray, out: np.ndarray) -> None:
         for i in range(len(x)):
             out[0, i], out[1, i] = tanh(x[i], x.dtype.type), sigmoid(x[i], x.dtype.type)
@@ -170,9 +170,9 @@ def test_a_model_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> N
     assert torch.equal(stacked[0][:, 3:4], alone[0])
     assert torch.equal(stacked[1][3:4], alone[1])
     one = Batch(*(part[:, 3:4] for part in data[:3]), data.x0[3:4], 0.1)
-    for whole, part in zip(nets[0].loss_and_gradient(flatten(nets), data),
+    for whole, cut in zip(nets[0].loss_and_gradient(flatten(nets), data),
                            nets[0].loss_and_gradient(flatten(nets[3:4]), one), strict=True):  # fmt: skip
-        assert torch.equal(whole[3:4], part)
+        assert torch.equal(whole[3:4], cut)
 
 
 def test_without_gradients_the_answer_is_the_same() -> None:
@@ -241,13 +241,13 @@ def test_without_numba_plain_torch_serves_and_says_so(monkeypatch: pytest.Monkey
     theta = flatten(nets)
     expected = nets[0].loss_and_gradient(theta, data)
     monkeypatch.setitem(sys.modules, "numba", None)
-    net_module._engine.cache_clear()
+    numba_is_there.cache_clear()
     try:
         with pytest.warns(UserWarning, match=r"pip install 'coopoc\[fast\]'"):
             found = nets[0].loss_and_gradient(theta, data)
         again = nets[0].loss_and_gradient(theta, data)
     finally:
-        net_module._engine.cache_clear()
+        numba_is_there.cache_clear()
     for one, two, three in zip(expected, found, again, strict=True):
         torch.testing.assert_close(one, two, rtol=1e-8, atol=1e-12)
         assert torch.equal(two, three)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import warnings
 from collections.abc import Callable
@@ -25,18 +26,19 @@ def use_kernels() -> bool:
     wish = os.environ.get(SWITCH, "numba")
     if wish not in ("numba", "numpy"):
         raise InputError(SWITCH, repr(wish), "must be 'numba' or 'numpy'", "Unset the environment variable.")
-    return wish == "numba" and _numba_is_there()
+    return wish == "numba" and numba_is_there("the NumPy reference runs, many times slower")
 
 
 @cache
-def _numba_is_there() -> bool:
-    try:
-        import numba  # noqa: F401
-    except ImportError:
-        warnings.warn(
-            "numba is not installed: the NumPy reference runs, many times slower. Run: pip install 'coopoc[fast]'",
-            stacklevel=2,
-        )
+def numba_is_there(instead: str) -> bool:
+    """Whether anything can be compiled; if not, one warning says what runs instead.
+
+    Args:
+        instead: the end of a sentence, such as "the NumPy reference runs, many times slower".
+    """
+    if importlib.util.find_spec("numba") is None:
+        text = f"numba is not installed: {instead}. Run: pip install 'coopoc[fast]'"
+        warnings.warn(text, stacklevel=2)
         return False
     return True
 
@@ -47,20 +49,37 @@ def compiled(function: Function) -> Function:
     The machine code is kept beside the source, or in the user's cache where that is read-only. It is made anew after a
     change of any file of the kernels or of the function's own folder, since it holds what it calls.
     """
-    return _compiled(function, {"contract"})
+    return _kept(_made(function, {"contract"}), function)
 
 
 def as_written(function: Function) -> Function:
     """Compiled, each product and sum rounded as it stands, so that numbers and vectors of them get the same digits."""
-    return _compiled(function, set())
+    return _kept(_made(function, set()), function)
 
 
-def _compiled(function: Function, liberties: set[str]) -> Function:
+def part(function: Function) -> Function:
+    """Compiled as `compiled` is, together with the first kernel that calls it, and kept in that one's machine code."""
+    return cast(Function, _made(function, {"contract"}))
+
+
+def summing(function: Function) -> Function:
+    """A part that adds many terms: it may do so in several sums, in one way for all arguments."""
+    return cast(Function, _made(function, {"contract", "reassoc"}))
+
+
+def _made(function: Function, liberties: set[str]) -> Any:
     import numba
 
-    made: Any = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=liberties)(function)
+    return numba.njit(nogil=True, error_model="numpy", fastmath=liberties)(function)
+
+
+def _kept(made: Any, function: Function) -> Function:
     folders = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
-    made._cache._cache_file._source_stamp = _stamp(tuple(sorted(folders)))
+    try:
+        made.enable_caching()
+        made._cache._cache_file._source_stamp = _stamp(tuple(sorted(folders)))
+    except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
+        pass
     return cast(Function, made)
 
 

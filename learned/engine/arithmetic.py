@@ -1,52 +1,23 @@
-"""What the compiled kernels share: how they are compiled, tanh and sigmoid that vectorise, views into flat memory."""
+"""What the compiled kernels share: tanh and sigmoid that vectorise, aligned memory, views into flat memory."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, cast
+from typing import Any, TypeAlias, cast
 
-import numba
 import numpy as np
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from coopoc.arrays import AnyArray
+from coopoc.kernels.compile import part
 
 PAD = 16
 """Columns of matrices come in multiples of this: whole vectors in either precision."""
 ZERO, ONE, TWO, THREE = np.arange(4)
 """NumPy's integers, because numba compiles a function anew for each constant of Python's."""
-SOURCES = tuple(Path(__file__).with_stem(stem).stat().st_mtime_ns for stem in
-                ("arithmetic", "places", "product", "tape", "forward", "backward", "optimiser"))  # fmt: skip
-"""What compiled code on disk was made from: numba itself looks at a function's own file only, not at those it calls."""
 Index: TypeAlias = int | np.integer[Any]
 """What kernels count and index with: Python's integers, and NumPy's that come from tables of them."""
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-def compiled(function: Function) -> Function:
-    """Compiled with the first kernel that calls it, without the interpreter's lock.
-
-    A product and a sum may become one instruction; nothing is reordered.
-    """
-    return cast(Function, numba.njit(nogil=True, error_model="numpy", fastmath={"contract"})(function))
-
-
-def summing(function: Function) -> Function:
-    """The same for a function that adds many terms: it may do so in several sums, in one way for all arguments."""
-    return cast(Function, numba.njit(nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})(function))
-
-
-def kernel(function: Function) -> Function:
-    """The same for what Python calls; machine code, with that of all it calls, is kept on disk for the next process."""
-    made = cast(Any, compiled(function))
-    try:
-        made.enable_caching()
-        made._cache._cache_file._source_stamp = SOURCES
-    except RuntimeError:  # neither this folder nor the user's can be written: every process compiles
-        pass
-    return cast(Function, made)
 
 
 def view(function: Callable[..., Any]) -> Callable[..., AnyArray]:
@@ -54,7 +25,7 @@ def view(function: Callable[..., Any]) -> Callable[..., AnyArray]:
     return cast(Callable[..., AnyArray], intrinsic(function))
 
 
-@compiled
+@part
 def tanh(v: Any, real: Any) -> Any:
     """tanh from [7/6] of its continued fraction at v/4 and two doublings, tanh 2y = 2 tanh y / (1 + tanh^2 y).
 
@@ -71,19 +42,19 @@ def tanh(v: Any, real: Any) -> Any:
     return (p + p) * q / (p * p + q * q)
 
 
-@compiled
+@part
 def sigmoid(v: Any, real: Any) -> Any:
     """1 / (1 + exp(-v))."""
     return real(0.5) + real(0.5) * tanh(real(0.5) * v, real)
 
 
-@compiled
+@part
 def whole(columns: Index) -> Index:
     """Columns rounded up to whole vectors."""
     return (columns + PAD - 1) // PAD * PAD
 
 
-@compiled
+@part
 def aligned(size: Index, like: AnyArray) -> AnyArray:
     """Zeros (size,) that begin where a vector may begin: one that crosses a line of the cache takes twice as long."""
     memory = np.zeros(size + PAD, like.dtype)

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats, Ints
+from coopoc.kernels.compile import compiled, part
 
 from ..nets.gain_net import LOG_FLOOR, SHORTEST
 from . import places as on
-from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, compiled, kernel, lent, window
+from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, lent, window
 from .forward import blend, layer, missing
 from .product import add_outer, add_product, dots, gated_product
 from .tape import Net, Tape, bias, matrix, pack, rows, span, unpack
@@ -40,7 +41,7 @@ class Inner(NamedTuple):
     gates: Floats
 
 
-@kernel
+@compiled
 def backward(
     theta: Floats, padded: Floats, layers: Ints, gnss: Floats, pulls: Floats, kept: Floats, fields: Ints, size: Index,
     delta_fields: Ints, delta_size: Index, slots: Index, gradient: Floats, first: Index, last: Index,
@@ -72,7 +73,7 @@ def backward(
                   positions)  # fmt: skip
 
 
-@compiled
+@part
 def _rollback(
     net: Net, ahead: Net, made: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, steps: Index, at: Index,
     stride: Index, slots: Index, work: Floats, positions: Floats,
@@ -96,7 +97,7 @@ def _rollback(
     pack(made)
 
 
-@compiled
+@part
 def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Pull, Inner]:
     """No gradient yet, in this memory, and room for those within a step."""
     wide, size, step = np.int64(PAD), lanes * PAD, lanes * THREE
@@ -112,7 +113,7 @@ def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Pull, Inner
     return pull, inner
 
 
-@compiled
+@part
 def _again(net: Net, tape: Tape) -> None:
     """The outputs of the wide layers at the present step, and what stands beside them."""
     moved, seen, wide = rows(tape, on.PRIOR_IN), rows(tape, on.INNOVATION_IN), net.layers[on.UPDATE, 2]
@@ -124,7 +125,7 @@ def _again(net: Net, tape: Tape) -> None:
     blend(tape, on.PROCESS_OLD, on.PROCESS_GATES, moved, wide)
 
 
-@compiled
+@part
 def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
     """Add what `count` steps from the present one on contribute to the gradient of every weight and bias.
 
@@ -142,7 +143,7 @@ def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
         add_outer(lent(one), ZERO, ONE, delta, column, bias(gradient, name))
 
 
-@compiled
+@part
 def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
     """Back over a step: `pull` becomes the gradient with respect to the state before it."""
     gain = _room(net, on.GAIN, deltas)
@@ -166,7 +167,7 @@ def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Ta
     _end(net, ahead, gnss, pull, tape, deltas, inner)
 
 
-@compiled
+@part
 def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, posterior: Floats) -> None:
     """Gradients of what a step gives: new states, K and innovation by x = x_prior + K (z - x_prior), posterior.
 
@@ -190,7 +191,7 @@ def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, pos
             posterior[b, j] = zero if gone or posterior_out[b, j] <= zero else pull.prior[b, j]
 
 
-@compiled
+@part
 def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
     """Gradients of the four changes, and `pull` before the step; without a fix only x and x_before were moved on."""
     wide = net.layers[on.UPDATE, 2]
@@ -217,7 +218,7 @@ def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tap
             pull.innovation[b, j] = inner.innovation[b, j]
 
 
-@compiled
+@part
 def _turn(features: Floats, lengths: Floats, b: Index, which: Index, values: Floats) -> None:
     """Gradient of a change, in place, from that of its direction and of the logarithm of its length."""
     real, at = values.dtype.type, on.CHANGES[which, 0]
@@ -230,26 +231,26 @@ def _turn(features: Floats, lengths: Floats, b: Index, which: Index, values: Flo
     values[b, 2] = r * scale + w * in_length
 
 
-@compiled
+@part
 def _room(net: Net, name: Index, deltas: Tape) -> Floats:
     """The field where the gradient of a layer's outputs stands."""
     return rows(deltas, net.layers[name, 9])
 
 
-@compiled
+@part
 def _add(net: Net, name: Index, deltas: Tape, at: Index, out: Floats) -> None:
     """Add to out (B, PAD) the gradient of a layer's inputs from input `at` on."""
     add_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name), at, out)
 
 
-@compiled
+@part
 def _gate(net: Net, name: Index, tape: Tape, reached: Index, below: Index, deltas: Tape) -> None:
     """The gradient of a layer's inputs, where these are positive, as that of the outputs of the layer below."""
     gated_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name),
                   rows(tape, reached), _room(net, below, deltas))  # fmt: skip
 
 
-@compiled
+@part
 def _gru(
     net: Net, name: Index, old: Index, gates_name: Index, after: Floats, work: Floats, tape: Tape, deltas: Tape
 ) -> None:

@@ -7,10 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats, Ints
+from coopoc.kernels.compile import compiled, part
 
 from ..nets.gain_net import LOG_FLOOR, SHORTEST
 from . import places as on
-from .arithmetic import PAD, THREE, ZERO, Index, aligned, compiled, kernel, lent, sigmoid, tanh, window
+from .arithmetic import PAD, THREE, ZERO, Index, aligned, lent, sigmoid, tanh, window
 from .product import affine, spread
 from .tape import Net, Tape, bias, matrix, rows, unpack
 
@@ -35,7 +36,7 @@ class Seen(NamedTuple):
     dt: float
 
 
-@kernel
+@compiled
 def forward(
     theta: Floats, padded: Floats, layers: Ints, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, kept: Floats,
     fields: Ints, size: Index, keep: Index, x: Floats, first: Index, last: Index,
@@ -59,7 +60,7 @@ def forward(
                  models * lanes * 3, keep, work, grus, positions)  # fmt: skip
 
 
-@compiled
+@part
 def _rollout(
     net: Net, tape: Tape, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, x: Floats, at: Index, stride: Index,
     keep: Index, work: Floats, grus: Floats, positions: Floats,
@@ -77,7 +78,7 @@ def _rollout(
         at += stride
 
 
-@compiled
+@part
 def _start(x0: Floats, grus: Floats, positions: Floats) -> State:
     """The state before the first step, in this memory: GRU states I, 0, I, all positions x0 (B, 3) m."""
     lanes, wide = len(x0), np.int64(PAD)
@@ -95,13 +96,13 @@ def _start(x0: Floats, grus: Floats, positions: Floats) -> State:
     return state
 
 
-@compiled
+@part
 def missing(gnss: Floats, b: Index) -> bool:
     """Whether lane b of gnss (B, 3) has no fix."""
     return bool(np.isnan(gnss[b, 0]) and np.isnan(gnss[b, 1]) and np.isnan(gnss[b, 2]))
 
 
-@compiled
+@part
 def _look(seen: Seen, state: State, tape: Tape, logs: bool) -> None:
     """The four changes as the layers read them, their lengths, and the innovation; a missing fix repeats the last."""
     real, features, lengths = state.x.dtype.type, rows(tape, on.FEATURES), rows(tape, on.LENGTHS)
@@ -124,7 +125,7 @@ def _look(seen: Seen, state: State, tape: Tape, logs: bool) -> None:
             lengths[b, which] = length
 
 
-@compiled
+@part
 def _think(net: Net, state: State, tape: Tape, work: Floats) -> None:
     """The net itself, from features to gain and posterior, all on the tape."""
     wide, core, back = net.layers[on.UPDATE, 2], rows(tape, on.CORE), window(work, ZERO, tape.lanes, np.int64(PAD))
@@ -146,14 +147,14 @@ def _think(net: Net, state: State, tape: Tape, work: Floats) -> None:
     layer(net, on.POSTERIOR, tape, rows(tape, on.POSTERIOR_OUT), on.FIRST)
 
 
-@compiled
+@part
 def layer(net: Net, name: Index, tape: Tape, out: Floats, at: Index) -> None:
     """What a layer makes of its window of the tape, into out (B, n) from column `at` on, with padding."""
     inputs, relu, field, column = net.layers[name, 3], net.layers[name, 6], net.layers[name, 7], net.layers[name, 8]
     affine(rows(tape, field), column, inputs, matrix(net, name), bias(net, name), relu > 0, out, at)
 
 
-@compiled
+@part
 def _gru(
     net: Net, name: Index, old: Index, gates_name: Index, state: Floats, tape: Tape, work: Floats, out: Floats,
     at: Index,
@@ -181,7 +182,7 @@ def _gru(
     blend(tape, old, gates_name, out, at)
 
 
-@compiled
+@part
 def blend(tape: Tape, old: Index, gates_name: Index, out: Floats, at: Index) -> None:
     """h <- n + z (h - n), the new state of a GRU, into out from column `at` on."""
     before, gates = rows(tape, old), rows(tape, gates_name)
@@ -191,7 +192,7 @@ def blend(tape: Tape, old: Index, gates_name: Index, out: Floats, at: Index) -> 
             out[b, at + j] = fresh + gates[b, on.KEEP + j] * (before[b, j] - fresh)
 
 
-@compiled
+@part
 def _move(seen: Seen, state: State, tape: Tape, wide: Index, x: Floats) -> None:
     """x <- x_prior + K (z - x_prior) and the states of the GRUs; without a fix x <- x_prior and nothing else."""
     lengths, core, moved = rows(tape, on.LENGTHS), rows(tape, on.CORE), rows(tape, on.PRIOR_IN)
@@ -214,7 +215,7 @@ def _move(seen: Seen, state: State, tape: Tape, wide: Index, x: Floats) -> None:
                 state.innovation[b, j] = core[b, on.CORE_INNOVATION + j]
 
 
-@kernel
+@compiled
 def score(x: Floats, truth: Floats, pulls: Floats, losses: Floats) -> None:
     """Squared errors (S,), mean over time and lanes, sum over components, and their gradient in x, pulls (T, S, B, 3).
 

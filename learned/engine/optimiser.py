@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, Ints
+from coopoc.kernels.compile import compiled, part, summing
 
-from .arithmetic import Index, compiled, kernel, lent, summing
+from .arithmetic import Index, lent
 
 
-@kernel
+@compiled
 def advance(
     theta: Floats, gradient: Floats, began: Floats, first: Floats, second: Floats, losses: Floats, rows: Ints,
     step: Index, rates: Floats, decay: float, l2: float, proximal: float, limit: float, finite: Bools,
@@ -34,7 +35,7 @@ def advance(
                    real(1.0 - rates[r] * decay), real(pace), real(size))  # fmt: skip
 
 
-@compiled
+@part
 def _pull(theta: Floats, gradient: Floats, began: Floats, penalty: Any, i: Index) -> Any:
     """Gradient of loss and penalties with respect to weight i."""
     return gradient[i] + penalty[0] * theta[i] + penalty[1] * (theta[i] - began[i])
@@ -52,7 +53,7 @@ def _square(theta: Floats, gradient: Floats, began: Floats, penalty: Any) -> Any
     return square + spoilt
 
 
-@compiled
+@part
 def _adamw(
     theta: Floats, gradient: Floats, began: Floats, penalty: Any, first: Floats, second: Floats, scale: Any, keep: Any,
     pace: Any, size: Any,

@@ -15,8 +15,9 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from coopoc.arrays import AnyArray
+from coopoc.kernels.compile import part, summing
 
-from .arithmetic import PAD, ZERO, Index, compiled, summing
+from .arithmetic import PAD, ZERO, Index
 
 BYTES = 64 if binding.get_host_cpu_features().get("avx512f") else 32
 """Of a vector register."""
@@ -31,7 +32,7 @@ instructions = cast(Callable[[Callable[..., Any]], Callable[..., Any]], intrinsi
 """`intrinsic` with a type."""
 
 
-@compiled
+@part
 def affine(
     a: AnyArray, at: Index, depth: Index, b: AnyArray, start: AnyArray, relu: bool, out: AnyArray, column: Index
 ) -> None:
@@ -45,7 +46,7 @@ def affine(
            out.dtype.type)  # fmt: skip
 
 
-@compiled
+@part
 def gated_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, gate: AnyArray, out: AnyArray) -> None:
     """out (m, n) = a[:, at:] (m, depth) b (depth, n) where gate (m, n) is positive, else zero."""
     size = out.itemsize
@@ -53,7 +54,7 @@ def gated_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, gate: AnyAr
            _at(out), out.strides[0], a.shape[0], depth, out.strides[0], GATE, out.dtype.type)  # fmt: skip
 
 
-@compiled
+@part
 def add_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, column: Index, out: AnyArray) -> None:
     """out (m, n) += a[:, at:] (m, depth) b[:, column:] (depth, n)."""
     size = out.itemsize
@@ -62,7 +63,7 @@ def add_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, column: Index
            out.dtype.type)  # fmt: skip
 
 
-@compiled
+@part
 def add_outer(a: AnyArray, at: Index, count: Index, b: AnyArray, column: Index, out: AnyArray) -> None:
     """out (count, n) += a[:, at:] (k, count)^T b[:, column:] (k, n).
 
@@ -89,7 +90,7 @@ def dots(a: AnyArray, depth: Index, b: AnyArray, first: Index, out: AnyArray) ->
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = s, t, u, v if logs else zero
 
 
-@compiled
+@part
 def _tiles(
     a: Index, a_row: Index, a_column: Index, b: Index, b_row: Index, start: Index, start_row: Index, gate: Index,
     gate_row: Index, out: Index, out_row: Index, rows: Index, depth: Index, end: Index, how: Index, real: Any,
@@ -117,7 +118,7 @@ def _at(typing: Any, array: Any) -> Any:
     return types.intp(array), generate
 
 
-@compiled
+@part
 def spread(gates: AnyArray) -> None:
     """Of every row of gates (m, 3 PAD), the three nines at 0, 9, 18 to 0, PAD, 2 PAD, where vectors begin.
 
@@ -137,11 +138,11 @@ def _spread(typing: Any, gates: Any, row: Any) -> Any:
         first = builder.gep(struct.data, [builder.mul(values[1], values[1].type(3 * PAD))])
         both = ir.VectorType(number, 2 * PAD)
         given = builder.load(builder.bitcast(first, ir.PointerType(both)), align=4)
-        for part in (1, 2):
-            mask = [min(9 * part + i, 2 * PAD - 1) for i in range(PAD)]
+        for half in (1, 2):
+            mask = [min(9 * half + i, 2 * PAD - 1) for i in range(PAD)]
             taken = ir.Constant(ir.VectorType(lane, PAD), mask)
             moved = builder.shuffle_vector(given, ir.Constant(both, ir.Undefined), taken)
-            place = builder.gep(first, [values[1].type(PAD * part)])
+            place = builder.gep(first, [values[1].type(PAD * half)])
             builder.store(moved, builder.bitcast(place, ir.PointerType(moved.type)), align=4)
         return context.get_dummy_value()
 

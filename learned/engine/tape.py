@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from coopoc.arrays import AnyArray, Bools, Ints
+from coopoc.kernels.compile import part
 
-from .arithmetic import ONE, PAD, Index, compiled, whole, window
+from .arithmetic import ONE, PAD, Index, whole, window
 
 
 class Net(NamedTuple):
@@ -38,13 +39,13 @@ class Tape(NamedTuple):
     lanes: Index
 
 
-@compiled
+@part
 def room(outputs: Index, inputs: Index) -> Index:
     """Padded memory of a layer: its weight, turned or not, and its bias."""
     return max(inputs * whole(outputs), outputs * whole(inputs + PAD - 9)) + whole(outputs)
 
 
-@compiled
+@part
 def matrix(net: Net, layer: Index) -> AnyArray:
     """Weight (outputs, inputs) of a layer, or turned (inputs, outputs), a view; inputs stand as on the tape.
 
@@ -55,7 +56,7 @@ def matrix(net: Net, layer: Index) -> AnyArray:
     return window(net.padded, at, rows, columns)
 
 
-@compiled
+@part
 def bias(net: Net, layer: Index) -> AnyArray:
     """Bias (1, outputs) of a layer with padded columns, a view."""
     outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
@@ -63,7 +64,7 @@ def bias(net: Net, layer: Index) -> AnyArray:
     return window(net.padded, end - whole(outputs), ONE, whole(outputs))
 
 
-@compiled
+@part
 def unpack(net: Net) -> None:
     """Every layer's weight and bias from theta into its matrix, with zeros as padding."""
     net.padded[:] = 0.0
@@ -83,7 +84,7 @@ def unpack(net: Net) -> None:
                     weights[column, o] = source[o, i]
 
 
-@compiled
+@part
 def pack(net: Net) -> None:
     """Every layer's weight and bias from its matrix into theta."""
     for layer in range(len(net.layers)):
@@ -100,13 +101,13 @@ def pack(net: Net) -> None:
                 target[o, :last] = weights[o, inputs - last : inputs]
 
 
-@compiled
+@part
 def rows(tape: Tape, name: Index) -> AnyArray:
     """(B, width) of a field at the present step, a view."""
     return span(tape, name, ONE)
 
 
-@compiled
+@part
 def span(tape: Tape, name: Index, count: Index) -> AnyArray:
     """(count B, width) of a field at `count` steps from the present one on, a view."""
     width, kept = tape.fields[name, 1], tape.fields[name, 2]

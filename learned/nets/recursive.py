@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
-from functools import cache
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -12,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from coopoc.arrays import Floats
+from coopoc.kernels.compile import numba_is_there
 from coopoc.methods.track import Method
 
 from ..training.clients import Batch
@@ -149,14 +148,9 @@ class _Reference(nn.Module):
         return self.net.reference(batch)
 
 
-@cache
 def _kernel() -> ModuleType | None:
     """The compiled rollout; None, with one warning, where numba is missing."""
-    try:
-        import numba  # noqa: F401
-    except ImportError:
-        mend = "pip install 'coopoc[fast]' (numba)"
-        warnings.warn(f"RecursiveGain runs in plain torch, some fifty times slower than compiled: {mend}", stacklevel=2)
+    if not numba_is_there("RecursiveGain runs in plain torch, some fifty times slower than compiled"):
         return None
     from . import recursive_kernel
 

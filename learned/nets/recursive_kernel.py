@@ -10,8 +10,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray
+from coopoc.kernels.compile import compiled, part
 
-from ..engine.arithmetic import compiled, sigmoid, tanh
+from ..engine.arithmetic import sigmoid, tanh
 from ..training.clients import Batch
 from .levels import FADE, FEATURES, FORGET, GNSS_STD, POOL, STILL, VELOCITY_SHARE, WEIGHT
 from .recursive import HEADS, LIMIT, RecursiveGain
@@ -84,7 +85,7 @@ def _product(delta: Tensor, given: Tensor) -> Tensor:
     return delta.flatten(1, 2).mT @ given.flatten(1, 2)
 
 
-@compiled
+@part
 def _levels(
     fix: AnyArray, velocity: AnyArray, x0: AnyArray, dt: float, gnss: AnyArray, ratio: AnyArray, told: AnyArray
 ) -> None:
@@ -160,7 +161,7 @@ def _forward(seen: Arrays, net: Arrays, into: AnyArray, tape: Arrays) -> None:
                 estimates[s, t, lane], spreads[s, t, lane] = x[lane], spread[lane]
 
 
-@compiled
+@part
 def _gru(
     into: AnyArray, own: AnyArray, weight: AnyArray, bias: AnyArray, back: AnyArray, gates: AnyArray, h: AnyArray
 ) -> None:
@@ -217,7 +218,7 @@ def _backward(
                     x[lane] -= pull / np.sqrt((real(1.0) + p) * gnss[s, t, lane])
 
 
-@compiled
+@part
 def _filter_back(seen: Arrays, tape: Arrays, at: Any, x: Any, spread: Any, variance: Any, heads: AnyArray) -> Any:
     """Pull on the spread before a step from those on x, spread and variance after it; those on the heads' outputs."""
     _, spreads, priors, gains, es, _, _, _, _, logs = tape
@@ -239,7 +240,7 @@ def _filter_back(seen: Arrays, tape: Arrays, at: Any, x: Any, spread: Any, varia
     return prior
 
 
-@compiled
+@part
 def _gru_back(gates: AnyArray, before: AnyArray, more: AnyArray, h: AnyArray, into: AnyArray, state: AnyArray) -> None:
     """Pulls through one lane's GRU step; h, the pull on its state, becomes the direct part of that one step before."""
     size, real = len(h), h.dtype.type

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.util import find_spec
 from types import ModuleType
 from typing import Literal
 
@@ -15,6 +13,7 @@ from torch import Tensor
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
+from coopoc.kernels.compile import numba_is_there
 
 Epoch = Literal["step", "pass"]
 
@@ -129,10 +128,9 @@ def advance(
     return good
 
 
-@cache
 def _compiled() -> ModuleType | None:
     """The compiled step; None where numba is missing."""
-    if find_spec("numba") is None:
+    if not numba_is_there("AdamW runs in torch, several times slower than compiled"):
         return None
     from ..engine import optimiser
 
