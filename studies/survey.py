@@ -40,7 +40,7 @@ def survey(
     began = time.perf_counter()
     changes = {"data": data, **({} if runs is None else {"runs": runs})}
     found = stages(NAMES, out, jobs, changes)
-    page = report([out / name for name in NAMES], out / "report.html", title=TITLE, lead=answers(found))
+    page = report([out / name for name in NAMES], out / "report.html", title=TITLE, answers=answers(found))
     return ended(began, found, page)
 
 
@@ -67,19 +67,26 @@ def ended(began: float, found: Mapping[str, Results], page: Path) -> int:
     return int(failed > 0)
 
 
-def answers(found: Mapping[str, Results]) -> list[str]:
-    """Question and answer, one sentence each, from what was run."""
-    said = [f"Which method with {words}? {answer}" for limit, words in LIMITS.items()
-            if "budget" in found and (answer := _under(found["budget"], limit))]  # fmt: skip
+def answers(found: Mapping[str, Results]) -> dict[str, str]:
+    """Question -> answer, from what was run."""
+    said = {}
+    for limit, words in LIMITS.items():
+        if "budget" in found and (answer := _under(found["budget"], limit)):
+            said[f"Which method with {words}?"] = answer
     for name, (question, begins) in QUESTIONS.items():
         told = [s for s in _findings(name, found[name]) if s.startswith(begins)] if name in found else []
-        said += [f"{question} {' '.join(told[:2])}"] if told else []
+        if told:
+            said[question] = _sentence(" ".join(map(_sentence, told[:2])))
     return said
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
 QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "correlated_gnss": ("And if errors of GNSS last?", ("own:", "common:")),
+    "correlated_gnss": ("If errors of GNSS last?", ("own:", "common:")),
     "latency_loss": ("If messages are late or lost?", ("",)),
     "heading_error": ("If the heading is wrong?", ("4° of bias",)),
     "robustness": ("If neighbours lie?", ("",)),
@@ -109,4 +116,4 @@ def _under(results: Results, limit: float) -> str:
             use = f" with K = {k} and {best.size:.0f} B/s" if k else ""
             far = budget.gap(results, best.where)
             parts.append(f"{words}, {look(best.where['method']).label}{use}: {best.error:.2f} m{far}")
-    return f"{'; '.join(parts)}." if parts else ""
+    return _sentence(f"{'; '.join(parts)}.") if parts else ""

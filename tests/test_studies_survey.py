@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from coopoc.studies import survey, views
+from coopoc.study.report import report
 
 
 def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -24,11 +25,14 @@ def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: 
     assert alone is not None
     assert together is not None
     assert bound is not None
-    rich, poor, none, heading = said
-    assert rich.startswith("Which method with at most 5 kB/s? with the noise known, Joint filter with K = 4 and ")
+    limits = [f"Which method with {words}?" for words in survey.LIMITS.values()]
+    assert list(said) == [*limits, "If the heading is wrong?"]
+    rich, poor, none, heading = said.values()
+    assert rich.startswith("With the noise known, Joint filter with K = 4 and ")
     assert f"{together / bound:.2f} times the bound" in rich
-    assert none.startswith("Which method with no V2X? with the noise known, KF: ")
+    assert none.startswith("With the noise known, KF: ")
     assert "with the noise fitted elsewhere, KF" in none
     assert poor != rich  # 4 neighbours at 10 Hz take more than 300 B/s
-    assert heading.startswith("If the heading is wrong? 4° of")
-    assert (tmp_path / "budget" / "views.json").is_file()
+    assert heading.startswith("4° of bias")
+    page = report([tmp_path / "budget"], tmp_path / "report.html", answers=said).read_text()
+    assert f"<dt>Which method with no V2X?</dt><dd>{none}</dd>" in page

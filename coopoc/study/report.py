@@ -29,6 +29,7 @@ def report(
     out: str | Path,
     title: str = "",
     lead: Sequence[str] = (),
+    answers: Mapping[str, str] | None = None,
     cards: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> Path:
     """Write one page that shows several studies, and return its path.
@@ -36,6 +37,7 @@ def report(
     Args:
         folders: of finished studies, in the order of the page. out: the file; a name in .pdf is printed by Chromium.
         title: of the page. lead: sentences under it, before the first study.
+        answers: question -> answer, shown after those.
         cards: name -> field -> value of the data that the studies stand on.
 
     Raises:
@@ -49,8 +51,9 @@ def report(
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
     page = _template().render(
-        title=title or f"coopoc: {', '.join(section['title'] for section in sections)}", lead=lead, sections=sections,
-        cards=cards or {}, environment=_environment(sections), css=markupsafe.Markup(_own("report.css")),
+        title=title or f"coopoc: {', '.join(section['title'] for section in sections)}", lead=lead,
+        answers=answers or {}, sections=sections, cards=cards or {}, environment=_environment(sections),
+        css=markupsafe.Markup(_own("report.css")),
         script=markupsafe.Markup(_own("report.js")),
     )  # fmt: skip
     store.write(Path(out), printed(page) if Path(out).suffix.lower() == ".pdf" else page)
