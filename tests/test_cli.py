@@ -43,7 +43,7 @@ def test_help_loads_nothing_heavy_and_lists_what_others_add(tmp_path: Path) -> N
     assert re.search(r"run +Run a study", own.stdout)
 
 
-@pytest.mark.parametrize("name", ["run", "merge", "compare", "table", "report", "list", "greet"])
+@pytest.mark.parametrize("name", ["run", "merge", "compare", "table", "report", "list", "reference", "survey", "greet"])
 def test_each_command_explains_itself_with_an_example(tmp_path: Path, name: str) -> None:
     done = coopoc(name, "--help", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
