@@ -13,6 +13,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.ledger import Kind, Ledger, Way, of_track
 from coopoc.evaluate.metrics import errors, max_error, nees, neighbour_rt_le, rt_le, share_inside
+from coopoc.methods.catalogue import METHODS
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.knowledge import Knowledge
@@ -35,8 +36,14 @@ COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 
 
 def key(p: Params) -> dict[str, str]:
-    """What changes the numbers of a cell beyond its parameters: data, code, and what was trained or fitted."""
+    """What changes the numbers of a cell beyond its parameters: data, code, and what was trained or fitted.
+
+    Raises:
+        InputError: a method that nobody has, or other settings that no cell can be computed with.
+    """
     found = dict(scene.facts(p))
+    if p["method"] not in METHODS and p["method"] not in weights.LEARNED and p["method"] != "bound":
+        find("coopoc.methods", p["method"])
     if p["method"] in weights.LEARNED:
         found["weights"] = weights.key(p["method"], p)
     if p.get("knowledge") == "fitted":

@@ -189,6 +189,8 @@ def _given(p: Params, name: str, default: float) -> float:
 def facts(p: Params) -> Mapping[str, str]:
     """What changes the numbers beyond a cell's parameters: its data and all code; InputError for what cannot be."""
     sensors(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
+    if int(p.get("runs", 1)) < 1:
+        raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
     return {"code": revision(*CODE), **_digests(p["data"])}
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coopoc.errors import InputError
 from coopoc.fleets import load
 from coopoc.methods.catalogue import METHODS
 from coopoc.studies import ablation, backends, scene
@@ -75,3 +76,11 @@ def test_side_by_side_takes_any_methods_and_conditions(tmp_path: Path, short_tow
     where = {"method": "joint", "max_neighbours": 4}
     assert results.values("rt_le_m", where).mean() > mild.values("rt_le_m", where).mean()
     assert (results.values("rt_le_m", {"method": "bound", "max_neighbours": 4}) > 0).all()
+
+
+def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path: Path, short_town: str) -> None:
+    for wrong, said in (({"method": "kalman,jont"}, r"method = 'jont': must be one of .* Did you mean joint\?"),
+                        ({"runs": 0}, r"runs = 0: must be >= 1")):  # fmt: skip
+        with pytest.raises(InputError, match=said):
+            run("side_by_side", tmp_path, settings={"data": short_town, **wrong}, progress=False)
+    assert not (tmp_path / "side_by_side").exists()
