@@ -195,7 +195,7 @@ STUDY = Study(
         "Under a cap the nearest neighbours are heard first where no other schedule is named.",
         "Numbers count as float32; CAMs quantise positions and velocities instead.",
     ),
-    minutes=10,
+    minutes=13,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("budget"),
 )  # fmt: skip
