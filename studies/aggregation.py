@@ -10,7 +10,6 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
@@ -18,9 +17,8 @@ from coopoc.methods.track import Method
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
-from coopoc.world.v2x import V2X
 
-from . import scene, views
+from . import lineup, scene, views
 from .federations import CONDITIONS, GRAPHS, RULES, WIRES, fitted, members, trained
 
 if TYPE_CHECKING:
@@ -54,7 +52,7 @@ def meaningful(p: Params) -> bool:
 def cell(p: Params) -> list[Row]:
     """Rows of a method under a condition in a scenario: RT-LE of the kept weights and of those of the last round."""
     if p["method"] == "bound":
-        return _bound(p)
+        return lineup.bound_rows(p)
     recording, who, drive = scene.recording(p), scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"])
     if p["method"] == "kalman":
         return _rows(rt_le(Kalman(fitted(p))(recording, who), drive), who)
@@ -83,13 +81,6 @@ def _rows(score: Floats, who: Sequence[str]) -> list[Row]:
     """RT-LE (R, E) as rows."""
     runs = range(len(score))
     return [{"run": r, "ego": ego, "rt_le_m": float(score[r, e])} for e, ego in enumerate(who) for r in runs]
-
-
-def _bound(p: Params) -> list[Row]:
-    drive, acting = scene.fleet(p["data"]), scene.sensors(p)
-    who = scene.egos(p["data"], str(p["egos"]))
-    return [{"run": 0, "ego": ego, "rt_le_m": bound_rt_le(posterior_bound(drive, acting, drive.index(ego), V2X(0)))}
-            for ego in who]  # fmt: skip
 
 
 def key(p: Params) -> dict[str, str]:

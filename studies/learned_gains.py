@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.study.study import Params, Row, Study
 
 from . import lineup, scene, views, weights
@@ -43,11 +42,7 @@ NEAR = {1: 0.03, 2: 0.07}
 
 def cell(p: Params) -> list[Row]:
     """Rows of one method in one case; of the bound, one row per ego."""
-    if p["method"] != "bound":
-        return lineup.rows(p)
-    drive, acting = scene.fleet(p["data"]), scene.sensors(p)
-    bounds = {ego: bound_rt_le(posterior_bound(drive, acting, ego)) for ego in scene.egos(p["data"], str(p["egos"]))}
-    return [{"run": 0, "ego": ego, "rt_le_m": bound} for ego, bound in bounds.items()]
+    return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
 
 
 def case(name: str) -> dict[str, Any]:

@@ -13,13 +13,12 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.track import Method
 from coopoc.study.study import Params, Row, Study
 
-from . import scene, views, weights
+from . import lineup, scene, views, weights
 from .privacy_views import FIGURES, TABLES, findings
 
 if TYPE_CHECKING:
@@ -101,7 +100,7 @@ def cell(p: Params) -> list[Row]:
     The weights are those of the last round: to choose a round by the clients' validation losses is not private.
     """
     if p["method"] == "bound":
-        return _bound(p)
+        return [{"measure": "rt_le", **row} for row in lineup.bound_rows(p)]
     if p["method"] == "kalman":
         return _scored(Kalman(weights.fitted(p)), p, "rt_le")
     made, method = trained(p), str(p["method"])
@@ -206,13 +205,6 @@ def _scored(method: Method, p: Params, measure: str, **more: Any) -> list[Row]:
         score = np.full((recording.runs, len(who)), LOST)
     return [{"measure": measure, "run": r, "ego": ego, "rt_le_m": float(score[r, e]), **more}
             for e, ego in enumerate(who) for r in range(len(score))]  # fmt: skip
-
-
-def _bound(p: Params) -> list[Row]:
-    drive, acting = scene.fleet(p["data"]), scene.sensors(p)
-    who = scene.egos(p["data"], str(p["egos"]))
-    levels = [bound_rt_le(posterior_bound(drive, acting, drive.index(ego), scene.channel(p))) for ego in who]
-    return [{"measure": "rt_le", "run": 0, "ego": e, "rt_le_m": x} for e, x in zip(who, levels, strict=True)]
 
 
 def key(p: Params) -> dict[str, str]:
