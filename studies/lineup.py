@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,27 +11,20 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
-from coopoc.evaluate.ledger import Kind, Ledger, Way, of_track
-from coopoc.evaluate.metrics import errors, max_error, nees, neighbour_rt_le, rt_le, share_inside
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.knowledge import Knowledge
-from coopoc.methods.track import Method, Track
+from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row
-from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
+from .scores import Scores, scored
 
-BYTES: Mapping[str, tuple[Kind, Way]] = {
-    "bytes_per_second": ("on air", "per receiver"), "sent_bytes_per_second": ("on air", "broadcast"),
-    "payload_bytes_per_second": ("payload", "per receiver"), "sent_payload_bytes_per_second": ("payload", "broadcast"),
-}  # fmt: skip
-"""Columns of rows that hold what is moved to decide, as a ledger counts it."""
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 
 
@@ -117,9 +110,8 @@ def rows(p: Params, *, quantiles: int = 0, own: Method | None = None) -> list[Ro
     who = scene.egos(p["data"], str(p["egos"]))
     found: list[Row] = []
     for seed, method in [(None, own)] if own else methods(p, recording):
-        track = method(recording, who)
-        account = of_track(track, recording, method.message)
-        found += _rows(track, drive, recording, account, quantiles, {} if seed is None else {"train_seed": seed})
+        scores = scored(method, recording, who, drive, quantiles)
+        found += _rows(scores, recording, who, {} if seed is None else {"train_seed": seed})
     return found
 
 
@@ -138,33 +130,19 @@ def bound_rows(p: Params) -> list[Row]:
     return found
 
 
-def _rows(
-    track: Track, drive: Fleet, recording: Recording, account: Ledger, quantiles: int, extra: dict[str, Any]
-) -> list[Row]:
-    who = account.names
-    columns: dict[str, Floats] = {
-        "rt_le_m": rt_le(track, drive),
-        "max_error_m": max_error(track, drive),
-        "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
-    }
-    mine = list(track.egos)
-    fixes = np.sqrt(((recording.gnss[:, :, mine] - drive.position[:, mine]) ** 2).sum(axis=-1).mean(axis=1))
-    columns["worse_than_gnss"] = (columns["rt_le_m"] > 1.001 * fixes).astype(float)
-    if track.covariance is not None:
-        found_nees = nees(track, drive)
-        columns["nees"] = np.nanmean(found_nees, axis=1)
-        columns["nees_inside"] = np.broadcast_to(share_inside(found_nees), columns["nees"].shape)
-    links = [len(recording.links.of(column)) / len(track.t) for column in track.egos]
-    distance = errors(track, drive) if quantiles else None
-    served = len(drive.ids) if recording.observers == tuple(range(len(drive.ids))) else len(who)
+def _rows(scores: Scores, recording: Recording, who: Sequence[str], extra: dict[str, Any]) -> list[Row]:
+    served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(who)
+    seconds, inside = scores.seconds / scores.runs / served, scores.inside
     found = []
     for e, ego in enumerate(who):
-        for r in range(len(track.x)):
-            row: Row = {"run": r, "ego": ego, **extra, "neighbours_mean": links[e]}
-            row |= {name: float(values[r, e]) for name, values in columns.items()}
-            row["seconds"] = track.seconds / len(track.x) / served
-            if distance is not None:
-                row["error_quantiles_m"] = np.quantile(distance[r, :, e], np.linspace(0, 1, quantiles)).tolist()
+        near = len(recording.links.of(recording.ids.index(ego))) / len(recording.t)
+        for r in range(scores.runs):
+            row: Row = {"run": r, "ego": ego, **extra, "neighbours_mean": near}
+            row |= {name: float(values[r, e]) for name, values in scores.columns.items()}
+            if scores.nees is not None:
+                row["nees_inside"] = float(inside[e])
+            row["seconds"] = seconds
+            if scores.quantiles.size:
+                row["error_quantiles_m"] = scores.quantiles[r, e].tolist()
             found.append(row)
     return found

@@ -110,12 +110,16 @@ def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, flo
 
 def nees_inside(track: Track, fleet: Fleet, level: float = 0.99) -> Floats:
     """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
-    return share_inside(nees(track, fleet), level)
+    found = nees(track, fleet)
+    return share_of_average(found.mean(axis=0), len(found), level)
 
 
-def share_inside(found: Floats, level: float = 0.99) -> Floats:
-    """`nees_inside` of what `nees` has found, (R, T, E)."""
-    low, high = nees_band(len(found), level)
-    average = found.mean(axis=0)
+def share_of_average(average: Floats, runs: int, level: float = 0.99) -> Floats:
+    """`nees_inside` of the average over `runs` runs of what `nees` has found, (T, E); NaN does not count.
+
+    >>> share_of_average(np.array([[3.0], [9.0]]), 30)
+    array([0.5])
+    """
+    low, high = nees_band(runs, level)
     inside = np.where(np.isnan(average), np.nan, (average >= low) & (average <= high))
     return np.asarray(np.nanmean(inside, axis=0))

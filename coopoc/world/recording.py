@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -88,6 +88,20 @@ class Recording:
     def runs(self) -> int:
         """R."""
         return int(self.gnss.shape[0])
+
+    def of_runs(self, runs: slice | Ints) -> Recording:
+        """The same drive in some of its runs; a slice of them copies nothing.
+
+        >>> from coopoc import Fleet, Sensors, observe
+        >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+        >>> observe(fleet, Sensors(), runs=5).of_runs(slice(1, 4)).runs
+        3
+        """
+        parts = {name: getattr(self, name)[runs] for name in ("gnss", "velocity", "relative", "arrival")}
+        found = replace(self, **parts)
+        if self.complete:
+            vars(found)["complete"] = True  # as each of its runs is
+        return found
 
     @cached_property
     def complete(self) -> bool:

@@ -129,17 +129,24 @@ def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:
     return found
 
 
-def _normals(fleet: Fleet, sensor: str, run: int, seed: int) -> Floats:
-    """(T, N, 3) standard normals, one stream per vehicle."""
-    return np.stack([stream(seed, sensor, run, i).standard_normal((len(fleet.t), 3)) for i in fleet.ids], axis=1)
+def _normals(fleet: Fleet, sensor: str, run: int, seed: int, scratch: Floats) -> Floats:
+    """(T, N, 3) standard normals, one stream per vehicle; a view of the scratch (N, T, 3)."""
+    for name, drawn in zip(fleet.ids, scratch, strict=True):
+        stream(seed, sensor, run, name).standard_normal(out=drawn)
+    return scratch.swapaxes(0, 1)
+
+
+def _scratch(fleet: Fleet) -> Floats:
+    return np.empty((len(fleet.ids), len(fleet.t), 3))
 
 
 def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    fixes = np.empty((runs, *fleet.position.shape))
+    fixes, scratch = np.empty((runs, *fleet.position.shape)), _scratch(fleet)
     low, high = sensors.gnss_bias
     steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
     for r in range(runs):  # one after the other stays in the cache
-        fixes[r] = fleet.position + _normals(fleet, "gnss", r, seed) * np.array(sensors.gnss_std)
+        np.multiply(_normals(fleet, "gnss", r, seed, scratch), np.array(sensors.gnss_std), out=fixes[r])
+        fixes[r] += fleet.position
         if high > 0:
             bias = [stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3)) for name in fleet.ids]
             fixes[r] += np.stack(bias, axis=1)
@@ -168,9 +175,11 @@ def gauss_markov(normals: Floats, steps: float) -> Floats:
 
 
 def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    velocity, std = np.empty((runs, *fleet.velocity.shape)), sensors.velocity_std(fleet.velocity)
+    velocity, scratch = np.empty((runs, *fleet.velocity.shape)), _scratch(fleet)
+    std = sensors.velocity_std(fleet.velocity)
     for r in range(runs):
-        velocity[r] = fleet.velocity + _normals(fleet, "velocity", r, seed) * std
+        np.multiply(_normals(fleet, "velocity", r, seed, scratch), std, out=velocity[r])
+        velocity[r] += fleet.velocity
     return velocity
 
 
@@ -210,11 +219,14 @@ def _sightings(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: in
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
     pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet, links)]
     relative, turned = np.empty((runs, *exact.shape)), _heading(fleet, links, sensors, runs, seed)
+    scratch = np.empty((len(fleet.t), 3))
     for r in range(runs):  # one after the other stays in the cache
         for observer, neighbour, index, step in pairs:
-            draws = stream(seed, "relative", r, observer, neighbour).standard_normal((step[-1] + 1, 3))
+            draws = scratch[: step[-1] + 1]
+            stream(seed, "relative", r, observer, neighbour).standard_normal(out=draws)
             relative[r, index] = draws[step]
-        relative[r] = exact + relative[r] * sensors.relative_std
+        relative[r] *= sensors.relative_std
+        relative[r] += exact
         relative[r, :, 0] = np.abs(relative[r, :, 0])
         relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
     return relative
