@@ -1,7 +1,8 @@
 """The most probable star of each run and step: converted linear start, then exact Gauss-Newton steps.
 
 A neighbour meets only the ego: H_k = G_k + E_k is eliminated, with G its fix and E its edge, and the ego remains,
-S = G_0 + sum E_k - E_k H_k^-1 E_k. Its covariance is S^-1. The tuples `measured` and `assumed` are those of
+S = G_0 + sum E_k - E_k H_k^-1 E_k. Its covariance is S^-1. LANES runs go abreast, each with the digits that it has
+alone: one that has settled stands still until the others have. The tuples `measured` and `assumed` are those of
 `coopoc.kernels.star_messages`, `fresh` being where a message is held.
 """
 
@@ -11,12 +12,16 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy import uint64
 
 from ..arrays import AnyArray, Floats, Ints
+from .abreast import less, plus, put, take
 from .blocks import inverse3
-from .compile import compiled
+from .blocks_abreast import put_three, three
+from .compile import as_written
+from .lanes import LANES
 from .sighting import exact, vector
-from .star_messages import hear
+from .star_messages import says
 
 SOLVED, MET, LOST = 0, 1, 2
 """Solved exactly; solved converted, since two vehicles met; not solved: Gauss-Newton did not settle."""
@@ -24,197 +29,280 @@ LIMIT = 12
 """Gauss-Newton steps before the damped reference has to do it; about 3 are needed."""
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05
 """m; of the converted start, as in `coopoc.optimize.initial`."""
+FAR = 1e300
+"""m, farther than any neighbour."""
 
 
-@compiled
+@as_written
 def snapshots(measured: Any, assumed: Any, tolerance: float, apart: float) -> tuple[Floats, Floats, Floats, Ints]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m, NaN if never heard, how each ended (R, T).
+
+    The covariance is that of the last linearisation, at most `tolerance` away.
 
     Args:
         tolerance: m, largest move in the last step. apart: m on the ground, closer vehicles stand in one place.
     """
     gnss, _, seen, _, start = measured[:5]
-    runs, steps = gnss.shape[0], gnss.shape[1]
+    runs, steps, most = gnss.shape[0], gnss.shape[1], 1 + np.diff(start).max()
     x, cov, others = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.shape[1], 3))
-    ended = np.empty((runs, steps), np.int64)
-    most = 1 + np.diff(start).max()
-    motion, who, nobody = np.zeros((4, most, 3)), np.zeros((4, most), np.int64), np.zeros((3, 0), np.int64)
-    edges, point = np.zeros((most, 15)), np.zeros((most, 3))
-    for run in range(runs):
+    ended, each = np.empty((runs, steps), np.int64), 3 * most * LANES
+    fix, weight, point, sight, edges = (
+        np.zeros(each), np.zeros(each), np.zeros(each), np.zeros(2 * each), np.zeros(5 * each)
+    )  # fmt: skip
+    spread, settled, nearest = np.zeros(6 * LANES), np.zeros(LANES), np.zeros(LANES)
+    star = (fix, weight, point, sight, edges, spread)
+    for first in range(0, runs, LANES):
+        last = min(first + LANES, runs) - 1
         for t in range(steps):
             n = 1 + start[t + 1] - start[t]
-            hear(measured, assumed, run, t, who[:, :n], nobody, motion)
-            here = seen[run, start[t] : start[t + 1]]
-            ended[run, t] = solve_star(motion[2, :n], motion[3, :n], here, assumed[2], assumed[3], tolerance, apart,
-                                       edges, point, cov[run, t])  # fmt: skip
-            x[run, t] = point[0]
-            others[run, start[t] : start[t + 1]] = point[1:n]
+            hear(measured, assumed, first, last, t, n, star)
+            here = (first, last, t, start[t])
+            solve(star, n, assumed[2], assumed[3], tolerance, apart, settled, nearest, here, (x, cov, others, ended))
     return x, cov, others, ended
 
 
-@compiled
-def solve_star(
-    fix: AnyArray, weight: AnyArray, seen: AnyArray, std: AnyArray, least: float, tolerance: float, apart: float,
-    edges: AnyArray, point: AnyArray, cov: AnyArray,
-) -> int:  # fmt: skip
-    """One star in place: points (n, 3) m, the ego first, its covariance (3, 3) m^2, and how it ended.
+@as_written
+def hear(measured: Any, assumed: Any, first: int, last: int, t: int, n: int, star: Any) -> None:
+    """The fix of each member, its weight 1/m^2, zero where nothing is held, and how the neighbour is seen."""
+    neighbour, start, newest, fresh, ego = measured[3:8]
+    fix, weight, _, sight = star[:4]
+    for k in range(n):
+        link = start[t] + k - 1
+        for lane in range(LANES):
+            run = min(first + lane, last)
+            member, sent = (ego, t) if k == 0 else (neighbour[link], newest[run, link])
+            _, _, place, certain = says(measured, assumed, run, t, member, sent, 1, k == 0 or fresh[run, link])
+            at = uint64(3 * LANES * k + lane)
+            for c in range(3):
+                fix[at + uint64(c * LANES)], weight[at + uint64(c * LANES)] = place[c], certain[c]
+            if k > 0:
+                for c in range(5):
+                    sight[uint64(LANES * (6 * k + c) + lane)] = measured[2][run, link, c]
 
-    The covariance is that of the last linearisation, at most `tolerance` away.
+
+@as_written
+def solve(
+    star: Any, n: int, std: AnyArray, least: float, tolerance: float, apart: float, settled: AnyArray,
+    nearest: AnyArray, here: Any, out: Any,
+) -> None:  # fmt: skip
+    """Points, the ego's covariance and how it ended, of each run that goes abreast, into `out`.
 
     Args:
-        fix, weight: (n, 3) m, 1/m^2, zero of a neighbour that has none: it is left out. seen: (n - 1, 5) of `unfolded`.
         std: (3,) m, rad, rad, of no length for unit matrices. least: m, angles of a shorter range are widened.
-        edges: (n, 15) scratch.
+        settled, nearest: (LANES,) scratch.
     """
-    n = len(fix)
-    point[:n] = fix
-    convert(weight, seen, std, least, edges, point)
-    move(fix, weight, edges, point, cov)
-    ended = SOLVED
+    fix, _, point = star[:3]
+    point[: 3 * n * LANES] = fix[: 3 * n * LANES]
+    convert(star, n, std, least)
+    put(settled, uint64(0), step(star, n, 1.0))
+    lanes, todo = here[1] - here[0] + 1, 0
+    for lane in range(lanes):
+        settled[lane] = 1.0 if len(std) == 0 else 0.0
+        todo += settled[lane] == 0.0
+        if settled[lane] == 1.0:
+            tell(star, n, lane, here, SOLVED, out)
+    for lane in range(lanes, LANES):
+        settled[lane] = 1.0
+    for _ in range(LIMIT):
+        if todo == 0:
+            break
+        relinearise(star, n, std, least)
+        put(nearest, uint64(0), step(star, n, 1.0 - take(settled, uint64(0))))
+        for lane in range(lanes):
+            if settled[lane] == 0.0 and nearest[lane] <= tolerance:
+                settled[lane], todo = 1.0, todo - 1
+                tell(star, n, lane, here, SOLVED, out)
+    for lane in range(lanes):
+        if settled[lane] == 0.0:
+            tell(star, n, lane, here, LOST, out)
     if len(std):
-        ended = LOST
-        for _ in range(LIMIT):
-            relinearise(weight, seen, std, least, edges, point)
-            if move(fix, weight, edges, point, cov) <= tolerance:
-                ended = SOLVED
-                break
-        if ended == SOLVED and meeting(weight, seen, point, apart):
-            convert(weight, seen, std, least, edges, point)
-            move(fix, weight, edges, point, cov)
-            ended = MET
+        put(nearest, uint64(0), ground(star, n))
+        mend_met(star, n, std, least, apart, settled, nearest, here, out)
+
+
+@as_written
+def mend_met(
+    star: Any, n: int, std: AnyArray, least: float, apart: float, settled: AnyArray, nearest: AnyArray, here: Any,
+    out: Any,
+) -> None:  # fmt: skip
+    """Where a neighbour is `apart` or less from the ego, the converted problem answers."""
+    met = 0
+    for lane in range(here[1] - here[0] + 1):
+        met += settled[lane] == 1.0 and nearest[lane] < apart
+    if met == 0:
+        return
+    fix, _, point = star[:3]
+    point[: 3 * n * LANES] = fix[: 3 * n * LANES]
+    convert(star, n, std, least)
+    step(star, n, 1.0)
+    for lane in range(here[1] - here[0] + 1):
+        if settled[lane] == 1.0 and nearest[lane] < apart:
+            tell(star, n, lane, here, MET, out)
+
+
+@as_written
+def tell(star: Any, n: int, lane: int, here: Any, how: int, out: Any) -> None:
+    """What one of the runs has found."""
+    _, weight, point, _, _, spread = star
+    x, cov, others, ended = out
+    run, t, link = here[0] + lane, here[2], here[3]
+    ended[run, t], at = how, 0
+    for i in range(3):
+        x[run, t, i] = point[i * LANES + lane]
+        for j in range(i, 3):
+            cov[run, t, i, j] = cov[run, t, j, i] = spread[at * LANES + lane]
+            at += 1
     for k in range(1, n):
-        if weight[k, 0] == 0.0:
-            point[k] = np.nan
-    return ended
+        for i in range(3):
+            place = uint64((3 * k + i) * LANES + lane)
+            others[run, link + k - 1, i] = point[place] if weight[place] > 0.0 else np.nan
 
 
-@compiled
-def widened(seen: AnyArray, std: AnyArray, least: float) -> Any:
+@as_written
+def sighted(sight: AnyArray, k: int) -> Any:
+    """What is seen of member k, as in `unfolded`."""
+    at = uint64(6 * k)
+    return (take(sight, at), take(sight, at + uint64(1)), take(sight, at + uint64(2)), take(sight, at + uint64(3)),
+            take(sight, at + uint64(4)))  # fmt: skip
+
+
+@as_written
+def widened(seen: Any, std: Any, least: float) -> Any:
     """Standard deviations of a sighting: `coopoc.optimize.sights.relative_std`."""
-    if seen[0] >= least:
-        return std[0], std[1], std[2]
-    wide = least / seen[0]
-    return std[0], min(wide * std[1], math.pi), min(wide * std[2], math.pi)
+    wide = max(least / seen[0], 1.0)
+    return std[0], -max(-(wide * std[1]), -math.pi), -max(-(wide * std[2]), -math.pi)
 
 
-@compiled
-def convert(weight: AnyArray, seen: AnyArray, std: AnyArray, least: float, edges: AnyArray, point: AnyArray) -> None:
-    """Edges (n, 9): information of the converted sightings and what they pull at `point`."""
-    for k in range(1, len(weight)):
-        if weight[k, 0] == 0.0:
-            continue
-        one = seen[k - 1]
-        xx, xy, xz, yy, yz, zz = as_measured(one, std, least)
-        x, y, z = vector(one)
-        x, y, z = x - point[k, 0] + point[0, 0], y - point[k, 1] + point[0, 1], z - point[k, 2] + point[0, 2]
-        e = edges[k]
-        e[0], e[1], e[2], e[3], e[4], e[5] = xx, xy, xz, yy, yz, zz
-        e[6], e[7], e[8] = xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z
-
-
-@compiled
+@as_written
 def as_measured(seen: Any, std: Any, least: float) -> Any:
     """Information, upper triangle, of a converted sighting where it was measured; the unit matrix without `std`."""
     if len(std) == 0:
-        return 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
+        o = 0.0 * seen[0]
+        return o + 1.0, o, o, o + 1.0, o, o + 1.0
     s0, s1, s2 = widened(seen, std, least)
     sa, ca, si, ci = seen[1], seen[2], seen[3], seen[4]
     d = max(seen[0], LEAST_RANGE)
-    a, b, c = 1.0 / s0**2, 1.0 / (s1 * d * max(abs(si), LEAST_SINE)) ** 2, 1.0 / (s2 * d) ** 2
-    flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
-    return (flat * ca * ca + b * sa * sa, (flat - b) * sa * ca, cross * ca, flat * sa * sa + b * ca * ca, cross * sa,
-            a * ci * ci + c * si * si)  # fmt: skip
+    b, c = s1 * d * max(abs(si), LEAST_SINE), s2 * d
+    o = 0.0 * d
+    a, b, c = 1.0 / (o + s0 * s0), 1.0 / (b * b), 1.0 / (c * c)
+    flat, cross = plus(a * si * si, c * ci, ci), (a - c) * si * ci
+    return (plus(flat * ca * ca, b * sa, sa), (flat - b) * sa * ca, cross * ca, plus(flat * sa * sa, b * ca, ca),
+            cross * sa, plus(a * ci * ci, c * si, si))  # fmt: skip
 
 
-@compiled
-def relinearise(
-    weight: AnyArray, seen: AnyArray, std: AnyArray, least: float, edges: AnyArray, point: AnyArray
-) -> None:  # fmt: skip
-    """Edges (n, 9) linear in range and angles at `point`."""
-    for k in range(1, len(weight)):
-        if weight[k, 0] == 0.0:
-            continue
-        one, e = seen[k - 1], edges[k]
-        x, y, z = point[k, 0] - point[0, 0], point[k, 1] - point[0, 1], point[k, 2] - point[0, 2]
-        e[0], e[1], e[2], e[3], e[4], e[5], e[6], e[7], e[8] = exact(x, y, z, one, widened(one, std, least), 0.0)
+@as_written
+def put_edge(edges: AnyArray, k: int, edge: Any) -> None:
+    """The first nine of the fifteen numbers of member k."""
+    at = uint64(15 * k)
+    put(edges, at, edge[0])
+    put(edges, at + uint64(1), edge[1])
+    put(edges, at + uint64(2), edge[2])
+    put(edges, at + uint64(3), edge[3])
+    put(edges, at + uint64(4), edge[4])
+    put(edges, at + uint64(5), edge[5])
+    put(edges, at + uint64(6), edge[6])
+    put(edges, at + uint64(7), edge[7])
+    put(edges, at + uint64(8), edge[8])
 
 
-@compiled
-def eliminate(weight: AnyArray, edges: AnyArray, cov: AnyArray) -> None:
-    """H_k^-1 into the last six of the edges (n, 15), and the ego's covariance."""
-    sxx, sxy, sxz, syy, syz, szz = weight[0, 0], 0.0, 0.0, weight[0, 1], 0.0, weight[0, 2]
-    for k in range(1, len(weight)):
-        if weight[k, 0] == 0.0:
-            continue
-        e = edges[k]
-        xx, xy, xz, yy, yz, zz = e[0], e[1], e[2], e[3], e[4], e[5]
-        gx, gy, gz = weight[k, 0], weight[k, 1], weight[k, 2]
-        a, b, c, d, f, g = inverse3(xx + gx, xy, xz, yy + gy, yz, zz + gz)
-        e[9], e[10], e[11], e[12], e[13], e[14] = a, b, c, d, f, g
+@as_written
+def convert(star: Any, n: int, std: AnyArray, least: float) -> None:
+    """Edges: information of the converted sightings and what they pull at the points."""
+    _, _, point, sight, edges, _ = star
+    u, v, w = three(point, 0)
+    for k in range(1, n):
+        one = sighted(sight, k)
+        xx, xy, xz, yy, yz, zz = as_measured(one, std, least)
+        (a, b, c), (p, q, r) = vector(one), three(point, k)
+        x, y, z = a - p + u, b - q + v, c - r + w
+        put_edge(edges, k, (xx, xy, xz, yy, yz, zz, plus(plus(xx * x, xy, y), xz, z), plus(plus(xy * x, yy, y), yz, z),
+                            plus(plus(xz * x, yz, y), zz, z)))  # fmt: skip
+
+
+@as_written
+def relinearise(star: Any, n: int, std: AnyArray, least: float) -> None:
+    """Edges linear in range and angles at the points."""
+    _, _, point, sight, edges, _ = star
+    u, v, w = three(point, 0)
+    for k in range(1, n):
+        one, (x, y, z) = sighted(sight, k), three(point, k)
+        put_edge(edges, k, exact(x - u, y - v, z - w, one, widened(one, std, least), 0.0))
+
+
+@as_written
+def step(star: Any, n: int, moves: Any) -> Any:
+    """One step to the minimum of the linear problem, in place, times `moves`; m, how far the farthest point goes.
+
+    A neighbour of weight zero adds nothing to the ego, and stays where it is.
+    """
+    fix, weight, point, _, edges, spread = star
+    gx, gy, gz = three(weight, 0)
+    (u, v, w), (x, y, z) = three(fix, 0), three(point, 0)
+    px, py, pz = gx * (u - x), gy * (v - y), gz * (w - z)
+    o = 0.0 * gx
+    sxx, sxy, sxz, syy, syz, szz = gx, o, o, gy, o, gz
+    for k in range(1, n):
+        at, (gx, gy, gz), (u, v, w), (x, y, z) = uint64(15 * k), three(weight, k), three(fix, k), three(point, k)
+        a, b, c, d, f, g = inverse3(
+            take(edges, at) + gx, take(edges, at + uint64(1)), take(edges, at + uint64(2)),
+            take(edges, at + uint64(3)) + gy, take(edges, at + uint64(4)), take(edges, at + uint64(5)) + gz,
+        )  # fmt: skip
+        put(edges, at + uint64(9), a)
+        put(edges, at + uint64(10), b)
+        put(edges, at + uint64(11), c)
+        put(edges, at + uint64(12), d)
+        put(edges, at + uint64(13), f)
+        put(edges, at + uint64(14), g)
         # E - E H^-1 E = G - G H^-1 G, and G is diagonal
-        sxx += gx - gx * a * gx
-        sxy -= gx * b * gy
-        sxz -= gx * c * gz
-        syy += gy - gy * d * gy
-        syz -= gy * f * gz
-        szz += gz - gz * g * gz
-    a, b, c, d, f, g = inverse3(sxx, sxy, sxz, syy, syz, szz)
-    cov[0, 0], cov[0, 1], cov[0, 2], cov[1, 0], cov[1, 1], cov[1, 2] = a, b, c, b, d, f
-    cov[2, 0], cov[2, 1], cov[2, 2] = c, f, g
-
-
-@compiled
-def move(fix: AnyArray, weight: AnyArray, edges: AnyArray, point: AnyArray, cov: AnyArray) -> float:
-    """One step to the minimum of the linear problem, in place; m, how far the point that moves most does."""
-    eliminate(weight, edges, cov)
-    px, py, pz = (
-        weight[0, 0] * (fix[0, 0] - point[0, 0]), weight[0, 1] * (fix[0, 1] - point[0, 1]),
-        weight[0, 2] * (fix[0, 2] - point[0, 2]),
-    )  # fmt: skip
-    for k in range(1, len(weight)):
-        if weight[k, 0] == 0.0:
-            continue
-        e = edges[k]
-        a, b, c, d, f, g = e[9], e[10], e[11], e[12], e[13], e[14]
-        gx, gy, gz = weight[k, 0], weight[k, 1], weight[k, 2]
-        x, y, z = gx * (fix[k, 0] - point[k, 0]), gy * (fix[k, 1] - point[k, 1]), gz * (fix[k, 2] - point[k, 2])
+        sxx, sxy, sxz = less(sxx + gx, gx * a, gx), less(sxy, gx * b, gy), less(sxz, gx * c, gz)
+        syy, syz, szz = less(syy + gy, gy * d, gy), less(syz, gy * f, gz), less(szz + gz, gz * g, gz)
         # -p + E H^-1 (x + p) = x - G H^-1 (x + p)
-        ux, uy, uz = x + e[6], y + e[7], z + e[8]
-        e[6], e[7], e[8] = a * ux + b * uy + c * uz, b * ux + d * uy + f * uz, c * ux + f * uy + g * uz
-        px += x - gx * e[6]
-        py += y - gy * e[7]
-        pz += z - gz * e[8]
-    x, y, z = (
-        cov[0, 0] * px + cov[0, 1] * py + cov[0, 2] * pz, cov[1, 0] * px + cov[1, 1] * py + cov[1, 2] * pz,
-        cov[2, 0] * px + cov[2, 1] * py + cov[2, 2] * pz,
-    )  # fmt: skip
-    most: float = max(abs(x), abs(y), abs(z))
-    for k in range(1, len(weight)):
-        if weight[k, 0] == 0.0:
-            continue
-        e = edges[k]
-        a, b, c, d, f, g = e[9], e[10], e[11], e[12], e[13], e[14]
-        # dx_k = H^-1 (x + p) + H^-1 E dx_0, and H^-1 E = I - H^-1 G
-        vx, vy, vz = weight[k, 0] * x, weight[k, 1] * y, weight[k, 2] * z
-        dx = e[6] + x - (a * vx + b * vy + c * vz)
-        dy = e[7] + y - (b * vx + d * vy + f * vz)
-        dz = e[8] + z - (c * vx + f * vy + g * vz)
-        point[k, 0] += dx
-        point[k, 1] += dy
-        point[k, 2] += dz
-        most = max(most, abs(dx), abs(dy), abs(dz))
-    point[0, 0] += x
-    point[0, 1] += y
-    point[0, 2] += z
+        x, y, z = gx * (u - x), gy * (v - y), gz * (w - z)
+        u, v, w = x + take(edges, at + uint64(6)), y + take(edges, at + uint64(7)), z + take(edges, at + uint64(8))
+        u, v, w = (plus(plus(a * u, b, v), c, w), plus(plus(b * u, d, v), f, w), plus(plus(c * u, f, v), g, w))
+        put(edges, at + uint64(6), u)
+        put(edges, at + uint64(7), v)
+        put(edges, at + uint64(8), w)
+        px, py, pz = px + less(x, gx, u), py + less(y, gy, v), pz + less(z, gz, w)
+    a, b, c, d, f, g = inverse3(sxx, sxy, sxz, syy, syz, szz)
+    put_three(spread, 0, (a, b, c))
+    put_three(spread, 1, (d, f, g))
+    x, y, z = plus(plus(a * px, b, py), c, pz), plus(plus(b * px, d, py), f, pz), plus(plus(c * px, f, py), g, pz)
+    most = max(max(abs(x), abs(y)), abs(z))
+    for k in range(1, n):
+        dx, dy, dz = follows(edges, weight, k, x, y, z)
+        most = max(most, max(max(abs(dx), abs(dy)), abs(dz)))
+        u, v, w = three(point, k)
+        put_three(point, k, (plus(u, dx, moves), plus(v, dy, moves), plus(w, dz, moves)))
+    u, v, w = three(point, 0)
+    put_three(point, 0, (plus(u, x, moves), plus(v, y, moves), plus(w, z, moves)))
     return most
 
 
-@compiled
-def meeting(weight: AnyArray, seen: AnyArray, point: AnyArray, apart: float) -> bool:
-    """True if the ego and a neighbour stand in one place; one without a fix stands where it is seen."""
-    for k in range(1, len(weight)):
-        x, y = point[k, 0] - point[0, 0], point[k, 1] - point[0, 1]
-        flat = abs(seen[k - 1, 0] * seen[k - 1, 3]) if weight[k, 0] == 0.0 else math.sqrt(x * x + y * y)
-        if flat < apart:
-            return True
-    return False
+@as_written
+def follows(edges: AnyArray, weight: AnyArray, k: int, x: Any, y: Any, z: Any) -> Any:
+    """How far member k goes if the ego goes (x, y, z): H^-1 (x + p) + H^-1 E dx_0, and H^-1 E = I - H^-1 G."""
+    at, (gx, gy, gz) = uint64(15 * k), three(weight, k)
+    a, b, c = take(edges, at + uint64(9)), take(edges, at + uint64(10)), take(edges, at + uint64(11))
+    d, f, g = take(edges, at + uint64(12)), take(edges, at + uint64(13)), take(edges, at + uint64(14))
+    u, v, w = gx * x, gy * y, gz * z
+    heard = gx / max(gx, 1e-300)
+    return (heard * (take(edges, at + uint64(6)) + x - plus(plus(a * u, b, v), c, w)),
+            heard * (take(edges, at + uint64(7)) + y - plus(plus(b * u, d, v), f, w)),
+            heard * (take(edges, at + uint64(8)) + z - plus(plus(c * u, f, v), g, w)))  # fmt: skip
+
+
+@as_written
+def ground(star: Any, n: int) -> Any:
+    """m on the ground between the ego and the neighbour nearest to it; one without a fix stands where it is seen."""
+    _, weight, point, sight, _, _ = star
+    u, v, _ = three(point, 0)
+    nearest = 0.0 * u + FAR
+    for k in range(1, n):
+        x, y, _ = three(point, k)
+        gx, _, _ = three(weight, k)
+        heard, one = gx / max(gx, 1e-300), sighted(sight, k)
+        x, y = x - u, y - v
+        flat = heard * math.sqrt(plus(x * x, y, y)) + (1.0 - heard) * abs(one[0] * one[3])
+        nearest = -max(-nearest, -flat)
+    return nearest
