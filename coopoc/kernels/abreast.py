@@ -103,6 +103,7 @@ def _all_lanes_at_most(context: Any, build: Any, signature: Any, args: Any) -> A
 
 
 _function(math.sqrt, "sqrt")
+_function(math.floor, "floor")
 _function(abs, "fabs")
 
 
@@ -171,6 +172,18 @@ def _fused(sign: Callable[[Any, Any], Any]) -> Callable[..., Any]:
     return typed
 
 
+def _choose(context: Any, sign: Any, a: Any, b: Any) -> Any:
+    """a where the sign is positive, else b; of numbers or of vectors."""
+
+    def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
+        positive = build.fcmp_ordered(">", args[0], ir.Constant(args[0].type, None if vectors else 0.0))
+        return build.select(positive, args[1], args[2])
+
+    vectors = isinstance(sign, Abreast)
+    kind = abreast if vectors else types.float64
+    return kind(kind, kind, kind), generate
+
+
 def _lane(context: Any, vector: Any, which: Any) -> Any:
     """One number of a vector."""
 
@@ -184,5 +197,6 @@ take: Any = intrinsic(_take)
 put: Any = intrinsic(_put)
 pack: Any = intrinsic(_pack)
 lane: Any = intrinsic(_lane)
+choose: Any = intrinsic(_choose)
 plus: Any = intrinsic(_fused(lambda build, a: a))
 less: Any = intrinsic(_fused(lambda build, a: build.fneg(a)))

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 from numba.extending import overload
+from numpy import uint64
 
 from ..arrays import AnyArray, Floats, Ints
-from .abreast import Abreast, lane, less, pack, plus
+from .abreast import Abreast, choose, lane, less, pack, plus, put
 from .compile import as_written
+from .lanes import LANES
 
 QUARTER = (math.pi / 2, 6.123233995736766e-17)
 """Of a turn, rad: the nearest number, and what it lacks."""
@@ -19,18 +21,27 @@ QUARTER = (math.pi / 2, 6.123233995736766e-17)
 @as_written
 def unfolded(relative: AnyArray, links: Ints) -> Floats:
     """(R, M, 5) range, sin and cos of azimuth and of inclination, of some of (R, L, 3) measurements: no angle is met
-    twice."""
-    seen = np.empty((relative.shape[0], len(links), 5))
+    twice. Four links abreast."""
+    seen, found = np.empty((relative.shape[0], len(links), 5)), np.empty(4 * LANES)
     for run in range(len(seen)):
-        for k, link in enumerate(links):
-            seen[run, k, 0] = relative[run, link, 0]
-            seen[run, k, 1], seen[run, k, 2] = sine_and_cosine(relative[run, link, 1])
-            seen[run, k, 3], seen[run, k, 4] = sine_and_cosine(relative[run, link, 2])
+        for k in range(0, len(links), LANES):
+            last = len(links) - 1
+            a, b, c, d = links[k], links[min(k + 1, last)], links[min(k + 2, last)], links[min(k + 3, last)]
+            for angle in range(2):
+                turn = pack(relative[run, a, angle + 1], relative[run, b, angle + 1], relative[run, c, angle + 1],
+                            relative[run, d, angle + 1])  # fmt: skip
+                sine, cosine = sine_and_cosine(turn)
+                put(found, uint64(2 * angle), sine)
+                put(found, uint64(2 * angle + 1), cosine)
+            for j in range(min(LANES, last + 1 - k)):
+                seen[run, k + j, 0] = relative[run, links[k + j], 0]
+                for i in range(4):
+                    seen[run, k + j, i + 1] = found[LANES * i + j]
     return seen
 
 
 @as_written
-def sine_and_cosine(turn: float) -> tuple[float, float]:
+def sine_and_cosine(turn: Any) -> Any:
     """By their Taylor series within an eighth of a turn of a multiple of a quarter, exact to the last bit there."""
     quarters = math.floor(turn * (2.0 / math.pi) + 0.5)
     x = less(less(turn, quarters, QUARTER[0]), quarters, QUARTER[1])
@@ -41,9 +52,9 @@ def sine_and_cosine(turn: float) -> tuple[float, float]:
     cosine = less(1 / 24, s, less(1 / 720, s, less(1 / 40320, s, less(1 / 3628800, s, cosine))))
     sine, cosine = less(x, x * s, sine), less(1.0, s, less(0.5, s, cosine))
     rest = quarters - 4.0 * math.floor(0.25 * quarters)
-    odd = abs(rest - 2.0) == 1.0
-    one, other = cosine if odd else sine, sine if odd else cosine
-    return -one if rest >= 2.0 else one, -other if abs(rest - 1.5) < 1.0 else other
+    odd = 0.5 - abs(abs(rest - 2.0) - 1.0)
+    one, other = choose(odd, cosine, sine), choose(odd, sine, cosine)
+    return choose(rest - 1.5, -one, one), choose(1.0 - abs(rest - 1.5), -other, other)
 
 
 @as_written

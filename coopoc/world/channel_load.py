@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import KDTree
 
 from ..arrays import Floats, frozen
 from ..errors import InputError
@@ -12,8 +13,6 @@ CARRIER_SENSE = 300.0
 """m, radius within which another's message keeps the channel busy (methods.md section 9.5)."""
 BIT_RATE = 6e6
 """bit/s of 802.11p in a channel of 10 MHz, the usual choice of eight."""
-AT_ONCE = 4_000_000
-"""Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
 
 
 def channel_load(
@@ -52,12 +51,15 @@ def channel_load(
             raise InputError(name, value.tolist(), f"must be a number >= 0, or {vehicles} of them", "One per vehicle.")
     busy = np.broadcast_to(8.0 * given["size"] * given["rate"] / bit_rate, vehicles)
     flat = places.reshape(-1, vehicles, 3)
-    step = max(1, AT_ONCE // vehicles**2)
-    parts = [_heard(flat[k : k + step], busy, carrier_sense) for k in range(0, len(flat), step)]
-    return np.concatenate(parts).reshape(places.shape[:-1])
+    return np.array([_heard(step, busy, carrier_sense) for step in flat]).reshape(places.shape[:-1])
 
 
 def _heard(position: Floats, busy: Floats, reach: float) -> Floats:
-    """(T, N) sum of what those within reach fill."""
-    gap = np.linalg.norm(position[:, :, None] - position[:, None], axis=-1)
-    return np.where(np.isnan(position[..., 0]), np.nan, (gap <= reach) @ busy)
+    """(N,) sum of what those within reach fill."""
+    here = np.flatnonzero(np.isfinite(position[:, 0]))
+    near = here[KDTree(position[here]).query_pairs(reach, output_type="ndarray")]
+    load = np.full(len(position), np.nan)
+    load[here] = busy[here]
+    for one, other in (near.T, near.T[::-1]):
+        load[here] += np.bincount(one, busy[other], len(position))[here]
+    return load
