@@ -20,8 +20,8 @@ from .blocks import inverse3
 from .blocks_abreast import put_three, three
 from .compile import as_written
 from .lanes import LANES
+from .messages_abreast import tell as tell_abreast
 from .sighting import exact, vector
-from .star_messages import says
 
 SOLVED, MET, LOST = 0, 1, 2
 """Solved exactly; solved converted, since two vehicles met; not solved: Gauss-Newton did not settle."""
@@ -45,39 +45,41 @@ def snapshots(measured: Any, assumed: Any, tolerance: float, apart: float) -> tu
     gnss, _, seen, _, start = measured[:5]
     runs, steps, most = gnss.shape[0], gnss.shape[1], 1 + np.diff(start).max()
     x, cov, others = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.shape[1], 3))
-    ended, each = np.empty((runs, steps), np.int64), 3 * most * LANES
-    fix, weight, point, sight, edges = (
-        np.zeros(each), np.zeros(each), np.zeros(each), np.zeros(2 * each), np.zeros(5 * each)
-    )  # fmt: skip
+    ended, each, held = np.empty((runs, steps), np.int64), most * LANES, np.zeros((5, most, LANES))
+    motion, point, sight, edges = np.zeros(12 * each), np.zeros(3 * each), np.zeros(5 * each), np.zeros(15 * each)
     spread, settled, nearest = np.zeros(6 * LANES), np.zeros(LANES), np.zeros(LANES)
-    star = (fix, weight, point, sight, edges, spread)
+    star = (motion, point, sight, edges, spread)
     for first in range(0, runs, LANES):
         last = min(first + LANES, runs) - 1
         for t in range(steps):
             n = 1 + start[t + 1] - start[t]
-            hear(measured, assumed, first, last, t, n, star)
+            hear(measured, assumed, first, last, t, n, held, star)
             here = (first, last, t, start[t])
             solve(star, n, assumed[2], assumed[3], tolerance, apart, settled, nearest, here, (x, cov, others, ended))
     return x, cov, others, ended
 
 
 @as_written
-def hear(measured: Any, assumed: Any, first: int, last: int, t: int, n: int, star: Any) -> None:
-    """The fix of each member, its weight 1/m^2, zero where nothing is held, and how the neighbour is seen."""
-    neighbour, start, newest, fresh, ego = measured[3:8]
-    fix, weight, _, sight = star[:4]
+def hear(measured: Any, assumed: Any, first: int, last: int, t: int, n: int, held: AnyArray, star: Any) -> None:
+    """What the members say, and how the neighbours are seen."""
+    seen, neighbour, start, newest, ego = measured[2], measured[3], measured[4], measured[5], measured[7]
+    motion, _, sight = star[:3]
     for k in range(n):
         link = start[t] + k - 1
         for lane in range(LANES):
             run = min(first + lane, last)
-            member, sent = (ego, t) if k == 0 else (neighbour[link], newest[run, link])
-            _, _, place, certain = says(measured, assumed, run, t, member, sent, 1, k == 0 or fresh[run, link])
-            at = uint64(3 * LANES * k + lane)
-            for c in range(3):
-                fix[at + uint64(c * LANES)], weight[at + uint64(c * LANES)] = place[c], certain[c]
-            if k > 0:
-                for c in range(5):
-                    sight[uint64(LANES * (6 * k + c) + lane)] = measured[2][run, link, c]
+            held[0, k, lane], held[1, k, lane] = t if k == 0 else newest[run, link], 1.0
+            for c in range(5 if k > 0 else 0):
+                sight[uint64(LANES * (5 * k + c) + lane)] = seen[run, link, c]
+        tell_abreast(measured, assumed, (first, last), t, k, ego if k == 0 else neighbour[link], held, motion)
+
+
+@as_written
+def begin(star: Any, n: int) -> None:
+    """Everyone stands where their fix is."""
+    motion, point = star[:2]
+    for k in range(n):
+        put_three(point, k, three(motion, 4 * k + 2))
 
 
 @as_written
@@ -91,8 +93,7 @@ def solve(
         std: (3,) m, rad, rad, of no length for unit matrices. least: m, angles of a shorter range are widened.
         settled, nearest: (LANES,) scratch.
     """
-    fix, _, point = star[:3]
-    point[: 3 * n * LANES] = fix[: 3 * n * LANES]
+    begin(star, n)
     convert(star, n, std, least)
     put(settled, uint64(0), step(star, n, 1.0))
     lanes, todo = here[1] - here[0] + 1, 0
@@ -131,8 +132,7 @@ def mend_met(
         met += settled[lane] == 1.0 and nearest[lane] < apart
     if met == 0:
         return
-    fix, _, point = star[:3]
-    point[: 3 * n * LANES] = fix[: 3 * n * LANES]
+    begin(star, n)
     convert(star, n, std, least)
     step(star, n, 1.0)
     for lane in range(here[1] - here[0] + 1):
@@ -143,7 +143,7 @@ def mend_met(
 @as_written
 def tell(star: Any, n: int, lane: int, here: Any, how: int, out: Any) -> None:
     """What one of the runs has found."""
-    _, weight, point, _, _, spread = star
+    motion, point, _, _, spread = star
     x, cov, others, ended = out
     run, t, link = here[0] + lane, here[2], here[3]
     ended[run, t], at = how, 0
@@ -154,14 +154,14 @@ def tell(star: Any, n: int, lane: int, here: Any, how: int, out: Any) -> None:
             at += 1
     for k in range(1, n):
         for i in range(3):
-            place = uint64((3 * k + i) * LANES + lane)
-            others[run, link + k - 1, i] = point[place] if weight[place] > 0.0 else np.nan
+            heard = motion[uint64((12 * k + 9) * LANES + lane)] > 0.0
+            others[run, link + k - 1, i] = point[uint64((3 * k + i) * LANES + lane)] if heard else np.nan
 
 
 @as_written
 def sighted(sight: AnyArray, k: int) -> Any:
     """What is seen of member k, as in `unfolded`."""
-    at = uint64(6 * k)
+    at = uint64(5 * k)
     return (take(sight, at), take(sight, at + uint64(1)), take(sight, at + uint64(2)), take(sight, at + uint64(3)),
             take(sight, at + uint64(4)))  # fmt: skip
 
@@ -208,7 +208,7 @@ def put_edge(edges: AnyArray, k: int, edge: Any) -> None:
 @as_written
 def convert(star: Any, n: int, std: AnyArray, least: float) -> None:
     """Edges: information of the converted sightings and what they pull at the points."""
-    _, _, point, sight, edges, _ = star
+    _, point, sight, edges, _ = star
     u, v, w = three(point, 0)
     for k in range(1, n):
         one = sighted(sight, k)
@@ -222,7 +222,7 @@ def convert(star: Any, n: int, std: AnyArray, least: float) -> None:
 @as_written
 def relinearise(star: Any, n: int, std: AnyArray, least: float) -> None:
     """Edges linear in range and angles at the points."""
-    _, _, point, sight, edges, _ = star
+    _, point, sight, edges, _ = star
     u, v, w = three(point, 0)
     for k in range(1, n):
         one, (x, y, z) = sighted(sight, k), three(point, k)
@@ -235,14 +235,15 @@ def step(star: Any, n: int, moves: Any) -> Any:
 
     A neighbour of weight zero adds nothing to the ego, and stays where it is.
     """
-    fix, weight, point, _, edges, spread = star
-    gx, gy, gz = three(weight, 0)
-    (u, v, w), (x, y, z) = three(fix, 0), three(point, 0)
+    motion, point, _, edges, spread = star
+    gx, gy, gz = three(motion, 3)
+    (u, v, w), (x, y, z) = three(motion, 2), three(point, 0)
     px, py, pz = gx * (u - x), gy * (v - y), gz * (w - z)
     o = 0.0 * gx
     sxx, sxy, sxz, syy, syz, szz = gx, o, o, gy, o, gz
     for k in range(1, n):
-        at, (gx, gy, gz), (u, v, w), (x, y, z) = uint64(15 * k), three(weight, k), three(fix, k), three(point, k)
+        at, (gx, gy, gz) = uint64(15 * k), three(motion, 4 * k + 3)
+        (u, v, w), (x, y, z) = three(motion, 4 * k + 2), three(point, k)
         a, b, c, d, f, g = inverse3(
             take(edges, at) + gx, take(edges, at + uint64(1)), take(edges, at + uint64(2)),
             take(edges, at + uint64(3)) + gy, take(edges, at + uint64(4)), take(edges, at + uint64(5)) + gz,
@@ -270,7 +271,7 @@ def step(star: Any, n: int, moves: Any) -> Any:
     x, y, z = plus(plus(a * px, b, py), c, pz), plus(plus(b * px, d, py), f, pz), plus(plus(c * px, f, py), g, pz)
     most = max(max(abs(x), abs(y)), abs(z))
     for k in range(1, n):
-        dx, dy, dz = follows(edges, weight, k, x, y, z)
+        dx, dy, dz = follows(edges, motion, k, x, y, z)
         most = max(most, max(max(abs(dx), abs(dy)), abs(dz)))
         u, v, w = three(point, k)
         put_three(point, k, (plus(u, dx, moves), plus(v, dy, moves), plus(w, dz, moves)))
@@ -280,9 +281,9 @@ def step(star: Any, n: int, moves: Any) -> Any:
 
 
 @as_written
-def follows(edges: AnyArray, weight: AnyArray, k: int, x: Any, y: Any, z: Any) -> Any:
+def follows(edges: AnyArray, motion: AnyArray, k: int, x: Any, y: Any, z: Any) -> Any:
     """How far member k goes if the ego goes (x, y, z): H^-1 (x + p) + H^-1 E dx_0, and H^-1 E = I - H^-1 G."""
-    at, (gx, gy, gz) = uint64(15 * k), three(weight, k)
+    at, (gx, gy, gz) = uint64(15 * k), three(motion, 4 * k + 3)
     a, b, c = take(edges, at + uint64(9)), take(edges, at + uint64(10)), take(edges, at + uint64(11))
     d, f, g = take(edges, at + uint64(12)), take(edges, at + uint64(13)), take(edges, at + uint64(14))
     u, v, w = gx * x, gy * y, gz * z
@@ -295,12 +296,12 @@ def follows(edges: AnyArray, weight: AnyArray, k: int, x: Any, y: Any, z: Any) -
 @as_written
 def ground(star: Any, n: int) -> Any:
     """m on the ground between the ego and the neighbour nearest to it; one without a fix stands where it is seen."""
-    _, weight, point, sight, _, _ = star
+    motion, point, sight, _, _ = star
     u, v, _ = three(point, 0)
     nearest = 0.0 * u + FAR
     for k in range(1, n):
         x, y, _ = three(point, k)
-        gx, _, _ = three(weight, k)
+        gx, _, _ = three(motion, 4 * k + 3)
         heard, one = gx / max(gx, 1e-300), sighted(sight, k)
         x, y = x - u, y - v
         flat = heard * math.sqrt(plus(x * x, y, y)) + (1.0 - heard) * abs(one[0] * one[3])

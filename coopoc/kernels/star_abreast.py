@@ -17,8 +17,9 @@ from .abreast import pack, put, take
 from .blocks_abreast import eliminate, loosen, nine, put_nine, put_three, substitute, three
 from .compile import as_written
 from .lanes import LANES
+from .messages_abreast import tell as tell_abreast
 from .sighting import converted, exact, vector
-from .star_messages import LEAST_PROCESS, place_of, says
+from .star_messages import LEAST_PROCESS, place_of
 
 
 @as_written
@@ -33,7 +34,7 @@ def follow_abreast(measured: Any, assumed: Any, refine: bool, first: int, last: 
         np.zeros(three_each), np.zeros(three_each), np.zeros(4 * three_each), np.zeros(6 * three_each)
     )  # fmt: skip
     member, was_member, kept = np.zeros((1, most), np.int64), np.zeros((1, most), np.int64), np.zeros(most, np.int64)
-    held, was_held = np.zeros((2, most, LANES), np.int64), np.zeros((2, most, LANES), np.int64)
+    held, was_held = np.zeros((5, most, LANES)), np.zeros((5, most, LANES))
     runs, old = (first, last), 0
     for t in range(len(start) - 1):
         n = 1 + start[t + 1] - start[t]
@@ -57,23 +58,17 @@ def hear(
     was_held: AnyArray, motion: AnyArray,
 ) -> None:  # fmt: skip
     """Who is in the star and its place in the last one; of each run the step of the message held and its uses, in
-    `held`; four vectors a component of what the messages say, in `motion`."""
-    neighbour, start, newest, fresh, ego = measured[3:8]
+    `held`; what the messages say, in `motion`."""
+    neighbour, start, newest, ego = measured[3], measured[4], measured[5], measured[7]
     for k in range(member.shape[1]):
         link = start[t] + k - 1
         member[0, k] = ego if k == 0 else neighbour[link]
         kept[k] = place = place_of(member[0, k], was)
         for lane in range(LANES):
-            run = min(runs[0] + lane, runs[1])
-            sent = t if k == 0 else newest[run, link]
+            sent = t if k == 0 else newest[min(runs[0] + lane, runs[1]), link]
             again = place >= 0 and was_held[0, place, lane] == sent
-            uses = was_held[1, place, lane] + 1 if again else 1
-            held[0, k, lane], held[1, k, lane] = sent, uses
-            heard = k == 0 or fresh[run, link]
-            said = says(measured, assumed, run, t, member[0, k], sent, uses, heard)
-            for i in range(4):
-                at = uint64(3 * LANES * (4 * k + i) + lane)
-                motion[at], motion[at + uint64(LANES)], motion[at + uint64(2 * LANES)] = said[i]
+            held[0, k, lane], held[1, k, lane] = sent, was_held[1, place, lane] + 1.0 if again else 1.0
+        tell_abreast(measured, assumed, runs, t, k, member[0, k], held, motion)
 
 
 @as_written
