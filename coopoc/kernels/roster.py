@@ -14,6 +14,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray, Ints
 from .compile import compiled
+from .star_messages import three_of
 
 MOVED, PROCESS, FIX, WEIGHT, AHEAD = range(5)
 """Rows of what is said of a member: motion m, its variance m^2, fix m, its information 1/m^2 where it is new, and the
@@ -54,33 +55,33 @@ def tell(
     """
     gnss, velocity, seen, neighbour, start, newest, fresh, ego, dt = measured
     variance, fixes, _, _, forgotten, acceleration = assumed
-    runs = held.shape[2]
+    runs, wide = held.shape[2], uint64(held.shape[2])
     for k in range(len(place)):
         link = start[t] + k - 1
-        member = ego if k == 0 else neighbour[link]
+        member, was_at, at = ego if k == 0 else neighbour[link], place[k], uint64(k)
         for r in range(runs):
-            run = first + r
+            run, lane = uint64(first + r), uint64(r)
             sent = t if k == 0 else newest[run, link]
-            again = place[k] >= 0 and was[0, place[k], r] == sent
-            uses = was[1, place[k], r] + 1 if again else 1
+            uses = was[1, was_at, r] + 1 if was_at >= 0 and was[0, was_at, r] == sent else 1
             held[0, k, r], held[1, k, r] = sent, uses
-            at = sent if sent >= 0 else t
-            age = t - at
-            new = k == 0 or fresh[run, link]
-            i, j, m = min(run, len(variance) - 1), min(at, variance.shape[1] - 1), min(member, variance.shape[2] - 1)
-            f, g, h = min(run, len(fixes) - 1), min(at, fixes.shape[1] - 1), min(member, fixes.shape[2] - 1)
+            when = sent if sent >= 0 else t
+            age, new, often = t - when, k == 0 or fresh[run, link], 2 * uses - 1
+            late = (dt * dt * age * acceleration) ** 2
+            i, j = uint64(when), uint64(member)
+            one, noise = three_of(variance, run, i, j), three_of(fixes, run, i, j)
+            u, fix = three_of(velocity, run, i, j), three_of(gnss, run, i, j)
             for c in range(3):
-                one = variance[i, j, m, c] + (dt * dt * age * acceleration) ** 2
-                moved = dt * velocity[run, at, member, c] if sent >= 0 else 0.0
-                lane = c * runs + r
-                said[MOVED, k, lane] = moved
-                said[PROCESS, k, lane] = (2 * uses - 1) * one if sent >= 0 else forgotten
-                said[FIX, k, lane] = gnss[run, at, member, c] + age * moved
-                said[WEIGHT, k, lane] = 1.0 / (fixes[f, g, h, c] + age * age * one) if new else 0.0
+                moved, spread = dt * u[c] if sent >= 0 else 0.0, one[c] + late
+                said[MOVED, at, lane] = moved
+                said[PROCESS, at, lane] = often * spread if sent >= 0 else forgotten
+                said[FIX, at, lane] = fix[c] + age * moved
+                said[WEIGHT, at, lane] = 1.0 / (noise[c] + age * age * spread) if new else 0.0
+                lane += wide
             if k > 0:
-                d, sine, cosine, up, level = seen[run, link]
-                said[AHEAD, k, r], said[AHEAD, k, runs + r] = d * up * cosine, d * up * sine
-                said[AHEAD, k, 2 * runs + r] = d * level
+                d, sine, cosine, up, level = seen[run, uint64(link)]
+                lane = uint64(r)
+                said[AHEAD, at, lane], said[AHEAD, at, lane + wide] = d * up * cosine, d * up * sine
+                said[AHEAD, at, lane + wide + wide] = d * level
 
 
 @compiled
