@@ -56,10 +56,14 @@ def test_vehicles_in_one_place_are_solved_converted(monkeypatch: pytest.MonkeyPa
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-6)
 
 
-def test_what_does_not_settle_goes_to_the_damped_reference(monkeypatch: pytest.MonkeyPatch, crossing: Fleet) -> None:
+@pytest.mark.parametrize("v2x", [V2X(max_neighbours=4), V2X(max_neighbours=4, latency=0.1, loss=0.5, max_age=0.3)])
+def test_what_does_not_settle_goes_to_the_damped_reference(
+    monkeypatch: pytest.MonkeyPatch, crossing: Fleet, v2x: V2X
+) -> None:
+    """A window by itself, with the uses of messages that came before it."""
     from coopoc.kernels import snapshot, window
 
-    recording, method = observe(crossing.between(0, 12), S2, V2X(max_neighbours=4), runs=2), CooperativeMAP(window=3)
+    recording, method = observe(crossing.between(0, 12), S2, v2x, runs=2), CooperativeMAP(window=3)
     wanted, true = in_numpy(monkeypatch, method, recording, [0]), window.windows
 
     def lossy(*args):

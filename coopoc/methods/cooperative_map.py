@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -110,21 +110,16 @@ class CooperativeMAP:
         self, recording: Recording, ego: int, box: Inbox, known: Knowledge, lost: Bools, whole: Estimate
     ) -> Iterator[tuple[int, int]]:
         """Put the answers of `_solve` where runs and steps (R, T) were lost, and count as that does."""
-        runs = np.flatnonzero(lost.any(axis=1))
-        few = replace(recording, gnss=recording.gnss[runs], velocity=recording.velocity[runs],
-                      relative=recording.relative[runs], arrival=recording.arrival[runs])  # fmt: skip
-        mine = replace(box, newest=box.newest[runs], fresh=box.fresh[runs])
-        for window in _windows(few, ego, mine, known, self.window):
-            step = window[-1].star.step
-            which = np.flatnonzero(lost[runs, step])
-            if len(which):
-                window = tuple(_runs_of(seen, which) for seen in window)
-                points, spread, counts = self._solve([window], known)
-                rank = np.argsort(np.argsort(vehicles(window)[-1]))
-                whole.x[runs[which], step], whole.covariance[runs[which], step] = points[0, :, 0], spread[0]
-                theirs = np.where(window[-1].held[:, 1:, None], points[0][:, rank[1:]], np.nan)
-                whole.neighbours[runs[which], box.start[step] : box.start[step + 1]] = theirs
-                yield counts
+        for step in np.flatnonzero(lost.any(axis=0)):
+            runs = np.flatnonzero(lost[:, step])
+            mine = replace(box, newest=box.newest[runs], fresh=box.fresh[runs])
+            window = deque(_windows(recording.of_runs(runs), ego, mine, known, self.window, int(step)), maxlen=1).pop()
+            points, spread, counts = self._solve([window], known)
+            rank = np.argsort(np.argsort(vehicles(window)[-1]))
+            whole.x[runs, step], whole.covariance[runs, step] = points[0, :, 0], spread[0]
+            theirs = np.where(window[-1].held[:, 1:, None], points[0][:, rank[1:]], np.nan)
+            whole.neighbours[runs, box.start[step] : box.start[step + 1]] = theirs
+            yield counts
 
     def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, tuple[int, int]]:
         """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were solved
@@ -208,20 +203,19 @@ def _solved(
     return Estimate(slice(None), x, cov, box.link, neighbours), ended == LOST, int((ended == MET).sum())
 
 
-def _runs_of(seen: Seen, runs: Ints) -> Seen:
-    """The same step in some of the runs."""
-    picked: dict[str, Any] = {
-        field.name: values[runs]
-        for field in fields(seen.star)
-        if isinstance(values := getattr(seen.star, field.name), np.ndarray) and values.ndim > 1 and len(values) > 1
-    }
-    return replace(seen, star=replace(seen.star, **picked), held=seen.held[runs])
+def _windows(
+    recording: Recording, ego: int, box: Inbox, known: Knowledge, length: int, last: int | None = None
+) -> Iterator[Window]:
+    """The last `length` steps at every step, fewer at the start; of those that end in step `last`, if it is given.
 
-
-def _windows(recording: Recording, ego: int, box: Inbox, known: Knowledge, length: int) -> Iterator[Window]:
-    """The last `length` steps at every step, fewer at the start."""
+    How often a message was used before a window begins is known from the steps since it may have been sent.
+    """
     recent: deque[Seen] = deque(maxlen=length)
-    for star in star_steps(recording, ego, box, known):
+    steps = None
+    if last is not None:
+        before = length - 1 + min(recording.v2x.max_age / recording.dt, last)
+        steps = range(max(0, last - int(np.ceil(before))), last + 1)
+    for star in star_steps(recording, ego, box, known, steps):
         members = np.concatenate([[ego], recording.links.neighbour[star.links]])
         span = slice(box.start[star.step], box.start[star.step + 1])
         held = np.concatenate([np.ones((recording.runs, 1), dtype=bool), box.newest[:, span] >= 0], axis=1)

@@ -45,8 +45,11 @@ class StarStep:
     heard: Bools
 
 
-def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge) -> Iterator[StarStep]:
-    """The ego's star at every step, with what the newest message of each member says.
+def star_steps(
+    recording: Recording, ego: int, box: Inbox, knowledge: Knowledge, steps: range | None = None
+) -> Iterator[StarStep]:
+    """The ego's star at every step, or as if only `steps` in a row had been, with what the newest message of each
+    member says.
 
     A fix sent `age` steps ago is brought forward with the velocity that came with it. A velocity that is used for the
     n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this
@@ -55,7 +58,7 @@ def star_steps(recording: Recording, ego: int, box: Inbox, knowledge: Knowledge)
     variance, fixes = knowledge.process_variance(recording), knowledge.fix_variance(recording)
     before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)
     uses = np.ones((recording.runs, 0), dtype=np.int64)
-    for t in range(len(recording.t)):
+    for t in range(len(recording.t)) if steps is None else steps:
         span = slice(box.start[t], box.start[t + 1])
         links = box.link[span]
         members = np.concatenate([[ego], recording.links.neighbour[links]])
