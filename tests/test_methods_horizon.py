@@ -353,7 +353,7 @@ def test_constraints_hold_and_help(formation: Fleet) -> None:
         assert np.abs(band.x[..., 2]).max() <= 1.5 + 1e-6
         assert np.abs(level.x[..., 2]).max() < 1e-6
         assert rt_le(level, fleet).mean() < rt_le(band, fleet).mean() < rt_le(free, fleet).mean()
-        kept = (band.x == free.x).all(axis=-1)  # windows that keep the band as they are
+        kept = np.abs(band.x - free.x).max(axis=-1) < 1e-9  # windows that keep the band as they are
         assert kept.any()
         assert not kept.all()
         assert level.notes == (f"{backend} loops over the runs",)

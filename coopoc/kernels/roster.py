@@ -44,6 +44,15 @@ def stay(t: int, start: AnyArray, kept: AnyArray, place: AnyArray) -> int:
 
 
 @compiled
+def widest(start: AnyArray) -> int:
+    """Members of the largest star."""
+    most = 0
+    for t in range(len(start) - 1):
+        most = max(most, start[t + 1] - start[t])
+    return 1 + most
+
+
+@compiled
 def tell(
     measured: Any, assumed: Any, first: int, t: int, place: AnyArray, held: AnyArray, was: AnyArray, said: AnyArray
 ) -> None:  # fmt: skip

@@ -14,7 +14,7 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..kernels.compile import use_kernels
 from ..optimize.batch import solve_batch
-from ..optimize.gnc import graduate, graduate_batch, surrogate_of
+from ..optimize.gnc import EASY, RATE, ROUNDS, SETTLED, graduate, graduate_batch, surrogate_of
 from ..optimize.initial import converted
 from ..optimize.problem import Problem
 from ..optimize.sights import Sight, chain
@@ -59,7 +59,8 @@ class CooperativeMAP:
         robust: "truncated" or "geman-mcclure"; None believes everyone.
         threshold: probability that the fixes of an honest neighbour in a window pass (of a robust loss).
         suspect_ego: doubt the ego's own fixes and its odometry, too, each as one group. Where all fixes are doubted
-            nothing says where the window is: it is then solved as if all were honest, and the notes count it.
+            nothing says where the window is: it is then solved as if all were honest, and the notes count it. There
+            is no compiled kernel for these doubts.
     """
 
     backend: str = "gauss-newton"
@@ -95,16 +96,34 @@ class CooperativeMAP:
                     yield Estimate(star.step, points[k, :, 0], spread[k], star.links, theirs)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            whole, lost, met = _solved(recording, ego, box, assumed, self.window)
+            whole, lost, met = self._compiled(recording, ego, box, assumed)
             replaced.append((met, 0))
             if lost.any():
                 replaced.extend(self._mend(recording, ego, box, known, lost, whole))
             yield whole
 
-        kernels = self.robust is None and self.backend == "gauss-newton" and use_kernels()
+        able = self.robust is None or not self.suspect_ego
+        kernels = able and self.backend == "gauss-newton" and use_kernels()
         assumed = assumed_arrays(recording, known) if kernels else ()
         track = follow_egos(self, recording, egos, drive if kernels else follow)
         return replace(track, notes=self._notes(*np.sum(replaced, axis=0)))
+
+    def _compiled(
+        self, recording: Recording, ego: int, box: Inbox, assumed: tuple[Any, ...]
+    ) -> tuple[Estimate, Bools, int]:
+        """All windows of a drive by compiled code, (R, T) True where one did not settle, and how many of the others
+        were solved converted."""
+        from ..kernels.snapshot import LOST, MET, snapshots
+        from ..kernels.window import windows
+
+        measured, fresh = measured_arrays(recording, ego, replace(box, fresh=box.newest >= 0)), box.fresh
+        if self.window == 1 and self.robust is None:
+            x, cov, neighbours, ended = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
+        else:
+            doubt = self.robust and doubt_of(self.robust, self.threshold, self.window)
+            x, cov, neighbours, ended = windows(measured, assumed, np.ascontiguousarray(fresh), self.window, TOLERANCE,
+                                                LEAST_GROUND, doubt)  # fmt: skip
+        return Estimate(slice(None), x, cov, box.link, neighbours), ended == LOST, int((ended == MET).sum())
 
     def _mend(
         self, recording: Recording, ego: int, box: Inbox, known: Knowledge, lost: Bools, whole: Estimate
@@ -186,21 +205,12 @@ class Seen:
 Window = tuple[Seen, ...]
 
 
-def _solved(
-    recording: Recording, ego: int, box: Inbox, assumed: tuple[Any, ...], length: int
-) -> tuple[Estimate, Bools, int]:
-    """All windows of a drive by compiled code, (R, T) True where one did not settle, and how many of the others were
-    solved converted."""
-    from ..kernels.snapshot import LOST, MET, snapshots
-    from ..kernels.window import windows
+def doubt_of(loss: str, threshold: float, length: int) -> tuple[Any, ...]:
+    """A robust loss as `coopoc.kernels.doubts` takes it, about fixes of at most `length` steps."""
+    from scipy.special import gammaincinv
 
-    measured = measured_arrays(recording, ego, replace(box, fresh=box.newest >= 0))
-    if length == 1:
-        x, cov, neighbours, ended = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
-    else:
-        fresh = np.ascontiguousarray(box.fresh)
-        x, cov, neighbours, ended = windows(measured, assumed, fresh, length, TOLERANCE, LEAST_GROUND)
-    return Estimate(slice(None), x, cov, box.link, neighbours), ended == LOST, int((ended == MET).sum())
+    freedom = 3.0 * np.maximum(np.arange(length + 1), 1)
+    return 2.0 * gammaincinv(0.5 * freedom, threshold), loss == "truncated", RATE, EASY, SETTLED, ROUNDS
 
 
 def _windows(

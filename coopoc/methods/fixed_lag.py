@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import Ints
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..optimize.factor import Factor
 from ..optimize.incremental import FixedLag
 from ..optimize.problem import Problem
@@ -21,7 +22,7 @@ from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
 from .slice import Slice, entering, estimate
-from .star import FORGOTTEN, star_steps
+from .star import FORGOTTEN, assumed_arrays, measured_arrays, star_steps
 from .track import Track
 from .window import Window, advance, sweep
 
@@ -74,8 +75,18 @@ class FixedLagSmoother:
         known = resolve(self.knowledge, recording)
         notes = (f"not causal: every estimate knows the next {self.lag} steps",) if self.smoothed else ()
         looped = (f"{self.backend} loops over the runs",) if self.backend != "gauss-newton" else ()
-        follow = self._by_gtsam if looped else self._follow
+        plain = self._follow if self.smoothed or not use_kernels() else self._compiled
+        follow = self._by_gtsam if looped else plain
         return follow_egos(self, recording, egos, lambda ego, box: follow(recording, ego, box, known), notes + looped)
+
+    def _compiled(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
+        """What `_follow` yields, as one estimate of all steps from compiled code."""
+        from ..kernels.horizon import horizons
+
+        measured, assumed = measured_arrays(recording, ego, box), assumed_arrays(recording, known)
+        exact = self.exact and known.exact_relative
+        x, cov, neighbours, _ = horizons(measured, assumed, None, self.lag + 1, exact, 0, 0.0, 0.0)
+        yield Estimate(slice(None), x, cov, box.link, neighbours)
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
         window: Window | None = None

@@ -10,13 +10,15 @@ import numpy as np
 
 from ..arrays import Ints
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..optimize.solve import backends, usable
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .knowledge import Knowledge, resolve
-from .slice import estimate
+from .slice import STRAYED, estimate
+from .star import assumed_arrays, measured_arrays
 from .track import Track
 from .true_time import Seen, known_by, seen_steps
 from .window import Window, advance, settle, sweep
@@ -24,6 +26,7 @@ from .window_problem import Road, heights, limited, solution_of, violated, windo
 
 SWEEPS = 10
 """Gauss-Newton steps of a window after the first; one is common."""
+DROPPED = "fixes came later than the horizon and were dropped"
 MOVING = "windows were still moving after 11 Gauss-Newton steps"
 
 
@@ -78,16 +81,34 @@ class MovingHorizon:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.knowledge, recording)
         counts: Counter[str] = Counter()
-        track = follow_egos(self, recording, egos, lambda ego, box: self._follow(recording, ego, box, known, counts))
+        follow = self._compiled if self.backend == "gauss-newton" and use_kernels() else self._follow
+        track = follow_egos(self, recording, egos, lambda ego, box: follow(recording, ego, box, known, counts))
         loop = () if self.backend == "gauss-newton" else (f"{self.backend} loops over the runs",)
         return replace(track, notes=(*loop, *(f"{count} {what}" for what, count in counts.items() if count)))
+
+    def _compiled(
+        self, recording: Recording, ego: int, box: Inbox, known: Knowledge, counts: Counter[str]
+    ) -> Iterator[Estimate]:
+        """What `_follow` yields, as one estimate of all steps from compiled code."""
+        from ..kernels.horizon import horizons
+
+        counts[DROPPED] += self._dropped(recording, box, box.arrival)
+        exact, limits = self.exact and known.exact_relative, recording.v2x.max_age / recording.dt + 1e-9
+        variance, _, *others = assumed_arrays(recording, known)
+        assumed = (variance, known.gnss_variance[None, None, None], *others)
+        x, cov, neighbours, moving = horizons(
+            measured_arrays(recording, ego, box), assumed, np.ascontiguousarray(box.arrival), self.horizon + 1, exact,
+            SWEEPS if exact else 0, limits, STRAYED,
+        )  # fmt: skip
+        counts[MOVING] += int(moving.sum())
+        yield Estimate(slice(None), x, cov, box.link, neighbours)
 
     def _follow(
         self, recording: Recording, ego: int, box: Inbox, known: Knowledge, counts: Counter[str]
     ) -> Iterator[Estimate]:
         exact, length = self.exact and known.exact_relative, self.horizon + 1
         arrival, variance = box.arrival, known.process_variance(recording)
-        counts["fixes came later than the horizon and were dropped"] += self._dropped(recording, box, arrival)
+        counts[DROPPED] += self._dropped(recording, box, arrival)
         recent: list[Seen] = []
         window: Window | None = None
         for new in seen_steps(recording, ego, box, arrival, known):

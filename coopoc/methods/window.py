@@ -102,8 +102,12 @@ def settle(window: Window, known: Knowledge, most: int) -> tuple[Window, int]:
 
 
 def eliminate(here: Slice, ahead: Slice, prior: Arrival) -> tuple[Eliminated, Arrival]:
-    """A slice given the next one, and what it leaves as the arrival cost of that: D - D S^-1 D, S = J + D."""
-    total, pull = system(here, prior)
+    """A slice given the next one, and what it leaves as the arrival cost of that: D S^-1 J, S = J + D.
+
+    D - D S^-1 D is the same, but a difference of near numbers where the motion is known well.
+    """
+    alone, pull = system(here, prior)
+    total = alone.copy()
     star = ahead.star
     stays = np.flatnonzero(star.kept >= 0)
     old, new = rows(star.kept[stays]), rows(stays)
@@ -112,9 +116,7 @@ def eliminate(here: Slice, ahead: Slice, prior: Arrival) -> tuple[Eliminated, Ar
     gap = (star.moved[:, stays] - moved).reshape(len(pull), -1)
     total[:, old, old] += stiffness
     inverse = np.linalg.inv(total)
-    left = -stiffness[:, :, None] * inverse[:, old[:, None], old] * stiffness[:, None]
-    at = np.arange(len(old))
-    left[:, at, at] += stiffness
+    left = stiffness[:, :, None] * (inverse[:, old] @ alone[:, :, old])
     size = ahead.point[0].size
     information, carried = np.zeros((len(pull), size, size)), np.zeros((len(pull), size))
     information[:, new[:, None], new] = left
