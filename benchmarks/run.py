@@ -23,7 +23,7 @@ from typing import Any
 from tabulate import tabulate
 
 HERE = Path(__file__).parent
-BENCHMARKS = ("classical", "networked", "learned_gain", "backends", "peers", "fleet", "growth")
+BENCHMARKS = ("classical", "networked", "online_methods", "learned_gain", "backends", "peers", "fleet", "growth")
 """Modules beside this one; each has measured() -> rows {name, us, ratio, right}."""
 BASELINE, RESULTS = HERE / "baseline.json", HERE / "results.json"
 TOLERANCE = 1.5

@@ -93,7 +93,8 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     growth = load("growth")
     found = {f"growth: {name}, {count} vehicles" for name in growth.METHOD_NAMES for count in growth.FLEETS}
     found |= {"growth: import coopoc"}
-    found |= {f"networked: {name}, {word}" for name in load("networked").JOBS for word in ("NumPy", "compiled")}
+    for module in ("networked", "online_methods"):
+        found |= {f"{module}: {name}, {word}" for name in load(module).JOBS for word in ("NumPy", "compiled")}
     for name in ("gtsam", "casadi", "osqp", "cvxpy", "filterpy"):
         pytest.importorskip(name)
     backends, classical, fleet = load("backends"), load("classical"), load("fleet")
