@@ -1,6 +1,6 @@
-"""The whole fleet: batch smoother of 60 vehicles and 900 steps, neighbour search, noise, solo filter, in one run.
+"""The whole fleet: batch smoother of 60 vehicles and 900 steps, neighbour search, noise, filters, in one run.
 
-    OMP_NUM_THREADS=1 python benchmarks/fleet.py            # three Markdown tables on stdout, about two minutes
+    OMP_NUM_THREADS=1 python benchmarks/fleet.py            # four Markdown tables on stdout, about two minutes
 
 Vehicles drive at random through a grid of streets, blocks of 60 m, as many a block at every size. Times are those of
 the process on its processors, medians of interleaved rounds; the ratios are to be compared. GTSAM gets factors whose
@@ -21,6 +21,7 @@ import gtsam
 import numba
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dpotri
 from tabulate import tabulate
 
@@ -215,6 +216,7 @@ def table(rows: Sequence[Row], peer: str) -> str:
 
 
 GTSAM, FILTERPY = "GTSAM Levenberg-Marquardt, converted problem, no marginals", "filterpy, KalmanFilter"
+CENTRAL = "CentralFilter, NumPy"
 
 
 def by_pairs(fleet: co.Fleet, most: int, radius: float, least: float) -> np.ndarray:
@@ -245,10 +247,48 @@ def search_rows(sizes: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
     return out
 
 
+def block(vehicles: int, steps: int) -> co.Fleet:
+    """Vehicles that drive on together, 14 m apart: every one has to do with every other."""
+    i, j = np.divmod(np.arange(vehicles), 10)
+    velocity = np.broadcast_to([10.0, 0.0, 0.0], (steps, vehicles, 3))
+    t = 0.1 * np.arange(steps)
+    start = 14.0 * np.stack([i, j, 0.05 * ((i + j) % 3)], axis=1)
+    return co.Fleet(tuple(f"v{k}" for k in range(vehicles)), t, start + t[:, None, None] * velocity[:1], velocity)
+
+
+def central_rows() -> list[Row]:
+    """The whole-fleet filter where its covariance is full, and what its matrices cost by themselves."""
+    recording, everyone, size = co.observe(block(VEHICLES, SHORT), SENSORS, CHANNEL), range(VEHICLES), 3 * VEHICLES
+    method, factor = co.CentralFilter(), np.random.default_rng(0).normal(size=(size, 2 * size))
+    full, work, half = np.asfortranarray(factor @ factor.T), np.empty((size, size), order="F"), factor[:, : size // 2]
+
+    def ours() -> Any:
+        return method(recording, everyone)
+
+    def lapack() -> None:
+        for _ in range(2 * SHORT):
+            work[:] = full
+            dpotrf(work, lower=1, overwrite_a=1, clean=0)
+            dpotri(work, lower=1, overwrite_c=1)
+
+    def product() -> None:
+        for _ in range(SHORT):
+            dgemm(1.0, half, half, 0.0, work, trans_b=1, overwrite_c=1)
+
+    away = float(np.abs(ours().x - plain(ours).x).max())
+    return [
+        Row("CentralFilter, compiled", ours, away, away < 1e-9),
+        Row(CENTRAL, lambda: plain(ours), 0.0, True),
+        Row("floor: LAPACK's factors and inverses of two covariances", lapack, None, True),
+        Row("floor: a product of (3N)^3 flops", product, None, True),
+    ]
+
+
 def parts() -> list[tuple[str, str, list[Row]]]:
     """The jobs of a short drive, each with the row that it is compared to."""
     recording = co.observe(town(VEHICLES, SHORT), SENSORS, CHANNEL)
-    return [("smoother", GTSAM, smoother_rows(recording)), ("solo", FILTERPY, solo_rows(recording))]
+    return [("smoother", GTSAM, smoother_rows(recording)), ("solo", FILTERPY, solo_rows(recording)),
+            ("central", CENTRAL, central_rows())]  # fmt: skip
 
 
 def measured() -> list[dict[str, Any]]:
@@ -335,7 +375,9 @@ def main() -> None:
     print("What makes a recording, microseconds per vehicle and step:\n")
     print(growth([(60, 900), (500, 300), (2000, 100)]), "\n")
     print("Solo filter, all vehicles, whole drive:\n")
-    print(table(solo_rows(recording), FILTERPY))
+    print(table(solo_rows(recording), FILTERPY), "\n")
+    print(f"Whole-fleet filter, one block of vehicles, {SHORT} steps:\n")
+    print(table(central_rows(), CENTRAL))
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Methods of a star that filter per axis, fuse pseudo-fixes or solve a window, and rounds of messages in a fleet.
+"""Methods of a star that filter per axis, fuse pseudo-fixes or solve a window, rounds of messages, a whole fleet.
 
-    OMP_NUM_THREADS=1 python benchmarks/networked.py            # a Markdown table on stdout, about half a minute
+    OMP_NUM_THREADS=1 python benchmarks/networked.py            # a Markdown table on stdout, about a minute
 
 Whole methods, compiled beside NumPy, each with its inbox and its Track, on town traffic at K = 6. Microseconds are per
 step and run of an ego, or of a vehicle where all take part. Right is the NumPy reference's answer to 1e-9 m.
@@ -23,7 +23,8 @@ from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 ROUNDS, NEIGHBOURS, STEPS, RUNS = 3, 6, 60, 16
 EGO = 0
 JOBS = {"lkf-sa": "identity", "lkf-sa, nominal": "nominal", "msmv-r": "nominal", "cooperative-map-5": "nominal",
-        "gbp": "nominal", "admm": "nominal"}  # fmt: skip
+        "split-ci": "nominal", "ci": "nominal", "gbp": "nominal", "admm": "nominal", "central-filter": "nominal",
+        "central-filter, identity": "identity"}  # fmt: skip
 """What is assumed of the noise, by the method's name and a word more."""
 
 

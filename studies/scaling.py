@@ -29,9 +29,8 @@ APART = 5_000.0
 EGOS = 60
 """Vehicles that per-ego methods serve, at every size of the fleet."""
 PER_EGO = ("kalman", "joint", "split-ci", "lkf-sa")
-DISTRIBUTED = ("gbp", "admm")
-DENSE = ("central-filter",)
-"""One covariance of all vehicles: its cost per vehicle grows, so it runs in small fleets only."""
+DISTRIBUTED = ("gbp", "admm", "central-filter")
+"""Methods that serve all vehicles at once."""
 
 
 @lru_cache(maxsize=1)
@@ -49,8 +48,7 @@ def copied(data: str, copies: int, steps: int) -> Fleet:
 
 
 def _grid() -> list[dict[str, Any]]:
-    methods = ("observe", *PER_EGO, *DISTRIBUTED, *DENSE)
-    return [{"copies": copies, "method": m} for copies in COPIES for m in methods if m not in DENSE or copies <= 4]
+    return [{"copies": copies, "method": m} for copies in COPIES for m in ("observe", *PER_EGO, *DISTRIBUTED)]
 
 
 def key(p: Params) -> dict[str, str]:
@@ -68,7 +66,7 @@ def cell(p: Params) -> list[Row]:
     scale = 1e6 / len(drive.t) / seen.runs
     if p["method"] == "observe":
         return [{**size, "us": scale * took / len(drive.ids), "seconds": took}]
-    egos = list(range(len(drive.ids))) if p["method"] in (*DISTRIBUTED, *DENSE) else _spread(len(drive.ids))
+    egos = list(range(len(drive.ids))) if p["method"] in DISTRIBUTED else _spread(len(drive.ids))
     method, spent = find("coopoc.methods", p["method"])("nominal"), []
     for _ in range(int(p["repeats"])):
         began = time.process_time()
@@ -93,7 +91,7 @@ def _table(results: Results) -> Table | None:
     sizes = [copies for copies in COPIES if views.present(results, {"copies": copies}, "us")]
     each = len(scene.fleet(results.settings["data"]).ids)
     body = []
-    for method in ("observe", *PER_EGO, *DISTRIBUTED, *DENSE):
+    for method in ("observe", *PER_EGO, *DISTRIBUTED):
         found = [_us(results, method, copies) for copies in sizes]
         ran = [value for value in found if value is not None]
         if ran:
@@ -108,8 +106,7 @@ def _caption(results: Results) -> str:
     return (
         f"CPU microseconds per vehicle served, step and run, best of {kept['repeats']} calls; "
         f"{Path(kept['data']).name}'s traffic beside itself, {kept['steps']} steps, K = {kept['max_neighbours']}, "
-        f"{kept['runs']} runs. The dense whole-fleet filter is exempt from the gate of 1.5: it keeps one covariance of "
-        "all vehicles."
+        f"{kept['runs']} runs."
     )
 
 
@@ -118,7 +115,7 @@ def _figure(results: Results) -> Plot | None:
 
     each, drawn = len(scene.fleet(results.settings["data"]).ids), []
     with canvas(1, 1, width=5.6, height=3.6) as (figure, panel):
-        for method in (*PER_EGO, *DISTRIBUTED, *DENSE):
+        for method in (*PER_EGO, *DISTRIBUTED):
             found = {each * copies: _us(results, method, copies) for copies in COPIES}
             ran = {size: value for size, value in found.items() if value is not None}
             if ran:

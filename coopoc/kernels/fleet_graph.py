@@ -18,7 +18,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Floats
 from .compile import compiled
-from .sighting import exact, vector
+from .sighting import exact, facing, vector
 
 
 @compiled
@@ -36,7 +36,8 @@ def linearise(at: AnyArray, graph: Any, again: bool) -> tuple[Floats, Floats]:
             x, y, z = at[t, j, 0] - at[t, i, 0], at[t, j, 1] - at[t, i, 1], at[t, j, 2] - at[t, i, 2]
             for link, sign in ((sight[k], 1.0), (back[k], -1.0)):
                 if link >= 0:
-                    found = sighted(sign * x, sign * y, sign * z, seen[link], std, least, again)
+                    one = (seen[link, 0], seen[link, 1], seen[link, 2], seen[link, 3], seen[link, 4])
+                    found = sighted(sign * x, sign * y, sign * z, one, std, least, again)
                     add(weight[k], pull[k], found, sign)
     return weight, pull
 
@@ -50,7 +51,7 @@ def sighted(x: float, y: float, z: float, seen: Any, std: Any, least: float, aga
         return 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, u, v, w
     if again:
         return exact(x, y, z, seen, std, least)
-    xx, xy, xz, yy, yz, zz, _, _, _ = exact(a, b, c, seen, std, least)
+    xx, xy, xz, yy, yz, zz = facing(seen, std, least)
     return (xx, xy, xz, yy, yz, zz, xx * u + xy * v + xz * w, xy * u + yy * v + yz * w,
             xz * u + yz * v + zz * w)  # fmt: skip
 

@@ -96,7 +96,7 @@ def link(
 ) -> None:  # fmt: skip
     """Information of a pair's sightings and its pull at the beliefs, linear where these and the sightings agree."""
     vx, vy, vz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-    _both(vx, vy, vz, links, seen, std, least, False, weight, pull)
+    both(vx, vy, vz, links, seen, std, least, False, weight, pull)
     if len(std) == 0:
         return
     a, b, c, d, e, f = inverse3(
@@ -107,14 +107,14 @@ def link(
         a * pull[0] + b * pull[1] + c * pull[2], b * pull[0] + d * pull[1] + e * pull[2],
         c * pull[0] + e * pull[1] + f * pull[2],
     )  # fmt: skip
-    _both(vx + mx, vy + my, vz + mz, links, seen, std, least, True, weight, pull)
+    both(vx + mx, vy + my, vz + mz, links, seen, std, least, True, weight, pull)
     pull[0] += weight[0] * mx + weight[1] * my + weight[2] * mz
     pull[1] += weight[1] * mx + weight[3] * my + weight[4] * mz
     pull[2] += weight[2] * mx + weight[4] * my + weight[5] * mz
 
 
 @compiled
-def _both(
+def both(
     x: float, y: float, z: float, links: Any, seen: AnyArray, std: AnyArray, least: float, again: bool,
     weight: AnyArray, pull: AnyArray,
 ) -> None:  # fmt: skip
@@ -124,7 +124,8 @@ def _both(
     for way in range(2):
         at, sign = links[way], 1.0 - 2.0 * way
         if at >= 0:
-            xx, xy, xz, yy, yz, zz, p, q, r = sighted(sign * x, sign * y, sign * z, seen[at], std, least, again)
+            one = (seen[at, 0], seen[at, 1], seen[at, 2], seen[at, 3], seen[at, 4])
+            xx, xy, xz, yy, yz, zz, p, q, r = sighted(sign * x, sign * y, sign * z, one, std, least, again)
             weight[0] += xx
             weight[1] += xy
             weight[2] += xz

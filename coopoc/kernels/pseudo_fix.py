@@ -44,9 +44,11 @@ def follow(measured: Any, assumed: Any, solo: Any, noise: AnyArray, flat: float)
                 weight[DIAGONAL[c]] += 1.0 / noise[c]
             for link in range(start[t], start[t + 1]):
                 sent = newest[run, link]
-                _hear(solo[0], velocity, run, t, sent, neighbour[link], dt, theirs, link)
+                hear(solo[0], velocity, run, t, sent, neighbour[link], dt, theirs, link)
                 if fresh[run, link]:
-                    _weigh(seen, run, link, std, least, p)
+                    one = (seen[run, link, 0], seen[run, link, 1], seen[run, link, 2], seen[run, link, 3],
+                           seen[run, link, 4])  # fmt: skip
+                    p[0], p[1], p[2], p[3], p[4], p[5] = weigh(one, std, least)
                     if len(std):
                         for c in range(3):
                             more = one_of(variance, run, sent, neighbour[link], c) * (t - sent) if t > sent else 0.0
@@ -83,7 +85,7 @@ def invert(a: AnyArray, out: AnyArray) -> None:
 
 
 @compiled
-def _hear(
+def hear(
     solo: AnyArray, velocity: AnyArray, run: int, t: int, sent: int, who: int, dt: float, theirs: AnyArray, link: int
 ) -> None:  # fmt: skip
     """What a neighbour says of itself, brought forward."""
@@ -97,17 +99,20 @@ def _hear(
 
 
 @compiled
-def _weigh(seen: AnyArray, run: int, link: int, std: AnyArray, least: float, p: AnyArray) -> None:
-    """Covariance of the converted vector, `coopoc.world.spherical.vector_cov`; the unit matrix without `std`."""
+def weigh(one: Any, std: AnyArray, least: float) -> Any:
+    """Covariance of a converted vector, `coopoc.world.spherical.vector_cov`, as six numbers; 1 without `std`.
+
+    Args:
+        one: range m, sine and cosine of azimuth and of inclination.
+    """
     if len(std) == 0:
-        p[0], p[1], p[2], p[3], p[4], p[5] = 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
-        return
-    d, sa, ca = max(seen[run, link, 0], least), seen[run, link, 1], seen[run, link, 2]
-    si, ci = seen[run, link, 3], seen[run, link, 4]
+        return 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
+    d, sa, ca, si, ci = one
+    d = max(d, least)
     a, b, c = std[0] ** 2, (std[1] * d * si) ** 2, (std[2] * d) ** 2
     flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
-    p[0], p[1], p[2] = flat * ca * ca + b * sa * sa, (flat - b) * sa * ca, cross * ca
-    p[3], p[4], p[5] = flat * sa * sa + b * ca * ca, cross * sa, a * ci * ci + c * si * si
+    return (flat * ca * ca + b * sa * sa, (flat - b) * sa * ca, cross * ca, flat * sa * sa + b * ca * ca, cross * sa,
+            a * ci * ci + c * si * si)  # fmt: skip
 
 
 @compiled

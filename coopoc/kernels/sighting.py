@@ -118,6 +118,20 @@ def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
 
 
 @as_written
+def facing(seen: Any, std: Any, least: float) -> Any:
+    """The information of `exact`, upper triangle, at the measured vector itself."""
+    x, y, z = vector(seen)
+    d = max(seen[0], least)
+    ground = max(abs(seen[0] * seen[3]), 1e-3 * d)
+    a, b = 1.0 / std[0], 1.0 / (ground * ground * std[1])
+    c = 1.0 / (ground * d * d * std[2])
+    ax, ay, az, bx, by = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4], -b * y, b * x
+    cx, cy, cz = c * x * z, c * y * z, -c * ground * ground
+    return (dot(ax, ax, bx, bx, cx, cx), dot(ax, ay, bx, by, cx, cy), plus(ax * az, cx, cz),
+            dot(ay, ay, by, by, cy, cy), plus(ay * az, cy, cz), plus(az * az, cz, cz))  # fmt: skip
+
+
+@as_written
 def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> Any:
     """J^T J, upper triangle, and J^T r of the whitened range, azimuth and inclination at the vector (x, y, z).
 

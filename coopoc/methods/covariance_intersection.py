@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import spherical, to_vector
@@ -17,7 +18,7 @@ from .egos import Estimate, follow_egos
 from .intersection import Belief, Criterion, intersect
 from .kalman import solo_filter
 from .knowledge import Knowledge, resolve
-from .star import ACCELERATION_STD
+from .star import ACCELERATION_STD, measured_arrays, sighting_noise
 from .track import Track
 
 
@@ -56,10 +57,34 @@ class CovarianceIntersection:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of what their neighbours say of themselves; InputError if one is unknown or absent."""
         known = resolve(self.knowledge, recording)
+        if use_kernels():
+            return follow_egos(self, recording, egos, self._compiled(recording, recording.columns(egos), known))
         variance = known.process_variance(recording)
         solo = solo_filter(recording.gnss, recording.velocity, variance, known.gnss_variance, recording.dt)
         said = Said(recording, known, *solo, np.broadcast_to(variance, recording.gnss.shape))
         return follow_egos(self, recording, egos, lambda ego, box: self._follow(said, ego, box))
+
+    def _compiled(
+        self, recording: Recording, egos: Sequence[int], known: Knowledge
+    ) -> Callable[[int, Inbox], Iterator[Estimate]]:
+        """What `_follow` yields, as one estimate of all steps from compiled code, for those in the stars only."""
+        from ..kernels.intersection import follow
+
+        links = recording.links
+        who = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+        variance, fix_variance = known.process_variance(recording, who.tolist()), known.gnss_variance
+        gnss, velocity = recording.gnss[:, :, who], recording.velocity[:, :, who]
+        solo = solo_filter(gnss, velocity, variance, fix_variance, recording.dt)
+        assumed = (np.ascontiguousarray(variance), *sighting_noise(known))
+        choice = (ACCELERATION_STD, self.split, self.criterion == "det")
+
+        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
+            _, _, seen, neighbour, *heard, _, dt = measured_arrays(recording, ego, box)
+            who_is_who = np.searchsorted(who, neighbour), *heard, int(np.searchsorted(who, ego))
+            x, cov, theirs = follow((gnss, velocity, seen, *who_is_who, dt), assumed, solo, fix_variance, *choice)
+            yield Estimate(slice(None), x, cov, box.link, theirs)
+
+        return drive
 
     def _follow(self, said: Said, ego: int, box: Inbox) -> Iterator[Estimate]:
         recording, fix_cov = said.recording, np.diag(said.known.gnss_variance)

@@ -12,7 +12,7 @@ from ..errors import InputError
 Criterion = Literal["trace", "det"]
 LEAST = 1e-9
 """Least weight of one's own estimate: at zero nothing might be left to invert."""
-ROUNDS, TOLERANCE = 40, 1e-6
+ROUNDS, TOLERANCE = 40, 1e-8
 """Of the search for the weight; its last step is Newton's, so that the error is far below the tolerance."""
 NEGLIGIBLE = 1e-12
 """A dependent share below this is none."""

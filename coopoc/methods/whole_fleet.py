@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from ..arrays import Floats
+from ..arrays import Bools, Floats
 from ..world.exchange import Exchange
 from ..world.recording import Recording
 from .kalman import solo_filter
@@ -78,16 +79,22 @@ def follow_compiled(
 ) -> tuple[Floats, Floats]:
     """What `follow_fleet` finds of belief propagation, or with rho > 0 of ADMM, from compiled code."""
     from ..kernels.gossip import follow
+
+    through = contacts.to_first & contacts.to_second
+    x, cov = follow(*contact_arrays(recording, contacts, known, through), int(rounds), float(damping), float(rho))
+    return x, cov
+
+
+def contact_arrays(recording: Recording, contacts: Exchange, known: Knowledge, alive: Bools) -> tuple[Any, Any, Any]:
+    """The tuples `measured`, `contacts` and `assumed` of `coopoc.kernels.gossip`; `alive` (R, P) are pairs to count."""
     from ..kernels.sighting import unfolded
 
     numbers = (contacts.first, contacts.second, contacts.sight, contacts.sight_back, contacts.start)
-    pairs = (*(np.ascontiguousarray(n, dtype=np.int64) for n in numbers), contacts.to_first & contacts.to_second)
+    pairs = (*(np.ascontiguousarray(n, dtype=np.int64) for n in numbers), alive)
     seen = unfolded(recording.relative, np.arange(len(recording.links)))
-    measured = (recording.gnss, recording.velocity, seen, recording.dt)
     variance = np.ascontiguousarray(known.process_variance(recording))
     assumed = (variance, known.gnss_variance, *sighting_noise(known))
-    x, cov = follow(measured, pairs, assumed, int(rounds), float(damping), float(rho))
-    return x, cov
+    return (recording.gnss, recording.velocity, seen, recording.dt), pairs, assumed
 
 
 def own_step(
