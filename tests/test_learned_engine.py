@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,14 @@ from torch import Tensor
 
 from coopoc import InputError
 from coopoc.kernels.compile import numba_is_there, part
-from coopoc.learned import GainNet
+from coopoc.learned import Gain, GainNet
 from coopoc.learned.engine import rollout as engine
 from coopoc.learned.engine.arithmetic import sigmoid, tanh
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training import schedule as schedule_module
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core, row_threads
-from coopoc.learned.training.schedule import Schedule, advance
+from coopoc.learned.training.schedule import Moving, Schedule, advance
 
 
 @pytest.fixture(autouse=True)
@@ -211,6 +212,56 @@ def test_an_optimiser_step_is_that_of_torch(numba: bool, monkeypatch: pytest.Mon
     still, lost = theta.clone(), torch.tensor([torch.inf], dtype=torch.float64)
     assert not advance(theta, torch.zeros(1, 50).double(), began, first, second, lost, [3], 5, [0.1], schedule).any()
     assert torch.equal(theta, still)
+
+
+def moving(nets: list[GainNet]) -> Moving:
+    theta = flatten(nets)
+    return Moving(theta, theta.clone(), torch.zeros_like(theta), torch.zeros_like(theta))
+
+
+def test_descent_is_that_of_torch() -> None:
+    """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the reference; other rows stay, and so does a
+    row whose loss is not finite."""
+    nets, data = [GainNet(2, 1, seed=s).double() for s in range(4)], batch(3, 3, 12, gaps=0.2)
+    data.truth[:, 1] = torch.nan
+    state, schedule = moving(nets), Schedule(weight_decay=0.3, l2=0.1, proximal=0.2, clip=0.5)
+    started, rates = state.theta.clone(), np.array([1e-2, 2e-2, 3e-2])
+    leaves = {0: nets[0], 2: nets[3]}
+    optimisers = {row: torch.optim.AdamW(net.parameters(), rates[row], weight_decay=0.3) for row, net in leaves.items()}
+    for step in range(1, 4):
+        losses, taken = nets[0].descend(state, np.array([0, 1, 3]), data, step, rates, schedule)
+        assert taken.tolist() == [True, False, True]
+        for row, net in leaves.items():
+            gnss, velocity, truth = (part[:, row].transpose(0, 1) for part in data[:3])
+            loss = (net.reference(gnss, velocity, data.x0[row], 0.1) - truth).square().sum(-1).mean()
+            torch.testing.assert_close(losses[row], loss.detach(), rtol=1e-10, atol=1e-12)
+            weights, began = torch.nn.utils.parameters_to_vector(net.parameters()), started[(0, 1, 3)[row]]
+            optimisers[row].zero_grad()
+            (loss + 0.1 * weights.square().sum() + 0.1 * (weights - began).square().sum()).backward()
+            torch.nn.utils.clip_grad_norm_(net.parameters(), 0.5)
+            optimisers[row].step()
+    torch.testing.assert_close(state.theta[[0, 3]], flatten([*leaves.values()]), rtol=1e-8, atol=1e-10)
+    assert torch.equal(state.theta[1:3], started[1:3])
+
+
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_descent_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> None:
+    """Bit for bit, the numbers of `loss_and_gradient` and `advance` one after the other."""
+    nets, data = [GainNet(seed=s) for s in range(3)], batch(3, lanes, 30, torch.float32)
+
+    def run(rows: list[int], threads: int, way: Callable[..., Any]) -> Tensor:
+        state = moving([nets[r] for r in rows])
+        mine = Batch(*(part[:, rows] for part in data[:3]), data.x0[rows], 0.1)
+        with row_threads(threads):
+            for step in range(1, 4):
+                way(nets[0], state, np.arange(len(rows)), mine, step, np.full(len(rows), 1e-2), Schedule())
+        return state.theta
+
+    stacked, alone = run([0, 1, 2], 1, GainNet.descend), run([1], 1, GainNet.descend)
+    assert torch.equal(stacked, run([0, 1, 2], 2, GainNet.descend))
+    assert torch.equal(stacked, run([0, 1, 2], 1, Gain.descend))
+    assert torch.equal(stacked[1:2], alone)
+    assert not torch.equal(alone, flatten(nets[1:2]))
 
 
 def test_gradients_of_inputs_go_through_the_reference() -> None:

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from typing import Any, TypeAlias, cast
 
 import numpy as np
+from llvmlite import ir
+from numba import njit
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import part
+from coopoc.kernels.compile import Function, part
 
 PAD = 16
 """Columns of matrices come in multiples of this: whole vectors in either precision."""
@@ -18,6 +20,20 @@ ZERO, ONE, TWO, THREE = np.arange(4)
 """NumPy's integers, because numba compiles a function anew for each constant of Python's."""
 Index: TypeAlias = int | np.integer[Any]
 """What kernels count and index with: Python's integers, and NumPy's that come from tables of them."""
+
+
+def inside(function: Function) -> Function:
+    """As `part`, and always copied into its caller: to hand arrays to a small function takes as long as it does."""
+    return cast(Function, njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)(function))
+
+
+def apart(function: Function) -> Function:
+    """As `part`, and also so where an `inside` calls it, whose callees are otherwise copied like itself."""
+    return cast(Function, njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=False)(function))
+
+
+instructions = cast(Callable[[Callable[..., Any]], Callable[..., Any]], intrinsic)
+"""`intrinsic` with a type."""
 
 
 def view(function: Callable[..., Any]) -> Callable[..., AnyArray]:
@@ -56,8 +72,8 @@ def whole(columns: Index) -> Index:
 
 @part
 def aligned(size: Index, like: AnyArray) -> AnyArray:
-    """Zeros (size,) that begin where a vector may begin: one that crosses a line of the cache takes twice as long."""
-    memory = np.zeros(size + PAD, like.dtype)
+    """Memory (size,) that begins where a vector may begin: one that crosses a line of the cache takes twice as long."""
+    memory = np.empty(size + PAD, like.dtype)
     first = -(memory.ctypes.data // memory.itemsize) % PAD
     return memory[first : first + size]
 
@@ -99,3 +115,22 @@ def lent(typing: Any, array: Any) -> Any:
         return made._getvalue()
 
     return array(array), generate
+
+
+@instructions
+def carry(typing: Any, source: Any, at: Any, target: Any, to: Any, row: Any) -> Any:
+    """target[row, to : to + PAD] = source[row, at : at + PAD] as one vector: of a loop the compiler does not know that
+    it does not read what it has just written."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def place(array: Any, given: Any, column: Any) -> Any:
+            struct = context.make_array(array)(context, builder, given)
+            first = builder.add(builder.mul(values[4], cgutils.unpack_tuple(builder, struct.shape, 2)[1]), column)
+            kind = ir.VectorType(context.get_value_type(array.dtype), int(PAD))
+            return builder.bitcast(builder.gep(struct.data, [first]), ir.PointerType(kind))
+
+        number = builder.load(place(source, values[0], values[1]), align=4)
+        builder.store(number, place(target, values[2], values[3]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(source, types.intp, target, types.intp, types.intp), generate

@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.kernels.compile import compiled, part
 
 from ..nets.gain_net import LOG_FLOOR, SHORTEST
 from . import places as on
-from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, lent, window
+from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, carry, inside, lent, window
 from .forward import blend, layer, missing
 from .product import add_outer, add_product, dots, gated_product
 from .tape import Net, Tape, bias, matrix, pack, rows, span, unpack
@@ -41,10 +41,20 @@ class Inner(NamedTuple):
     gates: Floats
 
 
+class Scratch(NamedTuple):
+    """Memory of a rollback: matrices that are not turned, all gradients, those within a step, of positions."""
+
+    straight: Floats
+    grown: Floats
+    inner: Floats
+    positions: Floats
+
+
 @compiled
 def backward(
-    theta: Floats, padded: Floats, layers: Ints, gnss: Floats, pulls: Floats, kept: Floats, fields: Ints, size: Index,
-    delta_fields: Ints, delta_size: Index, slots: Index, gradient: Floats, first: Index, last: Index,
+    theta: Floats, padded: Floats, layers: Ints, places: AnyArray, gnss: Floats, pulls: Floats, kept: Floats,
+    fields: Ints, size: Index, delta_fields: Ints, delta_size: Index, slots: Index, gradient: Floats, first: Index,
+    last: Index,
 ) -> None:  # fmt: skip
     """Gradient (S, P) of the models first..last - 1 from that of their estimates, `pulls` (T, S, B, 3).
 
@@ -53,45 +63,59 @@ def backward(
     one product over all their rows.
 
     Args:
-        theta: (S, P). padded, layers, gnss, kept: as `forward` left them. fields, delta_fields: as in `Tape`, the
-            latter of the gradients of the outputs. size, delta_size: of the memory that is not kept, with room for
+        theta: (S, P). padded, layers, places, gnss, kept: as `forward` left them. fields, delta_fields: as in `Tape`,
+            the latter of the gradients of the outputs. size, delta_size: of the memory that is not kept, with room for
             `slots` steps.
     """
-    steps, models, lanes, _ = gnss.shape
-    ahead_turned, turned, longer = layers[:, 2] > 0, layers[:, 2] < 0, layers[:, 2] > layers[:, 3]
-    passing, waiting, now = aligned(size, theta), aligned(delta_size, theta), np.zeros(2, np.int64)
-    straight, grown = aligned(padded.shape[1], theta), aligned(padded.shape[1], theta)
-    work, positions = aligned(lanes * 14 * PAD, theta), np.empty(3 * lanes * 3, theta.dtype)
-    fixes, pulled = gnss.reshape(-1), pulls.reshape(-1)
+    lanes, turned, now = gnss.shape[2], layers[:, 2] > 0, np.zeros(2, np.int64)
+    passing, waiting = aligned(size, theta), aligned(delta_size, theta)
+    room = scratch(lanes, padded.shape[1], theta)
     for s in range(first, last):
-        ahead = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(ahead_turned))
-        net = Net(lent(theta[s]), lent(straight), lent(layers), lent(turned))
-        made = Net(lent(gradient[s]), lent(grown), lent(layers), lent(longer))
+        net = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(turned), lent(places[0]))
         tape = Tape(lent(passing), lent(kept[s]), lent(fields), lent(now), lanes)
         deltas = Tape(lent(waiting), lent(waiting), lent(delta_fields), lent(now), lanes)
-        _rollback(net, ahead, made, tape, deltas, fixes, pulled, steps, s * lanes * 3, models * lanes * 3, slots, work,
-                  positions)  # fmt: skip
+        back(net, tape, deltas, gnss, pulls, s, slots, room, places, gradient[s])
+
+
+@part
+def scratch(lanes: Index, size: Index, like: Floats) -> Scratch:
+    """Memory for B lanes and matrices of this size."""
+    return Scratch(aligned(size, like), aligned(size, like), aligned(lanes * 14 * PAD, like),
+                   np.empty(3 * lanes * 3, like.dtype))  # fmt: skip
+
+
+@part
+def back(
+    ahead: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, s: Index, slots: Index, room: Scratch,
+    places: AnyArray, gradient: Floats,
+) -> None:  # fmt: skip
+    """Gradient (P,) of one model from pulls[:, s], its tape and its matrices as `follow` left them."""
+    turned, longer = ahead.layers[:, 2] < 0, ahead.layers[:, 2] > ahead.layers[:, 3]
+    net = Net(ahead.theta, lent(room.straight), ahead.layers, lent(turned), lent(places[1]))
+    made = Net(lent(gradient), lent(room.grown), ahead.layers, lent(longer), lent(places[2]))
+    _rollback(net, ahead, made, tape, deltas, gnss, pulls, s, slots, room, turned, longer)
 
 
 @part
 def _rollback(
-    net: Net, ahead: Net, made: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, steps: Index, at: Index,
-    stride: Index, slots: Index, work: Floats, positions: Floats,
+    net: Net, ahead: Net, made: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, s: Index, slots: Index,
+    room: Scratch, turned: Bools, longer: Bools,
 ) -> None:  # fmt: skip
-    """One model, whose lanes begin at `at` in flat gnss and pulls, and a step later `stride` further on."""
+    """`back` with the net's matrices straight and turned, and memory for the gradient; it holds what these are in."""
     unpack(net)
     made.padded[:] = 0.0
-    lanes, recompute = tape.lanes, tape.fields[on.CORRECTED, 2] == 0
-    pull, inner = _nothing(lanes, work, positions)
+    lanes, recompute, steps = tape.lanes, tape.fields[on.CORRECTED, 2] == 0, len(gnss)
+    fixes, pulled, stride = gnss.reshape(-1), pulls.reshape(-1), gnss.shape[1] * tape.lanes * 3
+    pull, inner = _nothing(lanes, room.inner, room.positions)
     for t in range(steps - 1, -1, -1):
-        tape.now[0], tape.now[1] = t % slots, t
-        given = window(pulls, at + t * stride, lanes, THREE)
+        tape.now[0], tape.now[1], at = t % slots, t, s * lanes * 3 + t * stride
+        given = window(pulled, at, lanes, THREE)
         for b in range(lanes):
             for i in range(3):
                 pull.x[b, i] += given[b, i]
         if recompute:
             _again(ahead, tape)
-        _step(net, ahead, window(gnss, at + t * stride, lanes, THREE), pull, tape, deltas, inner)
+        _step(net, ahead, window(fixes, at, lanes, THREE), pull, tape, deltas, inner)
         if t % slots == 0:
             _collect(made, tape, deltas, min(slots, steps - t))
     pack(made)
@@ -113,7 +137,7 @@ def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Pull, Inner
     return pull, inner
 
 
-@part
+@inside
 def _again(net: Net, tape: Tape) -> None:
     """The outputs of the wide layers at the present step, and what stands beside them."""
     moved, seen, wide = rows(tape, on.PRIOR_IN), rows(tape, on.INNOVATION_IN), net.layers[on.UPDATE, 2]
@@ -143,7 +167,7 @@ def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
         add_outer(lent(one), ZERO, ONE, delta, column, bias(gradient, name))
 
 
-@part
+@inside
 def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
     """Back over a step: `pull` becomes the gradient with respect to the state before it."""
     gain = _room(net, on.GAIN, deltas)
@@ -167,7 +191,7 @@ def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Ta
     _end(net, ahead, gnss, pull, tape, deltas, inner)
 
 
-@part
+@inside
 def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, posterior: Floats) -> None:
     """Gradients of what a step gives: new states, K and innovation by x = x_prior + K (z - x_prior), posterior.
 
@@ -191,7 +215,7 @@ def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, pos
             posterior[b, j] = zero if gone or posterior_out[b, j] <= zero else pull.prior[b, j]
 
 
-@part
+@inside
 def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
     """Gradients of the four changes, and `pull` before the step; without a fix only x and x_before were moved on."""
     wide = net.layers[on.UPDATE, 2]
@@ -218,7 +242,7 @@ def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tap
             pull.innovation[b, j] = inner.innovation[b, j]
 
 
-@part
+@inside
 def _turn(features: Floats, lengths: Floats, b: Index, which: Index, values: Floats) -> None:
     """Gradient of a change, in place, from that of its direction and of the logarithm of its length."""
     real, at = values.dtype.type, on.CHANGES[which, 0]
@@ -231,26 +255,26 @@ def _turn(features: Floats, lengths: Floats, b: Index, which: Index, values: Flo
     values[b, 2] = r * scale + w * in_length
 
 
-@part
+@inside
 def _room(net: Net, name: Index, deltas: Tape) -> Floats:
     """The field where the gradient of a layer's outputs stands."""
     return rows(deltas, net.layers[name, 9])
 
 
-@part
+@inside
 def _add(net: Net, name: Index, deltas: Tape, at: Index, out: Floats) -> None:
     """Add to out (B, PAD) the gradient of a layer's inputs from input `at` on."""
     add_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name), at, out)
 
 
-@part
+@inside
 def _gate(net: Net, name: Index, tape: Tape, reached: Index, below: Index, deltas: Tape) -> None:
     """The gradient of a layer's inputs, where these are positive, as that of the outputs of the layer below."""
     gated_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name),
                   rows(tape, reached), _room(net, below, deltas))  # fmt: skip
 
 
-@part
+@inside
 def _gru(
     net: Net, name: Index, old: Index, gates_name: Index, after: Floats, work: Floats, tape: Tape, deltas: Tape
 ) -> None:
@@ -265,10 +289,7 @@ def _gru(
             work[b, on.KEEP + j] = after[b, j] * (before[b, j] - fresh) * keep * (one - keep)
             work[b, on.FRESH + j], work[b, on.KEPT + j] = in_fresh, in_fresh * reset
             after[b, j] *= keep
-        for j in range(PAD):
-            given[b, j] = kept[b, j] = work[b, j]
-        for j in range(PAD):
-            given[b, 9 + j] = kept[b, 9 + j] = work[b, on.KEEP + j]
-        for j in range(PAD):
-            given[b, 18 + j], kept[b, 18 + j] = work[b, on.FRESH + j], work[b, on.KEPT + j]
+        for third in range(3):
+            carry(work, third * PAD, given, third * 9, b)
+            carry(work, (third + third // 2) * PAD, kept, third * 9, b)
     _add(net, name + 1, deltas, on.FIRST, after)

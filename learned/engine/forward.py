@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import AnyArray, Floats, Ints
 from coopoc.kernels.compile import compiled, part
 
 from ..nets.gain_net import LOG_FLOOR, SHORTEST
 from . import places as on
-from .arithmetic import PAD, THREE, ZERO, Index, aligned, lent, sigmoid, tanh, window
+from .arithmetic import PAD, THREE, ZERO, Index, aligned, carry, inside, lent, sigmoid, tanh, window
 from .product import affine, spread
 from .tape import Net, Tape, bias, matrix, rows, unpack
 
@@ -36,46 +36,58 @@ class Seen(NamedTuple):
     dt: float
 
 
+class Scratch(NamedTuple):
+    """Memory of a rollout: of a GRU's two halves, of the GRU states, of the positions."""
+
+    gates: Floats
+    grus: Floats
+    positions: Floats
+
+
 @compiled
 def forward(
-    theta: Floats, padded: Floats, layers: Ints, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, kept: Floats,
-    fields: Ints, size: Index, keep: Index, x: Floats, first: Index, last: Index,
+    theta: Floats, padded: Floats, layers: Ints, places: AnyArray, gnss: Floats, velocity: Floats, x0: Floats,
+    dt: Floats, kept: Floats, fields: Ints, size: Index, keep: Index, x: Floats, first: Index, last: Index,
 ) -> None:  # fmt: skip
     """Estimates x (T, S, B, 3) m of the models first..last - 1, and what backward needs of their tape.
 
     Args:
-        theta: (S, P). padded: (S, .) for the matrices. layers: as in `Net`. gnss, velocity: (T, S, B, 3) m, m/s.
-        x0: (S, B, 3) m. dt: (T,) s. kept: (S, .) of the tape. fields: as in `Tape`. size: of its memory that is not
-            kept. keep: 1 keeps all steps, 0 the last.
+        theta: (S, P). padded: (S, .) for the matrices. layers: as in `Net`. places: as in `Plan`. gnss, velocity:
+            (T, S, B, 3) m, m/s. x0: (S, B, 3) m. dt: (T,) s. kept: (S, .) of the tape. fields: as in `Tape`. size: of
+            its memory that is not kept. keep: 1 keeps all steps, 0 the last.
     """
-    _, models, lanes, _ = gnss.shape
-    turned, now = layers[:, 2] > 0, np.zeros(2, np.int64)
-    work, passing = aligned(2 * lanes * on.GATES, x), aligned(size, x)
-    grus, positions = aligned(3 * lanes * PAD, x), np.empty(4 * lanes * 3, x.dtype)
-    fixes, speeds, starts, made = gnss.reshape(-1), velocity.reshape(-1), x0.reshape(-1), x.reshape(-1)
+    lanes, turned, now = gnss.shape[2], layers[:, 2] > 0, np.zeros(2, np.int64)
+    passing, room = aligned(size, x), scratch(lanes, x)
     for s in range(first, last):
-        net = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(turned))
+        net = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(turned), lent(places[0]))
         tape = Tape(lent(passing), lent(kept[s]), lent(fields), lent(now), lanes)
-        _rollout(net, tape, fixes, speeds, window(starts, s * lanes * 3, lanes, THREE), dt, made, s * lanes * 3,
-                 models * lanes * 3, keep, work, grus, positions)  # fmt: skip
+        follow(net, tape, gnss, velocity, x0, dt, x, s, keep, room)
 
 
 @part
-def _rollout(
-    net: Net, tape: Tape, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, x: Floats, at: Index, stride: Index,
-    keep: Index, work: Floats, grus: Floats, positions: Floats,
+def scratch(lanes: Index, like: Floats) -> Scratch:
+    """Memory for B lanes."""
+    return Scratch(aligned(2 * lanes * on.GATES, like), aligned(3 * lanes * PAD, like),
+                   np.empty(4 * lanes * 3, like.dtype))  # fmt: skip
+
+
+@part
+def follow(
+    net: Net, tape: Tape, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, x: Floats, s: Index, keep: Index,
+    room: Scratch,
 ) -> None:  # fmt: skip
-    """One model, whose lanes begin at `at` in flat gnss, velocity and x, and a step later `stride` further on."""
+    """Estimates x[:, s] of one model, and its matrices."""
     unpack(net)
-    lanes, wide, logs, scratch = tape.lanes, net.layers[on.UPDATE, 2], net.layers[on.UPDATE, 3] > 3, lent(work)
-    state = _start(x0, grus, positions)
+    lanes, wide, logs, work = tape.lanes, net.layers[on.UPDATE, 2], net.layers[on.UPDATE, 3] > 3, lent(room.gates)
+    fixes, speeds, made, at = gnss.reshape(-1), velocity.reshape(-1), x.reshape(-1), s * lanes * 3
+    state = _start(window(x0.reshape(-1), at, lanes, THREE), room.grus, room.positions)
     for t in range(len(dt)):
-        tape.now[1] = t * keep
-        seen = Seen(window(gnss, at, lanes, THREE), window(velocity, at, lanes, THREE), dt[t])
+        tape.now[0], tape.now[1] = 0, t * keep
+        seen = Seen(window(fixes, at, lanes, THREE), window(speeds, at, lanes, THREE), dt[t])
         _look(seen, state, tape, logs)
-        _think(net, state, tape, scratch)
-        _move(seen, state, tape, wide, window(x, at, lanes, THREE))
-        at += stride
+        _think(net, state, tape, work)
+        _move(seen, state, tape, wide, window(made, at, lanes, THREE))
+        at += gnss.shape[1] * lanes * 3
 
 
 @part
@@ -96,13 +108,13 @@ def _start(x0: Floats, grus: Floats, positions: Floats) -> State:
     return state
 
 
-@part
+@inside
 def missing(gnss: Floats, b: Index) -> bool:
     """Whether lane b of gnss (B, 3) has no fix."""
     return bool(np.isnan(gnss[b, 0]) and np.isnan(gnss[b, 1]) and np.isnan(gnss[b, 2]))
 
 
-@part
+@inside
 def _look(seen: Seen, state: State, tape: Tape, logs: bool) -> None:
     """The four changes as the layers read them, their lengths, and the innovation; a missing fix repeats the last."""
     real, features, lengths = state.x.dtype.type, rows(tape, on.FEATURES), rows(tape, on.LENGTHS)
@@ -125,7 +137,7 @@ def _look(seen: Seen, state: State, tape: Tape, logs: bool) -> None:
             lengths[b, which] = length
 
 
-@part
+@inside
 def _think(net: Net, state: State, tape: Tape, work: Floats) -> None:
     """The net itself, from features to gain and posterior, all on the tape."""
     wide, core, back = net.layers[on.UPDATE, 2], rows(tape, on.CORE), window(work, ZERO, tape.lanes, np.int64(PAD))
@@ -147,14 +159,14 @@ def _think(net: Net, state: State, tape: Tape, work: Floats) -> None:
     layer(net, on.POSTERIOR, tape, rows(tape, on.POSTERIOR_OUT), on.FIRST)
 
 
-@part
+@inside
 def layer(net: Net, name: Index, tape: Tape, out: Floats, at: Index) -> None:
     """What a layer makes of its window of the tape, into out (B, n) from column `at` on, with padding."""
     inputs, relu, field, column = net.layers[name, 3], net.layers[name, 6], net.layers[name, 7], net.layers[name, 8]
     affine(rows(tape, field), column, inputs, matrix(net, name), bias(net, name), relu > 0, out, at)
 
 
-@part
+@inside
 def _gru(
     net: Net, name: Index, old: Index, gates_name: Index, state: Floats, tape: Tape, work: Floats, out: Floats,
     at: Index,
@@ -166,8 +178,7 @@ def _gru(
     real, before, gates = work.dtype.type, rows(tape, old), rows(tape, gates_name)
     given, kept = window(work, ZERO, tape.lanes, on.GATES), window(work, tape.lanes * on.GATES, tape.lanes, on.GATES)
     for b in range(tape.lanes):
-        for j in range(PAD):
-            before[b, j] = state[b, j]
+        carry(state, ZERO, before, ZERO, b)
     layer(net, name, tape, given, on.FIRST)
     layer(net, name + 1, tape, kept, on.FIRST)
     spread(given)
@@ -182,7 +193,7 @@ def _gru(
     blend(tape, old, gates_name, out, at)
 
 
-@part
+@inside
 def blend(tape: Tape, old: Index, gates_name: Index, out: Floats, at: Index) -> None:
     """h <- n + z (h - n), the new state of a GRU, into out from column `at` on."""
     before, gates = rows(tape, old), rows(tape, gates_name)
@@ -192,7 +203,7 @@ def blend(tape: Tape, old: Index, gates_name: Index, out: Floats, at: Index) -> 
             out[b, at + j] = fresh + gates[b, on.KEEP + j] * (before[b, j] - fresh)
 
 
-@part
+@inside
 def _move(seen: Seen, state: State, tape: Tape, wide: Index, x: Floats) -> None:
     """x <- x_prior + K (z - x_prior) and the states of the GRUs; without a fix x <- x_prior and nothing else."""
     lengths, core, moved = rows(tape, on.LENGTHS), rows(tape, on.CORE), rows(tape, on.PRIOR_IN)
@@ -213,23 +224,3 @@ def _move(seen: Seen, state: State, tape: Tape, wide: Index, x: Floats) -> None:
             for j in range(9):
                 state.process[b, j], state.prior[b, j] = moved[b, wide + j], posterior[b, j]
                 state.innovation[b, j] = core[b, on.CORE_INNOVATION + j]
-
-
-@compiled
-def score(x: Floats, truth: Floats, pulls: Floats, losses: Floats) -> None:
-    """Squared errors (S,), mean over time and lanes, sum over components, and their gradient in x, pulls (T, S, B, 3).
-
-    Added in one order, so that a number does not depend on who is beside it.
-    """
-    steps, models, lanes, _ = x.shape
-    share = 1.0 / (steps * lanes)
-    scale = x.dtype.type(2.0 * share)
-    for s in range(models):
-        total = 0.0
-        for t in range(steps):
-            for b in range(lanes):
-                for i in range(3):
-                    error = x[t, s, b, i] - truth[t, s, b, i]
-                    pulls[t, s, b, i] = scale * error
-                    total += error * error
-        losses[s] = total * share

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import Bools, Ints
+from coopoc.arrays import AnyArray, Bools, Ints
 
 from ..nets.gain_net import CELLS, GainNet
 from . import places as on
@@ -45,9 +45,11 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """For nets of one shape: the table of `tape.Net`, the lengths of theta and of the memory of the matrices."""
+    """For nets of one shape: `layers` of `tape.Net` and its `places` where all matrices are turned, none, or those with
+    more outputs than inputs (3, P); the lengths of theta and of the memory of the matrices."""
 
     layers: Ints
+    places: AnyArray
     parameters: int
     size: int
 
@@ -90,4 +92,17 @@ def plan_of(settings: tuple[tuple[str, Any], ...]) -> Plan:
         found.append([begin[name], begin[name.replace("weight", "bias")], outputs, inputs, size, last, relu, field,
                       column, delta, behind])  # fmt: skip
         size += room(outputs, inputs)
-    return Plan(np.array(found), at, size)
+    layers = np.array(found)
+    return Plan(layers, np.stack([_places(layers, at, which) for which in range(3)]), at, size)
+
+
+def _places(layers: Ints, parameters: int, which: int) -> AnyArray:
+    """(P,) a row of `Plan.places`."""
+    places = np.empty(parameters, np.uint32)  # numba asks of every signed index whether it counts from the end
+    for weight, bias, outputs, inputs, at, last, *_ in layers:
+        o, i = np.arange(outputs)[:, None], (np.arange(inputs) - last) % inputs
+        turned = (True, False, outputs > inputs)[which]
+        places[weight : weight + outputs * inputs] = (
+            at + (i * whole(outputs) + o if turned else o * whole(inputs + PAD - 9) + i)).ravel()  # fmt: skip
+        places[bias : bias + outputs] = at + room(outputs, inputs) - whole(outputs) + o[:, 0]
+    return places

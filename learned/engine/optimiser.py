@@ -21,18 +21,27 @@ def advance(
 
     Where loss or gradient is not finite, `finite` (R,) becomes false and nothing is changed.
     """
-    real = theta.dtype.type
-    penalty = real(2.0 * l2), real(proximal)
     for r in range(len(rows)):
         at = rows[r]
-        weights, given, start = lent(theta[at]), lent(gradient[r]), lent(began[at])
-        square = _square(weights, given, start, penalty)
-        finite[r] = np.isfinite(losses[r]) and not np.isnan(square)
-        if finite[r]:
-            scale = min(real(limit) / (np.sqrt(square) + real(1e-6)), real(1.0))
-            size, pace = 1.0 / (1.0 - 0.999**step), -rates[r] / (1.0 - 0.9**step)
-            _adamw(weights, given, start, penalty, lent(first[at]), lent(second[at]), scale,
-                   real(1.0 - rates[r] * decay), real(pace), real(size))  # fmt: skip
+        finite[r] = advanced(lent(theta[at]), lent(gradient[r]), lent(began[at]), lent(first[at]), lent(second[at]),
+                             losses[r], step, rates[r], decay, l2, proximal, limit)  # fmt: skip
+
+
+@part
+def advanced(
+    theta: Floats, gradient: Floats, began: Floats, first: Floats, second: Floats, loss: float, step: Index,
+    rate: float, decay: float, l2: float, proximal: float, limit: float,
+) -> bool:  # fmt: skip
+    """`advance` of one row (P,)."""
+    real = theta.dtype.type
+    penalty = real(2.0 * l2), real(proximal)
+    square = _square(theta, gradient, began, penalty)
+    if not np.isfinite(loss) or np.isnan(square):
+        return False
+    scale = min(real(limit) / (np.sqrt(square) + real(1e-6)), real(1.0))
+    size, pace = 1.0 / (1.0 - 0.999**step), -rate / (1.0 - 0.9**step)
+    _adamw(theta, gradient, began, penalty, first, second, scale, real(1.0 - rate * decay), real(pace), real(size))
+    return True
 
 
 @part

@@ -1,4 +1,4 @@
-"""Matrix products for compiled kernels: tiles whose sums stay in registers, written in LLVM's vectors.
+"""Matrix products for compiled kernels, of tiles whose sums stay in registers.
 
 NumPy's product inside numba is a call into BLAS, which for one trajectory takes longer than the product itself; a loop
 in Python's syntax keeps its sums in memory. These tiles are as fast as BLAS for many rows and half as fast for one.
@@ -6,33 +6,25 @@ in Python's syntax keeps its sums in memory. These tiles are as fast as BLAS for
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any
 
-import numpy as np
-from llvmlite import binding, ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
+from llvmlite import ir
+from numba.core import types
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import part, summing
+from coopoc.kernels.compile import summing
 
-from .arithmetic import PAD, ZERO, Index
+from .arithmetic import ONE, PAD, ZERO, Index, apart, inside, instructions
+from .tile import ADD, BYTES, GATE, RELU, shapes, stays
 
-BYTES = 64 if binding.get_host_cpu_features().get("avx512f") else 32
-"""Of a vector register."""
 TALL = 6
 """Most rows of a tile: 6 x 2 sums, two vectors of b and a factor fit the 16 registers of AVX2."""
-WIDEST = {1: 8, 2: 4}
-"""Most vectors of a tile by its rows, 2 for more rows: one with few rows is wide, so that no sum waits for itself."""
-ADD, RELU, GATE = np.array([1, 2, 4])
-"""What a product does besides: begin from numbers, not zero; end with zero where it, or a gate, is not positive."""
-
-instructions = cast(Callable[[Callable[..., Any]], Callable[..., Any]], intrinsic)
-"""`intrinsic` with a type."""
+WIDEST = {1: 2, 2: 4} | dict.fromkeys(range(3, TALL + 1), 2)
+"""Most vectors of a tile by its rows: one with few rows is wide, so that no sum waits for itself."""
+one_row, few_rows = shapes({1: 8}), shapes(WIDEST)
 
 
-@part
+@inside
 def affine(
     a: AnyArray, at: Index, depth: Index, b: AnyArray, start: AnyArray, relu: bool, out: AnyArray, column: Index
 ) -> None:
@@ -40,39 +32,53 @@ def affine(
 
     In all products n is a multiple of PAD. NaN stays NaN.
     """
-    size = out.itemsize
-    _tiles(_at(a) + at * size, a.strides[0], size, _at(b), b.strides[0], _at(start), ZERO, _at(start), ZERO,
-           _at(out) + column * size, out.strides[0], a.shape[0], depth, b.strides[0], ADD + RELU if relu else ADD,
-           out.dtype.type)  # fmt: skip
+    size, end, real = out.itemsize, b.strides[0], out.dtype.type
+    left, into = _at(a) + at * size, _at(out) + column * size
+    if a.shape[0] > 1:
+        _tiles(left, a.strides[0], size, _at(b), end, _at(start), ZERO, _at(start), ZERO, into, out.strides[0],
+               a.shape[0], depth, end, ADD + RELU if relu else ADD, real)  # fmt: skip
+    elif relu:
+        _row_relu(left, size, _at(b), end, _at(start), into, end, depth, real)
+    else:
+        _row_sum(left, size, _at(b), end, _at(start), into, end, depth, real)
 
 
-@part
+@inside
 def gated_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, gate: AnyArray, out: AnyArray) -> None:
     """out (m, n) = a[:, at:] (m, depth) b (depth, n) where gate (m, n) is positive, else zero."""
-    size = out.itemsize
-    _tiles(_at(a) + at * size, a.strides[0], size, _at(b), b.strides[0], _at(out), ZERO, _at(gate), gate.strides[0],
-           _at(out), out.strides[0], a.shape[0], depth, out.strides[0], GATE, out.dtype.type)  # fmt: skip
+    size, end, real = out.itemsize, out.strides[0], out.dtype.type
+    if a.shape[0] > 1:
+        _tiles(_at(a) + at * size, a.strides[0], size, _at(b), b.strides[0], _at(out), ZERO, _at(gate), gate.strides[0],
+               _at(out), end, a.shape[0], depth, end, GATE, real)  # fmt: skip
+    else:
+        _row_gated(_at(a) + at * size, size, _at(b), b.strides[0], _at(gate), _at(out), end, depth, real)
 
 
-@part
+@inside
 def add_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, column: Index, out: AnyArray) -> None:
     """out (m, n) += a[:, at:] (m, depth) b[:, column:] (depth, n)."""
-    size = out.itemsize
-    _tiles(_at(a) + at * size, a.strides[0], size, _at(b) + column * size, b.strides[0], _at(out), out.strides[0],
-           _at(out), ZERO, _at(out), out.strides[0], a.shape[0], depth, out.strides[0], ADD,
-           out.dtype.type)  # fmt: skip
+    size, end, real = out.itemsize, out.strides[0], out.dtype.type
+    left, right = _at(a) + at * size, _at(b) + column * size
+    if a.shape[0] > 1:
+        _tiles(left, a.strides[0], size, right, b.strides[0], _at(out), end, _at(out), ZERO, _at(out), end, a.shape[0],
+               depth, end, ADD, real)  # fmt: skip
+    else:
+        _row_sum(left, size, right, b.strides[0], _at(out), _at(out), end, depth, real)
 
 
-@part
+@inside
 def add_outer(a: AnyArray, at: Index, count: Index, b: AnyArray, column: Index, out: AnyArray) -> None:
     """out (count, n) += a[:, at:] (k, count)^T b[:, column:] (k, n).
 
     What lies behind rows of b that are shorter is read; the columns of out beyond them then mean nothing.
     """
-    size = out.itemsize
-    _tiles(_at(a) + at * size, size, a.strides[0], _at(b) + column * size, b.strides[0], _at(out), out.strides[0],
-           _at(out), ZERO, _at(out), out.strides[0], count, a.shape[0], out.strides[0], ADD,
-           out.dtype.type)  # fmt: skip
+    size, end, real = out.itemsize, out.strides[0], out.dtype.type
+    left, right = _at(a) + at * size, _at(b) + column * size
+    if count > 1:
+        _tiles(left, size, a.strides[0], right, b.strides[0], _at(out), end, _at(out), ZERO, _at(out), end, count,
+               a.shape[0], end, ADD, real)  # fmt: skip
+    else:
+        _row_sum(left, a.strides[0], right, b.strides[0], _at(out), _at(out), end, a.shape[0], real)
 
 
 @summing
@@ -90,13 +96,13 @@ def dots(a: AnyArray, depth: Index, b: AnyArray, first: Index, out: AnyArray) ->
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = s, t, u, v if logs else zero
 
 
-@part
+@inside
 def _tiles(
     a: Index, a_row: Index, a_column: Index, b: Index, b_row: Index, start: Index, start_row: Index, gate: Index,
     gate_row: Index, out: Index, out_row: Index, rows: Index, depth: Index, end: Index, how: Index, real: Any,
 ) -> None:  # fmt: skip
     """A product from addresses, strides and the length of a row of the result, all in bytes."""
-    wide, j = 8 if rows == 1 else 4 if rows == 2 else 2, 0
+    wide, j = 4 if rows == 2 else 2, 0
     while j < end:
         while wide * BYTES > end - j:
             wide //= 2
@@ -104,6 +110,59 @@ def _tiles(
             tall = min(rows - i, TALL)
             _tile(a + i * a_row, a_row, a_column, b + j, b_row, start + i * start_row + j, start_row,
                   gate + i * gate_row + j, gate_row, out + i * out_row + j, out_row, tall, wide, depth, how, real)
+        j += wide * BYTES
+
+
+@apart
+def _tile(
+    a: Index, a_row: Index, a_column: Index, b: Index, b_row: Index, start: Index, start_row: Index, gate: Index,
+    gate_row: Index, out: Index, out_row: Index, tall: Index, wide: Index, depth: Index, how: Index, real: Any,
+) -> None:  # fmt: skip
+    """A tile of so many rows and vectors at these addresses, in a function of its own: within the loops of `_tiles` the
+    compiler would work out the addresses of every shape before it takes one."""
+    stays()
+    few_rows(a, a_row, a_column, b, b_row, start, start_row, gate, gate_row, out, out_row, tall, wide, depth, how, real)
+
+
+@apart
+def _row_sum(
+    a: Index, a_column: Index, b: Index, b_row: Index, start: Index, out: Index, end: Index, depth: Index, real: Any
+) -> None:
+    """One row of a product with ADD."""
+    stays()
+    _row(a, a_column, b, b_row, start, start, out, end, depth, ADD, real)
+
+
+@apart
+def _row_relu(
+    a: Index, a_column: Index, b: Index, b_row: Index, start: Index, out: Index, end: Index, depth: Index, real: Any
+) -> None:
+    """One row with ADD and RELU."""
+    stays()
+    _row(a, a_column, b, b_row, start, start, out, end, depth, ADD + RELU, real)
+
+
+@apart
+def _row_gated(
+    a: Index, a_column: Index, b: Index, b_row: Index, gate: Index, out: Index, end: Index, depth: Index, real: Any
+) -> None:
+    """One row with GATE."""
+    stays()
+    _row(a, a_column, b, b_row, gate, gate, out, end, depth, GATE, real)
+
+
+@inside
+def _row(
+    a: Index, a_column: Index, b: Index, b_row: Index, start: Index, gate: Index, out: Index, end: Index, depth: Index,
+    how: Index, real: Any,
+) -> None:  # fmt: skip
+    """One row of a product, as `_tiles`."""
+    wide, j = 8, 0
+    while j < end:
+        while wide * BYTES > end - j:
+            wide //= 2
+        one_row(a, ZERO, a_column, b + j, b_row, start + j, ZERO, gate + j, ZERO, out + j, ZERO, ONE, wide, depth, how,
+             real)  # fmt: skip
         j += wide * BYTES
 
 
@@ -118,7 +177,7 @@ def _at(typing: Any, array: Any) -> Any:
     return types.intp(array), generate
 
 
-@part
+@inside
 def spread(gates: AnyArray) -> None:
     """Of every row of gates (m, 3 PAD), the three nines at 0, 9, 18 to 0, PAD, 2 PAD, where vectors begin.
 
@@ -147,103 +206,3 @@ def _spread(typing: Any, gates: Any, row: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(gates, types.intp), generate
-
-
-class _Tile(NamedTuple):
-    """Arguments of `_tile` as LLVM's values, in its order."""
-
-    a: Any
-    a_row: Any
-    a_column: Any
-    b: Any
-    b_row: Any
-    start: Any
-    start_row: Any
-    gate: Any
-    gate_row: Any
-    out: Any
-    out_row: Any
-    tall: Any
-    wide: Any
-    depth: Any
-    how: Any
-
-
-@instructions
-def _tile(
-    typing: Any, a: Any, a_row: Any, a_column: Any, b: Any, b_row: Any, start: Any, start_row: Any, gate: Any,
-    gate_row: Any, out: Any, out_row: Any, tall: Any, wide: Any, depth: Any, how: Any, real: Any,
-) -> Any:  # fmt: skip
-    """A tile of so many rows and vectors at these addresses."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        builder.function.attributes.add("noinline")
-        given, number = _Tile(*values[:-1]), context.get_value_type(real.instance_type)
-        vector, word = ir.VectorType(number, BYTES * 8 // real.instance_type.bitwidth), given.a.type
-        end = builder.append_basic_block("end")
-        which = builder.switch(builder.add(builder.mul(given.tall, word(16)), given.wide), end)
-        for shape in ((r, v) for r in range(1, TALL + 1) for v in (1, 2, 4, 8) if v <= WIDEST.get(r, 2)):
-            here = builder.append_basic_block("tile")
-            which.add_case(word(16 * shape[0] + shape[1]), here)
-            builder.position_at_end(here)
-            _emit(builder, vector, shape, given)
-            builder.branch(end)
-        builder.position_at_end(end)
-        return context.get_dummy_value()
-
-    words = (types.intp,) * len(_Tile._fields)
-    return types.void(*words, real), generate
-
-
-def _emit(builder: Any, vector: Any, shape: tuple[int, int], given: _Tile) -> None:
-    """The instructions of one tile; with few sums, several terms of each are added at once."""
-    word, (tall, wide), cells = given.a.type, shape, [(r, v) for r in range(shape[0]) for v in range(shape[1])]
-    terms, nothing = max(1, 8 // (tall * wide)), ir.Constant(vector, None)
-    begins, relu, gated = (builder.icmp_signed("!=", builder.and_(given.how, word(int(flag))), word(0))
-                           for flag in (ADD, RELU, GATE))  # fmt: skip
-    always = _splat(builder, builder.not_(builder.or_(relu, gated)), ir.VectorType(ir.IntType(1), vector.count))
-
-    def place(base: Any, kind: Any, *steps: tuple[Any, int]) -> Any:
-        for stride, count in steps:
-            base = builder.add(base, builder.mul(stride, word(count)))
-        return builder.inttoptr(base, ir.PointerType(kind))
-
-    def load(base: Any, *steps: tuple[Any, int]) -> Any:
-        return builder.load(place(base, vector, *steps), align=4)
-
-    starts = [builder.select(begins, load(given.start, (given.start_row, r), (word(BYTES), v)), nothing)
-              for r, v in cells]  # fmt: skip
-    sums = {(u, *cell): cast(Any, cgutils).alloca_once_value(builder, nothing if u else start)
-            for u in range(terms) for cell, start in zip(cells, starts, strict=True)}  # fmt: skip
-
-    def add(k: Any, u: int) -> None:
-        row = builder.add(given.b, builder.mul(k, given.b_row))
-        loaded = [load(row, (word(BYTES), v)) for v in range(wide)]
-        for r in range(tall):
-            left = place(builder.add(given.a, builder.mul(k, given.a_column)), vector.element, (given.a_row, r))
-            factor = _splat(builder, builder.load(left), vector)
-            for v in range(wide):
-                term = builder.fmul(factor, loaded[v], flags=("contract",))
-                builder.store(builder.fadd(builder.load(sums[u, r, v]), term, flags=("contract",)), sums[u, r, v])
-
-    full = builder.sub(given.depth, builder.urem(given.depth, word(terms)))
-    with cgutils.for_range_slice(builder, word(0), full, word(terms), inc=True) as (k, _):
-        for u in range(terms):
-            add(builder.add(k, word(u)), u)
-    with cgutils.for_range_slice(builder, full, given.depth, word(1), inc=True) as (k, _):
-        add(k, 0)
-    for r, v in cells:
-        parts = [builder.load(sums[u, r, v]) for u in range(terms)]
-        while len(parts) > 1:
-            parts = [builder.fadd(one, other) for one, other in zip(parts[::2], parts[1::2], strict=True)]
-        gate = builder.select(relu, parts[0], load(given.gate, (given.gate_row, r), (word(BYTES), v)))
-        keep = builder.or_(builder.fcmp_unordered(">", gate, nothing), always)
-        result = builder.select(keep, parts[0], nothing)
-        builder.store(result, place(given.out, vector, (given.out_row, r), (word(BYTES), v)), align=4)
-
-
-def _splat(builder: Any, number: Any, vector: Any) -> Any:
-    """A vector of one number."""
-    lane, nothing = ir.IntType(32), ir.Constant(vector, ir.Undefined)
-    first = builder.insert_element(nothing, number, lane(0))
-    return builder.shuffle_vector(first, nothing, ir.Constant(ir.VectorType(lane, vector.count), [0] * vector.count))

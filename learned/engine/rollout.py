@@ -14,13 +14,15 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from coopoc.arrays import AnyArray
+from coopoc.arrays import AnyArray, Floats, Ints
 from coopoc.errors import InputError
 
 from ..nets.gain_net import GainNet
 from ..training.clients import Batch
 from ..training.machine import threads
+from ..training.schedule import Moving, Schedule
 from . import backward as kernel_backward
+from . import descent as kernel_descent
 from . import forward as kernel_forward
 from .arithmetic import PAD
 from .layout import Plan, plan_of
@@ -49,7 +51,7 @@ def rollout(theta: Tensor, like: GainNet, gnss: Tensor, velocity: Tensor, x0: Te
     0.0
     """
     plan = plan_of(tuple(like.settings.items()))
-    seen = _checked(theta, plan.parameters, gnss, velocity, x0, dt)
+    seen = _checked(theta, len(theta), plan.parameters, gnss, velocity, x0, dt)
     if theta.requires_grad and torch.is_grad_enabled():
         x: Tensor = _Rollout.apply(theta, plan, seen)  # type: ignore[no-untyped-call]
         return x
@@ -65,15 +67,40 @@ def loss_and_gradient(theta: Tensor, like: GainNet, batch: Batch) -> tuple[Tenso
     >>> loss_and_gradient(torch.zeros(1, 19938), GainNet(), Batch(still, still, still, still[0], 0.1))[0]
     tensor([0.])
     """
+    weights, none = _array(theta, theta.dtype), np.empty(0)
+    law = weights, weights, weights, 0, none, 0.0, 0.0, 0.0, 0.0, none.astype(np.bool_)
+    found, gradient = _descend(weights, np.arange(len(weights)), like, theta, batch, law)
+    return torch.from_numpy(found), torch.from_numpy(gradient)
+
+
+def descend(
+    moving: Moving, rows: Ints, like: GainNet, batch: Batch, step: int, rates: Floats, schedule: Schedule
+) -> tuple[Tensor, Tensor]:
+    """One optimiser step in place of the rows (R,) of theta and moments, as `Gain.descend`."""
+    weights, began, first, second = (a.numpy() for a in moving)
+    finite = np.empty(len(rows), np.bool_)
+    law = float(schedule.weight_decay), float(schedule.l2), float(schedule.proximal), float(schedule.clip), finite
+    found, _ = _descend(weights, rows, like, moving.theta, batch, (began, first, second, step, rates, *law))
+    return torch.from_numpy(found), torch.from_numpy(finite)
+
+
+def _descend(
+    weights: AnyArray, rows: Ints, like: GainNet, theta: Tensor, batch: Batch, law: tuple[Any, ...]
+) -> tuple[AnyArray, AnyArray]:
+    """Losses (R,) and gradients (R, P), and if the law says so an optimiser step."""
     plan = plan_of(tuple(like.settings.items()))
-    seen = _checked(theta, plan.parameters, batch.gnss, batch.velocity, batch.x0, batch.dt)
-    truth = batch.truth.to(theta.dtype).contiguous().numpy()
+    seen = _checked(theta, len(rows), plan.parameters, batch.gnss, batch.velocity, batch.x0, batch.dt)
+    truth = _array(batch.truth, theta.dtype)
     if truth.shape != seen.gnss.shape:
         raise InputError("truth", f"shape {truth.shape}", f"must be {seen.gnss.shape}", "Give one position per fix.")
-    x, padded, kept = _forward(theta, plan, seen, keep=True)
-    pulls, found = np.empty_like(x), np.empty(len(theta), x.dtype)
-    kernel_forward.score(x, truth, pulls, found)
-    return torch.from_numpy(found), _backward(theta, plan, seen.gnss, pulls, padded, kept)
+    steps, models, lanes, _ = truth.shape
+    together = min(steps, -(-PRODUCT // lanes))
+    tape, deltas = plan.tape(lanes, steps, together), plan.deltas(lanes, together)
+    sizes = plan.size, tape.kept, tape.passing, deltas.passing
+    losses, gradient = np.empty(models, truth.dtype), np.empty((models, plan.parameters), truth.dtype)
+    _spread(kernel_descent.descend, models, weights, rows, plan.layers, plan.places, seen.gnss, seen.velocity, truth,
+            seen.x0, seen.dt, tape.fields, deltas.fields, sizes, together, gradient, losses, *law)  # fmt: skip
+    return losses, gradient
 
 
 class _Seen(NamedTuple):
@@ -107,7 +134,7 @@ def _forward(theta: Tensor, plan: Plan, seen: _Seen, keep: bool) -> tuple[AnyArr
     x, (steps, models, lanes, _) = np.empty_like(seen.gnss), seen.gnss.shape
     tape = plan.tape(lanes, steps if keep else 1)
     padded, kept = _aligned(models, plan.size, x.dtype), _aligned(models, tape.kept, x.dtype)
-    _spread(kernel_forward.forward, models, theta.detach().contiguous().numpy(), padded, plan.layers, *seen, kept,
+    _spread(kernel_forward.forward, models, _array(theta, theta.dtype), padded, plan.layers, plan.places, *seen, kept,
             tape.fields, tape.passing, int(keep), x)  # fmt: skip
     return x, padded, kept
 
@@ -119,7 +146,7 @@ def _backward(
     (steps, models, lanes, _), gradient = pulls.shape, torch.empty_like(theta)
     together = min(steps, -(-PRODUCT // lanes))
     tape, deltas = plan.tape(lanes, steps, together), plan.deltas(lanes, together)
-    _spread(kernel_backward.backward, models, theta.detach().contiguous().numpy(), padded, plan.layers, gnss, pulls,
+    _spread(kernel_backward.backward, models, _array(theta, theta.dtype), padded, plan.layers, plan.places, gnss, pulls,
             kept, tape.fields, tape.passing, deltas.fields, deltas.passing, together, gradient.numpy())  # fmt: skip
     return gradient
 
@@ -151,19 +178,29 @@ def _pool(workers: int) -> ThreadPoolExecutor:
 os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads
 
 
-def _checked(theta: Tensor, parameters: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> _Seen:
-    """The inputs as contiguous arrays of theta's dtype."""
+def _checked(
+    theta: Tensor, models: int, parameters: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor
+) -> _Seen:
+    """The inputs of so many models as contiguous arrays of theta's dtype."""
     if theta.dtype not in (torch.float32, torch.float64) or theta.device.type != "cpu":
         found = f"{theta.dtype} on {theta.device}"
         raise InputError("theta", found, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
-    steps, models, lanes = gnss.shape[:3]
-    wanted = {"theta": (theta, (models, parameters)), "gnss": (gnss, (steps, models, lanes, 3)),
+    steps, lanes = gnss.shape[0], gnss.shape[2]
+    wanted = {"theta": (theta, (len(theta), parameters)), "gnss": (gnss, (steps, models, lanes, 3)),
               "velocity": (velocity, (steps, models, lanes, 3)), "x0": (x0, (models, lanes, 3))}  # fmt: skip
     for name, (array, shape) in wanted.items():
         if array.shape != shape:
             raise InputError(name, f"shape {tuple(array.shape)}", f"must be {shape}", "See rollout.")
-    fixes, speeds, start = (array.detach().to(theta.dtype).contiguous().numpy() for array in (gnss, velocity, x0))
-    spans = np.asarray(dt, dtype=fixes.dtype)
+    fixes, speeds, start = _array(gnss, theta.dtype), _array(velocity, theta.dtype), _array(x0, theta.dtype)
+    spans = np.full(steps, dt, fixes.dtype) if isinstance(dt, float) else np.asarray(dt, dtype=fixes.dtype)
     if spans.shape not in ((), (steps,)):
         raise InputError("dt", f"shape {spans.shape}", f"must be one number or ({steps},)", "Give s per step.")
-    return _Seen(fixes, speeds, start, spans + np.zeros(steps, spans.dtype))
+    return _Seen(fixes, speeds, start, np.broadcast_to(spans, steps).copy() if spans.ndim == 0 else spans)
+
+
+def _array(tensor: Tensor, dtype: torch.dtype) -> AnyArray:
+    """The same numbers as a contiguous array; what is one is not asked twice, which takes as long as a step."""
+    if tensor.dtype != dtype or not tensor.is_contiguous() or tensor.requires_grad:
+        tensor = tensor.detach().to(dtype).contiguous()
+    array: AnyArray = tensor.numpy()
+    return array

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from coopoc.arrays import AnyArray, Bools, Ints
 from coopoc.kernels.compile import part
 
-from .arithmetic import ONE, PAD, Index, whole, window
+from .arithmetic import ONE, PAD, Index, inside, whole, window
 
 
 class Net(NamedTuple):
@@ -16,13 +16,15 @@ class Net(NamedTuple):
     `layers` (layers, 11) says of each where its weight and its bias begin in theta, its outputs, its inputs, where it
     begins in `padded`; how many of its inputs, the first ones, come last on the tape; whether it ends in a ReLU; the
     field of the tape with its inputs and their first column; the field of the deltas with the gradient of its outputs
-    and their first column. `turned` (layers,) says whose matrix is turned, (inputs, outputs).
+    and their first column. `turned` (layers,) says whose matrix is turned, (inputs, outputs), and `places` (P,) where
+    each number of theta is in `padded`.
     """
 
     theta: AnyArray
     padded: AnyArray
     layers: Ints
     turned: Bools
+    places: AnyArray
 
 
 class Tape(NamedTuple):
@@ -39,13 +41,13 @@ class Tape(NamedTuple):
     lanes: Index
 
 
-@part
+@inside
 def room(outputs: Index, inputs: Index) -> Index:
     """Padded memory of a layer: its weight, turned or not, and its bias."""
     return max(inputs * whole(outputs), outputs * whole(inputs + PAD - 9)) + whole(outputs)
 
 
-@part
+@inside
 def matrix(net: Net, layer: Index) -> AnyArray:
     """Weight (outputs, inputs) of a layer, or turned (inputs, outputs), a view; inputs stand as on the tape.
 
@@ -56,7 +58,7 @@ def matrix(net: Net, layer: Index) -> AnyArray:
     return window(net.padded, at, rows, columns)
 
 
-@part
+@inside
 def bias(net: Net, layer: Index) -> AnyArray:
     """Bias (1, outputs) of a layer with padded columns, a view."""
     outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
@@ -68,46 +70,24 @@ def bias(net: Net, layer: Index) -> AnyArray:
 def unpack(net: Net) -> None:
     """Every layer's weight and bias from theta into its matrix, with zeros as padding."""
     net.padded[:] = 0.0
-    for layer in range(len(net.layers)):
-        begin, last = net.layers[layer, 1], net.layers[layer, 5]
-        outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
-        weights, source = matrix(net, layer), window(net.theta, net.layers[layer, 0], outputs, inputs)
-        bias(net, layer)[0, :outputs] = net.theta[begin : begin + outputs]
-        for o in range(outputs):
-            if not net.turned[layer]:
-                weights[o, : inputs - last] = source[o, last:]
-                weights[o, inputs - last : inputs] = source[o, :last]
-        for i in range(inputs):
-            column = i - last if i >= last else i - last + inputs
-            if net.turned[layer]:
-                for o in range(outputs):
-                    weights[column, o] = source[o, i]
+    for i in range(len(net.theta)):
+        net.padded[net.places[i]] = net.theta[i]
 
 
 @part
 def pack(net: Net) -> None:
     """Every layer's weight and bias from its matrix into theta."""
-    for layer in range(len(net.layers)):
-        begin, last = net.layers[layer, 1], net.layers[layer, 5]
-        outputs, inputs = net.layers[layer, 2], net.layers[layer, 3]
-        weights, target = matrix(net, layer), window(net.theta, net.layers[layer, 0], outputs, inputs)
-        net.theta[begin : begin + outputs] = bias(net, layer)[0, :outputs]
-        for o in range(outputs):
-            if net.turned[layer]:
-                for i in range(inputs):
-                    target[o, i] = weights[i - last if i >= last else i - last + inputs, o]
-            else:
-                target[o, last:] = weights[o, : inputs - last]
-                target[o, :last] = weights[o, inputs - last : inputs]
+    for i in range(len(net.theta)):
+        net.theta[i] = net.padded[net.places[i]]
 
 
-@part
+@inside
 def rows(tape: Tape, name: Index) -> AnyArray:
     """(B, width) of a field at the present step, a view."""
     return span(tape, name, ONE)
 
 
-@part
+@inside
 def span(tape: Tape, name: Index, count: Index) -> AnyArray:
     """(count B, width) of a field at `count` steps from the present one on, a view."""
     width, kept = tape.fields[name, 1], tape.fields[name, 2]

@@ -9,10 +9,11 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, Ints
 from coopoc.methods.track import Method
 
 from ..training.clients import Batch, Pieces
+from ..training.schedule import Moving, Schedule, advance
 
 
 class Gain(nn.Module, ABC):
@@ -46,6 +47,18 @@ class Gain(nn.Module, ABC):
             means = self.losses(given, batch).mean(1)
             (gradient,) = torch.autograd.grad(means.sum(), given)
         return means.detach(), gradient
+
+    def descend(
+        self, moving: Moving, rows: Ints, batch: Batch, step: int, rates: Floats, schedule: Schedule
+    ) -> tuple[Tensor, Tensor]:
+        """One optimiser step (`schedule.advance`) in place: losses (R,) of the rows, and whether each could be taken.
+
+        Args:
+            moving: weights and moments (S, P). rows, rates: (R,). batch: what these R models see. step: >= 1.
+        """
+        losses, gradient = self.loss_and_gradient(moving.theta[rows], batch)
+        taken = advance(moving.theta, gradient, *moving[1:], losses, rows.tolist(), step, rates.tolist(), schedule)
+        return losses, taken
 
 
 def over_time(losses: Tensor) -> Tensor:

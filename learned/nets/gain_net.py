@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, Ints
 from coopoc.kernels.compile import numba_is_there
 from coopoc.methods.track import Method
 
 from ..training.clients import Batch
+from ..training.schedule import Moving, Schedule
 from .gain import Gain
 from .stack import named
 
@@ -106,6 +107,15 @@ class GainNet(Gain):
             found: tuple[Tensor, Tensor] = engine.loss_and_gradient(theta, self, batch)
             return found
         return super().loss_and_gradient(theta, batch)
+
+    def descend(
+        self, moving: Moving, rows: Ints, batch: Batch, step: int, rates: Floats, schedule: Schedule
+    ) -> tuple[Tensor, Tensor]:
+        """One optimiser step as in `Gain`, of each model from rollout to weights before the next one begins."""
+        if engine := _engine():
+            found: tuple[Tensor, Tensor] = engine.descend(moving, rows, self, batch, step, rates, schedule)
+            return found
+        return super().descend(moving, rows, batch, step, rates, schedule)
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import Floats
+from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
@@ -68,19 +69,35 @@ class Pieces:
 
     def batch(self, index: Tensor, draws: Sequence[torch.Generator] = ()) -> Batch:
         """Pieces `index` (S, B); new noise comes from the S generators `draws`."""
-        gnss, velocity, truth = self.gnss[index], self.velocity[index], self.truth[index]
-        if self.noise != "static":
-            shape = (2, *truth.shape[1:])
-            normals = torch.stack([torch.randn(shape, generator=draw) for draw in draws], dim=1)
-            gnss_std, velocity_std = self.gnss_std[index], self.velocity_std[index]
-            if self.noise == "wide":
-                gnss_std, velocity_std = _widened(gnss_std, velocity_std, draws)
-            gnss = truth + gnss_std * normals[0]
-            velocity = self.true_velocity[index] + velocity_std * normals[1]
-        known = self.true_start[index]
-        x0 = torch.where(known[..., None], truth[..., 0, :], gnss[..., 0, :])
-        gnss, velocity, truth = (a[..., 1:, :].permute(2, 0, 1, 3).contiguous() for a in (gnss, velocity, truth))
-        return Batch(gnss, velocity, truth, x0, self.dt, known if known.any() else None)
+        if self.noise == "static":
+            drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
+        else:
+            drives = torch.stack([*self._drawn(index, draws), self.truth[index]]).permute(0, 3, 1, 2, 4).contiguous()
+        x0, known = drives[0, 0], None
+        if self._any_true_start:
+            known = self.true_start[index]
+            x0, known = torch.where(known[..., None], drives[2, 0], x0), known if known.any() else None
+        gnss, velocity, truth = drives[:, 1:].unbind()
+        return Batch(gnss, velocity, truth, x0, self.dt, known)
+
+    @cached_property
+    def _drives(self) -> AnyArray:
+        """gnss, velocity and truth (3, T + 1, n, 3) with time first, as a batch has it."""
+        return np.ascontiguousarray(np.stack([self.gnss, self.velocity, self.truth]).swapaxes(1, 2))
+
+    @cached_property
+    def _any_true_start(self) -> bool:
+        """Whether any piece starts at the truth."""
+        return bool(self.true_start.any())
+
+    def _drawn(self, index: Tensor, draws: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
+        """gnss and velocity (S, B, T + 1, 3) with new noise."""
+        shape = (2, index.shape[1], *self.truth.shape[1:])
+        normals = torch.stack([torch.randn(shape, generator=draw) for draw in draws], dim=1)
+        gnss_std, velocity_std = self.gnss_std[index], self.velocity_std[index]
+        if self.noise == "wide":
+            gnss_std, velocity_std = _widened(gnss_std, velocity_std, draws)
+        return self.truth[index] + gnss_std * normals[0], self.true_velocity[index] + velocity_std * normals[1]
 
     def take(self, index: Sequence[int]) -> Pieces:
         """The pieces `index`."""
@@ -125,9 +142,10 @@ def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
     signs, swap = torch.where(dice[..., :3] < 0.5, -1.0, 1.0), dice[..., 3:] < 0.5
 
     def turn(vectors: Tensor) -> Tensor:
-        return torch.where(swap, vectors[..., [1, 0, 2]], vectors) * signs
+        return torch.where(swap, vectors.index_select(-1, torch.tensor([1, 0, 2])), vectors) * signs
 
-    return Batch(turn(batch.gnss), turn(batch.velocity), turn(batch.truth), turn(batch.x0), batch.dt, batch.known)
+    gnss, velocity, truth = turn(torch.stack([batch.gnss, batch.velocity, batch.truth])).unbind()
+    return Batch(gnss, velocity, truth, turn(batch.x0), batch.dt, batch.known)
 
 
 @dataclass(frozen=True, eq=False)

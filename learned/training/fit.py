@@ -20,7 +20,7 @@ from ..nets.gain import Gain
 from ..nets.stack import flatten, unflatten
 from .clients import Batch, Pieces, mirrored
 from .machine import one_core, watched
-from .schedule import Schedule, advance, cosine, generator
+from .schedule import Moving, Schedule, cosine, generator
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,21 +145,19 @@ def descend(
     A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
     models with shorter plans wait for the longest. Their loss is NaN.
     """
-    first, second, began = torch.zeros_like(theta), torch.zeros_like(theta), theta.clone()
+    moving = Moving(theta, theta.clone(), torch.zeros_like(theta), torch.zeros_like(theta))
     for step in range(max(map(len, plans))):
         rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
-        losses = torch.full((len(plans),), math.nan)
+        losses = np.full(len(plans), math.nan, np.float32)
         if rows:
             dice = [draws[r] for r in rows]
-            batch = pool.batch(torch.from_numpy(np.stack([plans[r][step] for r in rows])), dice)
+            batch = pool.batch(torch.from_numpy(np.array([plans[r][step] for r in rows])), dice)
             batch = mirrored(batch, dice) if schedule.mirror else batch
-            found, gradient = like.loss_and_gradient(theta if len(rows) == len(theta) else theta[rows], batch)
-            losses[rows] = found
-            rate = [rates[r][step] for r in rows]
-            finite = advance(theta, gradient, began, first, second, found, rows, step + 1, rate, schedule)
+            rate = np.array([rates[r][step] for r in rows])
+            losses[rows], taken = like.descend(moving, np.array(rows), batch, step + 1, rate, schedule)
             stopped |= {r: f"loss or gradient not finite at step {step + 1}"
-                        for r, good in zip(rows, finite.tolist(), strict=True) if not good}  # fmt: skip
-        yield step + 1, losses
+                        for r, good in zip(rows, taken.tolist(), strict=True) if not good}  # fmt: skip
+        yield step + 1, torch.from_numpy(losses)
 
 
 class Judge:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -61,6 +61,15 @@ class Schedule:
         passes = -(-steps * self.batch // pieces)
         order = np.concatenate([draw.permutation(pieces) for _ in range(passes)])
         return order[: steps * self.batch].reshape(steps, self.batch)
+
+
+class Moving(NamedTuple):
+    """What training changes, S models in rows (S, P): weights, where these began, mean gradient, mean square."""
+
+    theta: Tensor
+    began: Tensor
+    first: Tensor
+    second: Tensor
 
 
 def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
