@@ -12,7 +12,7 @@ from coopoc.world.channel_load import BIT_RATE, CARRIER_SENSE, channel_load
 from coopoc.world.v2x import ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 
 from . import scene, views, weights
-from .lineup import BYTES
+from .scores import BYTES
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
