@@ -26,7 +26,10 @@ from .sighting import exact, vector
 SOLVED, MET, LOST = 0, 1, 2
 """Solved exactly; solved converted, since two vehicles met; not solved: Gauss-Newton did not settle."""
 LIMIT = 12
-"""Gauss-Newton steps before the damped reference has to do it; about 3 are needed."""
+"""Gauss-Newton steps; about 3 are needed."""
+HALVES = 200
+"""Half steps where whole ones go to and fro, before the damped reference has to do it. They gain a digit every three or
+four, so that the last must be the shorter."""
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05
 """m; of the converted start, as in `coopoc.optimize.initial`."""
 FAR = 1e300
@@ -104,13 +107,14 @@ def solve(
             tell(star, n, lane, here, SOLVED, out)
     for lane in range(lanes, LANES):
         settled[lane] = 1.0
-    for _ in range(LIMIT):
+    for count in range(LIMIT + HALVES):
         if todo == 0:
             break
         relinearise(star, n, std, least)
-        put(nearest, uint64(0), step(star, n, 1.0 - take(settled, uint64(0))))
+        share, enough = (1.0, tolerance) if count < LIMIT else (0.5, 1e-3 * tolerance)
+        put(nearest, uint64(0), step(star, n, share * (1.0 - take(settled, uint64(0)))))
         for lane in range(lanes):
-            if settled[lane] == 0.0 and nearest[lane] <= tolerance:
+            if settled[lane] == 0.0 and nearest[lane] <= enough:
                 settled[lane], todo = 1.0, todo - 1
                 tell(star, n, lane, here, SOLVED, out)
     for lane in range(lanes):
