@@ -12,13 +12,21 @@ from classical import KNOWN, NEIGHBOURS, SENSORS
 from coopoc.optimize import Problem
 from coopoc.optimize.initial import initial_guess
 
+PLAIN: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "fatrop": ("fatrop", {"print_time": False}, {"print_level": 0}),
+    "ipopt": ("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"}),
+    "sqp": ("sqpmethod", {"print_time": False, "print_header": False, "print_iteration": False, "print_status": False,
+                          "qpsol": "qrqp", "qpsol_options": {"print_iter": False, "print_header": False}}, {}),
+}  # fmt: skip
+"""By our method: CasADi's plugin, its options, those of the solver behind it."""
 
-def casadi_exact(problem: Problem) -> Job:
-    """IPOPT on one programme whose measurements are parameters."""
+
+def casadi_exact(problem: Problem, method: str) -> Job:
+    """One programme whose measurements are parameters, by the same solver; fatrop is what `solve` takes by itself."""
     (fixes, edges), runs = problem.factors, problem.batch or 1
     start = initial_guess(problem)
     std, fix_std = np.array(SENSORS.relative_std), np.array(KNOWN.gnss_std)
-    quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes"}}
+    plugin, quiet, inner = PLAIN[method]
 
     def cost(x: Any, fix: Any, seen: Any) -> Any:
         """Of x and fix (3, n) and seen (3, K)."""
@@ -34,7 +42,7 @@ def casadi_exact(problem: Problem) -> Job:
     x, fix, sight = (casadi.SX.sym(name, 3, n) for name, n in
                      (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS)))  # fmt: skip
     nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, sight), "f": cost(x, fix, sight)}
-    solver = casadi.nlpsol("solver", "ipopt", nlp, quiet)
+    solver = casadi.nlpsol("solver", plugin, nlp, {**quiet, **({plugin: inner} if inner else {})})
 
     def batch() -> Any:
         numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
@@ -57,13 +65,11 @@ def casadi_exact(problem: Problem) -> Job:
             model.minimize(0.5 * total)
             for node, at in zip(nodes, start[b], strict=True):
                 model.set_initial(node, at)
-            model.solver("ipopt", {"print_time": False}, quiet["ipopt"])
+            model.solver(plugin, quiet, inner)
             answer = model.solve()
             found.append([answer.value(node) for node in nodes])
         return np.stack(found)
 
-    job = "casadi, snapshot, exact"
-    return Job([Row(job, "ours", runs, ours(problem, "casadi", runs)), Row(job, "hand-written", runs, batch),
-                Row(job, "Opti, rebuilt", 2, opti),
-                Row(job, "ours, sqp", runs, ours(problem, "casadi", runs, method="sqp"))],
-               as_good(problem))  # fmt: skip
+    job, options = f"casadi {method}, snapshot, exact", {} if method == "fatrop" else {"method": method}
+    return Job([Row(job, "ours", runs, ours(problem, "casadi", runs, **options)), Row(job, "hand-written", runs, batch),
+                Row(job, "Opti, rebuilt", 2, opti)], as_good(problem))  # fmt: skip

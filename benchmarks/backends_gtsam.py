@@ -98,7 +98,7 @@ def fixed_lag(problem: Problem, count: int) -> Job:
     best = {t: solve(problem).x[-n] for t, problem in whole.items()}
 
     def mine() -> Any:
-        smoother = FixedLag(lag, threshold=1e6)  # what is linear is never linearised again
+        smoother = FixedLag(lag, threshold=np.inf)  # what is linear is never linearised again
         return np.stack([smoother.update(part, dict.fromkeys(called(t), 0.1 * t), [f"0@{t}"]).x
                          for t, part in enumerate(pieces)])  # fmt: skip
 

@@ -16,12 +16,14 @@ TOLERANCE = 1e-4
 
 
 class Row(NamedTuple):
-    """One way to do a job: the job, its words, solves per call and the call, whose answer is (solves, n, 3)."""
+    """One way to do a job: the job, its words, solves per call and the call, whose answer is (solves, n, 3); if it is
+    to be the job's answer, and not another one by construction."""
 
     job: str
     words: str
     solves: int
     call: Callable[[], Any]
+    judged: bool = True
 
 
 class Job(NamedTuple):

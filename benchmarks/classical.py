@@ -11,8 +11,6 @@ within 1e-6 relative and position within 1 mm of the reference, for the filter w
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any, NamedTuple
@@ -22,9 +20,9 @@ import numba
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from tabulate import tabulate
+from timing import medians, plain, timed
 
 import coopoc as co
-from coopoc.kernels.compile import SWITCH
 from coopoc.kernels.snapshot import snapshots
 from coopoc.kernels.star_filter import follow
 from coopoc.methods.cooperative_map import LEAST_GROUND, TOLERANCE
@@ -33,7 +31,7 @@ from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.initial import converted
 from coopoc.optimize.problem import Problem
 from coopoc.world.inbox import inbox
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.spherical import spherical, to_vector
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 ROUNDS, NEIGHBOURS, STEPS, RUNS = 7, 10, 301, 10
@@ -72,24 +70,6 @@ def peak() -> float:
     return max(2.0 * 700**3 / timed(lambda: a @ a) for _ in range(9))
 
 
-def timed(call: Callable[[], Any]) -> float:
-    began = time.thread_time()
-    call()
-    return time.thread_time() - began
-
-
-def plain(call: Callable[[], Any]) -> Any:
-    """The call in NumPy."""
-    before = os.environ.get(SWITCH)
-    os.environ[SWITCH] = "numpy"
-    try:
-        return call()
-    finally:
-        os.environ.pop(SWITCH)
-        if before is not None:
-            os.environ[SWITCH] = before
-
-
 def snapshot_rows(recording: co.Recording) -> list[Row]:
     """Each against `solve_batch` to 1e-10 m of the exact, and of the converted, problem."""
     stars = [Problem.from_snapshot(recording, t, 0, run=None, noise=KNOWN) for t in range(20)]
@@ -123,31 +103,26 @@ def snapshot_rows(recording: co.Recording) -> list[Row]:
     def gtsam_all() -> Any:
         return [gtsam_solve(g) for g in graphs]
 
-    rows = [
+    return [
         judged("compiled kernel, exact", count, kernels, whole, exact),
         judged("CooperativeMAP, compiled", count, ours, ours().x[:, :20, 0], exact),
         judged("CooperativeMAP, NumPy", count, lambda: plain(ours), plain(ours).x[:, :20, 0], exact),
         judged(GTSAM, len(graphs), gtsam_all, found, linear, costs=False),
     ]
-    return [*rows, *stone_soup_snapshot(recording, graphs, exact, judged)]
 
 
 def gtsam_snapshot(recording: co.Recording, run: int, t: int) -> tuple[Any, ...]:
-    """Fixes, converted vectors and their square-root informations, as NumPy makes them beforehand; what was measured,
-    its angles within half a turn of those between the fixes, as a filter without circular numbers needs it."""
+    """Fixes, converted vectors and their square-root informations, as NumPy makes them beforehand."""
     links = slice(t * NEIGHBOURS, (t + 1) * NEIGHBOURS)
     order = [0, *recording.links.neighbour[links]]
     relative = recording.relative[run, links]
     factor = converted(Problem.from_snapshot(recording, t, 0, run=run, noise=KNOWN)).factors[1]
-    fix = recording.gnss[run, t, order]
-    expected = np.stack(spherical(*(fix[1:] - fix[0]).T), axis=1)
-    near = np.concatenate([relative[:, :1], expected[:, 1:] + wrap(relative - expected)[:, 1:]], axis=1)
-    return fix, to_vector(relative), factor.root, relative, near
+    return recording.gnss[run, t, order], to_vector(relative), factor.root
 
 
 def gtsam_solve(star: tuple[Any, ...]) -> np.ndarray:
     """Graph built and solved, (n, 3)."""
-    fix, vector, root = star[:3]
+    fix, vector, root = star
     graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
     zero = np.zeros(3)
@@ -159,66 +134,6 @@ def gtsam_solve(star: tuple[Any, ...]) -> np.ndarray:
         graph.add(gtsam.BetweenFactorPoint3(0, k + 1, vector[k], edge))
     found = graph.linearize(start).optimize()
     return np.stack([found.at(k) for k in range(len(fix))])
-
-
-def stone_soup() -> Any:
-    """Stone Soup's parts; None where it is not installed."""
-    try:
-        from stonesoup.models.measurement.linear import LinearGaussian
-        from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
-        from stonesoup.types.detection import Detection
-        from stonesoup.types.hypothesis import SingleHypothesis
-        from stonesoup.types.prediction import GaussianStatePrediction
-        from stonesoup.updater.kalman import ExtendedKalmanUpdater, KalmanUpdater
-    except ImportError:
-        return None
-    return (LinearGaussian, NonLinearGaussianMeasurement, Detection, SingleHypothesis, GaussianStatePrediction,
-            ExtendedKalmanUpdater, KalmanUpdater)  # fmt: skip
-
-
-def stone_soup_snapshot(recording: co.Recording, graphs: list[Any], exact: Any, judged: Any) -> list[Row]:
-    """Its extended filter's update of the fixes by ranges and angles: one step, so not the same answer."""
-    parts = stone_soup()
-    if parts is None:
-        return []
-    _, nonlinear, detection, hypothesis, prediction, extended, _ = parts
-
-    class Star(nonlinear):  # type: ignore[misc, valid-type]
-        @property
-        def ndim_meas(self) -> int:
-            return 3 * NEIGHBOURS
-
-        def function(self, state: Any, noise: bool = False, **_: Any) -> Any:
-            x = np.asarray(state.state_vector, dtype=float).reshape(-1, 3)
-            seen = spherical(*(x[1:] - x[0]).T)
-            return np.stack(seen, axis=1).reshape(-1, 1)
-
-        def jacobian(self, state: Any, **_: Any) -> Any:
-            x = np.asarray(state.state_vector, dtype=float).reshape(-1, 3)
-            dx, dy, dz = (x[1:] - x[0]).T
-            flat2 = dx**2 + dy**2
-            flat, r2 = np.sqrt(flat2), flat2 + dz**2
-            r = np.sqrt(r2)
-            slope = np.array([[dx / r, dy / r, dz / r], [-dy / flat2, dx / flat2, 0 * r],
-                              [dx * dz / (flat * r2), dy * dz / (flat * r2), -flat / r2]])  # fmt: skip
-            out = np.zeros((NEIGHBOURS, 3, NEIGHBOURS + 1, 3))
-            each = np.arange(NEIGHBOURS)
-            out[each, :, each + 1] = np.moveaxis(slope, 2, 0)
-            out[each, :, 0] = -np.moveaxis(slope, 2, 0)
-            return out.reshape(3 * NEIGHBOURS, SIZE)
-
-    std = np.tile(SENSORS.relative_std, NEIGHBOURS)
-    model = Star(ndim_state=SIZE, mapping=tuple(range(SIZE)), noise_covar=np.diag(std**2))
-    updater = extended(measurement_model=model)
-    prior_cov = np.diag(np.tile(KNOWN.gnss_variance, NEIGHBOURS + 1))
-
-    def solve(star: tuple[Any, ...]) -> np.ndarray:
-        prior = prediction(star[0].reshape(-1, 1), prior_cov)
-        seen = detection(star[4].reshape(-1, 1), measurement_model=model)
-        return np.asarray(updater.update(hypothesis(prior, seen)).state_vector, dtype=float).reshape(-1, 3)
-
-    found = np.stack([solve(g) for g in graphs]).reshape(20, RUNS, -1, 3).swapaxes(0, 1)
-    return [judged("Stone Soup, extended update", len(graphs), lambda: [solve(g) for g in graphs], found, exact)]
 
 
 def filter_rows(recording: co.Recording) -> list[Row]:
@@ -240,7 +155,7 @@ def filter_rows(recording: co.Recording) -> list[Row]:
     def all_steps(method: co.JointFilter) -> Any:
         return method(recording, [0]).x[:, :, 0]
 
-    rows = [
+    return [
         judged("compiled kernel, linear", lambda: kernel(False), kernel(False), peer),
         judged("compiled kernel, exact", lambda: kernel(True), kernel(True), best),
         judged("JointFilter(exact=False), compiled", lambda: all_steps(linear), all_steps(linear), peer),
@@ -250,11 +165,6 @@ def filter_rows(recording: co.Recording) -> list[Row]:
         judged("JointFilter(), NumPy", lambda: plain(lambda: all_steps(exact)), best, best),
         judged(FILTERPY, lambda: [filterpy_drive(d) for d in drives], peer, peer, 2 * STEPS),
     ]  # fmt: skip
-    if stone_soup() is not None:
-        found = np.stack([stone_soup_drive(d) for d in drives])
-        rows.append(judged("Stone Soup, KalmanUpdater", lambda: [stone_soup_drive(d) for d in drives], found, peer,
-                           2 * STEPS))  # fmt: skip
-    return rows
 
 
 class Drive(NamedTuple):
@@ -311,31 +221,9 @@ def filterpy_drive(drive: Drive) -> np.ndarray:
     return found
 
 
-def stone_soup_drive(drive: Drive) -> np.ndarray:
-    """(T, 3) of the ego; the prediction is one sum, which its predictors would make no faster."""
-    model_of, _, detection, hypothesis, prediction, _, kalman = stone_soup()
-    found = np.empty((STEPS, 3))
-    x, p = drive.x[:, None], drive.p
-    found[0] = drive.x[:3]
-    shown = drive.h
-    for t in range(1, STEPS):
-        model = model_of(ndim_state=SIZE, mapping=tuple(range(SIZE)), noise_covar=drive.noise[t])
-        model.matrix = lambda **_: shown
-        prior = prediction(x + drive.moved[t][:, None], p + drive.q)
-        seen = detection(drive.z[t][:, None], measurement_model=model)
-        made = kalman(measurement_model=model).update(hypothesis(prior, seen))
-        x, p = np.asarray(made.state_vector, dtype=float), np.asarray(made.covar, dtype=float)
-        found[t] = x[:3, 0]
-    return found
-
-
 def seconds(rows: list[Row]) -> dict[str, float]:
     """Per solve, medians of interleaved rounds."""
-    spent: dict[str, list[float]] = {row.words: [] for row in rows}
-    for _ in range(ROUNDS):
-        for row in rows:
-            spent[row.words].append(timed(row.call) / row.solves)
-    return {words: float(np.median(times)) for words, times in spent.items()}
+    return medians({row.words: lambda row=row: timed(row.call) / row.solves for row in rows}, ROUNDS)
 
 
 def parts() -> list[tuple[str, str, list[Row]]]:
@@ -345,27 +233,21 @@ def parts() -> list[tuple[str, str, list[Row]]]:
 
 
 def measured(found: list[tuple[str, str, list[Row]]] | None = None) -> list[dict[str, Any]]:
-    """Per row its name, microseconds, the ratio to the peer's time, and whether its answer is right: None where it is
-    another one by construction."""
+    """Per row its name, microseconds, the ratio to the peer's time, and whether its answer is right."""
     out: list[dict[str, Any]] = []
     for job, peer, rows in parts() if found is None else found:
-        medians = seconds(rows)
-        for row in rows:
-            right = None if row.words.startswith("Stone Soup, extended") else row.right
-            spent = medians[row.words]
-            ratio = spent / medians[peer]
-            out.append({"name": f"{job}: {row.words}", "us": 1e6 * spent, "ratio": ratio, "right": right})
+        spent = seconds(rows)
+        out += [{"name": f"{job}: {row.words}", "us": 1e6 * spent[row.words], "ratio": spent[row.words] / spent[peer],
+                 "right": row.right} for row in rows]  # fmt: skip
     return out
 
 
 def table(rows: list[Row], peer: str, floor: float) -> str:
     """Medians of interleaved rounds, and ratios to a peer and to the floor (s per solve)."""
-    medians = seconds(rows)
-    lines = [[row.words, 1e6 * medians[row.words], medians[peer] / medians[row.words], medians[row.words] / floor,
+    spent = seconds(rows)
+    lines = [[row.words, 1e6 * spent[row.words], spent[peer] / spent[row.words], spent[row.words] / floor,
               row.difference, "yes" if row.right else "NO"] for row in rows]  # fmt: skip
-    if stone_soup() is None:
-        lines.append(["Stone Soup: not installed", None, None, None, None, ""])
-    lines.append(["floor: flops at the measured peak", 1e6 * floor, medians[peer] / floor, 1.0, None, ""])
+    lines.append(["floor: flops at the measured peak", 1e6 * floor, spent[peer] / floor, 1.0, None, ""])
     header = ["", "us", f"x {peer.split(',')[0]}", "x floor", "difference m", "same answer"]
     return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", ".3g", ".3g", ".1e", ""))
 

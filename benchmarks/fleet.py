@@ -11,7 +11,6 @@ cost within 1e-6 of the reference, links the same in the same order, the solo fi
 from __future__ import annotations
 
 import gc
-import os
 import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
@@ -24,9 +23,9 @@ from filterpy.kalman import KalmanFilter
 from scipy.linalg.blas import dgemm
 from scipy.linalg.lapack import dpotrf, dpotri
 from tabulate import tabulate
+from timing import medians, plain
 
 import coopoc as co
-from coopoc.kernels.compile import SWITCH
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.network import whitened
 from coopoc.world import exchange, sensing
@@ -84,18 +83,6 @@ def timed(call: Callable[[], Any]) -> float:
     spent = time.process_time() - began
     gc.enable()
     return spent
-
-
-def plain(call: Callable[[], Any]) -> Any:
-    """The call in NumPy."""
-    before = os.environ.get(SWITCH)
-    os.environ[SWITCH] = "numpy"
-    try:
-        return call()
-    finally:
-        os.environ.pop(SWITCH)
-        if before is not None:
-            os.environ[SWITCH] = before
 
 
 class Linear(NamedTuple):
@@ -198,18 +185,14 @@ def smoother_in_numpy(recording: co.Recording) -> Row:
 
 def seconds(rows: Sequence[Row]) -> dict[str, float]:
     """Per call, medians of interleaved rounds."""
-    spent: dict[str, list[float]] = {row.words: [] for row in rows}
-    for _ in range(ROUNDS):
-        for row in rows:
-            spent[row.words].append(timed(row.call))
-    return {words: float(np.median(times)) for words, times in spent.items()}
+    return medians({row.words: lambda row=row: timed(row.call) for row in rows}, ROUNDS)
 
 
 def table(rows: Sequence[Row], peer: str) -> str:
     """Times, and ratios to a peer and to the last row, the floor."""
-    medians = seconds(rows)
-    lines = [[row.words, medians[row.words], medians[peer] / medians[row.words],
-              medians[row.words] / medians[rows[-1].words], row.difference, SAYS[row.right]]
+    spent = seconds(rows)
+    lines = [[row.words, spent[row.words], spent[peer] / spent[row.words],
+              spent[row.words] / spent[rows[-1].words], row.difference, SAYS[row.right]]
              for row in rows]  # fmt: skip
     header = ["", "s", "x peer", "x floor", "difference m", "same answer"]
     return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", ".3g", ".3g", ".1e", ""))
@@ -295,9 +278,9 @@ def measured() -> list[dict[str, Any]]:
     """Per row its name, microseconds per vehicle and step, the ratio to the peer's time, and whether it is right."""
     out = []
     for job, peer, rows in parts():
-        medians = seconds(rows)
-        out += [{"name": f"{job}: {row.words}", "us": 1e6 * medians[row.words] / (VEHICLES * SHORT),
-                 "ratio": medians[row.words] / medians[peer], "right": row.right} for row in rows]  # fmt: skip
+        spent = seconds(rows)
+        out += [{"name": f"{job}: {row.words}", "us": 1e6 * spent[row.words] / (VEHICLES * SHORT),
+                 "ratio": spent[row.words] / spent[peer], "right": row.right} for row in rows]  # fmt: skip
     return [*out, *search_rows(SEARCHED)]
 
 

@@ -1,19 +1,20 @@
-"""Peers that are no part of the project's environment, on the same problems: pyceres.
+"""Peers that are no part of the project's environment, on the same problems: pyceres and Stone Soup.
 
-    pip install pyceres                                        # into an environment that has the project
-    OMP_NUM_THREADS=1 python benchmarks/peers.py               # a Markdown table on stdout, a few seconds
+    pip install -c constraints.txt -e ".[peers]"               # leaves all that the project has pinned as it is
+    OMP_NUM_THREADS=1 python benchmarks/peers.py               # a Markdown table on stdout, half a minute
 
 The exact star of ten neighbours of backends.py. Ceres has no factor for range, azimuth and inclination in the world
 frame with a std each, so its users write one in Python; the fixes are its own NormalPrior, and its Schur complement
-eliminates the neighbours. "x pyceres" is a row's time over that of pyceres; a row counts only if its answer is that of
-gauss-newton. Where pyceres is not installed a line says so. What the index has as jaxls is a language server for JAX,
-not the solver of that name.
+eliminates the neighbours. Stone Soup's rows are in stone_soup.py. "x peer" is a row's time over that of the job's peer;
+a row counts only if its answer is that of the reference. What is not installed a line says. What the index has as jaxls
+is a language server for JAX, not the solver of that name.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Callable
 from importlib.util import find_spec
 from typing import Any
 
@@ -88,17 +89,36 @@ def ceres_exact(problem: Problem) -> Job:
 
 
 def measured() -> list[dict[str, Any]]:
-    """As `backends.measured`; nothing, and a line on stderr, without pyceres."""
-    if find_spec("pyceres") is None:
-        print("peers: pyceres is not installed, its rows are left out", file=sys.stderr)
-        return []
-    return measure([ceres_exact(star(RUNS))])
+    """As `backends.measured`; a line on stderr for each peer that is not installed."""
+    return measure([job for peer, jobs in PEERS.items() if found(peer) for job in jobs()])
+
+
+def found(peer: str) -> bool:
+    """Whether it is installed."""
+    if find_spec(peer) is not None:
+        return True
+    print(f"peers: {peer} is not installed, its rows are left out", file=sys.stderr)
+    return False
+
+
+def of_stone_soup() -> list[Job]:
+    """Its jobs; the import needs it."""
+    from stone_soup import joint_filter, snapshot
+
+    return [snapshot(), joint_filter()]
+
+
+PEERS: dict[str, Callable[[], list[Job]]] = {
+    "pyceres": lambda: [ceres_exact(star(RUNS))], "stonesoup": of_stone_soup,
+}  # fmt: skip
+"""By the package that they need."""
 
 
 def main() -> None:
     """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(tabulate(lines, ["", "us", "x pyceres", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
+    says = {True: "yes", False: "NO", None: "by another way"}
+    lines = [[row["name"], row["us"], row["ratio"], says[row["right"]]] for row in measured()]
+    print(tabulate(lines, ["", "us", "x peer", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
 
 
 if __name__ == "__main__":

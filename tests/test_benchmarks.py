@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import json
+import statistics
+import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -85,6 +87,42 @@ def test_the_command_prints_writes_and_fails(
     said = capsys.readouterr().out
     assert "| growth: ours" in said
     assert ("FAILED growth: ours" in said) == bool(code)
+
+
+def test_medians_are_those_of_interleaved_rounds(load: Any) -> None:
+    order, times = [], {"a": [3.0, 1.0, 2.0], "b": [9.0, 7.0, 30.0]}
+
+    def spend(name: str) -> float:
+        order.append(name)
+        return times[name][order.count(name) - 1]
+
+    found = load("timing").medians({name: lambda name=name: spend(name) for name in times}, 3)
+    assert found == {name: statistics.median(each) for name, each in times.items()}
+    assert order == ["a", "b"] * 3
+
+
+def test_a_peer_that_is_not_installed_is_said(
+    load: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    peers = load("peers")
+    monkeypatch.setattr(peers, "PEERS", {"no_such_peer": lambda: pytest.fail("it was asked for jobs")})
+    assert peers.measured() == []
+    assert "no_such_peer is not installed" in capsys.readouterr().err
+
+
+def test_stone_soup_ends_where_we_end(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its iterated update and its filter; one extended update does not."""
+    pytest.importorskip("stonesoup")
+    classical = load("classical")
+    monkeypatch.setattr(classical, "RUNS", 2)
+    monkeypatch.setattr(classical, "STEPS", 21)
+    monkeypatch.delitem(sys.modules, "stone_soup", raising=False)
+    soup = load("stone_soup")
+    snapshot = soup.snapshot()
+    assert [snapshot.right(row.call()) for row in snapshot.rows] == [True, True, False]
+    assert [row.judged for row in snapshot.rows] == [True, True, False]
+    joint = soup.joint_filter()
+    assert all(joint.right(row.call()) for row in joint.rows)
 
 
 def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:

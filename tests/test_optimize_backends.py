@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import gtsam
@@ -13,6 +14,8 @@ from scipy.optimize import least_squares
 
 from coopoc import V2X, Fleet, InputError, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Factor, Problem, Status, backends, solve, solve_batch
+from coopoc.optimize.backends import osqp_programme
+from coopoc.optimize.backends.casadi_ import METHODS
 from coopoc.optimize.backends.gauss_newton import linear_step
 from coopoc.optimize.initial import converted, initial_guess
 from coopoc.world.recording import Recording
@@ -283,23 +286,34 @@ def test_no_backend_can_flatter_itself(monkeypatch: pytest.MonkeyPatch, dense: R
 
 
 def test_osqp_ends_the_same_whatever_it_solved_before(dense: Recording) -> None:
-    """A workspace belongs to one call, and what the structures share is not written to."""
+    """The workspace of a structure is kept, one per thread; nothing of what it has solved shows."""
     near, far = (Problem.from_snapshot(dense, step, 0, run=None) for step in (10, 11))
-    first = solve_batch(near, "osqp")
-    solve_batch(far, "osqp")
-    again = solve_batch(near, "osqp")
-    assert np.array_equal(first.x, again.x)
-    assert np.array_equal(first.covariance, again.covariance)
+    for solver in (solve_batch, lambda problem, name: solve(problem.pick(1), name)):
+        osqp_programme.unbounded.cache_clear()
+        first = solver(near, "osqp")
+        solver(far, "osqp")
+        again = solver(near, "osqp")
+        assert osqp_programme.unbounded.cache_info().misses == 1
+        assert np.array_equal(first.x, again.x)
+        assert np.array_equal(first.covariance, again.covariance)
+
+
+def test_osqp_solves_in_threads_what_it_solves_alone(dense: Recording) -> None:
+    problems = [Problem.from_snapshot(dense, step, 0, run) for step in (10, 11, 12, 13) for run in range(4)]
+    alone = [solve(problem, "osqp").x for problem in problems]
+    with ThreadPoolExecutor(4) as pool:
+        found = pool.map(lambda problem: solve(problem, "osqp").x, problems * 3)
+        assert all(np.array_equal(x, alone[k % len(problems)]) for k, x in enumerate(found))
 
 
 def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
     problem = Problem.from_window(dense, 20, 0, 5)
-    from coopoc.optimize.backends import osqp_programme
-
     loose = {**osqp_programme.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(osqp_programme, "SETTINGS", loose)
+        osqp_programme.unbounded.cache_clear()
         solution = solve(problem, "osqp", throw=False)
+    osqp_programme.unbounded.cache_clear()
     assert solution.extras["repairs"] > 0
 
 
@@ -326,7 +340,7 @@ def test_a_missing_library_says_how_to_install_it(
         solve(Problem.from_snapshot(dense, 0, 0), backend)
 
 
-BATCHED = [("gauss-newton", {}), ("gtsam", {}), ("osqp", {}), ("casadi", {}), ("casadi", {"method": "sqp"})]
+BATCHED = [("gauss-newton", {}), ("gtsam", {}), ("osqp", {}), *(("casadi", {"method": method}) for method in METHODS)]
 LINEAR_ONLY = [("gtsam", {"optimizer": "lm"}), ("cvxpy", {})]
 
 

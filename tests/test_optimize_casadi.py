@@ -12,12 +12,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
-from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, measurement, pose, solve
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, measurement, pose, solve, solve_batch
 from coopoc.optimize.backends import casadi_programme
+from coopoc.optimize.backends.casadi_ import DENSE
 from coopoc.optimize.backends.casadi_programme import programme
+from coopoc.optimize.initial import initial_guess
 from coopoc.world.recording import Recording
 
-METHODS = ["ipopt", "sqp"]
+METHODS = ["auto", "fatrop", "ipopt", "sqp"]
 ROBUST = [Loss("huber", 1.0), Loss("cauchy", 2.0), Loss("geman-mcclure", 3.0)]
 
 
@@ -169,7 +171,7 @@ def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
     problem = Problem.from_snapshot(dense, 3, 0)
     solve(replace(problem, x0=solve(problem).x + 0.1), "casadi", method=method)
     assert programme.cache_info()[:2] == (4, 1)
-    for other in (robust(problem, ROBUST[0]), problem.constrain("position", 0, upper=[1e3, np.inf, np.inf]),
+    for other in (robust(problem, ROBUST[0]), problem.constrain("position", 0, [1, *[-np.inf] * 2], [1, *[np.inf] * 2]),
                   replace(problem, x0=solve(problem).x, held=(1,))):  # fmt: skip
         before = programme.cache_info().misses
         solve(other, "casadi", method=method)
@@ -202,6 +204,55 @@ def test_a_kind_of_the_same_name_is_another_structure() -> None:
     assert found == pytest.approx([9.0, 3.0], abs=1e-4)
 
 
+@pytest.mark.parametrize("start", [None, 20.0])
+def test_ranges_end_where_ipopt_and_scipy_end(start: float | None) -> None:
+    """From the linear start and from 20 m off; SciPy's trust region may go elsewhere from there, ipopt may not."""
+    for seed in range(12):
+        problem, rng = ranges_only(seed), np.random.default_rng(seed)
+        if start is not None:
+            problem = replace(problem, x0=problem.factors[0].z + rng.normal(0, start, (9, 3)))
+        found, ipopt = solve(problem, "casadi"), solve(problem, "casadi", method="ipopt")
+        assert found.extras["method"] == "fatrop"
+        assert "failed_first" not in found.extras
+        assert found.cost == pytest.approx(ipopt.cost, rel=1e-9)
+        assert found.x == pytest.approx(ipopt.x, abs=1e-6)
+        if start is None:
+            scipys = least_squares(
+                lambda v, p=problem: p.whiten(v.reshape(9, 3))[0], initial_guess(problem).ravel(),
+                lambda v, p=problem: p.whiten(v.reshape(9, 3))[1].toarray(), xtol=1e-15, ftol=1e-15,
+            )  # fmt: skip
+            assert found.cost == pytest.approx(scipys.cost, rel=1e-9)
+
+
+def test_inequalities_and_many_numbers_are_ipopts(dense: Recording) -> None:
+    problem = ranges_only(0)
+    equal = problem.constrain("range", ("a", "b"), lower=12.0, upper=12.0)
+    long = Problem.from_window(dense, 20, 0, 1 + DENSE // 33)
+    for case, method in ((problem, "fatrop"), (equal, "fatrop"), (long, "ipopt"),
+                         (problem.constrain("range", ("a", "b"), upper=12.0), "ipopt")):  # fmt: skip
+        solution = solve(case, "casadi")
+        assert solution.status is Status.SOLVED
+        assert solution.extras["method"] == method
+    with pytest.raises(InputError, match=r"fatrop.*does not hold inequalities"):
+        solve(problem.constrain("range", ("a", "b"), upper=12.0), "casadi", method="fatrop")
+
+
+def test_an_answer_that_is_none_is_found_out(monkeypatch: pytest.MonkeyPatch, dense: Recording) -> None:
+    """A solver that is content with any gradient: ipopt takes over, one by one and in a batch."""
+    monkeypatch.setitem(casadi_programme.FATROP, "tolerance", 1e6)
+    programme.cache_clear()
+    stars = Problem.from_snapshot(dense, 10, 0, run=None)
+    problem = stars.pick(1)
+    found, batch, best = solve(problem, "casadi"), solve_batch(stars, "casadi"), solve_batch(stars)
+    programme.cache_clear()
+    assert found.extras["failed_first"] == "fatrop: FAILED"
+    assert found.x == pytest.approx(solve(problem).x, abs=1e-6)
+    assert batch.again.all()
+    assert not best.again.any()
+    assert batch.converged.all()
+    assert batch.x == pytest.approx(best.x, abs=1e-6)
+
+
 def test_what_is_held_does_not_move(dense: Recording) -> None:
     problem = Problem.from_snapshot(dense, 10, 0)
     start = solve(problem).x + 0.3
@@ -216,7 +267,7 @@ def test_what_is_held_does_not_move(dense: Recording) -> None:
 def test_it_is_silent(dense: Recording, capfd: pytest.CaptureFixture[str], method: str) -> None:
     programme.cache_clear()
     solve(Problem.from_snapshot(dense, 10, 0), "casadi", method=method)
-    solve(Problem.from_snapshot(dense, 10, 0).constrain("position", 0, upper=5.0), "casadi", method=method)
+    solve(Problem.from_snapshot(dense, 10, 0).constrain("position", 0, 5.0, 5.0), "casadi", method=method)
     solve(flat_graph(0), "casadi", method=method)
     assert capfd.readouterr() == ("", "")
 
@@ -247,7 +298,7 @@ def test_a_truncated_loss_is_refused_with_the_way_out() -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_compiled_and_interpreted_programmes_agree(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
-    problem = problem.add("range", ("a", "b"), 7.0, std=0.3).constrain("position", "a", lower=[0.5, -np.inf, -np.inf])
+    problem = problem.add("range", ("a", "b"), 7.0, std=0.3).constrain("range", ("a", "b"), 8.0, 8.0)
     programme.cache_clear()
     compiled = solve(problem, "casadi", method=method, codegen=True)
     assert compiled.x == pytest.approx(solve(problem, "casadi", method=method).x, abs=1e-12)

@@ -20,7 +20,7 @@ from coopoc.optimize.active import active_at
 from coopoc.world.recording import Recording
 
 INF = np.inf
-LINEAR = [("osqp", {}), ("casadi", {}), ("casadi", {"method": "sqp"})]
+LINEAR = [("osqp", {}), *(("casadi", {"method": method}) for method in ("auto", "ipopt", "sqp"))]
 ANY = LINEAR[1:]
 PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 RANGED = PAIR.add("range", ("a", "b"), 8.0, std=0.5)

@@ -488,8 +488,8 @@ def test_a_fixed_lag_is_exact_on_a_linear_chain() -> None:
     residual, jacobian = whole.whiten(np.zeros((steps, 3)))
     best = np.linalg.lstsq(jacobian.toarray(), -residual)[0].reshape(-1, 3)
     spread = np.linalg.inv((jacobian.T @ jacobian).toarray())
-    for lag in (0.5, 3.5, np.inf):
-        smoother = FixedLag(lag)
+    for lag, threshold in ((0.5, 0.01), (3.5, 0.01), (3.5, np.inf), (np.inf, 0.01)):
+        smoother = FixedLag(lag, threshold)
         for k in range(steps):
             names = [f"p{k - 1}", f"p{k}"] if k else ["p0"]
             piece = Problem(names).add("position", names[-1], fixes[k], cov=spd(3))

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..arrays import Bools, Floats
 from .active import Active, active_at
 from .arrowhead import marginals, structure
+from .dense import diagonal_blocks, is_small, normal_matrix
+from .linear import Linear
 from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
 from .problem import Problem
@@ -49,25 +51,21 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     """Assessment of a single problem at x (n, width)."""
     linear = problem.linearise(x[None])
     cost = float(linear.cost[0])
-    scheme, frame = structure(problem)
-    blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
+    gradient, unconstrained = (_as_matrix if is_small(problem) else _as_blocks)(problem, linear)
     size = float(np.linalg.norm(gradient))
-    active = active_at(problem, x, gradient[0]) if problem.constraints else None
+    active = active_at(problem, x, gradient) if problem.constraints else None
     violation, violated = (0.0, "") if active is None else (active.violation, active.violated)
     if active is not None:
-        size = float(np.linalg.norm(gradient[0].ravel() + active.pull))
+        size = float(np.linalg.norm(gradient.ravel() + active.pull))
+    still = None if problem.free is None else ~problem.free
     try:
         if active is not None and active.holds:
-            cov, dx, sound = _restricted(problem.jacobian(linear), gradient[0], scheme.still, active)
+            cov, dx, sound = _restricted(problem.jacobian(linear), gradient, still, active)
         else:
-            if problem.hub or len(x) <= SMALL:
-                cov, dx = (each[0] for each in marginals(frame, blocks, gradient))
-            else:
-                cov, dx = _sparse(problem.jacobian(linear), gradient[0], scheme.still)
-            sound = bool(bounded(scheme, blocks, cov[None]).all())
+            cov, dx, sound = unconstrained()
         if sound and np.isfinite(dx).all() and np.isfinite(cov).all():
-            if scheme.still is not None:
-                cov = cov * ~(scheme.still[:, :, None] | scheme.still[:, None, :])
+            if still is not None:
+                cov = cov * ~(still[:, :, None] | still[:, None, :])
             remaining = float(np.abs(dx).max(initial=0.0))
             return Assessment(cost, size, cov, remaining, (), violation, violated, active)
     except np.linalg.LinAlgError:
@@ -75,6 +73,38 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
     free = _free(problem, problem.jacobian(linear), active)
     return Assessment(cost, size, unknown, np.nan, free, violation, violated, active)
+
+
+Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]
+"""Marginals (n, dof, dof), Gauss-Newton step (n, dof), and whether the former are bounded."""
+
+
+def _as_matrix(problem: Problem, linear: Linear) -> tuple[Floats, Marginals]:
+    """Gradient (n, dof) and what follows from one matrix."""
+    matrix, pull = normal_matrix(problem, linear)
+    gradient = pull.reshape(len(problem.names), -1)
+
+    def unconstrained() -> tuple[Floats, Floats, bool]:
+        cov, inverse = diagonal_blocks(matrix, len(gradient))
+        inflation = matrix.diagonal() * inverse.diagonal()
+        return cov, -(inverse @ pull).reshape(gradient.shape), bool(((inflation > 0) & (inflation < INFLATION)).all())
+
+    return gradient, unconstrained
+
+
+def _as_blocks(problem: Problem, linear: Linear) -> tuple[Floats, Marginals]:
+    """The same from blocks, by their Schur complement or sparse."""
+    scheme, frame = structure(problem)
+    blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
+
+    def unconstrained() -> tuple[Floats, Floats, bool]:
+        if problem.hub or len(gradient[0]) <= SMALL:
+            cov, dx = (each[0] for each in marginals(frame, blocks, gradient))
+        else:
+            cov, dx = _sparse(problem.jacobian(linear), gradient[0], scheme.still)
+        return cov, dx, bool(bounded(scheme, blocks, cov[None]).all())
+
+    return gradient[0], unconstrained
 
 
 def bounded(scheme: Pattern, blocks: Floats, cov: Floats) -> Bools:

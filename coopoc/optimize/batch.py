@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,11 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from .arrowhead import Arrow, marginals, structure
 from .assess import bounded
-from .descend import Descent, Step, descend
+from .descend import Descent, Step, descend, one_step
 from .initial import initial_guess, somewhere
 from .normal import normal_equations
 from .problem import Problem
-from .solve import POSITION_TOLERANCE, backend_module
+from .solve import POSITION_TOLERANCE, backend_module, second_way
 
 CHUNK = 40_000
 """Blocks of 3x3 numbers that one chunk may hold, so that a batch stays in the cache."""
@@ -26,6 +26,7 @@ CHUNK = 40_000
 class Batch:
     """Solutions of B realisations: x (B, n, width), covariance (B, n, dof, dof), the others (B,).
 
+    again: the backend's first way did not converge, and its second was taken (see `solve`).
     Not converged: the last step was still long, or a point is free; then the covariance is NaN. Unlike `solve` it does
     not look whether the stationary point is a saddle.
     """
@@ -35,6 +36,7 @@ class Batch:
     cost: Floats
     iterations: Ints
     converged: Bools
+    again: Bools
 
 
 def solve_batch(problem: Problem, backend: str = "gauss-newton", **options: Any) -> Batch:
@@ -72,8 +74,20 @@ def solve_batch(problem: Problem, backend: str = "gauss-newton", **options: Any)
         sound = bounded(scheme, blocks, cov)
         cov[~sound] = np.nan
         there = end.converged | (np.abs(left).max(axis=(1, 2)) <= POSITION_TOLERANCE)
-        parts.append((end.x, cov, linear.cost, end.iterations, there & sound))
-    return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        parts.append((end.x, cov, linear.cost, end.iterations, there & sound, np.zeros(len(sound), dtype=bool)))
+    found = Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    other = None if found.converged.all() else second_way(backend_module(backend, options), problem, options)
+    return found if other is None else _repeated(found, problem, backend, other)
+
+
+def _repeated(found: Batch, problem: Problem, backend: str, options: dict[str, Any]) -> Batch:
+    """The batch with what did not converge solved with other options."""
+    which = np.flatnonzero(~found.converged)
+    better = solve_batch(problem.pick(which) if problem.batch else problem, backend, **options)
+    for field in fields(Batch):
+        getattr(found, field.name)[which] = getattr(better, field.name)
+    found.again[which] = True
+    return found
 
 
 def _runner(problem: Problem, backend: str, options: dict[str, Any]) -> Callable[[Problem], Descent]:
@@ -89,11 +103,9 @@ def _runner(problem: Problem, backend: str, options: dict[str, Any]) -> Callable
 
 
 def _one_step(part: Problem, step: Step) -> Descent:
-    """All that a linear problem needs."""
-    x = somewhere(part)
-    dx = step(part.linearise(x), np.zeros((*x.shape[:2], part.space.dof)))
-    dx[~np.isfinite(dx).all(axis=(1, 2))] = 0.0
-    return Descent(part.space.retract(x, dx), np.ones(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool))
+    """One step, whose answer is not said to have converged."""
+    x = one_step(part, step, somewhere(part))
+    return Descent(x, np.ones(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool))
 
 
 def _claimed(module: Any, part: Problem, options: dict[str, Any]) -> Descent:

@@ -85,6 +85,16 @@ def descend(
     return Descent(best, count, done)
 
 
+def one_step(problem: Problem, step: Step, x: Floats) -> Floats:
+    """x (B, n, width) after all that a linear problem needs, one step; what is singular stays."""
+    try:
+        dx = step(problem.linearise(x), np.zeros((*x.shape[:2], problem.space.dof)))
+    except np.linalg.LinAlgError:
+        return x
+    dx[~np.isfinite(dx).all(axis=(1, 2))] = 0.0
+    return problem.space.retract(x, dx)
+
+
 def check_limits(max_iterations: int, tolerance: float) -> None:
     """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
     if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:

@@ -170,7 +170,7 @@ def graduate_batch(
     weighted = reweigh(problem, marked, end.weight, end.x)
     last = solve_batch(weighted, max_iterations=max_iterations, tolerance=tolerance)
     return Graduated(
-        last.x, last.covariance, last.cost, last.iterations, last.converged & end.settled,
+        last.x, last.covariance, last.cost, last.iterations, last.converged & end.settled, last.again,
         end.weight[:, marked.group], end.rounds, end.mu, weighted,
     )  # fmt: skip
 

@@ -48,7 +48,8 @@ class FixedLag:
 
     Args:
         lag: s; a node whose stamp is older than the newest one minus the lag leaves. Of steps of dt take (k + 1/2) dt,
-            so that rounding does not decide. threshold: m or rad, a move that asks for a fresh linearisation.
+            so that rounding does not decide. threshold: m or rad, a move that asks for a fresh linearisation; where
+            all is linear take infinity, which saves the search for them.
         passes: Gauss-Newton steps per update; more only matter for GTSAM's own nonlinear factors.
 
     Raises:
@@ -72,11 +73,13 @@ class FixedLag:
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         params.setRelinearizeThreshold(threshold)
         params.relinearizeSkip = 1
+        params.enableRelinearization = bool(np.isfinite(threshold))
         self.lag, self.passes = lag, passes
         self._smoother: Any = gtsam.IncrementalFixedLagSmoother(lag, params)
         self._keys: dict[str, int] = {}
         self._turns: dict[str, bool] = {}
         self._stamps: dict[str, float] = {}
+        self._newest = -np.inf
         self._dimension: int | None = None
         self._count = count()
 
@@ -114,27 +117,29 @@ class FixedLag:
         for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
         entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
-        moved = {name: float(at) for name, at in stamps.items()}
-        self._advance(graph, entering, {self._keys[name]: at for name, at in moved.items()})
-        self._stamps |= moved
-        self._forget()
+        moments = {name: float(at) for name, at in stamps.items()}
+        self._advance(graph, entering, {self._keys[name]: at for name, at in moments.items()})
+        self._age(moments)
         return self.estimate(wanted)
 
     def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
         """The nodes `wanted` of the window, by name; default those that have the newest stamp."""
         stamps = self._stamps
         if wanted is None:
-            newest = max(stamps.values(), default=0.0)
-            wanted = [name for name, at in stamps.items() if at == newest]
+            wanted = [name for name, at in stamps.items() if at == self._newest]
         names = tuple(wanted)
         for name in names:
             if name not in stamps:
                 raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", "See stamps.")
         return self._read(names, Space(self._dimension or 3, any(self._turns[name] for name in names)))
 
-    def _forget(self) -> None:
-        """What the smoother has marginalised, by its own rule; asking it for all its moments takes longer."""
-        last = max(self._stamps.values(), default=0.0) - self.lag
+    def _age(self, moments: dict[str, float]) -> None:
+        """The new moments, without what the smoother has marginalised, by its own rule: asking it takes longer."""
+        moved = not self._stamps.keys().isdisjoint(moments)
+        self._stamps |= moments
+        latest = max((self._stamps if moved else moments).values(), default=-np.inf)
+        self._newest = latest if moved else max(self._newest, latest)
+        last = self._newest - self.lag
         for name in [name for name, at in self._stamps.items() if at < last]:
             del self._stamps[name], self._keys[name], self._turns[name]
 
@@ -157,18 +162,21 @@ class FixedLag:
         if self._dimension not in (None, piece.dimension):
             mend = "Use one smoother per dimension."
             raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", mend)
-        own, newest = {*piece.names}, max([*before.values(), *stamps.values()], default=0.0)
+        own, newest = {*piece.names}, max([self._newest, *stamps.values()])
         for name, at in stamps.items():
             if not (name in own or name in before) or not newest - self.lag <= at < np.inf:
                 mend = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
                 raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", mend)
-        for name in [name for name in piece.names if name not in before and name not in stamps]:
-            mend = "Give a new node its moment; a node that has left the window cannot be measured any more."
-            raise InputError("stamps", f"none of {name!r}", "must have every new node", mend)
-        for name, turns in zip(piece.names, posed, strict=True):
-            if self._turns.get(name, turns) != turns:
+        fresh = []
+        for i, (name, turns) in enumerate(zip(piece.names, posed, strict=True)):
+            if name not in before:
+                fresh.append(i)
+                if name not in stamps:
+                    mend = "Give a new node its moment; a node that has left the window cannot be measured any more."
+                    raise InputError("stamps", f"none of {name!r}", "must have every new node", mend)
+            elif self._turns[name] != turns:
                 raise InputError("piece", repr(name), "must stay the point or pose that it was", "Name it in poses.")
-        return [i for i, name in enumerate(piece.names) if name not in before]
+        return fresh
 
     def _geometry(self, piece: Problem, rest: Sequence[int]) -> Floats:
         """(n, width) where the piece is linearised: its most probable nodes given the marginals of those of the window.

@@ -7,9 +7,8 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..world.spherical import to_vector
-from .arrowhead import eliminate, structure
+from .dense import damped_step
 from .factor import Factor, unchecked
-from .normal import normal_equations
 from .problem import Problem
 
 LEAST_RANGE = 1.0
@@ -45,9 +44,7 @@ def initial_guess(problem: Problem) -> Floats:
     linear = converted(problem)
     x: Floats = np.zeros((batch, len(problem.names), problem.dimension))
     if linear.factors:
-        scheme, frame = structure(linear)
-        blocks, gradient = normal_equations(scheme, linear.linearise(x), [f.nodes for f in linear.factors])
-        x = eliminate(frame, blocks, gradient, np.full_like(x, RIDGE))
+        x = damped_step(linear, linear.linearise(x), np.full_like(x, RIDGE))
     return _apart(problem, linear, x)
 
 

@@ -51,12 +51,13 @@ def linearise(
     residuals, slopes, cost = [], [], np.zeros(len(x))
     for factor in factors:
         residual, slope = _factor(space, factor, x)
-        square = np.einsum("bmk,bmk->bm", residual, residual)
-        if factor.loss is not None:
+        if factor.loss is None:
+            cost += 0.5 * np.einsum("bmk,bmk->b", residual, residual)
+        else:
+            square = np.einsum("bmk,bmk->bm", residual, residual)
             root = np.sqrt(factor.loss.weight(square))[..., None]
             residual, slope = residual * root, tuple(s * root[..., None] for s in slope)
-            square = factor.loss.cost(square)
-        cost += 0.5 * square.sum(axis=1)
+            cost += 0.5 * factor.loss.cost(square).sum(axis=1)
         if free is not None:
             slope = _masked(factor, slope, free)
         residuals.append(residual)

@@ -110,13 +110,13 @@ class Problem:
     def _start_batch(self) -> int | None:
         return len(self.x0) if self.x0 is not None and self.x0.ndim == 3 else None
 
-    @property
+    @cached_property
     def batch(self) -> int | None:
         """B noise realisations, or None for a single problem."""
         sizes = [b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None]
         return max(sizes) if sizes else None
 
-    @property
+    @cached_property
     def linear(self) -> bool:
         """True if the residuals are linear in x and the cost is quadratic."""
         return all(f.measurement.linear and f.loss is None for f in self.factors)

@@ -6,7 +6,7 @@ import importlib
 import inspect
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from importlib.util import find_spec
 from types import SimpleNamespace
@@ -61,7 +61,7 @@ BACKENDS = {
     for b in (
         Backend("gauss-newton", "gauss_newton", "reference: Levenberg-Marquardt, batched over noise runs"),
         Backend("gtsam", "gtsam_", "elimination by GTSAM, or its own LM, dogleg, ISAM2, GNC (optimizer=)", "gtsam"),
-        Backend("casadi", "casadi_", "nonlinear programming by IPOPT or SQP, constraints of any kind", "casadi", "all"),
+        Backend("casadi", "casadi_", "nonlinear programming by FATROP or IPOPT, any constraints", "casadi", "all"),
         Backend("cvxpy", "cvxpy_", "convex relaxations: QP, Shor's SDP with a lower bound, SOCP", "cvxpy"),
         Backend("osqp", "osqp_", "sequential quadratic programming, persistent workspace", "osqp", "linear"),
     )
@@ -81,6 +81,8 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     """The most probable positions: a minimum of the problem's cost, by the named backend.
 
     Cost, gradient, covariance, status and times are computed here from x alone, so that no backend can flatter itself.
+    Where the answer is no minimum and the backend has another way (casadi's is ipopt), that is taken, and
+    extras["failed_first"] says what became of the first.
 
     Args:
         problem: a single one; `solve_batch` takes B realisations. backend: a name of `backends()`, or
@@ -103,7 +105,18 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
         raise InputError("problem", repr(problem), "must be a single realisation", mend)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
-    _check_constraints(problem, usable(backend))
+    if problem.constraints:
+        _check_constraints(problem, usable(backend))
+    solution = _solved(problem, backend, module, options)
+    if solution.status is not Status.SOLVED and (other := second_way(module, problem, options)) is not None:
+        solution = _after(solution, _solved(problem, backend, module, other))
+    if throw and solution.status is not Status.SOLVED:
+        _raise(solution)
+    return solution
+
+
+def _solved(problem: Problem, backend: str, module: Any, options: dict[str, Any]) -> Solution:
+    """What a backend finds, and what is true of it."""
     began = time.perf_counter()
     start = _start(problem)
     run = module.build(problem, **options)
@@ -112,16 +125,28 @@ def solve(problem: Problem, backend: str = "gauss-newton", throw: bool = True, *
     solved = time.perf_counter()
     truth = assess(problem, ended.x)
     violated = {"violated": truth.violated} if truth.violation > FEASIBLE or ended.infeasible else {}
-    solution = Solution(
+    return Solution(
         x=ended.x, covariance=truth.covariance, cost=truth.cost, gradient=truth.gradient,
         status=_status(problem, ended, truth, options.get("max_iterations", MAX_ITERATIONS)),
         iterations=ended.iterations, build_seconds=built - began, solve_seconds=solved - built, backend=backend,
         names=problem.names, shown=problem.hub[-1] if problem.hub else 0, free=truth.free, space=problem.space,
         violation=truth.violation, extras=ended.extras | violated,
     )  # fmt: skip
-    if throw and solution.status is not Status.SOLVED:
-        _raise(solution)
-    return solution
+
+
+def _after(first: Solution, second: Solution) -> Solution:
+    """The second, with what became of the first and the time of both."""
+    return replace(
+        second, build_seconds=first.build_seconds + second.build_seconds,
+        solve_seconds=first.solve_seconds + second.solve_seconds,
+        extras=second.extras | {"failed_first": f"{first.extras['method']}: {first.status.name}"},
+    )  # fmt: skip
+
+
+def second_way(module: Any, problem: Problem, options: dict[str, Any]) -> dict[str, Any] | None:
+    """The options with which a backend tries again where its answer fails the checks; None if it has no other way."""
+    found: dict[str, Any] | None = module.second(problem, options) if hasattr(module, "second") else None
+    return found
 
 
 def usable(backend: str) -> Backend:
@@ -150,15 +175,18 @@ def _other(backend: str) -> Backend:
 
 def backend_module(backend: str, options: dict[str, Any]) -> Any:
     """The module of a backend that takes the options; errors as `solve`."""
-    known = usable(backend)
-    given = known.solver
-    module: Any = importlib.import_module(f".backends.{given}", __package__) if isinstance(given, str) else (
-        SimpleNamespace(build=given))  # fmt: skip
+    given = usable(backend).solver
+    module = _module(given) if isinstance(given, str) else SimpleNamespace(build=given)
     allowed = _options(module.build)
     for name in options:
         if name not in allowed:
             raise InputError(name, options[name], f"is no option of {backend}, which has {allowed}", "Leave it out.")
     return module
+
+
+@lru_cache(maxsize=64)
+def _module(name: str) -> Any:
+    return importlib.import_module(f".backends.{name}", __package__)
 
 
 @lru_cache(maxsize=64)
@@ -169,8 +197,6 @@ def _options(build: Any) -> list[str]:
 
 def _check_constraints(problem: Problem, known: Backend) -> None:
     """InputError if the backend cannot hold the problem's constraints; it names those that can."""
-    if not problem.constraints:
-        return
     needed = "linear" if all(c.measurement.linear for c in problem.constraints) else "all"
     able = [b.name for b in backends().values() if b.constraints in (needed, "all")]
     if known.name not in able:

@@ -24,6 +24,7 @@ IPOPT = {
     "acceptable_tol": 1e-8, "acceptable_iter": 3, "acceptable_constr_viol_tol": 1e-8, "acceptable_compl_inf_tol": 1e-17,
 }  # fmt: skip
 """For a cost scaled to a curvature of 1; what `tol` asks may lie below rounding, hence the acceptable level."""
+FATROP = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "acceptable_iter": 3}
 SQP = {
     "print_header": False, "print_iteration": False, "print_status": False, "qpsol": "qrqp",
     "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False},
@@ -40,7 +41,7 @@ class Programme:
     """What is built once.
 
     Args:
-        structure: of the problems that it solves. method: "ipopt" or "sqp".
+        structure: of the problems that it solves. method: "fatrop", "ipopt" or "sqp".
         solvers: CasADi's nlpsol objects, each starts where the one before it ended.
     """
 
@@ -83,7 +84,10 @@ class Solver:
         self._found["x"][:] = np.nan
         self._evaluate()
         found, stats = self._found, self._buffer.stats()
-        return found["x"].copy(), found["lam_g"].copy(), int(stats["iter_count"]), str(stats["return_status"])
+        said = stats["return_status"]
+        if isinstance(said, int):  # fatrop has one number for all that is not a success
+            said = "Solve_Succeeded" if stats["success"] else "Not_Solved"
+        return found["x"].copy(), found["lam_g"].copy(), int(stats["iter_count"]), said
 
 
 @lru_cache(maxsize=64)
@@ -98,6 +102,9 @@ def programme(structure: Structure, method: str, max_iterations: int, codegen: b
     if method == "ipopt":
         options = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
         return Programme(structure, method, (_compiled("ipopt", nlp, options, codegen),))
+    if method == "fatrop":
+        options = {**QUIET, "structure_detection": "none", "fatrop": {**FATROP, "max_iter": max_iterations}}
+        return Programme(structure, method, (_compiled("fatrop", nlp, options, codegen),))
     pulls = [ca.SX.sym("lam_f"), ca.SX.sym("lam_g", *found["g"].shape)]
     names = ["x", "p", "lam_f", "lam_g"], ["hess_gamma_x_x"]
     gauss = ca.Function("gauss", [x, p, *pulls], [pulls[0] * scale * flat], *names)

@@ -7,12 +7,11 @@ from functools import partial
 import numpy as np
 
 from ...arrays import Floats
-from ..arrowhead import eliminate, structure
 from ..assess import factorise
 from ..curvature import newton_step
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, descend
+from ..dense import damped_step, is_small
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
 from ..linear import Linear
-from ..normal import normal_equations
 from ..problem import Problem
 from .run import Ended, Run
 
@@ -28,9 +27,12 @@ def build(problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: flo
     Args:
         max_iterations: of Gauss-Newton steps. tolerance: m, largest move of a point in the last step.
     """
+    check_limits(max_iterations, tolerance)
     step = linear_step(problem)
 
     def run(x: Floats) -> Ended:
+        if problem.linear and is_small(problem) and max_iterations:
+            return Ended(one_step(problem, step, x[None])[0], 1)
         end = descend(problem, step, x[None], min(max_iterations, PATIENCE), tolerance)
         if end.converged[0] or max_iterations <= PATIENCE:
             return Ended(end.x[0], int(end.iterations[0]))
@@ -44,9 +46,7 @@ def linear_step(problem: Problem) -> Step:
     """The linear solver that suits the structure; batched unless the problem is large and has no hub."""
     if not problem.hub and len(problem.names) > DENSE_POINTS:
         return partial(_sparse_step, problem)
-    scheme, frame = structure(problem)
-    nodes = [f.nodes for f in problem.factors]
-    return lambda linear, damping: eliminate(frame, *normal_equations(scheme, linear, nodes), damping)
+    return partial(damped_step, problem)
 
 
 def _sparse_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:

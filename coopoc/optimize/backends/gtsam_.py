@@ -8,13 +8,14 @@ costs less than GTSAM's own and their noise models.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
 from ..linear import Linear
 from ..problem import Problem
 from .gtsam_forms import forms
@@ -45,8 +46,7 @@ def build(
 
         def run(x: Floats) -> Ended:
             if problem.linear and max_iterations:
-                dx = step(problem.linearise(x[None]), np.zeros((1, len(x), problem.space.dof)))[0]
-                return Ended(problem.space.retract(x, dx) if np.isfinite(dx).all() else x, 1)
+                return Ended(one_step(problem, step, x[None])[0], 1)
             end = descend(problem, step, x[None], max_iterations, tolerance)
             return Ended(end.x[0], int(end.iterations[0]))
 
@@ -86,14 +86,15 @@ def _optimising(problem: Problem, max_iterations: int, tolerance: float, optimiz
 
 
 def linear_step(problem: Problem) -> Step:
-    """GTSAM's multifrontal elimination, one realisation after the other, with an ordering (COLAMD) found once."""
+    """GTSAM's multifrontal elimination, one realisation after the other, with an ordering (COLAMD) per structure."""
     import gtsam
 
-    unit = {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 13)}
-    own, nothing = unit[problem.space.dof], np.zeros(problem.space.dof)
-    ordering: list[Any] = []
+    unit, nothing = _units(), np.zeros(problem.space.dof)
+    own = unit[problem.space.dof]
     held = [] if problem.free is None else [(i, np.diag(1.0 - problem.free[i]))
                                             for i in np.flatnonzero(~problem.free.all(axis=1)).tolist()]  # fmt: skip
+    touched = tuple((f.nodes.shape[1], f.nodes.tobytes()) for f in problem.factors)
+    orderings = _orderings(touched, tuple(i for i, _ in held))
 
     def step(linear: Linear, damping: Floats) -> Floats:
         dx, rows = np.full_like(damping, np.nan), _rows(problem, linear)
@@ -103,23 +104,38 @@ def linear_step(problem: Problem) -> Step:
             _add(graph, rows, b, unit)
             for i, root in (*held, *(enumerate(map(np.diag, np.sqrt(damping[b]))) if damped[b] else ())):
                 graph.add(i, root, nothing, own)
-            if not ordering:
-                ordering.append(gtsam.Ordering.ColamdGaussianFactorGraph(graph))
+            if damped[b] not in orderings:  # what is damped has every node, even one without measurements
+                orderings[damped[b]] = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
             try:
-                there: Floats = graph.optimize(ordering[0]).vector()
+                there: Floats = graph.optimize(orderings[damped[b]]).vector()
             except RuntimeError:  # a singular system: the step is not finite
                 continue
-            if there.size < dx[b].size:  # a node without measurements
-                ordering.clear()
-            else:
+            if there.size == dx[b].size:
                 dx[b] = there.reshape(dx[b].shape)
         return dx
 
     return step
 
 
+@lru_cache(maxsize=1)
+def _units() -> dict[int, Any]:
+    """GTSAM's noise models of variance one by size."""
+    import gtsam
+
+    return {size: gtsam.noiseModel.Unit.Create(size) for size in range(1, 13)}
+
+
+@lru_cache(maxsize=256)
+def _orderings(factors: tuple[tuple[int, bytes], ...], held: tuple[int, ...]) -> dict[bool, Any]:
+    """Of the graphs of a structure, without and with damping, as they are found."""
+    return {}
+
+
 def _rows(problem: Problem, linear: Linear) -> list[tuple[list[list[int]], list[Floats], Floats]]:
-    """Per factor the nodes by place (arity, M), a derivative (B, M, size, dof) by each of them, and -r (B, M, size)."""
+    """Per factor the nodes by place (arity, M), a derivative (B, M, size, dof) by each of them, and -r (B, M, size).
+
+    The derivatives are read-only: GTSAM's wrapper takes those a tenth faster.
+    """
     found = []
     for factor, residual, slopes in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
         wide = [np.broadcast_to(slope, (*residual.shape, slope.shape[-1])) for slope in slopes]

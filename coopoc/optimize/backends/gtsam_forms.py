@@ -9,12 +9,12 @@ of a direction, and range, azimuth and inclination in the world frame it does no
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Floats, frozen
 from ..factor import Factor
 from ..problem import Problem
 from ..space import Space, log
@@ -24,16 +24,15 @@ SAME = 1e-12
 """Share by which two weights may differ and count as equal."""
 Names: TypeAlias = Mapping[tuple[bool, ...], str]
 """GTSAM's class by which of the nodes are poses."""
-Given: TypeAlias = Callable[[Any, int], tuple[Any, ...]]
-"""(gtsam, row) -> what its class takes between keys and noise model."""
+Given: TypeAlias = Callable[[Any], list[tuple[Any, ...]]]
+"""gtsam -> by row what its class takes between keys and noise model."""
 
 
-@dataclass(frozen=True, eq=False)
-class Part:
+class Part(NamedTuple):
     """A GTSAM class that says a factor, or those of its residuals that `root` keeps.
 
     Args:
-        root: (M, k, k) S, square root of the information of its k errors.
+        root: (M or 1, k, k) S, square root of the information of its k errors.
     """
 
     names: Names
@@ -54,19 +53,30 @@ def form_of(problem: Problem, factor: Factor) -> Form:
     """Its parts in GTSAM, or why it has none."""
     if factor.kind not in FORMS:
         return "GTSAM has no such factor"
-    kinds = [[False] * factor.nodes.shape[1]]
+    kinds, form = [(False,) * factor.nodes.shape[1]], FORMS[factor.kind]
     if problem.poses:
-        kinds = np.unique(np.isin(factor.nodes, problem.poses), axis=0).tolist()
-    form = OF_POSES.get(factor.kind, FORMS[factor.kind]) if all(map(all, kinds)) else FORMS[factor.kind]
-    parts = form(factor, factor.root, problem.dimension)
+        kinds = [tuple(row) for row in np.unique(np.isin(factor.nodes, problem.poses), axis=0).tolist()]
+        form = OF_POSES.get(factor.kind, form) if all(map(all, kinds)) else form
+    parts = form(factor, _root(factor), problem.dimension)
     if isinstance(parts, str):
         return parts
     if len(parts) > 1 and factor.loss is not None:
         return "it takes two factors in GTSAM, which no robust loss can join"
-    for row in kinds:
-        if not all(tuple(row) in part.names or tuple(row[::-1]) in part.names for part in parts):
-            return f"GTSAM has none from {' to '.join('a pose' if turns else 'a point' for turns in row)}"
+    lacking = [row for row in kinds for part in parts if row not in part.names and row[::-1] not in part.names]
+    if lacking:
+        return f"GTSAM has none from {' to '.join('a pose' if turns else 'a point' for turns in lacking[0])}"
     return parts
+
+
+def _root(factor: Factor) -> Floats:
+    """W (M, size, size), or (1, size, size) where all measurements share it."""
+    return _inverse(factor.std.tobytes()) if factor.std is not None and len(factor.std) == 1 else factor.root
+
+
+@lru_cache(maxsize=256)
+def _inverse(raw: bytes) -> Floats:
+    """(1, size, size) of one measurement's std."""
+    return frozen(np.diag(1.0 / np.frombuffer(raw))[None])
 
 
 def pose_of(gtsam: Any, d: int, x: Floats) -> Any:
@@ -78,11 +88,11 @@ def pose_of(gtsam: Any, d: int, x: Floats) -> Any:
 
 def _position(factor: Factor, W: Floats, d: int) -> Form:
     names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
-    return [Part(names, lambda gtsam, k: (factor.z[k],), W)]
+    return [Part(names, lambda gtsam: list(zip(factor.z, strict=True)), W)]
 
 
 def _displacement(factor: Factor, W: Floats, d: int) -> Form:
-    return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda gtsam, k: (factor.z[k],), W)]
+    return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda gtsam: list(zip(factor.z, strict=True)), W)]
 
 
 def _displacement_of_poses(factor: Factor, W: Floats, d: int) -> Form:
@@ -91,7 +101,7 @@ def _displacement_of_poses(factor: Factor, W: Floats, d: int) -> Form:
     root = np.zeros((len(W), (d + 1) ** 2, (d + 1) ** 2))
     root[:, -d - 1 : -1, -d - 1 : -1] = W
     names: Names = {(POSE, POSE): f"FrobeniusLeftBetweenFactorPose{d}"}
-    return [Part(names, lambda gtsam, k: (pose_of(gtsam, d, z[k]),), root)]
+    return [Part(names, lambda gtsam: [(pose_of(gtsam, d, each),) for each in z], root)]
 
 
 def _range(factor: Factor, W: Floats, d: int) -> Form:
@@ -104,14 +114,14 @@ def _range(factor: Factor, W: Floats, d: int) -> Form:
         (POSE, POINT): f"RangeFactor{d}D",
         (POSE, POSE): f"RangeFactorPose{d}",
     }
-    return [Part(names, lambda gtsam, k: (far[k, 0],), W / dt[:, :, None])]
+    return [Part(names, lambda gtsam: list(zip(far[:, 0], strict=True)), W / dt[:, :, None])]
 
 
 def _bearing(factor: Factor, W: Floats, d: int) -> Form:
     if d == 3:
         return "GTSAM's bearing in space has no forward axis"
     names: Names = {(POSE, POINT): "BearingFactor2D", (POSE, POSE): "BearingFactorPose2"}
-    return [Part(names, lambda gtsam, k: (gtsam.Rot2(factor.z[k, 0]),), W)]
+    return [Part(names, lambda gtsam: [(gtsam.Rot2(angle),) for angle in factor.z[:, 0]], W)]
 
 
 def _body_spherical(factor: Factor, W: Floats, d: int) -> Form:
@@ -119,12 +129,12 @@ def _body_spherical(factor: Factor, W: Floats, d: int) -> Form:
     if d == 3:
         return "GTSAM weighs a bearing in space by its tangent plane, not by azimuth and inclination"
     names: Names = {(POSE, POINT): "BearingRangeFactor2D", (POSE, POSE): "BearingRangeFactorPose2"}
-    return [Part(names, lambda gtsam, k: (gtsam.Rot2(factor.z[k, 1]), factor.z[k, 0]), W[:, :, ::-1])]
+    return [Part(names, lambda gtsam: [(gtsam.Rot2(angle), far) for far, angle in factor.z], W[:, :, ::-1])]
 
 
 def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
     z = Space(d, turning=True).join(factor.z)
-    return _turned(W, {0: np.arange(d)}, lambda gtsam, k: (pose_of(gtsam, d, z[k]),), d)
+    return _turned(W, {0: np.arange(d)}, lambda gtsam: [(pose_of(gtsam, d, each),) for each in z], d)
 
 
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
@@ -132,8 +142,8 @@ def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     if not _apart(W, d):
         return "its std must not couple position and rotation"
 
-    def given(gtsam: Any, k: int) -> tuple[Any, ...]:
-        return (pose_of(gtsam, d, factor.z[k]),)
+    def given(gtsam: Any) -> list[tuple[Any, ...]]:
+        return [(pose_of(gtsam, d, z),) for z in factor.z]
 
     chord = _turned(W[:, :d, :d], {0: np.arange(d)}, given, d)
     if isinstance(chord, str):
@@ -146,7 +156,7 @@ def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
 
 def _relative_chordal(factor: Factor, W: Floats, d: int) -> Form:
     columns = {0: np.arange(d), **{1 + k: d + k + d * np.arange(d) for k in range(d)}}
-    return _turned(W, columns, lambda gtsam, k: (pose_of(gtsam, d, factor.z[k]),), d)
+    return _turned(W, columns, lambda gtsam: [(pose_of(gtsam, d, z),) for z in factor.z], d)
 
 
 def _turned(W: Floats, columns: dict[int, Any], given: Given, d: int) -> Form:
@@ -176,10 +186,13 @@ def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     turned = Space(d, turning=True).rotation(factor.z)
     back = np.swapaxes(turned, -1, -2)
 
-    def rotation(gtsam: Any, k: int) -> tuple[Any, ...]:
-        return (gtsam.Rot2(float(log(turned[k])[0])) if d == 2 else gtsam.Rot3(turned[k]),)
+    def rotation(gtsam: Any) -> list[tuple[Any, ...]]:
+        return [(gtsam.Rot2(float(log(turn)[0])) if d == 2 else gtsam.Rot3(turn),) for turn in turned]
 
-    return [Part({(POSE,): f"PoseTranslationPrior{d}D"}, lambda gtsam, k: (factor.z[k, :d],), W[:, :d, :d] @ back),
+    def position(gtsam: Any) -> list[tuple[Any, ...]]:
+        return list(zip(factor.z[:, :d], strict=True))
+
+    return [Part({(POSE,): f"PoseTranslationPrior{d}D"}, position, W[:, :d, :d] @ back),
             Part({(POSE,): f"PoseRotationPrior{d}D"}, rotation, W[:, d:, d:])]  # fmt: skip
 
 
@@ -191,8 +204,8 @@ def _chordal_prior(factor: Factor, W: Floats, d: int) -> Form:
     root = np.zeros((len(W), side**2, side**2))
     root[:, : W.shape[1], theirs] = W
 
-    def matrix(gtsam: Any, k: int) -> tuple[Any, ...]:
-        return (pose_of(gtsam, d, factor.z[k]).matrix(),)
+    def matrix(gtsam: Any) -> list[tuple[Any, ...]]:
+        return [(pose_of(gtsam, d, z).matrix(),) for z in factor.z]
 
     return [Part({(POSE,): f"FrobeniusPriorPose{d}"}, matrix, root)]
 
@@ -208,6 +221,6 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     "body_spherical": _body_spherical, "relative_position": _relative_position, "relative_pose": _relative_pose,
     "relative_pose_chordal": _relative_chordal, "pose": _pose_prior, "pose_chordal": _chordal_prior,
 }  # fmt: skip
-"""(factor, W (M, size, size), dimension) -> parts, by kind."""
+"""(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 OF_POSES = {"displacement": _displacement_of_poses}
 """The same where all nodes are poses and points would need another class."""

@@ -27,10 +27,16 @@ ESTIMATORS = {
 
 @dataclass(frozen=True, eq=False)
 class Native:
-    """A gtsam.NonlinearFactorGraph and, of each of its factors, which (factor, row) of the problem it says."""
+    """A gtsam.NonlinearFactorGraph and, in its order, which factor of the problem each part says, with the noise models
+    of its measurements; None: it says nothing and is not in the graph."""
 
     graph: Any
-    place: tuple[tuple[int, int], ...]
+    models: list[tuple[int, list[Any]]]
+
+    @property
+    def place(self) -> list[tuple[int, int]]:
+        """Of each factor of the graph, which (factor, row) of the problem it says."""
+        return [(f, k) for f, models in self.models for k, model in enumerate(models) if model is not None]
 
 
 def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | None = None) -> Native:
@@ -41,26 +47,30 @@ def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | N
     """
     import gtsam
 
-    graph, place = gtsam.NonlinearFactorGraph(), []
+    native = Native(gtsam.NonlinearFactorGraph(), [])
+    add = native.graph.add
     named = np.arange(len(problem.names)) if keys is None else np.array(keys)
     posed = which_turn(problem) if problem.poses else []
     for f, (factor, parts) in enumerate(zip(problem.factors, said, strict=True)):
-        rows, nodes = np.flatnonzero(factor.informative).tolist(), factor.nodes.tolist()
+        if isinstance(parts, str):
+            continue
         called = named[factor.nodes].tolist()
-        for part in () if isinstance(parts, str) else parts:
-            models, given = _models(part.root, factor), part.given
+        turns = [(False,) * len(called[0])] * len(called) if not posed else [
+            tuple([posed[i] for i in row]) for row in factor.nodes.tolist()]  # fmt: skip
+        for part in parts:
+            models = _models(part.root, factor)
             classes: dict[tuple[bool, ...], Any] = {at: getattr(gtsam, name) for at, name in part.names.items()}
-            made: Any = classes.get((False,) * factor.nodes.shape[1])
-            for k in rows:
-                touched = called[k]
-                if posed:
-                    turns = tuple([posed[i] for i in nodes[k]])
-                    made = classes.get(turns)
-                    if made is None:  # a range from a point to a pose
-                        touched, made = touched[::-1], classes[turns[::-1]]
-                graph.add(made(*touched, *given(gtsam, k), models[k]))
-            place += [(f, k) for k in rows]
-    return Native(graph, tuple(place))
+            classes |= {at[::-1]: _swapped(made) for at, made in classes.items() if at[::-1] not in classes}
+            for touched, kind, given, model in zip(called, turns, part.given(gtsam), models, strict=True):
+                if model is not None:
+                    add(classes[kind](*touched, *given, model))
+            native.models.append((f, models))
+    return native
+
+
+def _swapped(made: Any) -> Any:
+    """A factor of two nodes in the other order, such as a range from a point to a pose."""
+    return lambda first, second, *given: made(second, first, *given)
 
 
 def hold(problem: Problem, graph: Any) -> None:
@@ -79,14 +89,19 @@ def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) 
     import gtsam
 
     found = gtsam.Values()
-    for node, turns, key in zip(x, posed, keys, strict=True):
-        found.insert(key, _node(gtsam, space.dimension, node, turns))
+    nodes = x if not space.turning else (
+        _node(gtsam, space.dimension, node, turns) for node, turns in zip(x, posed, strict=True))  # fmt: skip
+    for key, node in zip(keys, nodes, strict=True):
+        found.insert(key, node)
     return found
 
 
 def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Iterable[int]) -> Floats:
     """x (n, width) of the nodes in gtsam.Values."""
     d, x = space.dimension, np.empty((len(posed), space.width))
+    if not space.turning:
+        at = found.atPoint3 if d == 3 else found.atPoint2
+        return np.array([at(key) for key in keys]).reshape(x.shape)
     for i, (turns, key) in enumerate(zip(posed, keys, strict=True)):
         if turns:
             pose = getattr(found, f"atPose{d}")(key)
@@ -152,9 +167,9 @@ def _node(gtsam: Any, d: int, x: Floats, posed: bool) -> Any:
 
 
 def _models(root: Floats, factor: Factor) -> list[Any]:
-    """A noise model per measurement (M, k, k), one object for equal ones."""
+    """A noise model per measurement of roots (M or 1, k, k), one object for equal ones; None: it says nothing."""
     size, loss = root.shape[-1], factor.loss
-    return [_model(row.tobytes(), size, loss) for row in root]
+    return [_model(row.tobytes(), size, loss) for row in root] * (len(factor.nodes) if len(root) == 1 else 1)
 
 
 @lru_cache(maxsize=1024)
@@ -163,6 +178,8 @@ def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
     import gtsam
 
     noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)
+    if not root.any():
+        return None
     diagonal = not any(entry for i, row in enumerate(root.tolist()) for entry in row[:i])
     model: Any = noise.Gaussian.SqrtInformation(root, diagonal)
     if loss is None:

@@ -135,7 +135,7 @@ def copied(factor: Factor, form: Form, d: int) -> Form:
         mend = 'Use optimizer="lm", or coopoc.optimize.graduate.'
         raise InputError("optimizer", "'gnc'", f"cannot copy {bad[0]}, GTSAM's {factor.kind}", mend)
     root = factor.root if d == 2 else np.roll(factor.root, -d, axis=2)
-    return [Part({(True, True): f"BetweenFactorPose{d}"}, lambda g, k: (pose_of(g, d, factor.z[k]),), root)]
+    return [Part({(True, True): f"BetweenFactorPose{d}"}, lambda g: [(pose_of(g, d, z),) for z in factor.z], root)]
 
 
 def _patient(params: Any, limit: int) -> Any:

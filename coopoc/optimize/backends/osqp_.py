@@ -6,7 +6,6 @@ moved onto them by the least step; from then on every step keeps them, so that t
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -16,12 +15,12 @@ import numpy as np
 from ...arrays import Floats
 from ..active import bounded, constraint_rows
 from ..arrowhead import structure
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
 from ..linear import Linear
 from ..local import local
 from ..normal import Pattern, normal_equations
 from ..problem import Problem
-from .osqp_programme import CLOSE, Infeasible, Programme
+from .osqp_programme import CLOSE, Infeasible, Programme, filled
 from .run import Ended, Run
 
 FAR = 1e-6
@@ -48,14 +47,14 @@ def build(
 
     def run(x: Floats) -> Ended:
         try:
-            x, feasible = _nearest(limits, x)
-            if not feasible:
-                return Ended(x, 0, dict(programme.counts), infeasible=True)
-            if problem.linear and max_iterations:
-                dx = step(problem.linearise(x[None]), np.zeros((1, len(x), problem.space.dof)))
-                return Ended(problem.space.retract(x, dx[0]), 1, dict(programme.counts))
+            if problem.constraints:
+                x, feasible = _nearest(limits, x)
+                if not feasible:
+                    return Ended(x, 0, dict(programme.counts), infeasible=True)
         except np.linalg.LinAlgError:
             return Ended(x, 0, dict(programme.counts))
+        if problem.linear and max_iterations:
+            return Ended(one_step(problem, step, x[None])[0], 1, dict(programme.counts))
         end = descend(problem, step, x[None], max_iterations, tolerance)
         return Ended(end.x[0], int(end.iterations[0]), dict(programme.counts))
 
@@ -70,8 +69,6 @@ def linear_step(problem: Problem, kkt_tolerance: float = 1e-9) -> Step:
 def _programme(problem: Problem, limits: _Limits, tolerance: float) -> tuple[Programme, Step]:
     scheme, _ = structure(problem)
     pattern, source = _upper(scheme, problem.space.dof)
-    upper = copy(pattern)  # shares the structure
-    upper.data = pattern.data.copy()
     nodes, at_own = [f.nodes for f in problem.factors], np.arange(problem.space.dof)
     own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
     at = scheme.pairs[own, 0]
@@ -84,9 +81,8 @@ def _programme(problem: Problem, limits: _Limits, tolerance: float) -> tuple[Pro
         values = np.ascontiguousarray(blocks.reshape(len(blocks), -1)[:, source])
         q = gradient.reshape(len(gradient), -1)
         if not len(limits.lower):
-            return programme.each(upper, values, q).reshape(damping.shape)
-        upper.data[:] = values[0]
-        return programme.solve(upper, q[0], *limits.around(linear.x[0])).reshape(damping.shape)
+            return programme.each(pattern, values, q).reshape(damping.shape)
+        return programme.solve(filled(pattern, values[0]), q[0], *limits.around(linear.x[0])).reshape(damping.shape)
 
     return programme, step
 

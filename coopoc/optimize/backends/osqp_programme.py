@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
+from threading import get_ident
 from typing import Any
 
 import numpy as np
@@ -54,6 +55,7 @@ class Workspace:
             setattr(self._settings, name, value)
         P, A, sides = ext.CSC(_short(half)), ext.CSC(_short(rows)), (self._finite(lower), self._finite(upper))
         self.solver = ext.OSQPSolver(P, q, A, *sides, *rows.shape, self._settings)
+        self._zero = np.zeros(len(q))
 
     def update(self, values: Floats, q: Floats, lower: Floats | None = None, upper: Floats | None = None) -> None:
         """New numbers; all arrays contiguous."""
@@ -61,6 +63,8 @@ class Workspace:
             lower, upper = self._finite(lower), self._finite(upper)
         self.solver.update_data_vec(q, lower, upper)
         self.solver.update_data_mat(values, None, None, None)
+        if lower is None:  # the workspace is kept: what it has solved before shall not show
+            self.solver.warm_start(self._zero, None)
 
     def polish(self, wanted: bool) -> None:
         """Whether OSQP solves for its active set exactly."""
@@ -104,29 +108,29 @@ class Programme:
 
         The answers are checked together; one that fails is solved again and repaired, and is NaN where that fails too.
         """
-        dx, nothing = np.empty_like(q), np.empty(0)
-        half.data[:] = values[0]
-        workspace = self._set(half, q[0], nothing, nothing)
+        dx, nothing, structure = np.empty_like(q), np.empty(0), _raw(half)
+        workspace = unbounded(*structure, get_ident())
         for b, now in enumerate(values):
             workspace.update(now, q[b])
             dx[b] = self._solve(workspace).x
-        weight, force = self._product(half, values, dx)
+        weight, force = self._product(structure, values, dx)
         for b in np.flatnonzero(~self._stationary(force + q, weight, q, dx)).tolist():
-            half.data[:] = values[b]
             try:
-                dx[b] = self.solve(half, q[b], nothing, nothing)
+                dx[b] = self.solve(filled(half, values[b]), q[b], nothing, nothing)
             except np.linalg.LinAlgError:
                 dx[b] = np.nan
         return dx
 
     def _set(self, half: Any, q: Floats, lower: Floats, upper: Floats) -> Workspace:
+        if not self._rows.shape[0]:
+            workspace = unbounded(*_raw(half), get_ident())
+            workspace.update(half.data, q)
+            return workspace
         if self._workspace is None:
             self._workspace = Workspace(half, q, self._rows, lower, upper)
-        elif self._rows.shape[0]:
+        else:
             self._polish(self._workspace, False)
             self._workspace.update(half.data, q, lower, upper)
-        else:
-            self._workspace.update(half.data, q)
         return self._workspace
 
     def _solve(self, workspace: Workspace) -> Any:
@@ -142,7 +146,7 @@ class Programme:
 
     def _holds(self, half: Any, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
-        weight, force = self._product(half, half.data[None], dx[None])
+        weight, force = self._product(_raw(half), half.data[None], dx[None])
         if not self._stationary(force + q + self._rows.T @ y, weight, q[None], dx[None])[0]:
             return False
         weak = self._tolerance * _size(weight, q[None], dx[None])[0]
@@ -151,9 +155,9 @@ class Programme:
         pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
         return bool(np.all(kept & pushed))
 
-    def _product(self, half: Any, values: Floats, dx: Floats) -> tuple[Floats, Floats]:
+    def _product(self, structure: tuple[bytes, bytes], values: Floats, dx: Floats) -> tuple[Floats, Floats]:
         """Diagonal of P and P dx, (B, n)."""
-        own, diagonal, entry, of, into = _places(*(a.astype(np.int32).tobytes() for a in (half.indices, half.indptr)))
+        own, diagonal, entry, of, into = _places(*structure)
         weight = np.zeros_like(dx)
         weight[:, own] = values[:, diagonal]
         return weight, (into @ (values[:, entry] * dx[:, of]).T).T
@@ -169,6 +173,30 @@ def _short(matrix: Any) -> Any:
     found = copy(matrix)
     found.indices, found.indptr = (a.astype(np.int32, copy=False) for a in (matrix.indices, matrix.indptr))
     return found
+
+
+@lru_cache(maxsize=64)
+def unbounded(indices: bytes, indptr: bytes, thread: int) -> Workspace:
+    """The workspace without bounds of a structure of P, set up once, its own for each thread; the values are I."""
+    from scipy.sparse import csc_matrix
+
+    row, start = np.frombuffer(indices, np.int32), np.frombuffer(indptr, np.int32)
+    size = len(start) - 1
+    identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
+    half = csc_matrix((identity, row, start), shape=(size, size))
+    return Workspace(half, np.zeros(size), csc_matrix((0, size)), np.empty(0), np.empty(0))
+
+
+def filled(half: Any, values: Floats) -> Any:
+    """The sparse matrix with other values in its places."""
+    found = copy(half)  # shares the structure
+    found.data = values
+    return found
+
+
+def _raw(half: Any) -> tuple[bytes, bytes]:
+    """The structure of P as a key."""
+    return half.indices.astype(np.int32).tobytes(), half.indptr.astype(np.int32).tobytes()
 
 
 def _size(weight: Floats, q: Floats, dx: Floats) -> Floats:

@@ -1,0 +1,79 @@
+"""Small problems as one matrix: against numpy.linalg, a Jacobian by differences, and the blocks of larger ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopoc.optimize import Loss, Problem, pose, solve
+from coopoc.optimize.assess import assess
+from coopoc.optimize.dense import NUMBERS, damped_step, diagonal_blocks, is_small, normal_matrix
+
+
+def plane() -> Problem:
+    """Poses and a landmark in the plane, one pose held, one robust factor."""
+    rng = np.random.default_rng(0)
+    x0 = np.concatenate([pose(rng.normal(size=(3, 2)) * 5, rng.normal(size=3)), pose(rng.normal(size=(1, 2)) * 9)])
+    problem = Problem("abcm", dimension=2, poses=range(3), x0=x0, held=(0,))
+    steps = pose(rng.normal(size=(2, 2)), rng.normal(size=2))
+    problem = problem.add("relative_pose", [(0, 1), (2, 1)], steps, std=[0.3, 0.2, 0.1])
+    problem = problem.add("range", [(0, 2), (3, 1)], [[4.0], [6.0]], std=0.5, loss=Loss("huber", 1.0))
+    return problem.add("bearing", [(0, 3), (2, 3)], [[0.3], [1.0]], std=0.1)
+
+
+def space() -> Problem:
+    rng = np.random.default_rng(1)
+    names = [f"v{k}" for k in range(NUMBERS // 3)]
+    problem = Problem(names, x0=rng.normal(size=(len(names), 3)) * 20, hub=(0,))
+    problem = problem.add("position", names, problem.x0 + rng.normal(size=problem.x0.shape), std=[1.0, 2.0, 3.0])
+    root = np.tril(rng.normal(size=(3, 3))) + 2 * np.eye(3)
+    problem = problem.add("displacement", ("v3", "v0"), [9, 9, 0], sqrt_information=root)
+    return problem.add("spherical", [("v0", "v1"), ("v2", "v0")], [[20, 0.3, 1.5], [9, 2, 1.6]], std=[1.0, 0.1, 0.1])
+
+
+def differences(problem: Problem, x: np.ndarray) -> np.ndarray:
+    """Jacobian (rows, n dof) of the whitened residuals by central differences; for Huber's, at its fixed weight."""
+    free = np.ones((len(x), problem.space.dof), bool) if problem.free is None else problem.free
+    columns = []
+    for place in np.ndindex(free.shape):
+        step = np.zeros(free.shape)
+        step[place] = 1e-6 * free[place]
+        up, down = (problem.whiten(problem.space.retract(x, s))[0] for s in (step, -step))
+        columns.append((up - down) / 2e-6)
+    return np.stack(columns, axis=1)
+
+
+@pytest.mark.parametrize("make", [plane, space])
+def test_the_matrix_and_the_gradient(make: object) -> None:
+    problem = make()
+    assert is_small(problem)
+    assert not is_small(problem.having(names=(*problem.names, *"abcdefghijklmnopqrstuvwxyz")))
+    x = np.asarray(problem.x0)
+    residual, jacobian = problem.whiten(x)
+    if make is space:
+        assert jacobian.toarray() == pytest.approx(differences(problem, x), abs=1e-5)
+    still = np.zeros(jacobian.shape[1]) if problem.free is None else ~problem.free.ravel()
+    J = jacobian.toarray()
+    matrix, gradient = normal_matrix(problem, problem.linearise(x[None]))
+    assert matrix == pytest.approx(J.T @ J + np.diag(still), rel=1e-12, abs=1e-12)
+    assert gradient == pytest.approx(J.T @ residual, rel=1e-12, abs=1e-12)
+    damping = np.abs(np.random.default_rng(2).normal(size=(1, *x.shape[:1], problem.space.dof)))
+    tall = np.concatenate([J, np.diag(np.sqrt(damping.ravel() + still))])
+    wanted = np.linalg.lstsq(tall, -np.concatenate([residual, np.zeros(len(still))]))[0]
+    assert damped_step(problem, problem.linearise(x[None]), damping).ravel() == pytest.approx(wanted, abs=1e-9)
+    own, inverse = diagonal_blocks(matrix, len(x))
+    assert inverse @ matrix == pytest.approx(np.eye(len(matrix)), abs=1e-9)
+    second = slice(problem.space.dof, 2 * problem.space.dof)
+    assert own[1] == pytest.approx(inverse[second, second])
+
+
+def test_one_matrix_and_blocks_assess_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    for problem in (plane(), space()):
+        x = solve(problem).x
+        whole = assess(problem, x)
+        monkeypatch.setattr("coopoc.optimize.dense.NUMBERS", 0)
+        blocks = assess(problem, x)
+        monkeypatch.undo()
+        assert whole.covariance == pytest.approx(blocks.covariance, rel=1e-9, abs=1e-12)
+        assert (whole.cost, whole.gradient) == pytest.approx((blocks.cost, blocks.gradient), abs=1e-9)
+        assert whole.remaining == pytest.approx(blocks.remaining, abs=1e-9)
