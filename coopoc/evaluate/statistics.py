@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy import stats
@@ -110,16 +111,25 @@ def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
 
 def _resampled(values: Floats, resamples: int, seed: int) -> Floats:
     """(resamples,) means; the same draws for any values of one shape, so pairs stay pairs."""
-    egos, runs = values.shape
-    rng = np.random.default_rng(seed)
-    step = max(1, _CHUNK // values.size)
-    means = []
+    flat, step = values.ravel(), max(1, _CHUNK // values.size)
+    counts = _counts(*values.shape, resamples, seed)
+    sums = [counts[k : k + step].astype(float) @ flat for k in range(0, resamples, step)]
+    return np.concatenate(sums) / values.size
+
+
+@lru_cache(maxsize=2)
+def _counts(egos: int, runs: int, resamples: int, seed: int) -> AnyArray:
+    """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each."""
+    size, rng = egos * runs, np.random.default_rng(seed)
+    found = np.empty((resamples, size), dtype=np.uint16 if size < 2**16 else np.uint32)
+    step = max(1, _CHUNK // size)
     for start in range(0, resamples, step):
         count = min(step, resamples - start)
         ego = rng.integers(egos, size=(count, egos, 1)) if egos > 1 else np.zeros((count, 1, 1), dtype=np.int64)
         run = rng.integers(runs, size=(count, egos, runs))
-        means.append(values[ego, run].mean(axis=(1, 2)))
-    return np.concatenate(means)
+        place = (np.arange(count)[:, None, None] * egos + ego) * runs + run
+        found[start : start + count] = np.bincount(place.ravel(), minlength=count * size).reshape(count, size)
+    return found
 
 
 def _interval(resampled: Floats, mean: float, values: Floats, level: float) -> Interval:
