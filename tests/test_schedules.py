@@ -16,7 +16,7 @@ from coopoc.methods.gbp import GaussianBeliefPropagation
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
 from coopoc.world.informative import UNKNOWN, MostInformative
-from coopoc.world.schedules import order
+from coopoc.world.schedules import Nearest, order, within_cap
 from coopoc.world.spherical import vector_cov
 from coopoc.world.v2x import ESTIMATE, FIX_AND_VELOCITY, Message, Schedule
 
@@ -44,6 +44,19 @@ def test_the_token_bucket_by_hand() -> None:
     assert heard_steps(pair, bytes_per_second=0.0) == []
     assert heard_steps(pair, bytes_per_second=320.0) == list(range(20))
     assert heard_steps(pair, bytes_per_second=100.0, latency=0.2) == [0, 1, 2, 3, 6, 10, 13, 16]  # two are on their way
+
+
+def test_the_compiled_bucket_is_the_reference(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Messages of many sizes, so that a later one may fit where an earlier one did not."""
+    channel, rng = V2X(4, loss=0.3, latency=0.1, bytes_per_second=900.0), np.random.default_rng(0)
+    seen = observe(crossing, S2, channel, runs=5)
+    link = seen.links.of(0)
+    size, start = rng.integers(10, 90, len(link)), np.searchsorted(seen.links.step[link], np.arange(len(seen.t) + 1))
+    given = (seen.arrival[:, link], size, start, seen, Nearest())
+    found = within_cap(*given)
+    monkeypatch.setenv("COOPOC_KERNELS", "numpy")
+    np.testing.assert_array_equal(found, within_cap(*given))
+    assert 0.2 < (found >= 0).mean() < 0.9 * (seen.arrival[:, link] >= 0).mean()
 
 
 def by_hand(seen: Recording, ego: int, size: int) -> list[set[tuple[int, int]]]:

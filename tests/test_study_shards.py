@@ -169,7 +169,7 @@ def test_a_cell_with_two_sets_of_numbers_is_named(study: Study, tmp_path: Path) 
     own = {*store.OWN_COLUMNS, *cell.params}
     merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "same")
     changed = [{k: v for k, v in row.items() if k not in own} | {"rt_le_m": row["rt_le_m"] + 1e-12} for row in rows]
-    store.save(tmp_path / "b/small", cell, changed, 1.0)
+    store.save(tmp_path / "b/small", cell, store.to_table(changed), 1.0)
     with pytest.warns(RuntimeWarning, match=f"cell {cell.name} has other numbers in .*b/small than in .*a/small"):
         merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "all")
     kept = store.load(tmp_path / "all/small", cell.name)

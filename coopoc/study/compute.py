@@ -12,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
+import pyarrow as pa
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import process_executor
 from threadpoolctl import threadpool_limits
@@ -39,7 +40,7 @@ class Outcome:
     """What a worker returns: rows, or the reason why there are none."""
 
     cell: Cell
-    rows: list[Row]
+    rows: pa.Table | None
     reason: str
     trace: str
     seconds: float
@@ -70,11 +71,10 @@ def attempt(function: Function, cell: Cell) -> Outcome:
     start = time.perf_counter()
     try:
         with threadpool_limits(limits=1):
-            rows = [dict(row) for row in function(cell.given)]
-        _check(rows, cell)
+            rows = _checked(function(cell.given), cell)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        return Outcome(cell, [], reason, traceback.format_exc(), time.perf_counter() - start)
+        return Outcome(cell, None, reason, traceback.format_exc(), time.perf_counter() - start)
     return Outcome(cell, rows, "", "", time.perf_counter() - start)
 
 
@@ -103,10 +103,11 @@ def _in_worker(function: Function, cell: Cell, parent: int) -> Outcome:
     return attempt(function, cell)
 
 
-def _check(rows: Sequence[Row], cell: Cell) -> None:
+def _checked(rows: Sequence[Row], cell: Cell) -> pa.Table:
     if not rows:
         raise InputError("rows", "none", "a cell must return at least one row", "Return one dict per run and ego.")
-    taken = {name for row in rows for name in row} & {*cell.params, *store.OWN_COLUMNS}
+    table = store.to_table(rows)
+    taken = {*table.column_names} & {*cell.params, *store.OWN_COLUMNS}
     if taken:
         raise InputError("rows", sorted(taken), "must not repeat a parameter", "The engine adds those columns.")
-    store.to_table(rows)
+    return table

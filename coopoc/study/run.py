@@ -133,11 +133,11 @@ def _work(
 
 
 def _keep(folder: Path, outcome: Outcome) -> bool:
-    if outcome.reason:
+    if outcome.rows is None:
         store.save_failure(folder, outcome.cell, outcome.reason, outcome.trace, outcome.seconds)
     else:
         store.save(folder, outcome.cell, outcome.rows, outcome.seconds)
-    return not outcome.reason
+    return outcome.rows is not None
 
 
 def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:

@@ -64,10 +64,12 @@ def content(path: Path, absent: str, mend: str) -> dict[str, Any]:
     return found
 
 
-def save(folder: Path, cell: Cell, rows: Sequence[Row], seconds: float) -> None:
+def save(folder: Path, cell: Cell, rows: pa.Table, seconds: float) -> None:
     """Keep the rows of a finished cell, and forget that it failed before."""
     own = {"cell": cell.name, "status": "ok", "reason": "", "cell_seconds": seconds}
-    table = to_table([{**cell.params, **row, **own} for row in rows])
+    before, after = ({name: pa.repeat(pa.scalar(value), rows.num_rows) for name, value in each.items()}
+                     for each in (cell.params, own))  # fmt: skip
+    table = pa.table({**before, **dict(zip(rows.column_names, rows.columns, strict=True)), **after})
     write(_finished(folder, cell.name), lambda file: pq.write_table(table, file))
     _failed(folder, cell.name).unlink(missing_ok=True)
 

@@ -99,9 +99,12 @@ class Recording:
         """
         parts = {name: getattr(self, name)[runs] for name in ("gnss", "velocity", "relative", "arrival")}
         found = replace(self, **parts)
-        if self.complete:
-            vars(found)["complete"] = True  # as each of its runs is
-        return found
+        return found.known_complete() if self.complete else found
+
+    def known_complete(self) -> Recording:
+        """Itself, told that it is `complete` by who knows without a look through all runs."""
+        vars(self)["complete"] = True
+        return self
 
     @cached_property
     def complete(self) -> bool:

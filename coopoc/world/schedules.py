@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..kernels.compile import use_kernels
 from .informative import MostInformative
 from .recording import Recording
 from .v2x import Message
@@ -95,8 +96,14 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, recording: Recording, hea
     cap = recording.v2x.bytes_per_second
     if not np.isfinite(cap) or not size.any():
         return arrival
-    kept, depth = np.full_like(arrival, -1), max(cap, int(size.max())) if cap else 0.0
-    tokens, last = np.full(len(arrival), float(depth)), 0
+    depth = float(max(cap, int(size.max()))) if cap else 0.0
+    if isinstance(heard_by, Nearest) and use_kernels():
+        from ..kernels.bucket import nearest_first
+
+        there, bytes_, first = (np.ascontiguousarray(values, dtype=np.int64) for values in (arrival, size, start))
+        return nearest_first(there, bytes_, first, cap * recording.dt, depth)
+    kept = np.full_like(arrival, -1)
+    tokens, last = np.full(len(arrival), depth), 0
     for t, span in enumerate(map(slice, start[:-1].tolist(), start[1:].tolist())):
         heard_by.see(t, span)
         left = arrival[:, span] >= 0

@@ -63,7 +63,7 @@ def observe(
     links = find_links(fleet, columns, v2x.max_neighbours, v2x.radius, sensors.min_range)
     broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
     drawn, key = (fleet, sensors, runs, seed), (fleet, repr(sensors), runs, seed)
-    return Recording(
+    seen = Recording(
         ids=fleet.ids, t=fleet.t,
         gnss=_once(("gnss", *key), lambda: _gnss(*drawn)),
         velocity=_once(("velocity", *key), lambda: _velocity(*drawn)),
@@ -71,6 +71,8 @@ def observe(
         broadcasts=broadcasts, arrival=arrival,
         sensors=assumed or sensors.without_bias(), v2x=v2x, observers=tuple(columns),
     )  # fmt: skip
+    everywhere = (np.isfinite(fleet.position) | np.isnan(fleet.velocity)).all()
+    return seen.known_complete() if everywhere else seen
 
 
 def find_links(fleet: Fleet, observers: Sequence[int], most: int, radius: float, min_range: float = 0.0) -> Links:
