@@ -48,7 +48,7 @@ def test_the_token_bucket_by_hand() -> None:
 
 def test_the_compiled_bucket_is_the_reference(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
     """Messages of many sizes, so that a later one may fit where an earlier one did not."""
-    channel, rng = V2X(4, loss=0.3, latency=0.1, bytes_per_second=900.0), np.random.default_rng(0)
+    channel, rng = V2X(4, loss=0.3, latency=0.1, bytes_per_second=500.0), np.random.default_rng(0)
     seen = observe(crossing, S2, channel, runs=5)
     link = seen.links.of(0)
     size, start = rng.integers(10, 90, len(link)), np.searchsorted(seen.links.step[link], np.arange(len(seen.t) + 1))
