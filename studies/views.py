@@ -36,7 +36,7 @@ def present(results: Results, where: Mapping[str, Any], value: str = "rt_le_m") 
         kept = kept & rows[name].isin(wanted).to_numpy()
     if not kept.any():
         return None
-    ran = {name: set(rows[name][kept]) for name in lists}
+    ran = {name: set(rows[name][kept].unique()) for name in lists}
     return {name: [v for v in wanted if v in ran[name]] for name, wanted in lists.items()}
 
 

@@ -116,7 +116,7 @@ def _fitted(clients: str, reading: VelocityReading) -> Knowledge:
 
 def trained(results: Results) -> list[str]:
     """The trained methods that a study has run."""
-    ran = set(results.frame.get("method", ()))
+    ran = set(results.frame["method"].unique()) if "method" in results.frame else set()
     return [name for name in LEARNED if name in ran]
 
 

@@ -21,6 +21,8 @@ PAIRS = 2_000_000
 """Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
 GRID = 1000
 """Cells along each side of the ground, at most."""
+VECTOR = np.dtype((np.void, 24))
+"""Three numbers."""
 _alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()
 """Draws of recordings that still exist, by all that they depend on: the next K or channel need not draw them again."""
 
@@ -131,24 +133,24 @@ def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:
     return found
 
 
-def _normals(fleet: Fleet, sensor: str, run: int, seed: int, scratch: Floats) -> Floats:
-    """(T, N, 3) standard normals, one stream per vehicle; a view of the scratch (N, T, 3)."""
-    for name, drawn in zip(fleet.ids, scratch, strict=True):
-        stream(seed, sensor, run, name).standard_normal(out=drawn)
-    return scratch.swapaxes(0, 1)
-
-
-def _scratch(fleet: Fleet) -> Floats:
-    return np.empty((len(fleet.ids), len(fleet.t), 3))
+def _noisy(fleet: Fleet, sensor: str, runs: int, seed: int, mean: Floats, std: Floats) -> Floats:
+    """(R, T, N, 3): mean (T, N, 3) and std, broadcastable to it, times standard normals, one stream per vehicle."""
+    centre, scale = (np.ascontiguousarray(np.broadcast_to(a, mean.shape).swapaxes(0, 1)) for a in (mean, std))
+    found, drawn = np.empty((runs, *mean.shape)), np.empty_like(centre)
+    for r in range(runs):  # one after the other stays in the cache
+        for name, normals in zip(fleet.ids, drawn, strict=True):
+            stream(seed, sensor, r, name).standard_normal(out=normals)
+        drawn *= scale
+        drawn += centre
+        found[r].view(VECTOR)[..., 0] = drawn.view(VECTOR)[..., 0].T  # three numbers at a time
+    return found
 
 
 def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    fixes, scratch = np.empty((runs, *fleet.position.shape)), _scratch(fleet)
+    fixes = _noisy(fleet, "gnss", runs, seed, fleet.position, np.array(sensors.gnss_std))
     low, high = sensors.gnss_bias
     steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
-    for r in range(runs):  # one after the other stays in the cache
-        np.multiply(_normals(fleet, "gnss", r, seed, scratch), np.array(sensors.gnss_std), out=fixes[r])
-        fixes[r] += fleet.position
+    for r in range(runs):
         if high > 0:
             bias = [stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3)) for name in fleet.ids]
             fixes[r] += np.stack(bias, axis=1)
@@ -177,12 +179,7 @@ def gauss_markov(normals: Floats, steps: float) -> Floats:
 
 
 def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    velocity, scratch = np.empty((runs, *fleet.velocity.shape)), _scratch(fleet)
-    std = sensors.velocity_std(fleet.velocity)
-    for r in range(runs):
-        np.multiply(_normals(fleet, "velocity", r, seed, scratch), std, out=velocity[r])
-        velocity[r] += fleet.velocity
-    return velocity
+    return _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
 
 
 def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
