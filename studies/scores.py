@@ -9,7 +9,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.evaluate.ledger import Kind, Way, of_track
-from coopoc.evaluate.metrics import errors, nees, neighbour_rt_le, share_of_average
+from coopoc.evaluate.metrics import distance, errors, nees, neighbour_rt_le, share_of_average
 from coopoc.methods.track import Method, Track
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
@@ -77,13 +77,13 @@ def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
 
 
 def _of(track: Track, recording: Recording, method: Method, drive: Fleet, quantiles: int) -> Scores:
-    distance, mine = errors(track, drive), list(track.egos)
-    level = np.sqrt((distance**2).mean(axis=1))
-    fixes = np.sqrt(((recording.gnss[:, :, mine] - drive.position[:, mine]) ** 2).sum(axis=-1).mean(axis=1))
+    error, mine = errors(track, drive), list(track.egos)
+    level = np.sqrt((error**2).mean(axis=1))
+    fixes = np.sqrt((distance(recording.gnss.take(mine, axis=2), drive.position[:, mine]) ** 2).mean(axis=1))
     account = of_track(track, recording, method.message)
     columns = {
         "rt_le_m": level,
-        "max_error_m": distance.max(axis=1),
+        "max_error_m": error.max(axis=1),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
         **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
         "worse_than_gnss": (level > 1.001 * fixes).astype(float),
@@ -91,6 +91,6 @@ def _of(track: Track, recording: Recording, method: Method, drive: Fleet, quanti
     found = None if track.covariance is None else nees(track, drive)
     if found is not None:
         columns["nees"] = np.nanmean(found, axis=1)
-    levels = np.moveaxis(np.quantile(distance, np.linspace(0, 1, quantiles), axis=1), 0, -1) if quantiles else (
+    levels = np.moveaxis(np.quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1) if quantiles else (
         np.empty((*level.shape, 0)))  # fmt: skip
     return Scores(columns, levels, track.seconds, None if found is None else found.sum(axis=0))

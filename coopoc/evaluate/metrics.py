@@ -7,6 +7,7 @@ from scipy import stats
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.compile import use_kernels
 from ..methods.track import Track
 from ..world.fleet import Fleet
 from ..world.recording import Recording
@@ -19,8 +20,21 @@ def errors(track: Track, fleet: Fleet) -> Floats:
             "track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps",
             "Score a track against the fleet that its recording was observed from.",
         )  # fmt: skip
-    x, y, z = np.moveaxis(track.x - fleet.position[:, list(track.egos)], -1, 0)
-    return np.asarray(np.sqrt(x * x + y * y + z * z))
+    return distance(track.x, fleet.position[:, list(track.egos)])
+
+
+def distance(x: Floats, truth: Floats) -> Floats:
+    """(R, T, E) m between estimates (R, T, E, 3) and the truth (T, E, 3).
+
+    >>> distance(np.zeros((1, 1, 1, 3)), np.array([[[1.0, 2.0, 2.0]]])).item()
+    3.0
+    """
+    if use_kernels():
+        from ..kernels.scores import distances
+
+        return distances(np.ascontiguousarray(x), np.ascontiguousarray(truth))
+    a, b, c = np.moveaxis(x - truth, -1, 0)
+    return np.asarray(np.sqrt(a * a + b * b + c * c))
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
@@ -50,6 +64,10 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     mine = [recording.links.of(ego) for ego in track.egos]
     links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
+    if use_kernels():
+        from ..kernels.scores import root_mean_squares
+
+        return root_mean_squares(np.ascontiguousarray(track.neighbours), truth, ends)
     for run, theirs in enumerate(track.neighbours):  # a run at a time stays in the cache
         x, y, z = (theirs - truth).T
         square = x * x + y * y + z * z
@@ -70,7 +88,16 @@ def nees(track: Track, fleet: Fleet) -> Floats:
         raise InputError(
             "covariance", None, "this method claims none", "NEES needs a method that reports a covariance."
         )
-    truth, found = fleet.position[:, list(track.egos)], np.empty(track.x.shape[:-1])
+    truth = fleet.position[:, list(track.egos)]
+    if use_kernels():
+        from ..kernels.scores import normalised
+
+        arrays = (np.ascontiguousarray(values) for values in (track.x, truth, track.covariance))
+        values, sound = normalised(*arrays)
+        if not sound:
+            raise np.linalg.LinAlgError("Singular covariance")
+        return values
+    found: Floats = np.empty(track.x.shape[:-1])
     for run, (x, cov) in enumerate(zip(track.x, track.covariance, strict=True)):  # a run at a time stays in the cache
         found[run] = _normalised(x - truth, cov)
     return found

@@ -1,0 +1,47 @@
+"""Errors and NEES of tracks: the compiled pass against NumPy's own solve, and against the reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopoc import V2X, Fleet, JointFilter, Kalman, Sensors, Track, observe
+from coopoc.evaluate.metrics import errors, nees, neighbour_rt_le
+
+S2 = Sensors.paper_scenario2()
+
+
+@pytest.fixture
+def track(crossing: Fleet) -> Track:
+    return JointFilter()(observe(crossing, S2, V2X(max_neighbours=4), runs=3), [0, 5])
+
+
+def test_errors_and_nees_are_numpys(track: Track, crossing: Fleet) -> None:
+    gap = track.x - crossing.position[:, [0, 5]]
+    np.testing.assert_allclose(errors(track, crossing), np.linalg.norm(gap, axis=-1), rtol=1e-14)
+    solved = np.linalg.solve(track.covariance, gap[..., None])[..., 0]
+    np.testing.assert_allclose(nees(track, crossing), (gap * solved).sum(axis=-1), rtol=1e-9)
+
+
+def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root mean square over the links that the ego knows something of, NaN without any."""
+    seen = observe(crossing, S2, V2X(max_neighbours=4, loss=0.5, max_age=0.2), runs=3)
+    theirs = track.neighbours.copy()
+    theirs[1, ::3], theirs[2] = np.nan, np.nan
+    partly = Track(track.t, track.egos, track.x, None, track.received_bytes, track.sent_bytes, 0.0, theirs)
+    found = neighbour_rt_le(partly, seen, crossing)
+    links = seen.links.of(0)
+    gap = theirs[1, : len(links)] - crossing.position[seen.links.step[links], seen.links.neighbour[links]]
+    assert found[1, 0] == pytest.approx(np.sqrt(np.nanmean((gap**2).sum(axis=-1))), rel=1e-13)
+    assert np.isnan(found[2]).all()
+    monkeypatch.setenv("COOPOC_KERNELS", "numpy")
+    np.testing.assert_allclose(found, neighbour_rt_le(partly, seen, crossing), rtol=1e-13)
+
+
+def test_a_start_that_is_known_has_no_nees(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = Kalman("nominal", x0=crossing.position[0, [0]])(observe(crossing, S2, runs=2), [0])
+    found = nees(known, crossing)
+    assert np.isnan(found[:, 0]).all()
+    assert np.isfinite(found[:, 1:]).all()
+    monkeypatch.setenv("COOPOC_KERNELS", "numpy")
+    np.testing.assert_allclose(found, nees(known, crossing), rtol=1e-12)
