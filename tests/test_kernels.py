@@ -17,8 +17,9 @@ from scipy.optimize import least_squares
 
 from coopoc import V2X, CooperativeMAP, Fleet, InputError, JointFilter, Knowledge, Recording, Sensors, observe
 from coopoc.kernels import compile as kernels
+from coopoc.methods.lkf_sa import LaplacianKalman
 from coopoc.methods.star import assumed_arrays, measured_arrays
-from coopoc.methods.track import Track
+from coopoc.methods.track import Method, Track
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -71,6 +72,19 @@ def test_the_filter_is_the_reference_with_little_and_with_constant_process_noise
     recording = observe(fleet, S2, V2X(max_neighbours=4, loss=0.2), runs=2)
     method = JointFilter(known)
     assert_same(method(recording, [1]), in_numpy(monkeypatch, method, recording, [1]))
+
+
+@pytest.mark.parametrize("method", [JointFilter(), LaplacianKalman("nominal"), CooperativeMAP(window=3)], ids=lambda m: m.name)
+def test_noise_that_grows_with_the_speed_is_the_reference(
+    crossing: Fleet, method: Method, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernels make the process noise from the measured velocity themselves, in a run alone and in five abreast."""
+    for runs in (1, 5):
+        noisy = replace(S2, velocity_reading="speed", velocity_floor=0.5)
+        recording = observe(crossing.between(0, 20), noisy, V2X(4, loss=0.2, latency=0.1, max_age=0.5), runs=runs)
+        found, wanted = method(recording, [0]), in_numpy(monkeypatch, method, recording, [0])
+        np.testing.assert_allclose(found.x, wanted.x, atol=1e-7, rtol=0)
+        np.testing.assert_allclose(found.covariance, wanted.covariance, atol=1e-6)
 
 
 def test_vehicles_that_appear_and_vanish(monkeypatch: pytest.MonkeyPatch, crossing: Fleet) -> None:

@@ -67,10 +67,16 @@ def summing(function: Function) -> Function:
     return cast(Function, _made(function, {"contract", "reassoc"}))
 
 
-def _made(function: Function, liberties: set[str]) -> Any:
+def inside(function: Function) -> Function:
+    """Compiled as `as_written` is, and copied into whoever calls it: a call would hand over every number that describes
+    an array, which takes longer than to read three of its elements."""
+    return cast(Function, _made(function, set(), forceinline=True))
+
+
+def _made(function: Function, liberties: set[str], forceinline: bool = False) -> Any:
     import numba
 
-    return numba.njit(nogil=True, error_model="numpy", fastmath=liberties)(function)
+    return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, forceinline=forceinline)(function)
 
 
 def _kept(made: Any, function: Function) -> Function:

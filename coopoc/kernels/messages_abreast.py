@@ -8,12 +8,12 @@ from numpy import uint64
 
 from ..arrays import AnyArray
 from .abreast import choose, pack, put, take
-from .compile import as_written
+from .compile import inside
 from .lanes import LANES
-from .star_messages import three_of
+from .star_messages import paced, three_of
 
 
-@as_written
+@inside
 def tell(
     measured: Any, assumed: Any, runs: Any, t: int, k: int, member: int, held: AnyArray, motion: AnyArray
 ) -> None:  # fmt: skip
@@ -38,10 +38,8 @@ def tell(
         i, j, m, to = uint64(run), uint64(when), uint64(member), at + uint64(lane)
         p, q, r = three_of(assumed[0], i, j, m)
         a, b, c = three_of(assumed[1], i, j, m)
-        u, v, w = velocity[i, j, m, zero], velocity[i, j, m, one], velocity[i, j, m, two]
-        motion[to] = u if there else 0.0
-        motion[to + width] = v if there else 0.0
-        motion[to + two * width] = w if there else 0.0
+        motion[to], motion[to + width] = velocity[i, j, m, zero], velocity[i, j, m, one]
+        motion[to + two * width] = velocity[i, j, m, two]
         to += uint64(3) * width
         motion[to], motion[to + width], motion[to + two * width] = p, q, r
         to += uint64(3) * width
@@ -49,19 +47,26 @@ def tell(
         motion[to + two * width] = gnss[i, j, m, two]
         to += uint64(3) * width
         motion[to], motion[to + width], motion[to + two * width] = a, b, c
-    uses, age, there_, new = numbers(held, 1, k), numbers(held, 2, k), numbers(held, 3, k), numbers(held, 4, k)
+    pace, first = assumed[6], uint64(12 * k)
+    uses, age, held_, new = numbers(held, 1, k), numbers(held, 2, k), numbers(held, 3, k), numbers(held, 4, k)
     late, often = dt * dt * age * assumed[5], 2.0 * uses - 1.0
     late = late * late
+    if len(pace):
+        u, v, w = take(motion, first), take(motion, first + one), take(motion, first + two)
+        p, q, r = paced(pace, u, v, w, dt)
+        put(motion, first + uint64(3), p)
+        put(motion, first + uint64(4), q)
+        put(motion, first + uint64(5), r)
     for c in range(3):
-        to = uint64(12 * k + c)
-        moved, spread = dt * take(motion, to), take(motion, to + uint64(3)) + late
+        to = first + uint64(c)
+        moved, spread = choose(held_, dt * take(motion, to), 0.0 * age), take(motion, to + uint64(3)) + late
         put(motion, to, moved)
-        put(motion, to + uint64(3), choose(there_, often * spread, 0.0 * often + assumed[4]))
+        put(motion, to + uint64(3), choose(held_, often * spread, 0.0 * often + assumed[4]))
         put(motion, to + uint64(6), take(motion, to + uint64(6)) + age * moved)
         put(motion, to + uint64(9), new / (take(motion, to + uint64(9)) + age * age * spread))
 
 
-@as_written
+@inside
 def numbers(held: AnyArray, what: int, k: int) -> Any:
     """The vector of one row of `held`."""
     return pack(held[what, k, 0], held[what, k, 1], held[what, k, 2], held[what, k, 3])

@@ -14,7 +14,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray, Ints
 from .compile import compiled
-from .star_messages import three_of
+from .star_messages import process_of, three_of
 
 MOVED, PROCESS, FIX, WEIGHT, AHEAD = range(5)
 """Rows of what is said of a member: motion m, its variance m^2, fix m, its information 1/m^2 where it is new, and the
@@ -63,7 +63,7 @@ def tell(
             the step before. said: (5, n or more, 3 runs), filled.
     """
     gnss, velocity, seen, neighbour, start, newest, fresh, ego, dt = measured
-    variance, fixes, _, _, forgotten, acceleration = assumed
+    variance, fixes, _, _, forgotten, acceleration, pace = assumed
     runs, wide = held.shape[2], uint64(held.shape[2])
     for k in range(len(place)):
         link = start[t] + k - 1
@@ -77,8 +77,8 @@ def tell(
             age, new, often = t - when, k == 0 or fresh[run, link], 2 * uses - 1
             late = (dt * dt * age * acceleration) ** 2
             i, j = uint64(when), uint64(member)
-            one, noise = three_of(variance, run, i, j), three_of(fixes, run, i, j)
             u, fix = three_of(velocity, run, i, j), three_of(gnss, run, i, j)
+            one, noise = process_of(variance, pace, u, dt, run, i, j), three_of(fixes, run, i, j)
             for c in range(3):
                 moved, spread = dt * u[c] if sent >= 0 else 0.0, one[c] + late
                 said[MOVED, at, lane] = moved

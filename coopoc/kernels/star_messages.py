@@ -5,17 +5,19 @@ The arguments of all kernels of a star travel in plain tuples, which numba's cac
     measured: gnss, velocity (R, T, N, 3) m, m/s; seen (R, M, 5) of `unfolded`; neighbour (M,); start (T+1,); newest and
         fresh (R, M), of the ego's inbox; ego; dt s.
     assumed: variance of the motion and of a fix, broadcastable to (R, T, N, 3) m^2; std (3,) m, rad, rad, of no length
-        for unit matrices; least range m; variance of who joins m^2; acceleration m/s^2.
+        for unit matrices; least range m; variance of who joins m^2; acceleration m/s^2; pace (3,), `Knowledge.pace`,
+        from which the variance of the motion is made instead, or of no length.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from numpy import uint64
 
 from ..arrays import AnyArray
-from .compile import as_written
+from .compile import as_written, inside
 
 LEAST_PROCESS = 1e-90
 """m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
@@ -57,12 +59,10 @@ def says(measured: Any, assumed: Any, run: int, t: int, member: int, sent: int, 
     age = t - at
     i, j, k = uint64(run), uint64(at), uint64(member)
     x, y, z = three_of(gnss, i, j, k)
-    p, q, r = three_of(assumed[0], i, j, k)
+    u, v, w = three_of(velocity, i, j, k)
+    p, q, r = process_of(assumed[0], assumed[6], (u, v, w), dt, i, j, k)
     a, b, c = three_of(assumed[1], i, j, k)
-    u, v, w = 0.0, 0.0, 0.0
-    if sent >= 0:
-        u, v, w = three_of(velocity, i, j, k)
-        u, v, w = dt * u, dt * v, dt * w
+    u, v, w = (dt * u, dt * v, dt * w) if sent >= 0 else (0.0, 0.0, 0.0)
     if age > 0:
         late = dt * dt * age * acceleration
         p, q, r = p + late * late, q + late * late, r + late * late
@@ -73,7 +73,25 @@ def says(measured: Any, assumed: Any, run: int, t: int, member: int, sent: int, 
     return (u, v, w), spread, (x, y, z), (1.0 / a, 1.0 / b, 1.0 / c) if heard else (0.0, 0.0, 0.0)
 
 
-@as_written
+@inside
+def process_of(variance: AnyArray, pace: AnyArray, velocity: Any, dt: float, run: Any, t: Any, member: Any) -> Any:
+    """Variance of the motion m^2: made from the measured velocity, or looked up."""
+    if len(pace) == 0:
+        return three_of(variance, run, t, member)
+    return paced(pace, velocity[0], velocity[1], velocity[2], dt)
+
+
+@inside
+def paced(pace: AnyArray, u: Any, v: Any, w: Any, dt: float) -> Any:
+    """Variance m^2 of the motion at a measured velocity, of numbers or of vectors."""
+    a, b, c = abs(u), abs(v), abs(w)
+    if pace[2] > 0.0:
+        a = b = c = math.sqrt(u * u + v * v + w * w)
+    a, b, c = dt * max(pace[0] * a, pace[1]), dt * max(pace[0] * b, pace[1]), dt * max(pace[0] * c, pace[1])
+    return a * a, b * b, c * c
+
+
+@inside
 def three_of(values: AnyArray, run: Any, t: Any, member: Any) -> Any:
     """Three of what is broadcastable to (R, T, N, 3)."""
     one = uint64(1)

@@ -91,6 +91,16 @@ class Knowledge:
             np.square(recording.dt * self.sensors.velocity_std(one, floor), out=variance[run])
         return variance
 
+    @property
+    def pace(self) -> Floats:
+        """(3,) what makes the process noise from a measured velocity: ratio, floor m/s, 1 for a ratio of the speed; of
+        no length where it comes from elsewhere."""
+        another = type(self).process_variance is not Knowledge.process_variance
+        if another or self.sensors is None or self.process_std is not None or self.velocity is not None:
+            return np.empty(0)
+        of_speed = float(self.sensors.velocity_reading == "speed")
+        return np.array([self.sensors.velocity_std_ratio, self.sensors.velocity_floor, of_speed])
+
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
         return self.gnss_variance[None, None, None]

@@ -94,9 +94,9 @@ def measured_arrays(recording: Recording, ego: int, box: Inbox) -> tuple[Any, ..
 
 def assumed_arrays(recording: Recording, known: Knowledge) -> tuple[Any, ...]:
     """What is assumed of it, as the tuple `assumed` of `coopoc.kernels.star_messages`."""
-    variance = np.ascontiguousarray(known.process_variance(recording))
-    fixes = np.ascontiguousarray(known.fix_variance(recording))
-    return variance, fixes, *sighting_noise(known), FORGOTTEN, ACCELERATION_STD
+    pace, fixes = known.pace, np.ascontiguousarray(known.fix_variance(recording))
+    variance = np.zeros((1, 1, 1, 3)) if len(pace) else np.ascontiguousarray(known.process_variance(recording))
+    return variance, fixes, *sighting_noise(known), FORGOTTEN, ACCELERATION_STD, pace
 
 
 def sighting_noise(known: Knowledge) -> tuple[Floats, float]:
