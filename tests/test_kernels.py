@@ -74,7 +74,10 @@ def test_the_filter_is_the_reference_with_little_and_with_constant_process_noise
     assert_same(method(recording, [1]), in_numpy(monkeypatch, method, recording, [1]))
 
 
-@pytest.mark.parametrize("method", [JointFilter(), LaplacianKalman("nominal"), CooperativeMAP(window=3)], ids=lambda m: m.name)
+SPEED = [JointFilter(), LaplacianKalman("nominal"), CooperativeMAP(window=3)]
+
+
+@pytest.mark.parametrize("method", SPEED, ids=lambda m: m.name)
 def test_noise_that_grows_with_the_speed_is_the_reference(
     crossing: Fleet, method: Method, monkeypatch: pytest.MonkeyPatch
 ) -> None:
