@@ -16,7 +16,7 @@ from .blocks import eliminate, inverse3, substitute, width
 from .compile import as_written
 from .lanes import LANES, minus_product, subtract
 from .sighting import converted, exact, vector
-from .snapshot import widened
+from .snapshot_step import widened
 from .star_abreast import block
 from .star_filter import add_edge, copy, rearrange
 from .star_messages import LEAST_PROCESS

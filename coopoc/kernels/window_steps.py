@@ -13,7 +13,8 @@ from .chains import LEAST_PROCESS, fold, unfold
 from .compile import compiled
 from .roster import FIX, MOVED, PROCESS
 from .sighting import exact, vector
-from .snapshot import LIMIT, as_measured, widened
+from .snapshot import LIMIT
+from .snapshot_step import as_measured, widened
 
 
 @compiled
