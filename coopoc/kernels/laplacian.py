@@ -14,7 +14,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray, Floats
 from .compile import compiled
-from .roster import AHEAD, FIX, PROCESS, WEIGHT, expect, places, stay, tell
+from .roster import AHEAD, FIX, PROCESS, WEIGHT, expect, places, stay, tell, widest
 
 LEAST_PROCESS = 1e-90
 """m^2; its inverse is still a number, and far beyond any digit that counts."""
@@ -32,7 +32,7 @@ def follow(measured: Any, assumed: Any, alike: bool) -> tuple[Floats, Floats, Fl
     runs, steps, links = measured[0].shape[0], measured[0].shape[1], measured[2].shape[1]
     x, others = np.empty((runs, steps, 3)), np.empty((runs, links, 3))
     variance = np.empty((1 if alike else runs, steps, 3))
-    kept, most = places(measured[3], measured[4]), kept_most(measured[4])
+    kept, most = places(measured[3], measured[4]), widest(measured[4])
     cov = np.zeros((steps if alike else 0, most, most, 3))
     for first in range(0, 1 if alike else runs, BLOCK):
         _block(measured, assumed, kept, first, 1 if alike else min(BLOCK, runs - first), cov, (x, variance, others))
@@ -45,7 +45,7 @@ def follow(measured: Any, assumed: Any, alike: bool) -> tuple[Floats, Floats, Fl
 def _block(measured: Any, assumed: Any, kept: AnyArray, first: int, runs: int, cov: AnyArray, found: Any) -> None:
     """The filter in some runs, and its covariances (T, n, n, lanes) m^2 if there is room for them."""
     start, unit = measured[4], len(assumed[2]) == 0
-    most, lanes, old = kept_most(start), 3 * runs, 0
+    most, lanes, old = widest(start), 3 * runs, 0
     held, was = np.zeros((2, most, runs), np.int64), np.zeros((2, most, runs), np.int64)
     said, place, edge = np.zeros((5, most, lanes)), np.zeros(most, np.int64), np.ones(lanes)
     state, pull = np.zeros((2, most, lanes)), np.zeros((most, lanes))
@@ -79,7 +79,7 @@ def _block(measured: Any, assumed: Any, kept: AnyArray, first: int, runs: int, c
 def _known(measured: Any, assumed: Any, kept: AnyArray, first: int, runs: int, cov: AnyArray, found: Any) -> None:
     """The filter in some runs with covariances (T, n, n, 3) that are known."""
     start, unit = measured[4], len(assumed[2]) == 0
-    most, lanes = kept_most(start), 3 * runs
+    most, lanes = widest(start), 3 * runs
     held, was = np.zeros((2, most, runs), np.int64), np.zeros((2, most, runs), np.int64)
     said, place, edge = np.zeros((5, most, lanes)), np.zeros(most, np.int64), np.ones(lanes)
     state, pull = np.zeros((2, most, lanes)), np.zeros((most, lanes))
@@ -97,15 +97,6 @@ def _known(measured: Any, assumed: Any, kept: AnyArray, first: int, runs: int, c
                         now[i, lane] += gain * pull[j, lane]
         keep(now, first, t, start[t], *found)
         held, was = was, held
-
-
-@compiled
-def kept_most(start: AnyArray) -> int:
-    """Members of the largest star."""
-    most = 0
-    for t in range(len(start) - 1):
-        most = max(most, start[t + 1] - start[t])
-    return 1 + most
 
 
 @compiled
