@@ -1,5 +1,6 @@
 # make paper   the environment, the training, the studies, the report in runs/paper/
 # make test    the environment, then style, types and tests
+# make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
 # make clean   forget the environment (results in runs/ stay)
 #
@@ -13,14 +14,19 @@ READY := $(VENV)/.ready
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: paper test benchmark clean
+.PHONY: paper test test-bounds benchmark clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
 
 test: $(VENV)/.ready-dev
 	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
 	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile
+
+test-bounds: $(VENV)/.ready-dev
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \
+		-n $(JOBS) --dist loadfile tests/test_memory_safety.py $(wildcard tests/test_kernels_s*.py)
 
 benchmark: $(VENV)/.ready-dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py --gate
@@ -31,12 +37,12 @@ $(READY): pyproject.toml constraints.txt
 		{ rm -rf $(VENV); echo "No venv module: apt-get install python3-venv, then repeat."; exit 1; }
 	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
 	$(PIP) setuptools wheel torch
-	$(PIP) --no-build-isolation --editable '.[fast]'
+	$(PIP) --no-build-isolation --editable .
 	@touch $(READY)
 
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
-	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,fast,flower,privacy,export,cluster]'
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,flower,privacy,export,cluster]'
 	@touch $@
 
 clean:

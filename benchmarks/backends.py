@@ -31,8 +31,14 @@ def jobs(runs: int = RUNS, steps: int = STEPS) -> list[Job]:
     """All of them; a call of each has run once."""
     exact = star(runs)
     linear = converted(exact)
-    return [gtsam_linear(linear), gtsam_exact(exact), fixed_lag(linear, steps),
-            *(casadi_exact(exact, method) for method in PLAIN), osqp_linear(linear), cvxpy_linear(linear)]  # fmt: skip
+    return [
+        gtsam_linear(linear),
+        gtsam_exact(exact),
+        fixed_lag(linear, steps),
+        *(casadi_exact(exact, method) for method in PLAIN),
+        osqp_linear(linear),
+        cvxpy_linear(linear),
+    ]
 
 
 def measured(found: list[Job] | None = None, rounds: int = ROUNDS) -> list[dict[str, Any]]:
@@ -43,8 +49,14 @@ def measured(found: list[Job] | None = None, rounds: int = ROUNDS) -> list[dict[
         spent = np.array([[timed(row.call) / row.solves for row in job.rows] for _ in range(rounds)])
         medians = np.median(spent, axis=0)
         for row, median, good in zip(job.rows, medians, right, strict=True):
-            out.append({"name": f"{row.job}: {row.words}", "us": 1e6 * float(median),
-                        "ratio": float(median / medians[1]), "right": good})  # fmt: skip
+            out.append(
+                {
+                    "name": f"{row.job}: {row.words}",
+                    "us": 1e6 * float(median),
+                    "ratio": float(median / medians[1]),
+                    "right": good,
+                }
+            )
     return out
 
 

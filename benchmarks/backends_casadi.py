@@ -15,9 +15,7 @@ from coopoc.optimize.initial import initial_guess
 PLAIN: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "fatrop": ("fatrop", {"print_time": False}, {"print_level": 0}),
     "ipopt": ("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"}),
-    "sqp": ("sqpmethod", {"print_time": False, "print_header": False, "print_iteration": False, "print_status": False,
-                          "qpsol": "qrqp", "qpsol_options": {"print_iter": False, "print_header": False}}, {}),
-}  # fmt: skip
+}
 """By our method: CasADi's plugin, its options, those of the solver behind it."""
 
 
@@ -34,20 +32,24 @@ def casadi_exact(problem: Problem, method: str) -> Job:
         flat = casadi.sqrt(gap[0, :] ** 2 + gap[1, :] ** 2)
         across = gap[1, :] * casadi.cos(seen[1, :]) - gap[0, :] * casadi.sin(seen[1, :])
         along = gap[0, :] * casadi.cos(seen[1, :]) + gap[1, :] * casadi.sin(seen[1, :])
-        rest = casadi.vertcat((casadi.sqrt(flat**2 + gap[2, :] ** 2) - seen[0, :]) / std[0],
-                              casadi.atan2(across, along) / std[1],
-                              (casadi.atan2(flat, gap[2, :]) - seen[2, :]) / std[2])  # fmt: skip
+        rest = casadi.vertcat(
+            (casadi.sqrt(flat**2 + gap[2, :] ** 2) - seen[0, :]) / std[0],
+            casadi.atan2(across, along) / std[1],
+            (casadi.atan2(flat, gap[2, :]) - seen[2, :]) / std[2],
+        )
         return 0.5 * (casadi.sumsqr((x - fix) / casadi.repmat(fix_std, 1, NEIGHBOURS + 1)) + casadi.sumsqr(rest))
 
-    x, fix, sight = (casadi.SX.sym(name, 3, n) for name, n in
-                     (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS)))  # fmt: skip
+    x, fix, sight = (
+        casadi.SX.sym(name, 3, n) for name, n in (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS))
+    )
     nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, sight), "f": cost(x, fix, sight)}
     solver = casadi.nlpsol("solver", plugin, nlp, {**quiet, **({plugin: inner} if inner else {})})
 
     def batch() -> Any:
         numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
-        return np.stack([np.asarray(solver(x0=a.ravel(), p=p)["x"]).reshape(-1, 3)
-                         for a, p in zip(start, numbers, strict=True)])  # fmt: skip
+        return np.stack(
+            [np.asarray(solver(x0=a.ravel(), p=p)["x"]).reshape(-1, 3) for a, p in zip(start, numbers, strict=True)]
+        )
 
     def opti() -> Any:
         found = []
@@ -71,5 +73,11 @@ def casadi_exact(problem: Problem, method: str) -> Job:
         return np.stack(found)
 
     job, options = f"casadi {method}, snapshot, exact", {} if method == "fatrop" else {"method": method}
-    return Job([Row(job, "ours", runs, ours(problem, "casadi", runs, **options)), Row(job, "hand-written", runs, batch),
-                Row(job, "Opti, rebuilt", 2, opti)], as_good(problem))  # fmt: skip
+    return Job(
+        [
+            Row(job, "ours", runs, ours(problem, "casadi", runs, **options)),
+            Row(job, "hand-written", runs, batch),
+            Row(job, "Opti, rebuilt", 2, opti),
+        ],
+        as_good(problem),
+    )

@@ -22,8 +22,17 @@ def osqp_linear(problem: Problem) -> Job:
     rows = [problem.pick(b).whiten(np.zeros((NEIGHBOURS + 1, 3))) for b in range(runs)]
     matrices = [csc_matrix(triu(J.T @ J, format="csc")) for _, J in rows]
     pulls = [np.asarray(J.T @ r) for r, J in rows]
-    settings = {"scaling": 0, "rho": 1e-4, "alpha": 1.0, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 200,
-                "check_termination": 1, "adaptive_rho": 0, "verbose": False}  # fmt: skip
+    settings = {
+        "scaling": 0,
+        "rho": 1e-4,
+        "alpha": 1.0,
+        "eps_abs": 1e-9,
+        "eps_rel": 1e-9,
+        "max_iter": 200,
+        "check_termination": 1,
+        "adaptive_rho": 0,
+        "verbose": False,
+    }
     nothing = csc_matrix((0, SIZE)), np.empty(0), np.empty(0)
 
     def workspace(b: int) -> Any:
@@ -54,10 +63,16 @@ def osqp_linear(problem: Problem) -> Job:
         return np.stack([workspace(b).solve(raise_error=False).x for b in range(10)]).reshape(10, -1, 3)
 
     job = "osqp, snapshot, converted"
-    return Job([Row(job, "ours", runs, ours(problem, "osqp", runs)), Row(job, "hand-written", runs, batch),
-                Row(job, "hand-written, without osqp's Python class", runs, bare),
-                Row(job, "setup at each solve", 10, setups),
-                Row(job, "ours, solve() one by one", 4, single(problem, "osqp", 4))], as_good(problem))  # fmt: skip
+    return Job(
+        [
+            Row(job, "ours", runs, ours(problem, "osqp", runs)),
+            Row(job, "hand-written", runs, batch),
+            Row(job, "hand-written, without osqp's Python class", runs, bare),
+            Row(job, "setup at each solve", 10, setups),
+            Row(job, "ours, solve() one by one", 4, single(problem, "osqp", 4)),
+        ],
+        as_good(problem),
+    )
 
 
 def cvxpy_linear(problem: Problem) -> Job:
@@ -72,8 +87,9 @@ def cvxpy_linear(problem: Problem) -> Job:
         x = cvxpy.Variable((NEIGHBOURS + 1, 3))
         gap = (x[1:] - np.ones((NEIGHBOURS, 1)) @ x[:1]).T
         parts = [cvxpy.sum(cvxpy.multiply(weights[3 * i : 3 * i + 3], gap), axis=0) - pull[:, i] for i in range(3)]
-        terms = [cvxpy.sum_squares(part) for part in (cvxpy.multiply(x - fix, np.tile(weight, (NEIGHBOURS + 1, 1))),
-                                                      *parts)]  # fmt: skip
+        terms = [
+            cvxpy.sum_squares(part) for part in (cvxpy.multiply(x - fix, np.tile(weight, (NEIGHBOURS + 1, 1))), *parts)
+        ]
         return x, cvxpy.Problem(cvxpy.Minimize(sum(terms)))
 
     given = [cvxpy.Parameter(shape) for shape in ((9, NEIGHBOURS), (NEIGHBOURS + 1, 3), (NEIGHBOURS, 3))]
@@ -100,5 +116,11 @@ def cvxpy_linear(problem: Problem) -> Job:
         return np.stack(found)
 
     job = "cvxpy, snapshot, converted"
-    return Job([Row(job, "ours", 10, ours(problem, "cvxpy", 10)), Row(job, "hand-written", 10, batch),
-                Row(job, "rebuilt", 4, rebuilt)], as_good(problem))  # fmt: skip
+    return Job(
+        [
+            Row(job, "ours", 10, ours(problem, "cvxpy", 10)),
+            Row(job, "hand-written", 10, batch),
+            Row(job, "rebuilt", 4, rebuilt),
+        ],
+        as_good(problem),
+    )

@@ -40,9 +40,15 @@ def gtsam_linear(problem: Problem) -> Job:
         return np.stack([custom_factors(fixes.z[b], edges.z[b], edges.root[b]) for b in range(4)])
 
     job = "gtsam, snapshot, converted"
-    return Job([Row(job, "ours", runs, ours(problem, "gtsam", runs)), Row(job, "hand-written", runs, batch),
-                Row(job, "CustomFactors and Levenberg-Marquardt", 4, custom),
-                Row(job, "ours, solve() one by one", 4, single(problem, "gtsam", 4))], as_good(problem))  # fmt: skip
+    return Job(
+        [
+            Row(job, "ours", runs, ours(problem, "gtsam", runs)),
+            Row(job, "hand-written", runs, batch),
+            Row(job, "CustomFactors and Levenberg-Marquardt", 4, custom),
+            Row(job, "ours, solve() one by one", 4, single(problem, "gtsam", 4)),
+        ],
+        as_good(problem),
+    )
 
 
 def custom_factors(fix: Any, vector: Any, root: Any) -> Any:
@@ -99,8 +105,9 @@ def fixed_lag(problem: Problem, count: int) -> Job:
 
     def mine() -> Any:
         smoother = FixedLag(lag, threshold=np.inf)  # what is linear is never linearised again
-        return np.stack([smoother.update(part, dict.fromkeys(called(t), 0.1 * t), [f"0@{t}"]).x
-                         for t, part in enumerate(pieces)])  # fmt: skip
+        return np.stack(
+            [smoother.update(part, dict.fromkeys(called(t), 0.1 * t), [f"0@{t}"]).x for t, part in enumerate(pieces)]
+        )
 
     def hand() -> Any:
         params = gtsam.ISAM2Params()
@@ -134,8 +141,14 @@ def seen(x: Any, z: Any, std: Any) -> tuple[Any, Any]:
     flat2 = dx**2 + dy**2
     flat, r2 = np.sqrt(flat2), flat2 + dz**2
     r = np.sqrt(r2)
-    slope = np.stack([np.stack([dx / r, dy / r, dz / r], -1), np.stack([-dy / flat2, dx / flat2, 0 * r], -1),
-                      np.stack([dx * dz / (flat * r2), dy * dz / (flat * r2), -flat / r2], -1)], -2)  # fmt: skip
+    slope = np.stack(
+        [
+            np.stack([dx / r, dy / r, dz / r], -1),
+            np.stack([-dy / flat2, dx / flat2, 0 * r], -1),
+            np.stack([dx * dz / (flat * r2), dy * dz / (flat * r2), -flat / r2], -1),
+        ],
+        -2,
+    )
     return wrap(np.stack(spherical(dx, dy, dz), -1) - z) / std, slope / std[..., None]
 
 
@@ -170,5 +183,10 @@ def gtsam_exact(problem: Problem) -> Job:
         return x
 
     job = "gtsam, snapshot, exact"
-    return Job([Row(job, "ours", runs, ours(problem, "gtsam", runs, tolerance=TOLERANCE)),
-                Row(job, "hand-written", runs, batch)], as_good(problem))  # fmt: skip
+    return Job(
+        [
+            Row(job, "ours", runs, ours(problem, "gtsam", runs, tolerance=TOLERANCE)),
+            Row(job, "hand-written", runs, batch),
+        ],
+        as_good(problem),
+    )

@@ -39,8 +39,12 @@ def star(runs: int, neighbours: int = NEIGHBOURS) -> Problem:
     gap = np.linspace(12, 25, neighbours)
     offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0.05 * gap], axis=1)])
     velocity = np.tile([10.0, 0.0, 0.0], (2, neighbours + 1, 1))
-    fleet = co.Fleet(tuple(f"v{i}" for i in range(neighbours + 1)), [0.0, 0.1],
-                     np.stack([offset, offset + 0.1 * velocity[0]]), velocity)  # fmt: skip
+    fleet = co.Fleet(
+        tuple(f"v{i}" for i in range(neighbours + 1)),
+        [0.0, 0.1],
+        np.stack([offset, offset + 0.1 * velocity[0]]),
+        velocity,
+    )
     recording = co.observe(fleet, SENSORS, co.V2X(max_neighbours=neighbours), runs=runs, observers=[0])
     return Problem.from_snapshot(recording, 1, 0, run=None, noise=KNOWN)
 

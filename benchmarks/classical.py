@@ -20,13 +20,13 @@ import numba
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from tabulate import tabulate
-from timing import medians, plain, timed
+from timing import medians, timed
 
 import coopoc as co
-from coopoc.kernels.snapshot import snapshots
-from coopoc.kernels.star_filter import follow
-from coopoc.methods.cooperative_map import LEAST_GROUND, TOLERANCE
-from coopoc.methods.star import assumed_arrays, measured_arrays
+from coopoc.kernels.joint_filter import follow
+from coopoc.methods.cooperative_map import Windows
+from coopoc.methods.star import POSITION, assumptions, measurements
+from coopoc.methods.window import dead_reckoned
 from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.initial import converted
 from coopoc.optimize.problem import Problem
@@ -36,7 +36,7 @@ from coopoc.world.v2x import FIX_AND_VELOCITY
 
 ROUNDS, NEIGHBOURS, STEPS, RUNS = 7, 10, 301, 10
 SENSORS = co.Sensors.paper_scenario2()
-KNOWN = co.Knowledge("fitted", SENSORS, process_std=(0.15, 0.05, 0.01), gnss_std=SENSORS.gnss_std)
+KNOWN = co.NoiseModel("fitted", SENSORS, process_std=(0.15, 0.05, 0.01), gnss_std=SENSORS.gnss_std)
 SIZE = 3 * (NEIGHBOURS + 1)
 GTSAM, FILTERPY = "GTSAM, linear Between factors, converted problem", "filterpy, KalmanFilter"
 
@@ -88,14 +88,17 @@ def snapshot_rows(recording: co.Recording) -> list[Row]:
         return Row(words, solves, call, away, right)
 
     box = inbox(recording, 0, FIX_AND_VELOCITY)
-    measured, assumed = measured_arrays(recording, 0, box), assumed_arrays(recording, KNOWN)
-    method, count = co.CooperativeMAP(knowledge=KNOWN), RUNS * STEPS
-    kernel = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
-    whole = np.concatenate([kernel[0][:, :, None], kernel[2].reshape(RUNS, STEPS, NEIGHBOURS, 3)], axis=2)[:, :20]
+    method, count = co.CooperativeMAP(noise_model=KNOWN), RUNS * STEPS
+    drive = Windows(recording, 0, box, KNOWN, dead_reckoned(recording, KNOWN), 1)
+    kernel = drive.solve(method.gnc)
+    whole = np.concatenate([kernel.x[:, :, None], kernel.neighbours.reshape(RUNS, STEPS, NEIGHBOURS, 3)], axis=2)[
+        :, :20
+    ]
     graphs = [gtsam_snapshot(recording, run, t) for t in range(20) for run in range(RUNS)]
     found = np.stack([gtsam_solve(g) for g in graphs]).reshape(20, RUNS, -1, 3).swapaxes(0, 1)
+
     def kernels() -> Any:
-        return snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
+        return drive.solve(method.gnc)
 
     def ours() -> Any:
         return method(recording, [0])
@@ -106,7 +109,6 @@ def snapshot_rows(recording: co.Recording) -> list[Row]:
     return [
         judged("compiled kernel, exact", count, kernels, whole, exact),
         judged("CooperativeMAP, compiled", count, ours, ours().x[:, :20, 0], exact),
-        judged("CooperativeMAP, NumPy", count, lambda: plain(ours), plain(ours).x[:, :20, 0], exact),
         judged(GTSAM, len(graphs), gtsam_all, found, linear, costs=False),
     ]
 
@@ -139,18 +141,18 @@ def gtsam_solve(star: tuple[Any, ...]) -> np.ndarray:
 def filter_rows(recording: co.Recording) -> list[Row]:
     """The linear filter against filterpy's, run by run, and what the exact one costs more."""
     box = inbox(recording, 0, FIX_AND_VELOCITY)
-    measured, assumed = measured_arrays(recording, 0, box), assumed_arrays(recording, KNOWN)
+    measured, assumed = measurements(recording, 0, box), assumptions(recording, KNOWN)
     linear, exact = co.JointFilter(KNOWN, exact=False), co.JointFilter(KNOWN)
     drives = [peer_drive(recording, run) for run in range(2)]
     peer = np.stack([filterpy_drive(d) for d in drives])
-    best = plain(lambda: exact(recording, [0])).x[:, :, 0]
+    best = exact(recording, [0]).x[:, :, 0]
 
     def judged(words: str, call: Callable[[], Any], found: Any, wanted: Any, solves: int = RUNS * STEPS) -> Row:
         away = float(np.abs(found[: len(wanted)] - wanted).max())
         return Row(words, solves, call, away, away < 1e-9)
 
     def kernel(refine: bool) -> Any:
-        return follow(measured, assumed, refine)[0]
+        return follow(measured, assumed, refine, None, POSITION)[0]
 
     def all_steps(method: co.JointFilter) -> Any:
         return method(recording, [0]).x[:, :, 0]
@@ -160,11 +162,8 @@ def filter_rows(recording: co.Recording) -> list[Row]:
         judged("compiled kernel, exact", lambda: kernel(True), kernel(True), best),
         judged("JointFilter(exact=False), compiled", lambda: all_steps(linear), all_steps(linear), peer),
         judged("JointFilter(), compiled", lambda: all_steps(exact), all_steps(exact), best),
-        judged("JointFilter(exact=False), NumPy", lambda: plain(lambda: all_steps(linear)),
-               plain(lambda: all_steps(linear)), peer),
-        judged("JointFilter(), NumPy", lambda: plain(lambda: all_steps(exact)), best, best),
         judged(FILTERPY, lambda: [filterpy_drive(d) for d in drives], peer, peer, 2 * STEPS),
-    ]  # fmt: skip
+    ]
 
 
 class Drive(NamedTuple):
@@ -237,16 +236,32 @@ def measured(found: list[tuple[str, str, list[Row]]] | None = None) -> list[dict
     out: list[dict[str, Any]] = []
     for job, peer, rows in parts() if found is None else found:
         spent = seconds(rows)
-        out += [{"name": f"{job}: {row.words}", "us": 1e6 * spent[row.words], "ratio": spent[row.words] / spent[peer],
-                 "right": row.right} for row in rows]  # fmt: skip
+        out += [
+            {
+                "name": f"{job}: {row.words}",
+                "us": 1e6 * spent[row.words],
+                "ratio": spent[row.words] / spent[peer],
+                "right": row.right,
+            }
+            for row in rows
+        ]
     return out
 
 
 def table(rows: list[Row], peer: str, floor: float) -> str:
     """Medians of interleaved rounds, and ratios to a peer and to the floor (s per solve)."""
     spent = seconds(rows)
-    lines = [[row.words, 1e6 * spent[row.words], spent[peer] / spent[row.words], spent[row.words] / floor,
-              row.difference, "yes" if row.right else "NO"] for row in rows]  # fmt: skip
+    lines = [
+        [
+            row.words,
+            1e6 * spent[row.words],
+            spent[peer] / spent[row.words],
+            spent[row.words] / floor,
+            row.difference,
+            "yes" if row.right else "NO",
+        ]
+        for row in rows
+    ]
     lines.append(["floor: flops at the measured peak", 1e6 * floor, spent[peer] / floor, 1.0, None, ""])
     header = ["", "us", f"x {peer.split(',')[0]}", "x floor", "difference m", "same answer"]
     return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", ".3g", ".3g", ".1e", ""))
@@ -255,8 +270,10 @@ def table(rows: list[Row], peer: str, floor: float) -> str:
 def main() -> None:
     """Print the tables."""
     recording, speed = ring(), peak()
-    print(f"{NEIGHBOURS} neighbours, {STEPS} steps, {RUNS} runs, one thread; products at {speed / 1e9:.0f} GFLOP/s; "
-          f"numba {numba.__version__}, gtsam {version('gtsam')}.\n")  # fmt: skip
+    print(
+        f"{NEIGHBOURS} neighbours, {STEPS} steps, {RUNS} runs, one thread; products at {speed / 1e9:.0f} GFLOP/s; "
+        f"numba {numba.__version__}, gtsam {version('gtsam')}.\n"
+    )
     print("Snapshot, per solve:\n")
     print(table(snapshot_rows(recording), GTSAM, 6300 / speed), "\n")
     print("Joint filter, per step:\n")

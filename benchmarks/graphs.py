@@ -20,7 +20,7 @@ import numpy as np
 from tabulate import tabulate
 
 from coopoc.evaluate.alignment import absolute_error
-from coopoc.formats import read_graph
+from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.convex import staircase
@@ -39,7 +39,7 @@ def plain_gtsam(problem: Problem) -> tuple[np.ndarray, float]:
     x0 = problem.x0
     for k, row in enumerate(x0):
         values.insert(k, gtsam.Pose2(row[0], row[1], float(np.arctan2(row[4], row[2]))))
-    first = problem.held[0]
+    first = problem.fixed[0]
     graph.add(gtsam.PriorFactorPose2(first, values.atPose2(first), gtsam.noiseModel.Constrained.All(3)))
     for k in set(range(len(x0))) - set(problem.poses):
         graph.add(
@@ -75,7 +75,7 @@ def error(graph: Graph, position: np.ndarray) -> float:
 
 def rows(path: Path) -> Iterator[list[object]]:
     """One row per solver: ours and GTSAM's from chained odometry, and ours from a relaxation that needs no start."""
-    graph = read_graph(path)
+    graph = load_graph(path)
     problem = from_graph(graph)
     size = str(len(problem.names))
     ours = solve(problem, throw=False)
@@ -87,14 +87,25 @@ def rows(path: Path) -> Iterator[list[object]]:
         return
     found = staircase(from_graph(graph, start="apart"))
     assert found.solution is not None
-    yield [path.stem, size, "coopoc staircase, robots apart", found.solution.status.name, found.solution.cost,
-           found.lower_bound, error(graph, found.solution.position), found.seconds]  # fmt: skip
+    yield [
+        path.stem,
+        size,
+        "coopoc staircase, robots apart",
+        found.solution.status.name,
+        found.solution.cost,
+        found.lower_bound,
+        error(graph, found.solution.position),
+        found.seconds,
+    ]
 
 
 def main(folder: str, *names: str) -> None:
     """Print the table."""
-    found = [row for name in names or ("mrclam5a", "mrclam6", "tiers", "plaza1")
-             for row in rows(Path(folder) / f"{name}.pyfg")]  # fmt: skip
+    found = [
+        row
+        for name in names or ("mrclam5a", "mrclam6", "tiers", "plaza1")
+        for row in rows(Path(folder) / f"{name}.pyfg")
+    ]
     header = ["graph", "nodes", "solver", "status", "cost", "lower bound", "ATE [m]", "seconds"]
     print(tabulate(found, header, tablefmt="github", floatfmt=("", "", "", "", ".2f", ".2f", ".3f", ".1f")))
 

@@ -1,6 +1,6 @@
 """What does not grow: the time of an import, and a method's time per vehicle and step in a larger fleet.
 
-    OMP_NUM_THREADS=1 python benchmarks/growth.py            # a Markdown table on stdout, about half a minute
+OMP_NUM_THREADS=1 python benchmarks/growth.py            # a Markdown table on stdout, about half a minute
 """
 
 from __future__ import annotations
@@ -51,11 +51,20 @@ def methods(fleets: dict[int, tuple[int, int]] = FLEETS, rounds: int = ROUNDS) -
         for call, fleet, recording in zip(calls, drives, recordings, strict=True):
             fixes = np.linalg.norm(recording.gnss - fleet.position, axis=-1).mean()
             right.append(bool(np.mean(co.rt_le(call(), fleet)) < fixes))
-        spent = [[timed(call) / (len(fleet.ids) * STEPS) for call, fleet in zip(calls, drives, strict=True)]
-                 for _ in range(rounds)]  # fmt: skip
+        spent = [
+            [timed(call) / (len(fleet.ids) * STEPS) for call, fleet in zip(calls, drives, strict=True)]
+            for _ in range(rounds)
+        ]
         medians = np.median(spent, axis=0)
-        out += [{"name": f"{name}, {count} vehicles", "us": 1e6 * float(median), "ratio": float(median / medians[0]),
-                 "right": good} for count, median, good in zip(fleets, medians, right, strict=True)]  # fmt: skip
+        out += [
+            {
+                "name": f"{name}, {count} vehicles",
+                "us": 1e6 * float(median),
+                "ratio": float(median / medians[0]),
+                "right": good,
+            }
+            for count, median, good in zip(fleets, medians, right, strict=True)
+        ]
     return out
 
 
@@ -67,8 +76,9 @@ def printed(code: str) -> str:
 def imports() -> list[dict[str, Any]]:
     """Microseconds of `import coopoc` in a fresh process and their ratio to `import numpy`; right is below 0.3 s."""
     code = "import time; a = time.process_time(); import {}; print(time.process_time() - a)"
-    numpy, ours = (float(np.median([float(printed(code.format(name))) for _ in range(ROUNDS)]))
-                   for name in ("numpy", "coopoc"))  # fmt: skip
+    numpy, ours = (
+        float(np.median([float(printed(code.format(name))) for _ in range(ROUNDS)])) for name in ("numpy", "coopoc")
+    )
     return [{"name": "import coopoc", "us": 1e6 * ours, "ratio": ours / numpy, "right": ours < IMPORT_SECONDS}]
 
 

@@ -33,7 +33,7 @@ def star(kind: str, neighbours: int = 10) -> Problem:
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (neighbours, 3)) * [1, 1, 0.2]])
     names = ["ego", *(f"v{j}" for j in range(neighbours))]
     pairs = [("ego", name) for name in names[1:]]
-    problem = Problem(names, hub=(0,)).add("position", names, truth + rng.normal(0, 2, truth.shape), std=2.0)
+    problem = Problem(names, separator=(0,)).add("position", names, truth + rng.normal(0, 2, truth.shape), std=2.0)
     x, y, z = truth[1:].T
     r = np.linalg.norm(truth[1:], axis=1)
     seen = np.stack([r + rng.normal(0, 0.5, neighbours), np.arctan2(y, x), np.arccos(z / r)], axis=1)
@@ -85,8 +85,13 @@ def custom_spherical(z: np.ndarray):
         flat, r2 = math.sqrt(flat2), flat2 + up * up
         r = math.sqrt(r2)
         if slopes is not None:
-            slope = np.array([[x / r, y / r, up / r], [-y / flat2, x / flat2, 0.0],
-                              [x * up / (flat * r2), y * up / (flat * r2), -flat / r2]])  # fmt: skip
+            slope = np.array(
+                [
+                    [x / r, y / r, up / r],
+                    [-y / flat2, x / flat2, 0.0],
+                    [x * up / (flat * r2), y * up / (flat * r2), -flat / r2],
+                ]
+            )
             slopes[0], slopes[1] = -slope, slope
         return np.array([r - z[0], math.remainder(math.atan2(y, x) - z[1], math.tau), math.atan2(flat, up) - z[2]])
 
@@ -123,8 +128,11 @@ def custom_graph(problem: Problem) -> Any:
         wide = lambda found, k, row: np.append(row @ found.atPose2(k).rotation().matrix(), [[0.0]], axis=1)  # noqa: E731
     else:
         point, wide = (lambda found, k: found.atPoint3(k)), (lambda found, k, row: row)
-    make = {"range": lambda z: custom_range(z, point, wide), "spherical": custom_spherical,
-            "relative_pose": custom_relative_pose}  # fmt: skip
+    make = {
+        "range": lambda z: custom_range(z, point, wide),
+        "spherical": custom_spherical,
+        "relative_pose": custom_relative_pose,
+    }
     for factor in problem.factors:
         if factor.nodes.shape[1] == 2:
             model = gtsam.noiseModel.Diagonal.Sigmas(np.array(factor.std[0]))
@@ -140,13 +148,19 @@ def ways(problem: Problem) -> dict[str, tuple[Callable[[], Any], Callable[[Any],
     found: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {}
     said = forms(problem)
     if not any(isinstance(form, str) for form in said):
-        found["GTSAM's own"] = (lambda: native_graph(problem, forms(problem)).graph,
-                                lambda graph: graph.linearize(at).optimize())  # fmt: skip
+        found["GTSAM's own"] = (
+            lambda: native_graph(problem, forms(problem)).graph,
+            lambda graph: graph.linearize(at).optimize(),
+        )
     damping = np.zeros((1, len(problem.names), problem.space.dof))
-    found["JacobianFactors from NumPy"] = (lambda: gtsam_.linear_step(problem),
-                                           lambda step: step(problem.linearise(x), damping))  # fmt: skip
-    found["CustomFactors, Python's loop"] = (lambda: custom_graph(problem),
-                                             lambda graph: graph.linearize(at).optimize())  # fmt: skip
+    found["JacobianFactors from NumPy"] = (
+        lambda: gtsam_.linear_step(problem),
+        lambda step: step(problem.linearise(x), damping),
+    )
+    found["CustomFactors, Python's loop"] = (
+        lambda: custom_graph(problem),
+        lambda graph: graph.linearize(at).optimize(),
+    )
     return found
 
 
@@ -189,19 +203,21 @@ def steps_table(problems: dict[str, Problem]) -> list[str]:
 
 def solves_table(problems: dict[str, Problem]) -> list[str]:
     """Milliseconds to build and to run a backend, and its iterations."""
-    backends = {"gauss-newton": gauss_newton.build, **{o: partial(gtsam_.build, optimizer=o)
-                for o in ("elimination", "lm", "dogleg", "isam2")}}  # fmt: skip
+    backends = {
+        "gauss-newton": gauss_newton.prepare,
+        **{o: partial(gtsam_.prepare, optimizer=o) for o in ("elimination", "lm")},
+    }
     lines = ["| problem | " + " | ".join(backends) + " |", "|--" * (1 + len(backends)) + "|"]
     for title, problem in problems.items():
         spent: dict[str, list[tuple[float, int]]] = {}
-        start = initial_guess(problem)[0]
+        start = initial_guess(problem)
         for _ in range(ROUNDS):
-            for name, build in backends.items():
+            for name, prepare in backends.items():
                 try:
-                    took, ended = timed(lambda build=build: build(problem)(start))  # noqa: B023
+                    took, ended = timed(lambda prepare=prepare: prepare(problem)(problem, start))  # noqa: B023
                 except InputError:  # what GTSAM has no factors for
                     continue
-                spent.setdefault(name, []).append((took, ended.iterations))
+                spent.setdefault(name, []).append((took, int(np.ravel(ended.iterations)[0])))
         cells = [
             f"{np.median([t for t, _ in spent[b]]):.1f} ({spent[b][0][1]})" if b in spent else "-" for b in backends
         ]
@@ -210,7 +226,11 @@ def solves_table(problems: dict[str, Problem]) -> list[str]:
 
 
 if __name__ == "__main__":
-    cases = {"star of 10, ranges": star("range"), "star of 10, spherical": star("spherical"),
-             "2 drives of 20 poses": two_drives(20), "2 drives of 200 poses": two_drives(200)}  # fmt: skip
+    cases = {
+        "star of 10, ranges": star("range"),
+        "star of 10, spherical": star("spherical"),
+        "2 drives of 20 poses": two_drives(20),
+        "2 drives of 200 poses": two_drives(200),
+    }
     print("\n".join(steps_table(cases)), "\n")
     print("\n".join(solves_table(cases)))

@@ -27,9 +27,10 @@ from tabulate import tabulate
 from torch import Tensor
 
 import coopoc as co
+from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
-from coopoc.learned.training.clients import Pieces, clients
+from coopoc.learned.training.clients import Segments, clients
 from coopoc.learned.training.fit import descend
 from coopoc.learned.training.machine import one_core, row_threads
 from coopoc.learned.training.schedule import Schedule
@@ -106,7 +107,7 @@ def timed(call: Callable[[], Any]) -> float:
     return spent / calls
 
 
-def plain_training(net: GainNet, pieces: Pieces, plan: np.ndarray) -> Tensor:
+def plain_training(net: GainNet, pieces: Segments, plan: np.ndarray) -> Tensor:
     """Weights (P,) after one optimiser step per row of the plan (steps, batch)."""
     mine = GainNet(**net.settings)
     mine.load_state_dict(net.state_dict())
@@ -115,13 +116,13 @@ def plain_training(net: GainNet, pieces: Pieces, plan: np.ndarray) -> Tensor:
         batch = pieces.batch(torch.from_numpy(index)[None])
         gnss, velocity, truth = (a[:, 0].transpose(0, 1) for a in (batch.gnss, batch.velocity, batch.truth))
         optimiser.zero_grad()
-        found = mine.reference(gnss, velocity, batch.x0[0], batch.dt)
+        found = Recurrent.forward(mine, gnss, velocity, batch.x0[0], batch.dt)
         (found - truth).square().sum(-1).mean().backward()
         optimiser.step()
     return flatten([mine])[0]
 
 
-def our_training(net: GainNet, pieces: Pieces, plans: list[np.ndarray]) -> Tensor:
+def our_training(net: GainNet, pieces: Segments, plans: list[np.ndarray]) -> Tensor:
     """The same (S, P) for S nets that all start as this one, each with its plan."""
     theta, rates = flatten([net] * len(plans)), [np.full(len(plan), RATE) for plan in plans]
     draws = [torch.Generator() for _ in plans]
@@ -130,20 +131,25 @@ def our_training(net: GainNet, pieces: Pieces, plans: list[np.ndarray]) -> Tenso
     return theta
 
 
-def training(net: GainNet, pieces: Pieces) -> list[Row]:
+def training(net: GainNet, pieces: Segments) -> list[Row]:
     """One pass over the pieces, or for plain torch at batch 1 over a few."""
     count, length = len(pieces), pieces.gnss.shape[1] - 1
     order = np.arange(count)
     one, few, full = order[:, None], order[:4, None], order[None]
     four = [part.reshape(-1, count // 6) for part in np.split(np.tile(order, 4), 4)]
     many = [np.roll(order, s)[:36].reshape(-1, 2) for s in range(35)]
-    rows = [Row("plain torch, batch 1", len(few) * length, lambda: plain_training(net, pieces, few), 0.0),
-            Row(f"plain torch, batch {count}", count * length, lambda: plain_training(net, pieces, full), 0.0)]
-    ours = [("engine, batch 1", [one], [few], 1), (f"engine, batch {count}", [full], [full], 1),
-            (f"engine, 4 nets x batch {count // 6}", four, [p[:2] for p in four], 1),
-            (f"engine, 4 nets x batch {count // 6}, 2 threads", four, [p[:2] for p in four], 2),
-            ("engine, 35 nets x batch 2", many, [p[:2] for p in many[:3]], 1),
-            ("engine, 35 nets x batch 2, 2 threads", many, [p[:2] for p in many[:3]], 2)]  # fmt: skip
+    rows = [
+        Row("plain torch, batch 1", len(few) * length, lambda: plain_training(net, pieces, few), 0.0),
+        Row(f"plain torch, batch {count}", count * length, lambda: plain_training(net, pieces, full), 0.0),
+    ]
+    ours = [
+        ("engine, batch 1", [one], [few], 1),
+        (f"engine, batch {count}", [full], [full], 1),
+        (f"engine, 4 nets x batch {count // 6}", four, [p[:2] for p in four], 1),
+        (f"engine, 4 nets x batch {count // 6}, 2 threads", four, [p[:2] for p in four], 2),
+        ("engine, 35 nets x batch 2", many, [p[:2] for p in many[:3]], 1),
+        ("engine, 35 nets x batch 2, 2 threads", many, [p[:2] for p in many[:3]], 2),
+    ]
     for words, plans, checked, threads in ours:
         wanted = torch.stack([plain_training(net, pieces, plan) for plan in checked])
         error = float((our_training(net, pieces, checked) - wanted).abs().max())
@@ -152,13 +158,13 @@ def training(net: GainNet, pieces: Pieces) -> list[Row]:
     return rows
 
 
-def inference(net: GainNet, drive: Pieces) -> list[Row]:
+def inference(net: GainNet, drive: Segments) -> list[Row]:
     """One drive of 900 steps, and 128 of them at once."""
     batch = drive.batch(torch.zeros(1, 1, dtype=torch.long))
     gnss, velocity, x0 = batch.gnss[:, 0].transpose(0, 1), batch.velocity[:, 0].transpose(0, 1), batch.x0[0]
     many = [a.expand(128, *a.shape[1:]).contiguous() for a in (gnss, velocity, x0)]
-    wanted, length = net.reference(gnss, velocity, x0, batch.dt), gnss.shape[1]
-    rows = [Row("plain torch, 1 drive", length, lambda: net.reference(gnss, velocity, x0, batch.dt), 0.0)]
+    wanted, length = Recurrent.forward(net, gnss, velocity, x0, batch.dt), gnss.shape[1]
+    rows = [Row("plain torch, 1 drive", length, lambda: Recurrent.forward(net, gnss, velocity, x0, batch.dt), 0.0)]
     for words, inputs in (("engine, 1 drive", (gnss, velocity, x0)), ("engine, 128 drives", many)):
         found = net(*inputs, batch.dt)
         error = float((found - wanted).abs().max())
@@ -176,15 +182,15 @@ def seconds(rows: list[Row]) -> dict[str, float]:
     return {words: float(np.median(times)) for words, times in spent.items()}
 
 
-def parts() -> tuple[GainNet, Pieces, Pieces]:
+def parts() -> tuple[GainNet, Segments, Segments]:
     """The net, what it trains on and the drive that it follows."""
-    group = clients(co.load("town10-clients"))
-    pieces = Pieces.join([c.training for c in group])
+    group = clients(co.load_fleet("town10-clients"))
+    pieces = Segments.join([c.training for c in group])
     return GainNet(), pieces.take(range(len(pieces) // 12 * 12)), group[0].long.take([0])
 
 
 @one_core()
-def measured(found: tuple[GainNet, Pieces, Pieces] | None = None) -> list[dict[str, Any]]:
+def measured(found: tuple[GainNet, Segments, Segments] | None = None) -> list[dict[str, Any]]:
     """Per row its name, microseconds, the ratio to plain torch's time, and whether its answer is right."""
     net, pieces, drive = parts() if found is None else found
     out: list[dict[str, Any]] = []
@@ -201,7 +207,7 @@ def measured(found: tuple[GainNet, Pieces, Pieces] | None = None) -> list[dict[s
 
 
 @torch.no_grad()
-def following(net: GainNet, drive: Pieces) -> list[Row]:
+def following(net: GainNet, drive: Segments) -> list[Row]:
     """`inference`, without gradients also when its calls are timed later."""
     return [row._replace(call=torch.no_grad()(row.call)) for row in inference(net, drive)]
 
@@ -213,8 +219,17 @@ def table(rows: list[Row], floors: dict[str, float], allowed: float, against: Ca
     for row in rows:
         us = 1e6 * medians[row.words]
         ratio = medians[against(row).words] / medians[row.words]
-        lines.append([row.words, us, f"{1e6 / us:,.0f}", ratio, *(us / (1e6 * floor) for floor in floors.values()),
-                      row.error, "yes" if row.error <= allowed else "NO"])  # fmt: skip
+        lines.append(
+            [
+                row.words,
+                us,
+                f"{1e6 / us:,.0f}",
+                ratio,
+                *(us / (1e6 * floor) for floor in floors.values()),
+                row.error,
+                "yes" if row.error <= allowed else "NO",
+            ]
+        )
     header = ["", "us per step", "steps/s", "x plain torch", *floors, "difference", "same answer"]
     form = ("", ".3g", "", ".3g", *[".3g"] * len(floors), ".1e", "")
     return tabulate(lines, header, tablefmt="github", floatfmt=form)
@@ -229,8 +244,10 @@ def main() -> None:
     speed = peak()
     floor, read = 2.0 * weights / speed, reading(weights)
     versions = f"numba {numba.__version__}, torch {torch.__version__}"
-    print(f"{weights:,} weights in layers; peak {speed / 1e9:.0f} GFLOP/s on one core, which reads them in "
-          f"{1e6 * read:.2f} us; {versions}; {count} pieces of {pieces.gnss.shape[1] - 1} steps.\n")  # fmt: skip
+    print(
+        f"{weights:,} weights in layers; peak {speed / 1e9:.0f} GFLOP/s on one core, which reads them in "
+        f"{1e6 * read:.2f} us; {versions}; {count} pieces of {pieces.gnss.shape[1] - 1} steps.\n"
+    )
     rows = training(net, pieces)
     print("Training, AdamW included:\n")
     floors = {"x flop floor": 3 * floor}

@@ -34,7 +34,7 @@ def sighting(z: Any, std: Any) -> Any:
     """A cost function of the ego's and a neighbour's position, derivatives by hand."""
     import pyceres
 
-    class Sighting(pyceres.CostFunction):  # type: ignore[misc]
+    class RelativeMeasurement(pyceres.CostFunction):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__()
             self.set_num_residuals(3)
@@ -58,7 +58,7 @@ def sighting(z: Any, std: Any) -> Any:
                     jacobian[:] = sign * slope
             return True
 
-    return Sighting()
+    return RelativeMeasurement()
 
 
 def ceres_exact(problem: Problem) -> Job:
@@ -83,9 +83,13 @@ def ceres_exact(problem: Problem) -> Job:
         return points
 
     job = "snapshot, exact"
-    return Job([Row(job, "solve_batch, gauss-newton", RUNS, ours(problem, "gauss-newton", RUNS)),
-                Row(job, "pyceres", FEW, lambda: np.stack([one(b) for b in range(FEW)]))],
-               as_good(problem))  # fmt: skip
+    return Job(
+        [
+            Row(job, "solve_batch, gauss-newton", RUNS, ours(problem, "gauss-newton", RUNS)),
+            Row(job, "pyceres", FEW, lambda: np.stack([one(b) for b in range(FEW)])),
+        ],
+        as_good(problem),
+    )
 
 
 def measured() -> list[dict[str, Any]]:
@@ -109,8 +113,9 @@ def of_stone_soup() -> list[Job]:
 
 
 PEERS: dict[str, Callable[[], list[Job]]] = {
-    "pyceres": lambda: [ceres_exact(star(RUNS))], "stonesoup": of_stone_soup,
-}  # fmt: skip
+    "pyceres": lambda: [ceres_exact(star(RUNS))],
+    "stonesoup": of_stone_soup,
+}
 """By the package that they need."""
 
 

@@ -23,7 +23,17 @@ from typing import Any
 from tabulate import tabulate
 
 HERE = Path(__file__).parent
-BENCHMARKS = ("classical", "networked", "online_methods", "learned_gain", "backends", "peers", "fleet", "growth")
+BENCHMARKS = (
+    "classical",
+    "networked",
+    "cliffs",
+    "online_methods",
+    "learned_gain",
+    "backends",
+    "peers",
+    "fleet",
+    "growth",
+)
 """Modules beside this one; each has measured() -> rows {name, us, ratio, right}."""
 BASELINE, RESULTS = HERE / "baseline.json", HERE / "results.json"
 TOLERANCE = 1.5
@@ -53,16 +63,23 @@ def slower(rows: Rows, baseline: Mapping[str, Mapping[str, float]], measured: Se
         if name not in ratios:
             said.append(f"{name}: in the baseline, but not measured")
         elif not ratios[name] <= limit:
-            said.append(f"{name}: ratio {ratios[name]:.3g}, at most {limit:.3g} allowed ({wanted['ratio']:.3g} x "
-                        f"{wanted['tolerance']:.3g})")  # fmt: skip
+            said.append(
+                f"{name}: ratio {ratios[name]:.3g}, at most {limit:.3g} allowed ({wanted['ratio']:.3g} x "
+                f"{wanted['tolerance']:.3g})"
+            )
     return said
 
 
 def kept(rows: Rows, baseline: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
     """The baseline of these rows, with the tolerances that it had."""
-    return {row["name"]: {"ratio": float(f"{row['ratio']:.3g}"),
-                          "tolerance": baseline.get(row["name"], {}).get("tolerance", TOLERANCE)}
-            for row in rows if any(word in row["name"] for word in OURS) and row["right"]}  # fmt: skip
+    return {
+        row["name"]: {
+            "ratio": float(f"{row['ratio']:.3g}"),
+            "tolerance": baseline.get(row["name"], {}).get("tolerance", TOLERANCE),
+        }
+        for row in rows
+        if any(word in row["name"] for word in OURS) and row["right"]
+    }
 
 
 def report(rows: Rows) -> str:

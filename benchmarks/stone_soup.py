@@ -20,11 +20,10 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, IteratedKalmanUpdater, KalmanUpdater
 
-from coopoc.kernels.snapshot import snapshots
-from coopoc.kernels.star_filter import follow
-from coopoc.methods.cooperative_map import LEAST_GROUND
-from coopoc.methods.cooperative_map import TOLERANCE as SETTLED
-from coopoc.methods.star import assumed_arrays, measured_arrays
+from coopoc.kernels.joint_filter import follow
+from coopoc.methods.cooperative_map import CooperativeMAP, Windows
+from coopoc.methods.star import POSITION, assumptions, measurements
+from coopoc.methods.window import dead_reckoned
 from coopoc.optimize import Problem, solve_batch
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, wrap
@@ -55,8 +54,13 @@ class Sightings(NonLinearGaussianMeasurement):  # type: ignore[misc]
         flat2 = dx**2 + dy**2
         flat, r2 = np.sqrt(flat2), flat2 + dz**2
         r = np.sqrt(r2)
-        slope = np.array([[dx / r, dy / r, dz / r], [-dy / flat2, dx / flat2, 0 * r],
-                          [dx * dz / (flat * r2), dy * dz / (flat * r2), -flat / r2]])  # fmt: skip
+        slope = np.array(
+            [
+                [dx / r, dy / r, dz / r],
+                [-dy / flat2, dx / flat2, 0 * r],
+                [dx * dz / (flat * r2), dy * dz / (flat * r2), -flat / r2],
+            ]
+        )
         out = np.zeros((NEIGHBOURS, 3, NEIGHBOURS + 1, 3))
         each = np.arange(NEIGHBOURS)
         out[each, :, each + 1] = np.moveaxis(slope, 2, 0)
@@ -70,12 +74,12 @@ def snapshot() -> Job:
     stars = [Problem.from_snapshot(recording, t, 0, run=None, noise=KNOWN) for t in range(SHOWN)]
     exact = np.concatenate([solve_batch(p, tolerance=1e-10).x for p in stars])
     cost = np.concatenate([p.linearise(x).cost for p, x in zip(stars, np.split(exact, SHOWN), strict=True)])
-    measured = measured_arrays(recording, 0, inbox(recording, 0, FIX_AND_VELOCITY))
-    assumed = assumed_arrays(recording, KNOWN)
+    box, method = inbox(recording, 0, FIX_AND_VELOCITY), CooperativeMAP(noise_model=KNOWN)
+    drive = Windows(recording, 0, box, KNOWN, dead_reckoned(recording, KNOWN), 1)
 
     def kernel() -> Any:
-        ego, _, others, *_ = snapshots(measured, assumed, SETTLED, LEAST_GROUND)
-        found = np.concatenate([ego[:, :, None], others.reshape(RUNS, STEPS, NEIGHBOURS, 3)], axis=2)
+        solved = drive.solve(method.gnc)
+        found = np.concatenate([solved.x[:, :, None], solved.neighbours.reshape(RUNS, STEPS, NEIGHBOURS, 3)], axis=2)
         return found[:, :SHOWN].swapaxes(0, 1).reshape(-1, NEIGHBOURS + 1, 3)
 
     def right(x: Any) -> bool:
@@ -111,8 +115,8 @@ def updated(updater: Any, stars: list[tuple[Any, Any]]) -> Callable[[], Any]:
 def joint_filter() -> Job:
     """The ego of two runs, each step a prediction and an update, against filterpy's numbers."""
     recording = ring()
-    measured = measured_arrays(recording, 0, inbox(recording, 0, FIX_AND_VELOCITY))
-    assumed = assumed_arrays(recording, KNOWN)
+    measured = measurements(recording, 0, inbox(recording, 0, FIX_AND_VELOCITY))
+    assumed = assumptions(recording, KNOWN)
     drives = [peer_drive(recording, run) for run in range(2)]
     wanted = np.stack([filterpy_drive(drive) for drive in drives])
 
@@ -120,9 +124,13 @@ def joint_filter() -> Job:
         return float(np.abs(x[:2] - wanted).max()) < 1e-9
 
     job = "joint filter, linear"
-    return Job([Row(job, "kernel", RUNS * STEPS, lambda: follow(measured, assumed, False)[0]),
-                Row(job, "Stone Soup, KalmanUpdater", 2 * STEPS, lambda: np.stack([followed(d) for d in drives]))],
-               right)  # fmt: skip
+    return Job(
+        [
+            Row(job, "kernel", RUNS * STEPS, lambda: follow(measured, assumed, False, None, POSITION)[0]),
+            Row(job, "Stone Soup, KalmanUpdater", 2 * STEPS, lambda: np.stack([followed(d) for d in drives])),
+        ],
+        right,
+    )
 
 
 def followed(drive: Drive) -> np.ndarray:

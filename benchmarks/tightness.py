@@ -23,9 +23,15 @@ Case = Callable[[int], Problem]
 
 
 def ranged(
-    seed: int, vehicles: int = 7, d: int = 3, gnss_std: float = 3.5, range_std: float = 1.0, stretch: float = 1.0,
-    shape: str = "volume", mesh: bool = False,
-) -> Problem:  # fmt: skip
+    seed: int,
+    vehicles: int = 7,
+    d: int = 3,
+    gnss_std: float = 3.5,
+    range_std: float = 1.0,
+    stretch: float = 1.0,
+    shape: str = "volume",
+    mesh: bool = False,
+) -> Problem:
     """Fixes of all vehicles, and the ranges of a star around the first or of all pairs.
 
     Args:
@@ -35,7 +41,7 @@ def ranged(
     spread = {"volume": np.ones(d), "street": np.array([*np.ones(d - 1), 0.1]), "line": np.eye(d)[0]}[shape]
     truth = rng.uniform(-20, 20, (vehicles, d)) * spread
     std = gnss_std * np.array([*np.ones(d - 1), stretch])
-    problem = Problem(tuple(f"v{k}" for k in range(vehicles)), dimension=d, hub=() if mesh else (0,))
+    problem = Problem(tuple(f"v{k}" for k in range(vehicles)), dimension=d, separator=() if mesh else (0,))
     problem = problem.add("position", list(range(vehicles)), truth + std * rng.standard_normal(truth.shape), std)
     return with_ranges(problem, truth, rng, range_std, star=not mesh)
 
@@ -93,7 +99,7 @@ def driven(seed: int, noise: float, steps: int = 6) -> Problem:
     truth = pose(at, turn.ravel())
     turned = truth[:, 2:].reshape(-1, 2, 2)
     names = tuple(f"{robot}{k}" for robot in "AB" for k in range(steps))
-    problem = Problem(names, x0=truth, dimension=2, poses=tuple(range(2 * steps)), held=(0,))
+    problem = Problem(names, x0=truth, dimension=2, poses=tuple(range(2 * steps)), fixed=(0,))
     pairs = [(k, k + 1) for k in range(2 * steps - 1) if k != steps - 1]
     z = np.array([np.append(turned[i].T @ (at[j] - at[i]), turned[i].T @ turned[j]) for i, j in pairs])
     z[:, :2] += 0.02 * noise * rng.standard_normal((len(z), 2))
@@ -148,14 +154,16 @@ def row(name: str, case: Case, seeds: int) -> str:
         relaxed.append((shor if quadratic(problem).bound <= 32 else staircase)(problem))
         best = relaxed[-1].solution
         assert best is not None
-        blind = problem if problem.x0 is not None and not problem.held else replace(problem, x0=_blind(problem, seed))
+        blind = problem if problem.x0 is not None and not problem.fixed else replace(problem, x0=_blind(problem, seed))
         found = solve(blind, throw=False)
         alone += found.status is Status.SOLVED and found.cost <= best.cost * (1 + 1e-6) + 1e-9
     gaps = np.array([r.gap / max(r.lower_bound + r.gap, 1e-12) for r in relaxed])
     tight = sum(r.tight for r in relaxed)
     spent = 1e3 * float(np.median([r.seconds for r in relaxed]))
-    return (f"| {name} | {tight}/{seeds} | {np.median(gaps):.0e} | {gaps.max():.0e} | "
-            f"{np.median([r.rank_gap for r in relaxed]):.0e} | {alone}/{seeds} | {spent:.0f} |")  # fmt: skip
+    return (
+        f"| {name} | {tight}/{seeds} | {np.median(gaps):.0e} | {gaps.max():.0e} | "
+        f"{np.median([r.rank_gap for r in relaxed]):.0e} | {alone}/{seeds} | {spent:.0f} |"
+    )
 
 
 def _blind(problem: Problem, seed: int) -> Floats | None:
@@ -169,7 +177,7 @@ def _blind(problem: Problem, seed: int) -> Floats | None:
         return at
     start = pose(at, rng.uniform(-np.pi, np.pi, n))
     assert problem.x0 is not None
-    start[list(problem.held)] = problem.x0[list(problem.held)]
+    start[list(problem.fixed)] = problem.x0[list(problem.fixed)]
     return start
 
 

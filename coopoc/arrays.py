@@ -1,26 +1,120 @@
-"""Array types used in every signature; shapes stand in the docstrings as (R, T, N, 3)."""
+"""Array types used in every signature, and checks of arrays and numbers; shapes stand in docstrings as (R, T, N, 3)."""
 
 from __future__ import annotations
 
+import sys
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+
+from .errors import InputError
 
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Ints: TypeAlias = npt.NDArray[np.int64]
 Bools: TypeAlias = npt.NDArray[np.bool_]
 AnyArray: TypeAlias = npt.NDArray[Any]
 
+KINDS: dict[Any, tuple[str, str]] = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
+"""What an array may be made of: the kinds of dtype, and what one entry is called."""
+
 
 def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
-    """Read-only array of `values`: the nouns are frozen, and so is what they hold.
+    """Read-only, contiguous and aligned array of `values`: compiled code may rely on all three.
 
     >>> frozen([1, 2]).flags.writeable
     False
     """
-    array = np.asarray(values, dtype=dtype)
+    given = np.asarray(values)
+    array = np.require(given, dtype, ["C", "A"])
     if array.flags.writeable:
-        array = array.copy()  # the caller may go on writing to its own
+        if array is given and not isinstance(values, list | tuple):
+            array = array.copy()  # the caller may go on writing to its own
         array.flags.writeable = False
     return array
+
+
+def checked(
+    field: str, values: npt.ArrayLike, axes: str = "", shape: tuple[int, ...] | None = None, dtype: Any = float
+) -> AnyArray:
+    """`frozen` values of one of KINDS with that shape.
+
+    Args:
+        field: name of the values in an error.
+        values: what was given.
+        axes: the shape in letters, such as "(R, T, N, 3)".
+        shape: the shape in numbers, -1 where any length will do; None for any shape.
+        dtype: float, int or bool. Numbers that are not of that kind are refused, and never rounded or parsed.
+
+    Raises:
+        InputError: another shape or another kind of values.
+
+    >>> checked("t", [0.0, 0.1], "(T,)", (3,))
+    Traceback (most recent call last):
+    coopoc.errors.InputError: t = shape (2,): must have shape (T,) = (3,). Give one entry per index of each axis.
+    """
+    kinds, word = KINDS[dtype]
+    try:
+        given = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        given = np.empty(0, dtype=object)
+    if given.dtype.kind not in kinds and (given.size or given.dtype == object):
+        hint = "Convert it with numpy first: rows must be equally long, text is not parsed, floats are not rounded."
+        raise InputError(field, f"dtype {given.dtype}", f"must be an array of {word}s", hint)
+    wrong = shape is not None and (
+        given.ndim != len(shape) or any(n not in (size, -1) for n, size in zip(shape, given.shape, strict=True))
+    )
+    if shape is not None and wrong:
+        wanted = str(tuple("any" if n < 0 else n for n in shape)).replace("'", "")
+        allowed = f"must have shape {axes} = {wanted}"
+        raise InputError(field, f"shape {given.shape}", allowed, "Give one entry per index of each axis.")
+    return frozen(given, dtype)
+
+
+def number(
+    field: str,
+    value: object,
+    low: float = 0.0,
+    high: float = sys.float_info.max,
+    *,
+    kind: Any = float,
+    allowed: str = "finite and >= 0",
+    hint: str = "Give a number in SI units.",
+) -> Any:
+    """`value` as a Python float or int in [low, high].
+
+    Args:
+        field: its name in an error.
+        value: a Python or NumPy number.
+        low: least value.
+        high: largest value; infinity allows infinity.
+        kind: float or int. Booleans, text and (for int) floats are refused.
+        allowed: the range in words.
+        hint: how to fix it.
+
+    Raises:
+        InputError: not a number of that kind, or outside the range.
+
+    >>> number("range_std", 2)
+    2.0
+    """
+    kinds, word = KINDS[kind]
+    given = np.asarray(value if isinstance(value, int | float | np.generic | np.ndarray) else None)
+    if given.ndim or given.dtype.kind not in kinds:
+        raise InputError(field, repr(value)[:60], f"must be a {word}, {allowed}", hint)
+    found = kind(given.item())
+    if not low <= found <= high:
+        raise InputError(field, value, f"must be {allowed}", hint)
+    return found
+
+
+def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hint: str) -> None:
+    """InputError that names the first value where `wrong` is true, if there is one; both have the same shape.
+
+    >>> refuse("step", np.array([3, -1]), [False, True], "must be >= 0", "Count steps from 0.")
+    Traceback (most recent call last):
+    coopoc.errors.InputError: step[1] = -1: must be >= 0. Count steps from 0.
+    """
+    if np.any(wrong):
+        place = tuple(np.argwhere(wrong)[0].tolist())
+        raise InputError(f"{field}[{', '.join(map(str, place))}]", values[place], allowed, hint)

@@ -1,4 +1,4 @@
-"""The command line: coopoc run, merge, compare, table, report, list, and what installed distributions add."""
+"""The command line: coopoc run, merge, compare, table, report, list, and the commands of installed distributions."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 
 _ABOUT = """usage: coopoc COMMAND [options]
 
-Cooperative localization: studies of what other vehicles, and learned gains, are worth.
+Cooperative localization: solvers, filters, learned gains, and studies that compare them.
 
 commands:
 {commands}
 
-Each command explains itself: coopoc COMMAND --help. Example: coopoc run neighbours --jobs 2
+Options and an example of each command: coopoc COMMAND --help. Example: coopoc run neighbours --jobs 2
 Tables and JSON go to stdout, progress and messages to stderr.
 Exit status: 0 done, 1 some cells failed, 2 usage, 130 interrupted and resumable."""
 
@@ -49,12 +49,12 @@ def run(
     retry_failed: bool = False,
     dry_run: bool = False,
 ) -> int:
-    """Run a study, or resume it: what is finished is kept, and what failed is left until you ask for it.
+    """Run a study, or resume it: finished cells are kept, failed cells are computed again with --retry-failed.
 
     Example: coopoc run neighbours --jobs 2 --set runs=100 max_neighbours=0,4
 
     Args:
-        name: of the study; coopoc list shows them. Your own: FILE.py:NAME.
+        name: of the study, as in coopoc list, or FILE.py:NAME for a file of your own.
         data: a data set instead of the study's own.
         out: of all studies; this one goes to FOLDER/NAME.
         jobs: worker processes. Results do not depend on it.
@@ -62,12 +62,11 @@ def run(
         shard: compute only the I-th of N parts; a run without it completes and publishes them.
         cluster: a Dask scheduler, whose workers compute instead of processes here.
         retry_failed: compute failed cells once more.
-        dry_run: say what would be kept, repeated and computed, and stop.
+        dry_run: print which cells would be kept, repeated and computed, and stop.
     """
     from .study.parse import assignments
     from .study.publish import tables
-    from .study.run import plan
-    from .study.run import run as run_study
+    from .study.run import plan, run_study
 
     changes = dict(assignments([text for group in set for text in group]))
     if data is not None:
@@ -94,7 +93,7 @@ def merge(
     /,
     out: Annotated[Path, arg(metavar="FOLDER")],
 ) -> int:
-    """Bring the folders of one study together, such as those that several machines filled shard by shard.
+    """Merge folders of one study, such as those that several machines filled shard by shard.
 
     Example: coopoc merge a/neighbours b/neighbours --out runs
 
@@ -120,7 +119,7 @@ def compare(
     where: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
     format: Literal["markdown", "csv", "latex", "html"] = "markdown",
 ) -> None:
-    """Show what changed beyond noise between two runs of one study.
+    """Show the changes beyond noise between two runs of one study.
 
     Example: coopoc compare before/neighbours after/neighbours --where method=okf,kalman
 
@@ -128,7 +127,7 @@ def compare(
         run_a: folder of the study.
         run_b: folder of the same study, run with other code or settings.
         value: the metric.
-        by: columns beside the parameters that tell rows apart, such as round.
+        by: columns beside the parameters that identify a row, such as round.
         where: rows of the results to compare.
         format: of the tables.
     """
@@ -155,11 +154,12 @@ def table(
         folder: of the study.
         format: of the table.
         name: only this one of the study's tables.
-        rows: what labels the rows of another table.
-        columns: what labels its columns.
-        value: its numbers.
-        where: rows of the results that it stands on.
+        rows: parameter down the rows of another table.
+        columns: parameter across its columns.
+        value: metric that it shows.
+        where: rows of the results that it is made from.
     """
+    from .study.pivot import pivot
     from .study.publish import tables
     from .study.results import Results
 
@@ -167,8 +167,7 @@ def table(
         print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
         return
     results = Results.load(folder)
-    shown = results.table(rows=rows, columns=columns, value=value, where=results.parsed(where))
-    print(shown.render(format).rstrip("\n"))
+    print(pivot(results, rows, columns, value, results.parsed(where)).render(format).rstrip("\n"))
 
 
 def report(
@@ -177,7 +176,7 @@ def report(
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     title: Annotated[str, arg(metavar="TEXT")] = "",
 ) -> None:
-    """Write one self-contained HTML page on one or several studies, or print it to a PDF.
+    """Write a self-contained HTML page on one or several studies, or print it to a PDF.
 
     Example: coopoc report runs/neighbours runs/error_cdf --out report.html
 
@@ -197,7 +196,7 @@ def report(
 
 
 def list_names() -> None:
-    """List methods, studies, data sets and backends that are installed.
+    """List what is installed: methods, studies, data sets, backends and other open sets.
 
     Example: coopoc list
     """
@@ -207,8 +206,13 @@ def list_names() -> None:
 
 
 OWN: Mapping[str, Command] = {
-    "run": run, "merge": merge, "compare": compare, "table": table, "report": report, "list": list_names,
-}  # fmt: skip
+    "run": run,
+    "merge": merge,
+    "compare": compare,
+    "table": table,
+    "report": report,
+    "list": list_names,
+}
 
 
 def _status(argv: list[str]) -> int:
@@ -225,7 +229,7 @@ def _status(argv: list[str]) -> int:
     except KeyboardInterrupt:
         print("coopoc: interrupted. Finished cells are kept: repeat the command to resume.", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # whoever reads stdout has seen enough, as in: coopoc table FOLDER | head
+    except BrokenPipeError:  # the reader of stdout has ended, as in: coopoc table FOLDER | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
@@ -234,7 +238,7 @@ def _status(argv: list[str]) -> int:
 
 
 def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> int:
-    """Call the command that argv names; only that one is loaded and parsed, which keeps the start quick."""
+    """Call the command that argv names. Only that one is loaded and parsed: a quick start."""
     if not argv or argv[0] in ("-h", "--help"):
         print(_help(commands, prog))
         return 0 if argv else 2
@@ -255,7 +259,7 @@ def _help(commands: Mapping[str, Command], prog: str) -> str:
 
 
 def _summary(command: Command) -> str:
-    """First line of the docstring; a command that cannot be loaded says why instead of hiding the others."""
+    """First line of the docstring; for a command that cannot be loaded the reason, and the others stay visible."""
     try:
         loaded = command.load() if isinstance(command, EntryPoint) else command
     except Exception as error:

@@ -1,21 +1,21 @@
-"""Exceptions that say which field is wrong, what is allowed and how to mend it."""
+"""Exceptions that name the wrong field, the allowed values and a way to correct it."""
 
 from __future__ import annotations
 
 
 class InputError(ValueError):
-    """A value that cannot be used: names the field, the value, what is allowed, and the mend.
+    """A value that cannot be used: names the field, the value, what is allowed, and a hint.
 
     >>> print(InputError("max_neighbours", -1, "must be >= 0", "Use 0 for no neighbours."))
     max_neighbours = -1: must be >= 0. Use 0 for no neighbours.
     """
 
-    def __init__(self, field: str, value: object, allowed: str, mend: str) -> None:
-        self.field, self.value, self.allowed, self.mend = field, value, allowed, mend
-        super().__init__(f"{field} = {value}: {allowed.rstrip('.')}. {mend}")
+    def __init__(self, field: str, value: object, allowed: str, hint: str) -> None:
+        self.field, self.value, self.allowed, self.hint = field, value, allowed, hint
+        super().__init__(f"{field} = {value}: {allowed.rstrip('.')}. {hint}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, object, str, str]]:
-        return type(self), (self.field, self.value, self.allowed, self.mend)
+        return type(self), (self.field, self.value, self.allowed, self.hint)
 
 
 class MissingLibraryError(ImportError):

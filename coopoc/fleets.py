@@ -1,4 +1,4 @@
-"""load: a bundled fleet by name, or the user's own file."""
+"""load_fleet: a bundled fleet by name, or the user's own file."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from .plugins import find
 from .world.fleet import Fleet
 
 
-def load(name_or_path: str | Path, **options: Any) -> Fleet:
+def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
     """Fleet of a bundled dataset or of a file or folder: CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM.
 
     Args:
-        name_or_path: a name that `coopoc data list` shows, or a path. options: of the reader, such as dt in seconds.
+        name_or_path: a name that `coopoc data list` shows, or a path.
+        options: of the reader, such as dt in seconds.
 
     Raises:
         InputError: an unknown name (the message lists all), or a file with a fault.
 
-    >>> load("town10")
+    >>> load_fleet("town10")
     Fleet(town10: 60 vehicles x 900 steps, dt 0.1 s)
     """
     fleet: Fleet = find("coopoc.readers", "load")(name_or_path, **options)

@@ -1,4 +1,4 @@
-"""What somebody keeps in one Python file of their own, by path: "folder/mine.py:NAME" wherever a name is asked for."""
+"""Objects of one's own in one Python file, by path: "folder/mine.py:NAME" is accepted wherever a name is."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from typing import Any
 
 from .errors import InputError
 
+_PREFIX = "coopoc_file_"
+
 
 def in_file(name: str) -> bool:
     """True for a path to a Python file and a name in it.
@@ -20,31 +22,36 @@ def in_file(name: str) -> bool:
     >>> in_file("mine.py:StayPut"), in_file("kalman")
     (True, False)
     """
-    path, colon, held = name.rpartition(":")
-    return bool(colon and held) and path.endswith(".py")
+    path, colon, attribute = name.rpartition(":")
+    return bool(colon and attribute) and path.endswith(".py")
 
 
 def from_file(name: str, noun: str = "object") -> Any:
-    """The object that the file holds under the name; the file is run once for each of its contents.
+    """The object of that name in the file; the file is run once for each of its contents.
 
     Args:
-        name: "folder/mine.py:NAME", from the working folder. noun: what it is to be, for the error.
+        name: "folder/mine.py:NAME", from the working folder.
+        noun: kind of the object, for the error.
 
     Raises:
-        InputError: no such file, or no such name in it (lists its names). What the file itself raises comes as it is.
+        InputError: no such file, or no such name in it (lists its names). Errors of the file itself pass unchanged.
     """
-    path, _, held = name.rpartition(":")
+    path, _, attribute = name.rpartition(":")
     module = _module(str(Path(path).resolve()), file_digest(name, noun))
-    if not hasattr(module, held):
+    if not hasattr(module, attribute):
         own = [n for n, value in vars(module).items() if not n.startswith("_") and not isinstance(value, ModuleType)]
-        near = difflib.get_close_matches(held, own, n=1)
-        mend = f"Did you mean {path}:{near[0]}?" if near else "Name what the file defines."
-        raise InputError(noun, repr(name), f"is not in the file, which has {', '.join(own) or 'no names'}", mend)
-    return getattr(module, held)
+        near = difflib.get_close_matches(attribute, own, n=1)
+        hint = f"Did you mean {path}:{near[0]}?" if near else "Name what the file defines."
+        raise InputError(noun, repr(name), f"is not in the file, which has {', '.join(own) or 'no names'}", hint)
+    return getattr(module, attribute)
 
 
 def file_digest(name: str, noun: str = "object") -> str:
-    """Hash of the file's contents, which the names of cells hold: they are computed again when the file changes.
+    """Hash of the file's contents. Cells are named by it, so that they are computed again when the file changes.
+
+    Args:
+        name: "folder/mine.py:NAME".
+        noun: kind of the object, for the error.
 
     Raises:
         InputError: no such file.
@@ -55,9 +62,16 @@ def file_digest(name: str, noun: str = "object") -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:20]
 
 
+def path_of(kind: type[Any]) -> Path | None:
+    """Path of the file that `from_file` loaded a class from; None for any other class."""
+    module = sys.modules.get(kind.__module__)
+    held = kind.__module__.startswith(_PREFIX) and module is not None and module.__file__
+    return Path(held) if held else None
+
+
 @cache
 def _module(path: str, digest: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(f"coopoc_file_{Path(path).stem}_{digest}", path)
+    spec = importlib.util.spec_from_file_location(f"{_PREFIX}{Path(path).stem}_{digest}", path)
     if spec is None or spec.loader is None:  # no path that ends in .py is without
         raise InputError("path", repr(path), "is no Python source", "Name a .py file.")
     module = importlib.util.module_from_spec(spec)

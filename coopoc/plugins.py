@@ -1,4 +1,4 @@
-"""Entry points: how the core meets datasets, methods, studies, backends and commands that it never imports."""
+"""Entry points: data sets, methods, studies, backends and commands, which the core finds by name and never imports."""
 
 from __future__ import annotations
 
@@ -10,17 +10,27 @@ from typing import Any
 from .errors import InputError
 from .one_file import from_file, in_file
 
-GROUPS = {"coopoc.datasets": "data set", "coopoc.methods": "method", "coopoc.studies": "study",
-          "coopoc.backends": "backend", "coopoc.recipes": "recipe", "coopoc.nets": "net",
-          "coopoc.commands": "command"}  # fmt: skip
+GROUPS = {
+    "coopoc.datasets": "data set",
+    "coopoc.methods": "method",
+    "coopoc.studies": "study",
+    "coopoc.backends": "backend",
+    "coopoc.measurements": "measurement",
+    "coopoc.recipes": "recipe",
+    "coopoc.nets": "net",
+    "coopoc.rules": "aggregation rule",
+    "coopoc.channels": "channel",
+    "coopoc.metrics": "metric",
+    "coopoc.commands": "command",
+}
 """Group -> what one of its names is called."""
 
 
 def points(group: str) -> Mapping[str, metadata.EntryPoint]:
     """Entry points of a group by name, none of them loaded; InputError if two distributions claim one name.
 
-    They are made anew as Python's own: once the backport importlib_metadata is imported, as Dask does, Python's finder
-    gives entry points of a class of its own.
+    Once the backport importlib_metadata is imported, as Dask does, Python's finder returns entry points of another
+    class; each is therefore made anew as Python's own.
     """
     found: dict[str, metadata.EntryPoint] = {}
     for point in sorted(metadata.entry_points(group=group), key=lambda p: p.name):
@@ -41,14 +51,20 @@ def names(group: str) -> tuple[str, ...]:
 
 
 def find(group: str, name: str) -> Any:
-    """The object registered under `name`, loaded now; its library is imported only here.
+    """Load the object that is registered under `name`; its library is imported only here.
+
+    A path runs the file. It must come from the user: a name read from data is looked up only after `in_file` is False.
 
     Args:
         group: one of GROUPS, or a third party's own.
         name: an entry point, a key of an entry point that holds a mapping, or "folder/mine.py:NAME", a name in a file.
 
+    Returns:
+        The object itself: a class, a function, a Study.
+
     Raises:
-        InputError: no such name (lists the names and the nearest one), or two distributions claim it.
+        InputError: no such name (lists the names and the nearest one), no such file, or two distributions claim the
+            name.
 
     >>> find("nothing", "x")
     Traceback (most recent call last):
@@ -69,8 +85,8 @@ def find(group: str, name: str) -> Any:
 
 
 def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:
-    """What an entry point that holds a mapping stands for. One that cannot be loaded keeps its own name, and says why
-    when somebody asks for it."""
+    """Names in an entry point that holds a mapping. One that cannot be loaded is listed under its own name, and raises
+    when it is asked for."""
     try:
         loaded = point.load()
     except Exception:
@@ -78,15 +94,20 @@ def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:
     return loaded if isinstance(loaded, Mapping) else {}
 
 
-def unknown(noun: str, name: str, known: Iterable[str]) -> InputError:
-    """The error for a name that is not registered: lists what is, and proposes the nearest.
+def unknown(noun: str, name: object, known: Iterable[str]) -> InputError:
+    """The error for an unknown name: lists the known ones and proposes the nearest.
+
+    Args:
+        noun: kind of the thing, such as "method".
+        name: that was asked for.
+        known: names that exist.
 
     >>> print(unknown("method", "kalmann", ["gnss", "kalman"]))
     method = 'kalmann': must be one of gnss, kalman. Did you mean kalman?
     """
     known = list(known)
-    near = difflib.get_close_matches(name, known, n=1)
+    near = difflib.get_close_matches(str(name), known, n=1)
     listed = noun in GROUPS.values()
     other = "List all with: coopoc list." if listed else "Use one of these names." if known else "There is none to use."
-    mend = f"Did you mean {near[0]}?" if near else other
-    return InputError(noun, repr(name), "must be one of " + (", ".join(known) or "(there is none)"), mend)
+    hint = f"Did you mean {near[0]}?" if near else other
+    return InputError(noun, repr(name), "must be one of " + (", ".join(known) or "(there is none)"), hint)

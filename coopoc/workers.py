@@ -11,7 +11,11 @@ from functools import lru_cache
 
 @lru_cache
 def leave_with(parent: int) -> None:
-    """End this process when its parent, by process id, does: Ctrl-C is for that one, and a kill leaves no orphan."""
+    """End this process when its parent ends. Ctrl-C is left to the parent, and a killed parent leaves no orphan.
+
+    Args:
+        parent: process id.
+    """
 
     def watch() -> None:
         while os.getppid() == parent:

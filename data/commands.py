@@ -8,6 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from coopoc.plugins import unknown
+
 from .registry import DATASETS, convert, list_datasets
 
 
@@ -30,9 +32,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
         name: of the fleet.
     """
     if name not in DATASETS:
-        from coopoc.errors import InputError
-
-        raise InputError("name", repr(name), f"must be one of {', '.join(DATASETS)}", "See coopoc data list.")
+        raise unknown("fleet", name, DATASETS)
     print(DATASETS[name].card().render())
 
 
@@ -42,8 +42,10 @@ def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fle
     Example: coopoc data make town10 --maps carla_maps
 
     Args:
-        recipe: name of a bundled fleet. maps: folder with the .xodr files of CARLA.
-        out: folder for the fleet and its card. seed: another one than the recipe's.
+        recipe: name of a bundled fleet.
+        maps: folder with the .xodr files of CARLA.
+        out: folder for the fleet and its card.
+        seed: instead of the recipe's.
     """
     from .generate import make as generate
 
@@ -52,15 +54,21 @@ def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fle
 
 
 def convert_(
-    source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path], *, dt: float | None = None,
+    source: tyro.conf.Positional[str],
+    out: tyro.conf.Positional[Path],
+    *,
+    dt: float | None = None,
     format: str | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Convert a drive to CSV, Parquet or a folder of TUM files.
 
     Example: coopoc data convert fcd.xml drive.csv --dt 0.1
 
     Args:
-        source: name or path. out: .csv, .parquet or a folder. dt: s, resample. format: of the source, if not detected.
+        source: name or path.
+        out: .csv, .parquet or a folder.
+        dt: s, resample.
+        format: of the source, if it is not detected.
     """
     print(f"{convert(source, out, dt, format=format)!r} written to {out}", file=sys.stderr)
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.world.recording import Links, Recording
+from coopoc.world.links import Links
+from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe, schedule
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X

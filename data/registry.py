@@ -63,7 +63,7 @@ READERS: Mapping[str, Callable[..., Fleet]] = {
 }
 
 
-def load(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
+def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
     """Fleet of a bundled dataset or of a file or folder.
 
     Args:
@@ -76,7 +76,7 @@ def load(name_or_path: str | Path, *, format: str | None = None, **options: Any)
     Raises:
         InputError: an unknown name (the message lists all), an unknown format or option, or a file with a fault.
 
-    >>> load("town10-clients").present.sum(axis=0)
+    >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
     name = str(name_or_path)
@@ -176,18 +176,22 @@ def list_datasets() -> list[dict[str, Any]]:
 def convert(
     name_or_path: str | Path, out: str | Path, dt: float | None = None, *, format: str | None = None, **options: Any
 ) -> Fleet:
-    """Load a fleet, resample it to dt seconds if given, write it, and return what was written.
+    """Load a fleet, resample it if dt is given, write it, and return it as it was written.
 
     Args:
-        out: .csv or .parquet file, or a folder (no suffix) that gets one TUM file per vehicle.
+        name_or_path: as in `load_fleet`.
+        out: .csv or .parquet file, or a folder (no suffix) for one TUM file per vehicle.
+        dt: s, resample.
+        format: of the source, if it is not detected.
+        options: of the reader.
 
     Raises:
-        InputError: what `load` raises, or another ending of `out`.
+        InputError: as `load_fleet`, another ending of `out`, or ids that are no file names for TUM.
     """
     path = Path(out)
     if path.suffix not in (".csv", ".parquet", ""):
         raise InputError("out", path.name, "must end in .csv or .parquet, or be a folder for TUM files", "Rename it.")
-    fleet = load(name_or_path, format=format, **options, **({} if dt is None else {"dt": dt}))
+    fleet = load_fleet(name_or_path, format=format, **options, **({} if dt is None else {"dt": dt}))
     path.parent.mkdir(parents=True, exist_ok=True)
     (write_table if path.suffix else write_tum)(fleet, path)
     return fleet

@@ -99,13 +99,13 @@ def read_csv(path: Path, text: str = "") -> pd.DataFrame:
     """
     import pandas as pd
 
-    allowed, mend = "must be comma separated text with a header", "Export it again, with commas and decimal points."
+    allowed, hint = "must be comma separated text with a header", "Export it again, with commas and decimal points."
     try:
         frame = pd.read_csv(path, skipinitialspace=True, converters={text: str.strip})
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise InputError(path.name, error, allowed, mend) from None
+        raise InputError(path.name, error, allowed, hint) from None
     if len(frame.columns) == 1:
-        raise InputError(path.name, repr(frame.columns[0]), allowed, mend)
+        raise InputError(path.name, repr(frame.columns[0]), allowed, hint)
     if len(frame) and not isinstance(frame.index, pd.RangeIndex):
         longer = f"{frame.index.nlevels + len(frame.columns)} cells under {len(frame.columns)} names"
         raise InputError(path.name, longer, "must have one name per column", "Name every column in the header.")

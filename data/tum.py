@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from coopoc.errors import InputError
+from coopoc.file_names import file_name, inside
 from coopoc.formats import tum
 from coopoc.formats.trajectory import Trajectory
 from coopoc.world.fleet import Fleet
@@ -52,10 +53,22 @@ def read_tum(path: Path, *, dt: float | None = None) -> Fleet:
 
 
 def write_tum(fleet: Fleet, folder: Path) -> None:
-    """Write <id>.tum for every vehicle: no velocity, and the identity as orientation, which a Fleet lacks."""
+    """Write <id>.tum for every vehicle: no velocity, and the identity as orientation, which a Fleet lacks.
+
+    Args:
+        fleet: to write.
+        folder: for the files.
+
+    Raises:
+        InputError: an id that is no file name, ids that differ in case only, or a symbolic link out of the folder.
+    """
+    hint = "Write a .csv or .parquet file, which takes any id."
+    paths = [folder / f"{file_name('id', name, hint)}.tum" for name in fleet.ids]
+    if len({name.casefold() for name in fleet.ids}) < len(fleet.ids):
+        raise InputError("id", sorted(fleet.ids), "must differ in more than their case", hint)
     folder.mkdir(parents=True, exist_ok=True)
-    for column, name in enumerate(fleet.ids):
+    for column, path in enumerate(inside(folder, path) for path in paths):
         present = fleet.present[:, column]
         position = fleet.position[present, column]
         poses = Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
-        tum.write_tum(poses, folder / f"{name}.tum")
+        tum.write_tum(poses, path)

@@ -8,7 +8,7 @@ from coopoc.learned import load_method
 
 def main() -> None:
     """Print a solved snapshot and a small comparison."""
-    fleet = co.load("town10")
+    fleet = co.load_fleet("town10")
     sensors, v2x, ego = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=6), "town10-24"
     seen = co.observe(fleet, sensors, v2x, runs=10, seed=0, observers=[ego])
 
@@ -17,11 +17,11 @@ def main() -> None:
         print(f"{backend:13s}{co.solve(problem, backend=backend)}")
 
     methods = {
-        "GNSS": co.Gnss(),
+        "GNSS": co.GNSS(),
         "Kalman, identity": co.Kalman("identity"),
         "Kalman, nominal": co.Kalman("nominal"),
         "FedKalmanNet": load_method("fedkalmannet"),
-        "LKF-SA, identity": co.LaplacianKalman("identity"),
+        "LKF-SA, identity": co.LKFSA("identity"),
         "Joint filter, nominal": co.JointFilter("nominal"),
     }
     for name, method in methods.items():

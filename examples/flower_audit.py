@@ -23,9 +23,9 @@ import numpy as np
 import tyro
 from flower_deployment import Site, deployment, family, finished, join, submit
 
-from coopoc import Fleet, load
-from coopoc.learned.flower.job import data as clients_of
+from coopoc import Fleet, load_fleet
 from coopoc.learned.flower.job import job_of
+from coopoc.learned.recipes import job_clients
 from coopoc.learned.training.clients import Client
 
 HOME = (8361947.123, -4720583.456, 913.77)
@@ -45,12 +45,12 @@ def main(folder: Path = Path("runs/flower_audit"), data: str = "town10-clients",
         data: fleet, a name or a path. The first vehicle must stay within 300 m of its start.
         rounds: of the federation.
     """
-    fleet, folder = load(data), folder.resolve()
+    fleet, folder = load_fleet(data), folder.resolve()
     drives = {vehicle: fleet.select([vehicle]) for vehicle in fleet.ids}
     first = fleet.ids[0]
     drives[first] = moved(drives[first])
     job = job_of({"recipe": "fedkalmannet", "rounds": rounds, "local-epochs": 1})
-    secret = Secret.of(clients_of(job, drives[first])[0])
+    secret = Secret.of(job_clients(job, drives[first])[0])
     words = [f'change="rounds={rounds} local-epochs=1"', f"nodes={len(drives)}", f'out="{folder / "net.safetensors"}"']
     with deployment(folder, tls=False) as site, Wiretap(site.port) as tap:
         join(site, drives, tap.port)

@@ -2,10 +2,10 @@
 
 Makes a certificate authority, a certificate for the server and a key pair for every vehicle; starts a SuperLink with
 TLS and node authentication, and for each vehicle a SuperNode that holds the drive of this vehicle only; trains; prints
-the rounds; stops all processes, on Ctrl-C and errors too.
+the rounds; stops all processes, on Ctrl-C and errors too. Exits with 1 if the run fails.
 
 Run:  python examples/flower_deployment.py --rounds 3
-      python examples/flower_deployment.py --rounds 3 --kill 2     vehicle 2 dies in the second round
+      python examples/flower_deployment.py --rounds 3 --kill 2     vehicle 2 is killed in the second round
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
-from coopoc import Fleet, load
+from coopoc import Fleet, load_fleet
 from coopoc.data.table import write_table
 from coopoc.learned.checkpoint import read_card
 
@@ -41,9 +41,13 @@ PATIENCE = 300.0
 
 
 def main(
-    folder: Path = Path("runs/flower"), data: str = "town10-clients", rounds: int = 3, kill: int | None = None,
-    patience: float = 3.0, change: str = "",
-) -> None:  # fmt: skip
+    folder: Path = Path("runs/flower"),
+    data: str = "town10-clients",
+    rounds: int = 3,
+    kill: int | None = None,
+    patience: float = 3.0,
+    change: str = "",
+) -> None:
     """Train a federation of all vehicles of a fleet, one process each.
 
     Args:
@@ -52,9 +56,9 @@ def main(
         rounds: of the federation.
         kill: this vehicle, counted from 1, in the middle of the second round.
         patience: times as long as it took most clients that a round waits for the others.
-        config: more of examples/flower/pyproject.toml, such as net-in-mult=2.
+        change: fields of the recipe, its schedule or its net, such as net-in-mult=2.
     """
-    fleet, folder = load(data), folder.resolve()
+    fleet, folder = load_fleet(data), folder.resolve()
     out = folder / "fedkalmannet.safetensors"
     words = [f'change="rounds={rounds} {change}"', f"patience={patience}", f"nodes={len(fleet.ids)}", f'out="{out}"']
     with deployment(folder) as site:
@@ -66,6 +70,7 @@ def main(
             os.killpg(nodes[kill - 1].pid, signal.SIGKILL)
             print(f"killed node-{kill}", flush=True)
         finished(run, "flwr run", 600.0 * (rounds + 2))
+        completed(site)
     show(out)
 
 
@@ -85,14 +90,19 @@ class Site:
         home.mkdir(exist_ok=True)
         with open(self.folder / f"{name}.log", "wb") as log:
             process = subprocess.Popen(
-                [str(TOOLS / command[0]), *command[1:]], stdin=subprocess.DEVNULL, stdout=log, stderr=log, cwd=home,
-                env=environment(home), start_new_session=True,
-            )  # fmt: skip
+                [str(TOOLS / command[0]), *command[1:]],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd=home,
+                env=environment(home),
+                start_new_session=True,
+            )
         self.started.append(process)
         return process
 
     def operator(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
-        """`flwr`, the command of whoever operates the server."""
+        """`flwr`, the command of the server's operator."""
         (self.folder / name).mkdir(exist_ok=True)
         safe = f'root-certificates = "{self.folder / "ca.pem"}"' if self.tls else "insecure = true"
         (self.folder / name / "config.toml").write_text(f'[superlink.here]\naddress = "{HOST}:{self.port}"\n{safe}\n')
@@ -103,26 +113,45 @@ TOOLS = Path(sys.executable).parent
 
 
 def environment(home: Path) -> dict[str, str]:
-    """Variables of a Flower process: its own home, nothing sent to Flower's makers, one core, quick looks for work."""
+    """Variables of a Flower process: its own home, no telemetry, one core, quick looks for work."""
     return os.environ | {
-        "FLWR_HOME": str(home), "FLWR_TELEMETRY_ENABLED": "0", "FLWR_DISABLE_UPDATE_CHECK": "1",
-        "FLWR_SUPEREXEC_TASK_POLL_INTERVAL": "0.2", "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1",
+        "FLWR_HOME": str(home),
+        "FLWR_TELEMETRY_ENABLED": "0",
+        "FLWR_DISABLE_UPDATE_CHECK": "1",
+        "FLWR_SUPEREXEC_TASK_POLL_INTERVAL": "0.2",
+        "OMP_NUM_THREADS": "1",
+        "PYTHONUNBUFFERED": "1",
         "PATH": f"{TOOLS}{os.pathsep}{os.environ.get('PATH', '')}",
-    }  # fmt: skip
+    }
 
 
 @contextmanager
 def deployment(folder: Path, tls: bool = True) -> Iterator[Site]:
-    """A running SuperLink; in the end, however it comes, all processes are stopped."""
+    """A running SuperLink; all processes are stopped in the end, on errors too."""
     folder.mkdir(parents=True, exist_ok=True)
     site, options = Site(folder, free_port(), tls), ["--insecure"]
     if tls:
         certificates(folder)
-        options = ["--enable-supernode-auth", "--ssl-ca-certfile", str(folder / "ca.pem"), "--ssl-certfile",
-                   str(folder / "server.pem"), "--ssl-keyfile", str(folder / "server.key")]  # fmt: skip
+        options = [
+            "--enable-supernode-auth",
+            "--ssl-ca-certfile",
+            str(folder / "ca.pem"),
+            "--ssl-certfile",
+            str(folder / "server.pem"),
+            "--ssl-keyfile",
+            str(folder / "server.key"),
+        ]
     try:
-        link = site.start("superlink", "flower-superlink", "--host", HOST, "--port", str(site.port),
-                          "--disable-runtime-dependency-installation", *options)  # fmt: skip
+        link = site.start(
+            "superlink",
+            "flower-superlink",
+            "--host",
+            HOST,
+            "--port",
+            str(site.port),
+            "--disable-runtime-dependency-installation",
+            *options,
+        )
         wait(lambda: listens(site.port), link, "the SuperLink")
         yield site
     finally:
@@ -141,8 +170,12 @@ def join(site: Site, drives: Mapping[str, Fleet], port: int | None = None) -> li
         write_table(drives[vehicle], home / "drive.parquet")
     if site.tls:
         keys = {vehicle: key_pair(home) for vehicle, home in homes.items()}
-        asked = [site.operator(f"register-{homes[vehicle].name}", "supernode", "register", str(key), "here", "--name",
-                               vehicle) for vehicle, key in keys.items()]  # fmt: skip
+        asked = [
+            site.operator(
+                f"register-{homes[vehicle].name}", "supernode", "register", str(key), "here", "--name", vehicle
+            )
+            for vehicle, key in keys.items()
+        ]
         for process in asked:
             finished(process, "flwr supernode register")
     nodes = {home.name: supernode(site, home.name, identity(site, home), port) for home in homes.values()}
@@ -161,13 +194,36 @@ def identity(site: Site, home: Path) -> list[str]:
 def supernode(site: Site, name: str, who: Sequence[str], port: int | None = None) -> subprocess.Popen[bytes]:
     """A SuperNode that reads its drive from FOLDER/NAME/drive.parquet."""
     drive, link = site.folder / name / "drive.parquet", f"{HOST}:{port or site.port}"
-    return site.start(name, "flower-supernode", *who, "--superlink", link, "--max-retries", "3", "--host", HOST,
-                      "--port", str(free_port()), "--node-config", f'data="{drive}"')  # fmt: skip
+    return site.start(
+        name,
+        "flower-supernode",
+        *who,
+        "--superlink",
+        link,
+        "--max-retries",
+        "3",
+        "--host",
+        HOST,
+        "--port",
+        str(free_port()),
+        "--node-config",
+        f'data="{drive}"',
+    )
 
 
 def submit(site: Site, words: Sequence[str], app: Path = APP) -> subprocess.Popen[bytes]:
     """Send the app to the SuperLink and follow its run: the process ends when the run does."""
     return site.operator("run", "run", str(app), "here", "--stream", "--run-config", " ".join(words))
+
+
+def completed(site: Site) -> None:
+    """Raise RuntimeError if the latest run failed: `flwr run` exits with 0 in any case."""
+    status = ""
+    while "finished:" not in status:
+        finished(site.operator("list", "list", "here", "--limit", "1", "--format", "json"), "flwr list")
+        status = log(site, "list")
+    if "finished:completed" not in status:
+        raise RuntimeError(f"the run failed: see {site.folder}/run.log; the last round's checkpoint is at `out`")
 
 
 def show(out: Path) -> None:
@@ -238,14 +294,14 @@ def finished(process: subprocess.Popen[bytes], what: str, patience: float = PATI
 
 
 def free_port() -> int:
-    """A port of the loopback that nobody listens on, below those that outgoing connections are given."""
+    """A free port of the loopback, below the range of outgoing connections."""
     while True:
         with suppress(OSError), socket.create_server((HOST, port := random.SystemRandom().randrange(20_000, 32_000))):
             return port
 
 
 def listens(port: int) -> bool:
-    """Whether somebody does."""
+    """Whether a process listens on the port."""
     with suppress(OSError), socket.create_connection((HOST, port), timeout=1):
         return True
     return False

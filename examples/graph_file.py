@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 
 from coopoc.evaluate.alignment import absolute_error, align
-from coopoc.formats import read_graph
+from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve
 from coopoc.optimize.graphs import from_graph
@@ -23,7 +23,7 @@ from coopoc.optimize.graphs import from_graph
 
 def main(path: str, picture: str | None = None) -> Solution:
     """Solve the file, say how good it is, and draw it if a file name is given."""
-    graph = read_graph(path)
+    graph = load_graph(path)
     problem = from_graph(graph)
     before = absolute_error(problem.x0[graph.is_pose, :2], graph.position[graph.is_pose])
     solution = solve(problem)

@@ -65,7 +65,7 @@ def kitti(odometry: Path, times: Path, truth: Path) -> Log:
 
 def bundled(vehicle: str = "town10-24") -> Log:
     """A simulated drive with the velocity noise of the paper's training, for those who have no log at hand."""
-    fleet = co.load("town10").select([vehicle])
+    fleet = co.load_fleet("town10").select([vehicle])
     seen = co.observe(fleet, co.Sensors.paper_training(), co.V2X(max_neighbours=0))
     return Log(fleet.t, np.cumsum(seen.dt * seen.velocity[0, :, 0], axis=0), fleet.position[:, 0])
 
@@ -88,9 +88,9 @@ def ticks(log: Log, *, jitter: bool, drop: bool, late: bool) -> list[Tick]:
     return found
 
 
-def known(assumed: co.Sensors) -> co.Knowledge:
+def known(assumed: co.Sensors) -> co.NoiseModel:
     """That velocity noise, and the GNSS noise as it is."""
-    return co.Knowledge.nominal(replace(assumed, gnss_std=(GNSS_STD,) * 3))
+    return co.NoiseModel.nominal(replace(assumed, gnss_std=(GNSS_STD,) * 3))
 
 
 def replay(filter: Any, drive: Iterable[Tick]) -> tuple[float, float]:

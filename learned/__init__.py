@@ -1,29 +1,58 @@
 """Learned gains: nets that filter, their federated, centralised and individual training, and their shipped weights."""
 
 from .checkpoint import Checkpoint, load, save
-from .federation.federated import Federation, federate
-from .federation.history import ledger
+from .federation.federated import federate
+from .federation.history import Federation, ledger
 from .federation.participation import Participation
 from .method import Diagnostics, LearnedGain
 from .nets.cooperative import CooperativeGain
-from .nets.gain import Gain
+from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
 from .nets.noise_net import NoiseNet
-from .nets.okf import NoiseNumbers, OptimisedKF
-from .nets.recursive import RecursiveGain
-from .nets.recursive_filter import RecursiveFilter
+from .nets.okf import NoiseParameters, OptimisedKF
+from .nets.recursive import RecursiveFilter, RecursiveGain
 from .nets.split import SplitGain
 from .privacy.differential import Privacy
-from .privacy.secure import SecureMean
-from .recipes import RECIPES, Recipe, Setting, load_method, train_all
-from .training.clients import Client, Pieces, clients
+from .privacy.secure import SecureAggregation
+from .recipes import RECIPES, Recipe, Setting, load_method
+from .train import train_all
+from .training.clients import Client, Segments, clients
 from .training.fit import Fit, fit
 from .training.okf_fit import fit_okf
 from .training.schedule import Schedule
 
 __all__ = [
-    "RECIPES", "Checkpoint", "Client", "CooperativeGain", "Diagnostics", "Federation", "Fit", "Gain", "GainNet",
-    "LearnedGain", "NoiseNet", "NoiseNumbers", "OptimisedKF", "Participation", "Pieces", "Privacy", "Recipe",
-    "RecursiveFilter", "RecursiveGain", "Schedule", "SecureMean", "Setting", "SplitGain", "clients", "federate", "fit",
-    "fit_okf", "ledger", "load", "load_method", "save", "train_all",
-]  # fmt: skip
+    "RECIPES",
+    "Checkpoint",
+    "Client",
+    "CooperativeGain",
+    "Diagnostics",
+    "Federation",
+    "Fit",
+    "Gain",
+    "GainNet",
+    "LearnedGain",
+    "NoiseNet",
+    "NoiseParameters",
+    "OptimisedKF",
+    "Participation",
+    "Privacy",
+    "Recipe",
+    "Recurrent",
+    "RecursiveFilter",
+    "RecursiveGain",
+    "Schedule",
+    "SecureAggregation",
+    "Segments",
+    "Setting",
+    "SplitGain",
+    "clients",
+    "federate",
+    "fit",
+    "fit_okf",
+    "ledger",
+    "load",
+    "load_method",
+    "save",
+    "train_all",
+]

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from coopoc.errors import InputError
+from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
 
 from .nets.gain import Gain
@@ -61,8 +62,12 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
         InputError: a net of a class that is no entry point in `coopoc.nets`: nobody could read it again.
     """
     path, model = Path(path), checkpoint.model
-    card = dict(checkpoint.card) | {"environment": environment(), "kind": kind(model), "net": dict(model.settings),
-                                    "parameters": sum(p.numel() for p in model.parameters())}  # fmt: skip
+    card = dict(checkpoint.card) | {
+        "environment": environment(),
+        "kind": kind(model),
+        "net": dict(model.settings),
+        "parameters": sum(p.numel() for p in model.parameters()),
+    }
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
     if checkpoint.history is not None:
         tensors[_HISTORY] = checkpoint.history
@@ -75,21 +80,32 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
 
 
 def kind(model: Gain) -> str:
-    """Name of a net's class among the entry points `coopoc.nets`; InputError if it has none."""
-    value = f"{type(model).__module__}:{type(model).__qualname__}"
+    """Name of a net's class among the entry points `coopoc.nets`, or "mine.py:Net" for one of a file.
+
+    Raises:
+        InputError: a class that is neither an entry point nor loaded from a file by its path.
+    """
+    made = type(model)
+    value = f"{made.__module__}:{made.__qualname__}"
     for name, point in points("coopoc.nets").items():
         if point.value == value:
             return name
-    mend = "Name it in [project.entry-points.\"coopoc.nets\"] of your package."
-    raise InputError("net", value, "must be an entry point in coopoc.nets", mend)
+    if path := path_of(made):
+        return f"{path.name}:{made.__qualname__}"
+    hint = 'Name it by its file, "mine.py:Net", or in [project.entry-points."coopoc.nets"] of your package.'
+    raise InputError("net", value, "must be an entry point in coopoc.nets or come from a file", hint)
 
 
-def load(path: Path | str) -> Checkpoint:
-    """Read a checkpoint and check every tensor's shape against what its card promises.
+def load(path: Path | str, net: str = "") -> Checkpoint:
+    """Read a checkpoint and check every tensor's shape against its card. No code named by the file alone is run.
+
+    Args:
+        path: of the safetensors file.
+        net: the net, "folder/mine.py:Net", if it is one of your own files; a card cannot name such a file.
 
     Raises:
-        InputError: no such file, no card, a kind of net that is not installed, or tensors of another shape than its
-            net has.
+        InputError: no such file, no card, a kind of net that is not installed, a file that `net` does not name, or
+            tensors of another shape than its net has.
     """
     tensors, card = _read(Path(path))
     history = tensors.pop(_HISTORY, None)
@@ -97,7 +113,15 @@ def load(path: Path | str) -> Checkpoint:
         given = {name: card.get(name) for name in ("kind", "net")}
         allowed = "must name a kind of net and its settings"
         raise InputError(f"checkpoint {path}: card", given, allowed, "Write it with save.")
-    model: Gain = find("coopoc.nets", card["kind"])(**card["net"])
+    if in_file(card["kind"]) and not net:
+        allowed = "names a file, whose code does not run unless you name it, too"
+        hint = f"If you trust that file: load({str(path)!r}, net={card['kind']!r})."
+        raise InputError(f"checkpoint {path}: kind", repr(card["kind"]), allowed, hint)
+    made = find("coopoc.nets", net or card["kind"])
+    try:
+        model: Gain = made(**card["net"])
+    except TypeError as error:
+        raise InputError(f"checkpoint {path}: net", card["net"], f"does not fit ({error})", "Train it again.") from None
     load_into(model, tensors, path)
     if history is not None:
         count = sum(p.numel() for p in model.parameters())
@@ -135,7 +159,12 @@ def _card(file: Any, path: Path | str) -> dict[str, Any]:
     text = (file.metadata() or {}).get("card")
     if text is None:
         raise InputError("checkpoint", path, "must carry a card in its metadata", "Write it with checkpoint.save.")
-    card: dict[str, Any] = json.loads(text)
+    try:
+        card: Any = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InputError("checkpoint", path, f"has a damaged card ({error})", "Train it again.") from None
+    if not isinstance(card, dict):
+        raise InputError("checkpoint", path, "must have a card of named fields", "Write it with checkpoint.save.")
     return card
 
 
@@ -149,6 +178,8 @@ def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], found: Map
     for name in sorted(expected.keys() | shapes.keys()):
         if expected.get(name) != shapes.get(name):
             raise InputError(
-                f"checkpoint {path}", f"{name} of shape {shapes.get(name, 'missing')}",
-                f"expected {expected.get(name, 'no such tensor')}", "Use a net of its card's settings.",
-            )  # fmt: skip
+                f"checkpoint {path}",
+                f"{name} of shape {shapes.get(name, 'missing')}",
+                f"expected {expected.get(name, 'no such tensor')}",
+                "Use a net of its card's settings.",
+            )

@@ -35,16 +35,25 @@ Run = Callable[[Sequence[AnyArray]], Sequence[AnyArray]]
 
 
 class Step(nn.Module):
-    """`GainNet.step` with the memory spread out: tensors in the order of INPUTS -> tensors in that of OUTPUTS."""
+    """`GainNet.step` with the memory as separate tensors, in the order of INPUTS -> in that of OUTPUTS."""
 
     def __init__(self, net: GainNet) -> None:
         super().__init__()
         self.net = net
 
     def forward(
-        self, process: Tensor, prior: Tensor, innovation: Tensor, x: Tensor, x_before: Tensor, prior_before: Tensor,
-        gnss_before: Tensor, gnss: Tensor, velocity: Tensor, dt: Tensor,
-    ) -> tuple[Tensor, ...]:  # fmt: skip
+        self,
+        process: Tensor,
+        prior: Tensor,
+        innovation: Tensor,
+        x: Tensor,
+        x_before: Tensor,
+        prior_before: Tensor,
+        gnss_before: Tensor,
+        gnss: Tensor,
+        velocity: Tensor,
+        dt: Tensor,
+    ) -> tuple[Tensor, ...]:
         """One step."""
         memory = Memory(process, prior, innovation, x, x_before, prior_before, gnss_before)
         new, gain = self.net.step(memory, gnss, velocity, dt)
@@ -60,11 +69,12 @@ def to_onnx(model: GainNet | Checkpoint, path: Path | str) -> Path:
     before the file is kept.
 
     Args:
-        model: net, or checkpoint of one. path: of the file, which appears whole or not at all.
+        model: net, or checkpoint of one.
+        path: of the file, which is written whole or not at all.
 
     Raises:
-        InputError: no GainNet, or the exported step differs by more than 1e-5. MissingLibraryError: onnx, onnxruntime
-            or onnxscript is not there.
+        InputError: no GainNet, or the exported step differs by more than 1e-5.
+        MissingLibraryError: onnx, onnxruntime or onnxscript is not installed.
 
     >>> INPUTS[-3:], OUTPUTS[3]
     (('gnss', 'velocity', 'dt'), 'next_x')
@@ -74,8 +84,15 @@ def to_onnx(model: GainNet | Checkpoint, path: Path | str) -> Path:
     _library("onnxscript")
     lanes = tuple({0: torch.export.Dim.DYNAMIC} for _ in INPUTS[:-1])
     with _quiet(FutureWarning, "`isinstance.treespec, LeafSpec.` is deprecated"):
-        program = torch.onnx.export(Step(net).eval(), _example(net), dynamo=True, dynamic_shapes=(*lanes, {}),
-                                    input_names=INPUTS, output_names=OUTPUTS, verbose=False)  # fmt: skip
+        program = torch.onnx.export(
+            Step(net).eval(),
+            _example(net),
+            dynamo=True,
+            dynamic_shapes=(*lanes, {}),
+            input_names=INPUTS,
+            output_names=OUTPUTS,
+            verbose=False,
+        )
     assert program is not None
     file = program.model_proto
     graph = file.graph
@@ -86,8 +103,12 @@ def to_onnx(model: GainNet | Checkpoint, path: Path | str) -> Path:
     def run(session: Any) -> Run:
         return lambda arrays: session.run(None, dict(zip(INPUTS, arrays, strict=True)))
 
-    return _kept(path, lambda part: onnx.save(file, part), net,
-                 lambda part: run(runtime.InferenceSession(part, providers=["CPUExecutionProvider"])))  # fmt: skip
+    return _kept(
+        path,
+        lambda part: onnx.save(file, part),
+        net,
+        lambda part: run(runtime.InferenceSession(part, providers=["CPUExecutionProvider"])),
+    )
 
 
 def to_torchscript(model: GainNet | Checkpoint, path: Path | str) -> Path:
@@ -137,8 +158,12 @@ def agree(net: GainNet, run: Run) -> float:
         gaps = [float(np.abs(a - b).max()) for a, b in zip(own, found, strict=True)]
         worst = max(worst, *gaps) if np.isfinite(gaps).all() else np.nan
         if not worst <= AGREE:
-            raise InputError("export", f"differs by {worst:g} at step {number + 1}", f"must agree to {AGREE:g}",
-                             "Nothing was written; try another version of the exporting library.")  # fmt: skip
+            raise InputError(
+                "export",
+                f"differs by {worst:g} at step {number + 1}",
+                f"must agree to {AGREE:g}",
+                "Nothing was written; try another version of the exporting library.",
+            )
         mine, theirs = [*own[:-1], *given], [*found[:-1], *given]
     return worst
 
@@ -166,7 +191,12 @@ def _parts(model: GainNet | Checkpoint) -> tuple[GainNet, Mapping[str, str]]:
     """The net, and its card as text under "card"."""
     net = model.model if isinstance(model, Checkpoint) else model
     if not isinstance(net, GainNet):
-        raise InputError("model", type(net).__name__, "must be a GainNet", "A Kalman filter needs no export.")
+        raise InputError(
+            "model",
+            type(net).__name__,
+            "must be a GainNet",
+            "No other net has an exported step; stream it: method.start().",
+        )
     return net, {"card": json.dumps(dict(model.card), sort_keys=True)} if isinstance(model, Checkpoint) else {}
 
 

@@ -1,10 +1,9 @@
-"""LearnedGain: a trained GainNet as a method, Recording -> Track."""
+"""LearnedGain: a trained net as a method, Recording -> Track."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,18 +18,21 @@ from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
-from .nets.gain_net import SIZE, GainNet
-from .stream import Driven, gain_stream
+from .stream import GainState, SoloGain, StepByStep
 from .training.machine import one_core
+
+SIZE = 3
+"""Components of a position."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
-    """What the paper calls the net's covariance estimates, by name; none of them is a covariance.
+    """The quantities that the paper calls the net's covariance estimates; none of them is a covariance.
 
-    A GRU state is a running mix of tanh values and so stays in [-1, 1] whatever the noise; it need not be symmetric or
+    A GRU state is a running average of tanh values: it stays in [-1, 1] at any noise and need not be symmetric or
     positive. `posterior` is K times the assumed GNSS covariance, which equals the posterior covariance only if K is the
-    optimal gain. All (R, T, E, 3, 3), the first step NaN; where a fix is missing the gain is zero and the states stay.
+    optimal gain. All are (R, T, E, 3, 3), the first step NaN; where a fix is missing the gain is zero and the states do
+    not change.
     """
 
     gain: Floats
@@ -42,33 +44,45 @@ class Diagnostics:
 
 @dataclass(frozen=True, eq=False)
 class LearnedGain:
-    """Position from own fixes and velocities with the gain of a net; nothing is received or sent while driving.
+    """Position from own fixes and velocities with the gain of a net; no messages are exchanged.
 
-    x_prior = x + dt u;  x <- x_prior + K (z - x_prior). It claims no covariance. Estimates are made relative to the
-    start, so that float32 costs no accuracy far from the origin.
+    x_prior = x + dt u;  x <- x_prior + K (z - x_prior). The track has no covariance. Estimates are relative to the
+    first fix, so that float32 costs no accuracy far from the origin.
 
     Args:
-        model: trained net. name: in tables. x0: (R, E, 3) or (E, 3) m, a known start as in KalmanNet's
-            published loop; None starts at the first fix.
+        model: trained net.
+        name: label in tables.
+        x0: (R, E, 3) or (E, 3) m, a known start as in KalmanNet's published loop; None starts at the first fix.
 
-    Source: arXiv 2411.05847, equations 4-6 and section II.B.
+    References:
+        arXiv 2411.05847, equations 4-6 and section II.B.
 
+    >>> from coopoc.learned import GainNet
     >>> LearnedGain(GainNet()).message.payload
     0
     """
 
-    model: GainNet
+    model: StepByStep
     name: str = "fedkalmannet"
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
 
-    def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[Driven]:
-        """The net that is fed step by step (docs/streaming.md)."""
-        return gain_stream(self.model, x0, history)
+    def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[GainState]:
+        """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.
+
+        Args:
+            x0: (3,) m, known before the first step; None starts at the first fix.
+            history: s, the oldest fix that is accepted.
+
+        >>> from coopoc.learned import GainNet
+        >>> LearnedGain(GainNet(2, 1)).start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+        (array([1., 2., 0.]), None)
+        """
+        return Stream(SoloGain(self.model), x0, history)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
-        """Estimates of the egos, all runs at once; `notes` name the runs that left the fixes behind."""
+        """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
         began, columns = time.perf_counter(), recording.columns(egos, missing=True)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
         with one_core(), torch.inference_mode():
@@ -77,25 +91,33 @@ class LearnedGain:
         estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
-        notes = tuple(_divergence(estimates, recording, columns))
+        notes = tuple(divergence(estimates, recording, columns))
         return Track(recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes)
 
     def diagnostics(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Diagnostics:
-        """Gain, GRU states and K times the GNSS covariance at every step, with the caveat of `Diagnostics`."""
+        """Gain, GRU states and K times the GNSS covariance at every step; see the caveat of `Diagnostics`.
+
+        Raises:
+            InputError: the net has no `trace`, that is, no GRU states that stand for covariances.
+        """
+        trace = getattr(self.model, "trace", None)
+        if trace is None:
+            allowed = "must be a net with a trace, such as GainNet"
+            raise InputError("model", type(self.model).__name__, allowed, "Read its gain from a stream's state.")
         columns = recording.columns(egos, missing=True)
         gnss, velocity, x0 = self._lanes(recording, columns)
         states: list[tuple[Tensor, ...]] = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
-        with one_core(), torch.inference_mode(), _heard(self.model) as heard:
+        with one_core(), torch.inference_mode():
             memory = self.model.start(x0)
             for fix, speed in zip(gnss.unbind(1), velocity.unbind(1), strict=True):
-                memory, gain = self.model.step(memory, fix, speed, recording.dt)
+                memory, gain, cells = trace(memory, fix, speed, recording.dt)
                 missing = fix.isnan().all(1, keepdim=True)
-                kept = [torch.where(missing, old, new) for old, new in zip(states[-1][1:], heard, strict=True)]
-                states.append((gain.flatten(1), *kept))
+                held = [torch.where(missing, old, new) for old, new in zip(states[-1][1:], cells, strict=True)]
+                states.append((gain.flatten(1), *held))
         found = torch.stack([torch.stack(step) for step in states]).double().numpy()
         found = found.reshape(len(states), 4, recording.runs, len(columns), SIZE, SIZE).transpose(1, 2, 0, 3, 4, 5)
-        posterior = found[0] * np.square(np.array(recording.sensors.gnss_std))
-        return Diagnostics(found[0], found[1], found[2], found[3], posterior)
+        gain, process, prior, innovation = found
+        return Diagnostics(gain, process, prior, innovation, gain * np.square(np.array(recording.sensors.gnss_std)))
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""
@@ -119,24 +141,11 @@ class LearnedGain:
         return np.broadcast_to(self.x0, fixes.shape)
 
 
-@contextmanager
-def _heard(model: GainNet) -> Iterator[list[Tensor]]:
-    """What the GRUs of process, prior and innovation gave at the last step, kept up to date inside."""
-    heard = [torch.empty(0)] * 3
-    hooks = [cell.register_forward_hook(lambda _, __, state, at=at: heard.__setitem__(at, state))
-             for at, cell in enumerate((model.process, model.prior, model.innovation))]  # fmt: skip
-    try:
-        yield heard
-    finally:
-        for hook in hooks:
-            hook.remove()
-
-
 DIVERGED = 10.0
-"""Standard deviations (norm of the assumed GNSS std) between estimate and fix beyond which a run counts as lost."""
+"""Standard deviations (norm of the assumed GNSS std) between estimate and fix beyond which a run counts as diverged."""
 
 
-def _divergence(x: Floats, recording: Recording, columns: list[int]) -> list[str]:
+def divergence(x: Floats, recording: Recording, columns: list[int]) -> list[str]:
     """A note if an estimate is ever farther from its fix than `DIVERGED` standard deviations."""
     limit = DIVERGED * float(np.linalg.norm(recording.sensors.gnss_std))
     gap = np.linalg.norm(x - recording.gnss[:, :, columns], axis=-1)

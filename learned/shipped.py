@@ -10,19 +10,20 @@ from pathlib import Path
 
 import torch
 
-from coopoc.errors import InputError
 from coopoc.evaluate.metrics import nees_inside, rt_le
-from coopoc.fleets import load as load_fleet
+from coopoc.fleets import load_fleet
 from coopoc.methods.kalman import Kalman
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
+from coopoc.plugins import unknown
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from .checkpoint import Checkpoint, load, save
 from .nets.stack import flatten
-from .recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of, trained
+from .recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of
+from .train import trained
 
 CLIENTS, JUDGES = "town10-clients", "town10-validation"
 """Fleets that the weights are trained on, and that their cards' metrics are of."""
@@ -54,9 +55,13 @@ def ship(recipes: Sequence[str] = tuple(RECIPES), out: Path = WEIGHTS, progress:
     paths = []
     for recipe in recipes:
         for name, checkpoint in _made(recipe, progress).items():
-            card = {**checkpoint.card, "sha256": digest(checkpoint), "machine": machine(),
-                    "metrics": metrics(checkpoint.model.method(name)),
-                    "limits": [LIMITS[RECIPES[recipe].noise], *EVERYWHERE]}  # fmt: skip
+            card = {
+                **checkpoint.card,
+                "sha256": digest(checkpoint),
+                "machine": machine(),
+                "metrics": metrics(checkpoint.model.method(name)),
+                "limits": [LIMITS[RECIPES[recipe].noise], *EVERYWHERE],
+            }
             paths.append(save(out / f"{name}.safetensors", Checkpoint(checkpoint.model, card)))
     return paths
 
@@ -67,16 +72,21 @@ def differences(name: str, folder: Path = WEIGHTS, progress: bool = True) -> dic
     On the machine and with the versions that the card names they differ by less than 1e-6; elsewhere rounding grows.
 
     Args:
-        name: of weights, such as "individual2", or of a recipe, for all that it makes. folder: of the weights.
+        name: of weights, such as "individual2", or of a recipe, for all of its weights.
+        folder: of the weights.
+        progress: bars on stderr.
 
     Raises:
         InputError: a name that is neither, or weights that are not in the folder.
     """
     recipe = name if name in RECIPES else name.rstrip("0123456789")
     if recipe not in RECIPES or name not in (recipe, *jobs(recipe)):
-        raise InputError("weights", repr(name), f"must be one of {sorted(RECIPES)}", "Pick one.")
-    pairs = {label: (flatten([checkpoint.model]), flatten([load(folder / f"{label}.safetensors").model]))
-             for label, checkpoint in _made(recipe, progress).items() if name in (recipe, label)}  # fmt: skip
+        raise unknown("weights", name, RECIPES)
+    pairs = {
+        label: (flatten([checkpoint.model]), flatten([load(folder / f"{label}.safetensors").model]))
+        for label, checkpoint in _made(recipe, progress).items()
+        if name in (recipe, label)
+    }
     return {label: float((again - shipped).abs().max()) for label, (again, shipped) in pairs.items()}
 
 
@@ -89,8 +99,8 @@ def machine() -> str:
     """The processor, as far as rounding depends on it: architecture, model and vector instructions."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().split("\n\n")[0].splitlines() if info.is_file() else []
-    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
-    facts = [told[name] for name in ("model name", "cpu family", "model") if name in told] or [platform.processor()]
+    known = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    facts = [known[name] for name in ("model name", "cpu family", "model") if name in known] or [platform.processor()]
     return ", ".join([platform.machine(), *facts, torch.backends.cpu.get_cpu_capability()])
 
 
@@ -106,7 +116,7 @@ def metrics(method: Method, runs: int = 20) -> dict[str, dict[str, float]]:
     egos = [i for i, column in enumerate(fleet.present.T) if column.all()]
     for name, sensors in SENSORS.items():
         recording = observe(fleet, sensors, V2X(max_neighbours=0), runs=runs, seed=1)
-        track, oracle = method(recording, egos), Kalman(Knowledge.oracle(sensors, fleet))(recording, egos)
+        track, oracle = method(recording, egos), Kalman(NoiseModel.oracle(sensors, fleet))(recording, egos)
         ours = float(rt_le(track, fleet).mean())
         found[name] = {"rt_le_m": ours, "times_oracle": ours / float(rt_le(oracle, fleet).mean())}
         if track.covariance is not None and sensors.gnss_bias[1] == 0:

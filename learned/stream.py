@@ -1,95 +1,76 @@
-"""Streaming of learned filters: a net's gain, or trained noise numbers, fed one step at a time."""
+"""A net that filters step by step, as a `Solo`: one step at a time, near its own origin."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 import torch
+from torch import Tensor, nn
 
 from coopoc.arrays import Floats
-from coopoc.methods.kalman import Gaussian, SoloKalman
-from coopoc.methods.stream import Stream, white
 
-from .nets.gain_net import GainNet, Memory
 from .training.machine import one_core
 
-if TYPE_CHECKING:
-    from .nets.okf import OptimisedKF
 
-POSITIONS = ("x", "x_before", "prior_before", "gnss_before")
-"""What of a net's memory is a place, m; the rest has no origin."""
+class StepByStep(Protocol):
+    """What `LearnedGain` needs of a net; `nets.gain.Recurrent` has all of it."""
+
+    positions: tuple[str, ...]
+
+    def start(self, x0: Tensor) -> Any:
+        """The memory before the first step at x0 (B, 3) m: a NamedTuple whose field `x` is the estimate."""
+
+    def step(self, memory: Any, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Any, Tensor]:
+        """The memory after a step, and the gain (B, 3, 3)."""
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """The weights."""
+
+    def __call__(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
+        """The estimates (B, T, 3) m."""
 
 
-class Driven(NamedTuple):
-    """A net on its way: origin (3,) m of the positions in its memory (one lane), and its last gain (3, 3)."""
+class GainState(NamedTuple):
+    """The state of a streamed net: origin (3,) m of its memory's positions, memory (one lane), last gain (3, 3)."""
 
     origin: Floats
-    memory: Memory
+    memory: Any
     gain: Floats
 
 
 @dataclass(frozen=True, eq=False)
 class SoloGain:
-    """A net as a `Solo`. It claims no covariance, so how late a fix is changes nothing but the fix.
+    """A net as a `Solo`. It has no covariance, so the age of a fix changes nothing but the fix.
 
-    The origin moves along with the estimate, so that the net's float32 is as good after a day as after a step.
+    The origin moves along with the estimate: the net's float32 is as accurate after a day as after a step.
     """
 
-    model: GainNet
+    model: StepByStep
 
-    def begin(self, x: Floats, late: Floats | None) -> Driven:
+    def begin(self, x: Floats, late: Floats | None) -> GainState:
         """The net's first memory, at x."""
-        like = next(self.model.parameters())
-        return Driven(x, self.model.start(torch.zeros((1, 3), dtype=like.dtype)), np.full((3, 3), np.nan))
+        like = next(iter(self.model.parameters()))
+        return GainState(x, self.model.start(torch.zeros((1, 3), dtype=like.dtype)), np.full((3, 3), np.nan))
 
     def process(self, velocity: Floats, dt: float) -> Floats:
-        """Nothing: the net knows no variances."""
+        """Zeros: the net has no process noise."""
         return np.zeros(3)
 
     @one_core()
-    def advance(self, state: Driven, moved: Floats, process: Floats, fix: Floats, late: Floats) -> Driven:
-        """`GainNet.step` with the motion as a velocity over one second; a fix of NaN only predicts."""
+    def advance(self, state: GainState, moved: Floats, process: Floats, fix: Floats, late: Floats) -> GainState:
+        """`step` with the motion as a velocity over one second; a fix of NaN only predicts."""
         kind = state.memory.x.dtype
         near, step = (torch.as_tensor(a[None], dtype=kind) for a in (fix - state.origin, moved))
         with torch.inference_mode():
             memory, gain = self.model.step(state.memory, near, step, 1.0)
             here = memory.x
-            memory = memory._replace(**{name: getattr(memory, name) - here for name in POSITIONS})
-        return Driven(state.origin + here[0].numpy(), memory, gain[0].numpy())
+            positions = [name for name in self.model.positions if name in memory._fields]
+            memory = memory._replace(**{name: getattr(memory, name) - here for name in positions})
+        return GainState(state.origin + here[0].numpy(), memory, gain[0].numpy())
 
-    def read(self, state: Driven) -> tuple[Floats, None]:
+    def read(self, state: GainState) -> tuple[Floats, None]:
         """The estimate."""
         return state.origin, None
-
-
-def gain_stream(model: GainNet, x0: npt.ArrayLike | None = None, history: float = 10.0) -> Stream[Driven]:
-    """A net that is fed step by step; dt and velocity enter through their product only.
-
-    Args:
-        x0: (3,) m, known before the first step; None starts at the first fix. history: s, how old a fix may be.
-
-    >>> gain_stream(GainNet(2, 1)).step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
-    (array([1., 2., 0.]), None)
-    """
-    return Stream(SoloGain(model), x0, history)
-
-
-def okf_stream(
-    method: OptimisedKF, x0: npt.ArrayLike | None = None, interval: float = 0.1, history: float = 10.0
-) -> Stream[Gaussian]:
-    """The optimised Kalman filter that is fed step by step: x0, interval (dt of its training) and history as in
-    `Kalman.start`; variance of motion dt / interval (a^2 + (b interval u)^2).
-
-    >>> from coopoc.learned import OptimisedKF
-    >>> okf_stream(OptimisedKF((1.0,) * 3, (0.0,) * 3, (1.0,) * 3)).step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)[0]
-    array([1., 2., 0.])
-    """
-
-    def step(velocity: Floats) -> Floats:
-        moved = np.array(method.velocity_ratio) * interval * velocity
-        return np.asarray(np.square(method.process_std) + moved**2)
-
-    return Stream(SoloKalman(white(step, interval), np.square(method.gnss_std)), x0, history)

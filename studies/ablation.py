@@ -11,8 +11,8 @@ from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.fixed_lag import FixedLagSmoother
 from coopoc.methods.gbp import GaussianBeliefPropagation
 from coopoc.methods.joint_filter import JointFilter
-from coopoc.methods.knowledge import Knowledge
 from coopoc.methods.moving_horizon import MovingHorizon
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.study.study import Params, Row, Study
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-Made = Callable[[Knowledge | str, int], Method]
+Made = Callable[[NoiseModel | str, int], Method]
 CHOICES: Mapping[tuple[str, str], tuple[Made, tuple[int, ...], int]] = {
-    ("cooperative-map", "window"): (lambda known, v: CooperativeMAP(window=v, knowledge=known), (1, 2, 5, 10), 1),
-    ("fixed-lag", "lag"): (lambda known, v: FixedLagSmoother(lag=v, knowledge=known), (0, 1, 2, 5, 10), 5),
-    ("mhe", "horizon"): (lambda known, v: MovingHorizon(horizon=v, knowledge=known), (1, 5, 10), 10),
+    ("cooperative-map", "window"): (lambda known, v: CooperativeMAP(window=v, noise_model=known), (1, 2, 5, 10), 1),
+    ("fixed-lag", "lag"): (lambda known, v: FixedLagSmoother(lag=v, noise_model=known), (0, 1, 2, 5, 10), 5),
+    ("mhe", "horizon"): (lambda known, v: MovingHorizon(horizon=v, noise_model=known), (1, 5, 10), 10),
     ("gbp", "rounds"): (lambda known, v: GaussianBeliefPropagation(known, rounds=v), (1, 2, 3, 5, 10), 3),
     ("admm", "rounds"): (lambda known, v: ConsensusADMM(known, rounds=v), (1, 2, 3, 5, 10, 30), 3),
     ("joint", "exact step"): (lambda known, v: JointFilter(known, exact=bool(v)), (0, 1), 1),
@@ -39,25 +39,28 @@ KNOWLEDGE = ("identity", "fitted", "nominal", "oracle")
 
 def _grid() -> list[dict[str, Any]]:
     grid = [
-        {"method": method, "choice": choice, "value": value, "knowledge": "nominal"}
-        for (method, choice), (_, values, _) in CHOICES.items() for value in values
-    ]  # fmt: skip
-    grid += [{"method": m, "choice": "knowledge", "value": 0, "knowledge": known} for m in KNOWN for known in KNOWLEDGE]
-    return [*grid, {"method": "bound", "choice": "none", "value": 0, "knowledge": "bound"}]
+        {"method": method, "choice": choice, "value": value, "noise_model": "nominal"}
+        for (method, choice), (_, values, _) in CHOICES.items()
+        for value in values
+    ]
+    grid += [
+        {"method": m, "choice": "noise_model", "value": 0, "noise_model": known} for m in KNOWN for known in KNOWLEDGE
+    ]
+    return [*grid, {"method": "bound", "choice": "none", "value": 0, "noise_model": "bound"}]
 
 
 def cell(p: Params) -> list[Row]:
     """Rows of one method with one value of one of its choices; of the bound, one row per ego."""
     if p["method"] == "bound":
         return lineup.bound_rows(p)
-    if p["choice"] == "knowledge":
+    if p["choice"] == "noise_model":
         return lineup.rows(p)
-    return lineup.rows(p, own=CHOICES[p["method"], p["choice"]][0](lineup.knowledge(p), int(p["value"])))
+    return lineup.rows(p, own=CHOICES[p["method"], p["choice"]][0](lineup.noise_model(p), int(p["value"])))
 
 
 def at(method: str, choice: str, value: int, known: str = "nominal") -> dict[str, Any]:
     """A selection."""
-    return {"method": method, "choice": choice, "value": value, "knowledge": known}
+    return {"method": method, "choice": choice, "value": value, "noise_model": known}
 
 
 def _choices(results: Results) -> Table | None:
@@ -72,15 +75,25 @@ def _choices(results: Results) -> Table | None:
             if views.present(results, where) is None:
                 continue
             base = views.present(results, at(method, choice, usual))
-            gap = None if base is None or value == usual else paired_difference(
-                results.values("rt_le_m", where), results.values("rt_le_m", base))  # fmt: skip
-            body.append((
-                look(method).label, choice, value, views.mean(results, where), gap if gap else "default",
-                views.mean(results, where, "nees"), _microseconds(results, where),
-            ))  # fmt: skip
+            gap = (
+                None
+                if base is None or value == usual
+                else paired_difference(results.values("rt_le_m", where), results.values("rt_le_m", base))
+            )
+            body.append(
+                (
+                    look(method).label,
+                    choice,
+                    value,
+                    views.mean(results, where),
+                    gap if gap else "default",
+                    views.mean(results, where, "nees"),
+                    _microseconds(results, where),
+                )
+            )
     header = ("Method", "Choice", "Value", "RT-LE [m]", "Less the default's [m]", "NEES", "Time [µs]")
     text = (
-        "Nominal knowledge. Differences are paired: the same noise draws. Time: wall microseconds per ego, step and "
+        "Nominal noise model. Differences are paired: the same noise draws. Time: wall microseconds per ego, step and "
         f"run on one thread of this machine, with the compiling where it is the first call. {_conditions(results)}"
     )
     return Table(header, tuple(body), text, decimals=3) if body else None
@@ -103,8 +116,8 @@ def _knowledge(value: str, text: str, decimals: int) -> Any:
     def table(results: Results) -> Table | None:
         from coopoc.study.style import look
 
-        rows = [((look(method).label,), {"method": method, "choice": "knowledge"}) for method in KNOWN]
-        columns = [(known, {"knowledge": known}) for known in KNOWLEDGE]
+        rows = [((look(method).label,), {"method": method, "choice": "noise_model"}) for method in KNOWN]
+        columns = [(known, {"noise_model": known}) for known in KNOWLEDGE]
         return views.crossed(results, ("Method",), rows, columns, number, f"{text} {_conditions(results)}", decimals)
 
     return table
@@ -130,7 +143,7 @@ def _figure(results: Results) -> Plot | None:
                     panel.plot(list(ran), list(ran.values()), **strokes({"method": method}))
                     drawn.append({"method": method})
             if bound is not None:
-                panel.axhline(bound, **strokes({"method": "bound", "knowledge": "bound"}))
+                panel.axhline(bound, **strokes({"method": "bound", "noise_model": "bound"}))
             panel.set(xlabel=label[0].upper() + label[1:])
         panels[1].set_xscale("log")
         panels[1].set_xticks([1, 2, 3, 5, 10, 30], labels=["1", "2", "3", "5", "10", "30"])
@@ -152,8 +165,10 @@ def _findings(results: Results) -> Sequence[str]:
             (low, first), *_, (high, last) = ran.items()
             found.append(f"{look(method).label}, {choice} {low} to {high}: {first:.3f} m to {last:.3f} m.")
     for method in KNOWN:
-        two = [views.mean(results, {"method": method, "choice": "knowledge", "knowledge": k}) for k in
-               ("identity", "nominal")]  # fmt: skip
+        two = [
+            views.mean(results, {"method": method, "choice": "noise_model", "noise_model": k})
+            for k in ("identity", "nominal")
+        ]
         if two[0] is not None and two[1] is not None:
             found.append(f"{look(method).label}: {two[0]:.3f} m with unit covariances, {two[1]:.3f} m with nominal.")
     return found
@@ -166,22 +181,32 @@ STUDY = Study(
     key=lineup.key,
     grid=_grid(),
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "max_neighbours": 6, "backend": "gauss-newton", "egos": "auto",
-        "runs": 8, "seed": 0, "train_seeds": 0,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "max_neighbours": 6,
+        "backend": "gauss-newton",
+        "egos": "auto",
+        "runs": 8,
+        "seed": 0,
+        "train_seeds": 0,
     },
     tables={
         "choices": _choices,
-        "knowledge": _knowledge("rt_le_m", "RT-LE [m] by what is assumed of the noise.", 3),
+        "noise_model": _knowledge("rt_le_m", "RT-LE [m] by what is assumed of the noise.", 3),
         "knowledge_nees": _knowledge("nees", "NEES by what is assumed of the noise (3 is consistent).", 1),
     },
     figures={"choices": _figure},
     findings=_findings,
     limitations=(
         "One K, one scenario: a window pays where messages are late, which study latency_loss shows.",
-        "Fitted knowledge comes from vehicles that drive alone: of neighbours it assumes what the sensors' card says.",
+        "The fitted noise model comes from vehicles that drive alone; for neighbours it takes the data sheet.",
     ),
     minutes=8,
     metrics={"rt_le_m": "lower", "nees": 3.0},
     reference=views.reference("ablation"),
-)  # fmt: skip
+)

@@ -28,25 +28,32 @@ if TYPE_CHECKING:
 LOST = 1e6
 """m, the RT-LE of a net whose estimates left every bound; a mean above a thousandth of it is shown as "diverged"."""
 REFERENCES = ("kalman", "bound")
+BESIDE = ("centralised", *GRAPHS, "kalman")
+"""Methods beside the rules under `iid` and `heterogeneous`."""
+METHODS = (*RULES, *BESIDE, *WIRES, "bound")
+"""Methods of the grid; other rules by name or path: `--set method=mean,mine.py:RULE`."""
 OF_THE_TEST = ("condition", "method", "scenario", "velocity_ratio", "runs", "egos", "data", "seed")
 """Parameters that change no training, and the two that name it."""
 
 
-def _grid() -> list[dict[str, Any]]:
-    """Every rule under every condition (`uniform` is `mean` where all have as many pieces), and what is beside them."""
-    pairs = [(c, rule) for c in CONDITIONS for rule in RULES if rule != "uniform" or c == "heterogeneous"]
-    beside = ("centralised", *GRAPHS, "kalman")
-    pairs += [(condition, name) for condition in ("iid", "heterogeneous") for name in beside]
-    pairs += [("iid", name) for name in (*WIRES, "bound")]
-    return [{"condition": c, "method": m, "scenario": s} for c, m in pairs for s in (1, 2)]
-
-
 def meaningful(p: Params) -> bool:
-    """No rule that takes more clients than take part."""
-    from coopoc.learned.federation import aggregate
+    """Every rule under every condition in which enough clients take part; other methods where they are compared.
 
-    asked = int(p["members"]) // 2 if p["condition"] == "half absent" else int(p["members"])
-    return p["method"] not in RULES or aggregate.RULES[p["method"]].least <= asked
+    `uniform` is `mean` where all clients have as many pieces.
+    """
+    from coopoc.learned.federation.aggregate import rule
+
+    condition, method, asked = (
+        p["condition"],
+        p["method"],
+        int(p["members"]) // (2 if p["condition"] == "half absent" else 1),
+    )
+    if method in BESIDE:
+        return condition in ("iid", "heterogeneous")
+    if method in (*WIRES, "bound"):
+        return condition == "iid"
+    enough: bool = rule(method).least <= asked
+    return enough and (method != "uniform" or condition == "heterogeneous")
 
 
 def cell(p: Params) -> list[Row]:
@@ -60,10 +67,18 @@ def cell(p: Params) -> list[Row]:
     found: list[Row] = []
     for seed, net in enumerate(trained(p["condition"], p["method"], training)):
         kept, last = (_score(one.method(p["method"]), recording, who, drive) for one in (net.kept, net.last))
-        more = {"train_seed": seed, "sent_kb": net.sent / 1e3, "received_kb": net.received / 1e3,
-                "rejected": net.rejected, "idle_rounds": net.idle, "train_seconds": net.seconds}  # fmt: skip
-        found += [{**row, "last_rt_le_m": end["rt_le_m"], **more}
-                  for row, end in zip(_rows(kept, who), _rows(last, who), strict=True)]  # fmt: skip
+        more = {
+            "train_seed": seed,
+            "sent_kb": net.sent / 1e3,
+            "received_kb": net.received / 1e3,
+            "rejected": net.rejected,
+            "idle_rounds": net.idle,
+            "train_seconds": net.seconds,
+        }
+        found += [
+            {**row, "last_rt_le_m": end["rt_le_m"], **more}
+            for row, end in zip(_rows(kept, who), _rows(last, who), strict=True)
+        ]
     return found
 
 
@@ -98,15 +113,25 @@ def _table(scenario: int, value: str, text: str) -> Any:
         at = {"scenario": scenario}
         ran = [c for c in CONDITIONS if views.present(results, {**at, "condition": c}, value)]
         body = []
-        for method in dict.fromkeys(p["method"] for p in _grid()):
+        for method in dict.fromkeys((*METHODS, *results.frame["method"])):
             wheres = [{**at, "condition": c, "method": method} for c in ran]
             row = [_entry(results, value, w) for w in wheres]
             if any(entry is not None for entry in row):
                 body.append((look(method).label, *row))
         conditions = scene.conditions({**results.settings, **at})
         told = "; ".join(f"{c}: {CONDITIONS[c]}" for c in ran)
-        return Table(("Rule", *(c.capitalize() for c in ran)), tuple(body), f"{text} {conditions} {told}. {NOTE}",
-                     best="min", along="column", decimals=3) if body else None  # fmt: skip
+        return (
+            Table(
+                ("Rule", *(c.capitalize() for c in ran)),
+                tuple(body),
+                f"{text} {conditions} {told}. {NOTE}",
+                best="min",
+                along="column",
+                decimals=3,
+            )
+            if body
+            else None
+        )
 
     return table
 
@@ -126,8 +151,13 @@ def _costs(results: Results) -> Table | None:
     from coopoc.study.style import look
     from coopoc.study.tables import Table
 
-    columns = {"sent_kb": "Sent [kB]", "received_kb": "Received [kB]", "rejected": "Answers rejected",
-               "idle_rounds": "Rounds without change", "train_seconds": "Training [s]"}  # fmt: skip
+    columns = {
+        "sent_kb": "Sent [kB]",
+        "received_kb": "Received [kB]",
+        "rejected": "Answers rejected",
+        "idle_rounds": "Rounds without change",
+        "train_seconds": "Training [s]",
+    }
     body: list[Any] = []
     for (condition, method), rows in results.groups(["condition", "method"]):
         if method not in REFERENCES:
@@ -175,14 +205,28 @@ STUDY = Study(
     question="Which rule should combine the clients' nets when they are alike, differ, lie or stay away?",
     cell=cell,
     key=key,
-    grid=_grid(),
+    grid={"condition": tuple(CONDITIONS), "method": METHODS, "scenario": (1, 2)},
     where=meaningful,
     shares=("condition", "method"),
     settings={
-        "data": "town10", "clients": "town10-validation", "members": 12, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "egos": "auto", "runs": 15, "seed": 0, "train_seeds": 3,
-        "rounds": 20, "local_epochs": 2, "steps": 1500, "piece": 100, "in_mult": 40, "out_mult": 5, "radius_m": 30.0,
-        "factor": 20.0, "offset_m": 10.0,
+        "data": "town10",
+        "clients": "town10-validation",
+        "members": 12,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "egos": "auto",
+        "runs": 15,
+        "seed": 0,
+        "train_seeds": 3,
+        "rounds": 20,
+        "local_epochs": 2,
+        "steps": 1500,
+        "piece": 100,
+        "in_mult": 40,
+        "out_mult": 5,
+        "radius_m": 30.0,
+        "factor": 20.0,
+        "offset_m": 10.0,
     },
     tables={
         **{f"scenario{s}": _table(s, "rt_le_m", "RT-LE [m], kept weights.") for s in (1, 2)},
@@ -199,4 +243,4 @@ STUDY = Study(
     minutes=25,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("aggregation"),
-)  # fmt: skip
+)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.optimize.factor import Factor
 from coopoc.optimize.initial import initial_guess
 from coopoc.optimize.problem import Problem
@@ -43,13 +43,13 @@ def _window(seen: Recording, step: int, ego: str, run: int) -> Problem:
 
 def _converted(seen: Recording, step: int, ego: str, run: int) -> Problem:
     """Sightings as vectors of unit covariance: a linear problem."""
-    return Problem.from_snapshot(seen, step, ego, run, Knowledge.identity())
+    return Problem.from_snapshot(seen, step, ego, run, NoiseModel.identity())
 
 
 def _ranges(seen: Recording, step: int, ego: str, run: int) -> Problem:
     """The snapshot without its angles."""
     whole = Problem.from_snapshot(seen, step, ego, run)
-    return whole.having(factors=tuple(map(_distance, whole.factors)))
+    return whole.replace_unchecked(factors=tuple(map(_distance, whole.factors)))
 
 
 def _distance(factor: Factor) -> Factor:
@@ -64,10 +64,17 @@ def _std(factor: Factor) -> Floats:
 
 
 PROBLEMS: Mapping[str, Callable[[Recording, int, str, int], Problem]] = {
-    "snapshot": _snapshot, "window": _window, "ranges": _ranges, "converted": _converted,
-}  # fmt: skip
-WORDS = {"snapshot": "snapshot, range and angles", "window": f"window of {WINDOW} steps", "ranges": "snapshot, ranges",
-         "converted": "snapshot, converted vectors"}  # fmt: skip
+    "snapshot": _snapshot,
+    "window": _window,
+    "ranges": _ranges,
+    "converted": _converted,
+}
+WORDS = {
+    "snapshot": "snapshot, range and angles",
+    "window": f"window of {WINDOW} steps",
+    "ranges": "snapshot, ranges",
+    "converted": "snapshot, converted vectors",
+}
 
 
 def referee(problem: Problem) -> Floats:
@@ -105,10 +112,15 @@ def _solved(problem: Problem, backend: str) -> Row:
     fair = referee(problem)
     gap, cost = float(np.abs(mine.x - fair).max()), problem.cost(fair)
     return {
-        "gap_m": gap, "same": float(gap < SAME_M), "cost_gap": (mine.cost - cost) / max(cost, 1e-12),
-        "solved": float(mine.status is Status.SOLVED), "iterations": mine.iterations,
-        "solve_ms": 1e3 * mine.solve_seconds, "whole_ms": 1e3 * whole, "seconds": whole,
-    }  # fmt: skip
+        "gap_m": gap,
+        "same": float(gap < SAME_M),
+        "cost_gap": (mine.cost - cost) / max(cost, 1e-12),
+        "solved": float(mine.status is Status.SOLVED),
+        "iterations": mine.iterations,
+        "solve_ms": 1e3 * mine.solve_seconds,
+        "whole_ms": 1e3 * whole,
+        "seconds": whole,
+    }
 
 
 def _agreement(results: Results) -> Table | None:
@@ -124,13 +136,30 @@ def _agreement(results: Results) -> Table | None:
             rows = results.select(where)
             one = rows[rows["same"] == 1.0]
             worst = f"{1e6 * one['gap_m'].max():.2g}" if len(one) else None
-            body.append((
-                words, look(backend).label, len(rows), f"{100 * rows['solved'].mean():.0f} %",
-                f"{100 * rows['same'].mean():.0f} %", worst, f"{one['cost_gap'].abs().max():.0e}" if len(one) else None,
-                int((rows["cost_gap"] < -1e-6).sum()), int((rows["cost_gap"] > 1e-6).sum()),
-            ))  # fmt: skip
-    header = ("Problem", "Backend", "Solves", "At a minimum", "The referee's", "Farthest [µm]", "Cost differs",
-              "Lower", "Higher")  # fmt: skip
+            body.append(
+                (
+                    words,
+                    look(backend).label,
+                    len(rows),
+                    f"{100 * rows['solved'].mean():.0f} %",
+                    f"{100 * rows['same'].mean():.0f} %",
+                    worst,
+                    f"{one['cost_gap'].abs().max():.0e}" if len(one) else None,
+                    int((rows["cost_gap"] < -1e-6).sum()),
+                    int((rows["cost_gap"] > 1e-6).sum()),
+                )
+            )
+    header = (
+        "Problem",
+        "Backend",
+        "Solves",
+        "At a minimum",
+        "The referee's",
+        "Farthest [µm]",
+        "Cost differs",
+        "Lower",
+        "Higher",
+    )
     text = (
         "Answers beside SciPy's trust-region least squares from the same start. The referee's: less than 1 mm away; of "
         "those, the farthest and the largest relative difference of cost. Lower, higher: solves that ended in a better "
@@ -142,11 +171,17 @@ def _agreement(results: Results) -> Table | None:
 def _cost(results: Results) -> Table | None:
     from coopoc.study.style import look
 
-    rows = [((words, look(backend).label), {"problem": problem, "method": backend})
-            for problem, words in WORDS.items() for backend in BACKENDS]  # fmt: skip
+    rows = [
+        ((words, look(backend).label), {"problem": problem, "method": backend})
+        for problem, words in WORDS.items()
+        for backend in BACKENDS
+    ]
     ks = sorted(results.frame["max_neighbours"].unique()) if len(results.frame) else []
-    columns = [(f"{label}, K = {k}", {"max_neighbours": k, "value": value})
-               for value, label in (("solve_ms", "Solver"), ("whole_ms", "All")) for k in ks]  # fmt: skip
+    columns = [
+        (f"{label}, K = {k}", {"max_neighbours": k, "value": value})
+        for value, label in (("solve_ms", "Solver"), ("whole_ms", "All"))
+        for k in ks
+    ]
     text = (
         "Milliseconds of one solve() from its first guess, median. Solver: the backend alone. All: with structure, "
         "checks, cost and covariance. Batches and streams, which keep the structure, are in docs/performance.md; times "
@@ -166,8 +201,10 @@ def _findings(results: Results) -> Sequence[str]:
         return []
     frame = results.frame
     apart = frame[(frame["same"] == 0.0) & (frame["cost_gap"] > 1e-6)]
-    said = [f"{len(frame)} solves; {100 * frame['same'].mean():.1f} % end where SciPy's least squares does, and "
-            f"{len(apart)} in a worse minimum."]  # fmt: skip
+    said = [
+        f"{len(frame)} solves; {100 * frame['same'].mean():.1f} % end where SciPy's least squares does, and "
+        f"{len(apart)} in a worse minimum."
+    ]
     wrong = frame[(frame["same"] == 0.0) & (frame["solved"] == 1.0) & (frame["cost_gap"].abs() <= 1e-6)]
     if len(wrong):
         said.append(f"{len(wrong)} have the referee's cost at another place.")
@@ -190,11 +227,21 @@ STUDY = Study(
     key=key,
     grid=[
         {"max_neighbours": k, "problem": problem, "method": backend}
-        for k in (2, 6, 10) for problem in PROBLEMS for backend in BACKENDS if backend != "cvxpy" or problem in CONVEX
+        for k in (2, 6, 10)
+        for problem in PROBLEMS
+        for backend in BACKENDS
+        if backend != "cvxpy" or problem in CONVEX
     ],
     settings={
-        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0,
-        "egos": "auto", "samples": 12, "seed": 0, "train_seeds": 0,
+        "data": "town10",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "egos": "auto",
+        "samples": 12,
+        "seed": 0,
+        "train_seeds": 0,
     },
     shares=("max_neighbours",),
     tables={"agreement": _agreement, "cost": _cost},
@@ -206,4 +253,4 @@ STUDY = Study(
     minutes=2,
     metrics={"solved": "higher", "same": "higher"},
     reference=views.reference("backends"),
-)  # fmt: skip
+)

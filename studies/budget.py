@@ -14,8 +14,14 @@ if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-SOLO = (("gnss", "none"), ("kalman", "fitted"), ("kalman", "nominal"), ("fedokf", "trained"),
-        ("fedkalmannet", "trained"), ("recursive", "trained"))  # fmt: skip
+SOLO = (
+    ("gnss", "none"),
+    ("kalman", "fitted"),
+    ("kalman", "nominal"),
+    ("fedokf", "trained"),
+    ("fedkalmannet", "trained"),
+    ("recursive", "trained"),
+)
 NEIGHBOURS = (1, 2, 4, 10)
 RATES = (1.0, 2.0, 5.0)
 BOUND = ("bound", "bound")
@@ -25,14 +31,14 @@ def _grid() -> list[dict[str, Any]]:
     """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; two
     of them under caps with other schedules."""
     alone = {"channel": "ideal", "max_neighbours": 0, **FREE}
-    grid = [{**alone, "method": m, "knowledge": known} for m, known in (*SOLO, BOUND)]
+    grid = [{**alone, "method": m, "noise_model": known} for m, known in (*SOLO, BOUND)]
     ways = [{"channel": name, "max_neighbours": k, **FREE} for name in scene.CHANNELS for k in NEIGHBOURS]
     ways += [{"channel": "ideal", "max_neighbours": 10, **FREE, "rate_hz": rate} for rate in RATES]
     ways += [{"channel": "ideal", "max_neighbours": 10, **FREE, "cap_bytes_per_second": cap} for cap in CAPS]
     bounded = [way for way in ways if way["channel"] == "ideal" and not way["cap_bytes_per_second"]]
-    grid += [{**way, "method": m, "knowledge": known} for way in ways for m, known in SHARED]
+    grid += [{**way, "method": m, "noise_model": known} for way in ways for m, known in SHARED]
     grid += [under(cap, each, m, known) for cap in CAPS for each in SCHEDULES[1:] for m, known in SCHEDULED]
-    return grid + [{**way, "method": "bound", "knowledge": "bound"} for way in bounded if not way["rate_hz"]]
+    return grid + [{**way, "method": "bound", "noise_model": "bound"} for way in bounded if not way["rate_hz"]]
 
 
 def cell(p: Params) -> list[Row]:
@@ -46,13 +52,14 @@ def _pareto(results: Results) -> Plot | None:
 
     drawn, ran = list[dict[str, Any]](), choices(results)
     with canvas(1, 2, width=8.6, height=3.9, sharey=True, gridspec_kw={"width_ratios": [1.0, 1.3]}) as (
-        figure, (left, right),
-    ):  # fmt: skip
+        figure,
+        (left, right),
+    ):
         for method, known in SOLO:
-            error = views.mean(results, {"method": method, "knowledge": known})
+            error = views.mean(results, {"method": method, "noise_model": known})
             if error is None:
                 continue
-            names = {"method": method, "knowledge": known}
+            names = {"method": method, "noise_model": known}
             total = weights.training_bytes(results.settings, [method])[method] if method in TRAINED else None
             if total is None:
                 for panel in (left, right):
@@ -61,10 +68,10 @@ def _pareto(results: Results) -> Plot | None:
                 left.plot([total / (3600 * hours) for hours in HOURS], [error] * len(HOURS), **strokes(names))
             drawn.append(names)
         for method, known in (*SHARED, BOUND):
-            points = [one for one in ran if (one.where["method"], one.where["knowledge"]) == (method, known)]
+            points = [one for one in ran if (one.where["method"], one.where["noise_model"]) == (method, known)]
             found = sorted((one.size, one.error) for one in points if one.size)
             if found:
-                names = {"method": method, "knowledge": known}
+                names = {"method": method, "noise_model": known}
                 right.plot(*zip(*found, strict=True), **{**strokes(names, thin=True), "linestyle": "none"})
                 right.plot(*zip(*front(found), strict=True), **{**strokes(names), "marker": ""})
                 drawn.append(names)
@@ -112,11 +119,11 @@ class Choice(NamedTuple):
 
 def choices(results: Results) -> list[Choice]:
     """All that was run over an ideal channel, and the bound."""
-    names, found = ["channel", "max_neighbours", *FREE, "method", "knowledge"], list[Choice]()
+    names, found = ["channel", "max_neighbours", *FREE, "method", "noise_model"], list[Choice]()
     known = {*SOLO, *SHARED, BOUND}
     for each, _ in results.frame.groupby(names, sort=False) if set(names) <= set(results.frame) else ():
         where = dict(zip(names, each, strict=True))
-        if where["channel"] == "ideal" and (where["method"], where["knowledge"]) in known:
+        if where["channel"] == "ideal" and (where["method"], where["noise_model"]) in known:
             error = views.mean(results, where)
             if error is not None:
                 found.append(Choice(error, views.mean(results, where, PAYLOAD) or 0.0, where))
@@ -137,7 +144,7 @@ def _findings(results: Results) -> Sequence[str]:
         best = best_under(found, limit)
         if best is not None:
             error, size, where = best
-            how = f"{look(where['method']).label} ({where['knowledge']})"
+            how = f"{look(where['method']).label} ({where['noise_model']})"
             at = f", K = {where['max_neighbours']}{_first(where)}, {size:.0f} B/s" if where["max_neighbours"] else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
             said.append(f"{words}: best is {how}{at}, {error:.3f} m{gap(results, where)}.")
@@ -179,13 +186,25 @@ STUDY = Study(
     prepare=weights.prepare,
     grid=_grid(),
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "egos": "auto", "runs": 30, "seed": 0, "train_seeds": 3,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
+        "train_seeds": 3,
     },
     shares=("channel", "max_neighbours", *FREE),
     tables={
-        "channels": budget_tables.channels, "load": budget_tables.load, "schedules": budget_tables.schedules,
-        "break_even": budget_tables.even, "ledger": budget_tables.ledger,
+        "channels": budget_tables.channels,
+        "load": budget_tables.load,
+        "schedules": budget_tables.schedules,
+        "break_even": budget_tables.even,
+        "ledger": budget_tables.ledger,
     },
     figures={"pareto": _pareto},
     findings=_findings,
@@ -198,4 +217,4 @@ STUDY = Study(
     minutes=13,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("budget"),
-)  # fmt: skip
+)

@@ -18,8 +18,14 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-SHARED = (("lkf-sa", "identity"), ("lkf-sa", "fitted"), ("joint", "fitted"), ("joint", "nominal"),
-          ("split-ci", "nominal"), ("cooperative", "trained"))  # fmt: skip
+SHARED = (
+    ("lkf-sa", "identity"),
+    ("lkf-sa", "fitted"),
+    ("joint", "fitted"),
+    ("joint", "nominal"),
+    ("split-ci", "nominal"),
+    ("cooperative", "trained"),
+)
 SCHEDULED = (("joint", "nominal"), ("split-ci", "nominal"))
 """Which of them run under every schedule."""
 CAPS = (100.0, 200.0, 400.0, 800.0)
@@ -29,8 +35,11 @@ TRAINED = ("fedokf", "recursive", "fedkalmannet")
 """Trained by federation, in the order of their bytes."""
 WORDS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cpm": "CPM, 5 Hz"}
 COUNTS: tuple[tuple[Kind, Way], ...] = (
-    ("payload", "per receiver"), ("payload", "broadcast"), ("on air", "per receiver"), ("on air", "broadcast")
-)  # fmt: skip
+    ("payload", "per receiver"),
+    ("payload", "broadcast"),
+    ("on air", "per receiver"),
+    ("on air", "broadcast"),
+)
 CROWD = 300
 """Vehicles within earshot of each other, as in a jam (methods.md section 9.4)."""
 
@@ -56,12 +65,12 @@ def channels(results: Results) -> Table | None:
     k = most(results)
     for name in scene.CHANNELS:
         for method, known in SHARED:
-            where = {"channel": name, "max_neighbours": k, **FREE, "method": method, "knowledge": known}
+            where = {"channel": name, "max_neighbours": k, **FREE, "method": method, "noise_model": known}
             if k and (error := views.mean(results, where)) is not None:
                 account = _account(results, where)
                 sizes = [round(account.rate(kind)) for kind in ("payload", "on air")] if account else [None, None]
                 body.append((WORDS[name], look(method).label, known, error, *sizes))
-    header = ("Channel", "Method", "Knowledge", "RT-LE [m]", "Payload [B/s]", "On air [B/s]")
+    header = ("Channel", "Method", "NoiseModel", "RT-LE [m]", "Payload [B/s]", "On air [B/s]")
     text = (
         f"K = {k} over channels as they are in the field: rate, latency, loss in bursts, and what a message carries "
         f"anyway. Payload is what a method adds. {scene.conditions(results.settings)}"
@@ -107,8 +116,10 @@ def schedules(results: Results) -> Table | None:
                 continue
             base = results.values("rt_le_m", found[0])
             errors = [None if where is None else results.interval("rt_le_m", where) for where in found]
-            gaps = [None if where is None else paired_difference(results.values("rt_le_m", where), base)
-                    for where in found[1:]]  # fmt: skip
+            gaps = [
+                None if where is None else paired_difference(results.values("rt_le_m", where), base)
+                for where in found[1:]
+            ]
             body.append((int(cap), look(method).label, *errors, *gaps))
     differences = tuple(f"{each} - {SCHEDULES[0]}" for each in SCHEDULES[1:])
     header = ("Cap [B/s]", "Method", *SCHEDULES, *differences)
@@ -122,7 +133,7 @@ def schedules(results: Results) -> Table | None:
 def under(cap: float, schedule: str, method: str, known: str) -> dict[str, Any]:
     """The selection of a method under a cap and a schedule."""
     limited = {**FREE, "cap_bytes_per_second": cap, "schedule": schedule}
-    return {"channel": "ideal", "max_neighbours": 10, **limited, "method": method, "knowledge": known}
+    return {"channel": "ideal", "max_neighbours": 10, **limited, "method": method, "noise_model": known}
 
 
 def _account(results: Results, where: dict[str, Any]) -> Ledger | None:
@@ -147,7 +158,7 @@ def even(results: Results) -> Table | None:
     body: list[tuple[Any, ...]] = []
     for channel in scene.CHANNELS:
         for method, known in SHARED:
-            where = {"channel": channel, "max_neighbours": k, **FREE, "method": method, "knowledge": known}
+            where = {"channel": channel, "max_neighbours": k, **FREE, "method": method, "noise_model": known}
             account = _account(results, where) if k and ran and known in ("nominal", "trained") else None
             if account is not None:
                 times = [spoken(break_even(total, account)) for total in ran.values()]
@@ -172,7 +183,7 @@ def ledger(results: Results) -> Table | None:
     method, known = SCHEDULED[0]
     body: list[tuple[Any, ...]] = []
     for channel in scene.CHANNELS:
-        where = {"channel": channel, "max_neighbours": k, **FREE, "method": method, "knowledge": known}
+        where = {"channel": channel, "max_neighbours": k, **FREE, "method": method, "noise_model": known}
         account = _account(results, where)
         for kind, way in COUNTS if account is not None else ():
             if account is not None and not (kind == "on air" and not scene.CHANNELS[channel](k).overhead):

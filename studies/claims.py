@@ -25,12 +25,12 @@ def findings(results: Results) -> Sequence[str]:
 
 
 def _at(method: str, known: str, k: int) -> dict[str, Any]:
-    return {"method": method, "knowledge": known, **IDEAL, "max_neighbours": k}
+    return {"method": method, "noise_model": known, **IDEAL, "max_neighbours": k}
 
 
 def _steps(results: Results, known: str, *methods: str) -> list[int]:
     """The K >= 1 at which one of the methods was run with this knowledge."""
-    where = views.present(results, {"method": list(methods), "knowledge": known, **IDEAL})
+    where = views.present(results, {"method": list(methods), "noise_model": known, **IDEAL})
     return sorted(int(k) for k in results.select(where)["max_neighbours"].unique() if k) if where else []
 
 
@@ -64,8 +64,12 @@ def _fitted(results: Results) -> str:
     steps = _steps(results, "fitted", *lineup.COOPERATIVE)
     if not steps:
         return ""
-    names = {"FedKalmanNet": ("fedkalmannet", "trained"), "fitted KF": ("kalman", "fitted"),
-             "fitted joint filter": ("joint", "fitted"), "fitted LKF-SA": ("lkf-sa", "fitted")}  # fmt: skip
+    names = {
+        "FedKalmanNet": ("fedkalmannet", "trained"),
+        "fitted KF": ("kalman", "fitted"),
+        "fitted joint filter": ("joint", "fitted"),
+        "fitted LKF-SA": ("lkf-sa", "fitted"),
+    }
     found = {words: views.mean(results, _at(*which, steps[-1])) for words, which in names.items()}
     ranked = sorted((value, words) for words, value in found.items() if value is not None)
     order = " < ".join(f"{words} {value:.3g} m" for value, words in ranked)

@@ -29,7 +29,7 @@ USUAL = ("nominal", "trained")
 def _grid() -> list[dict[str, Any]]:
     pairs = [*((name, "nominal") for name in CLASSICAL), *((name, "trained") for name in TRAINED)]
     pairs += [("kalman", "fitted"), ("joint", "fitted"), ("kalman", "identity"), ("lkf-sa", "identity")]
-    return [{"max_neighbours": 0 if name in SOLO else 6, "method": name, "knowledge": known} for name, known in pairs]
+    return [{"max_neighbours": 0 if name in SOLO else 6, "method": name, "noise_model": known} for name, known in pairs]
 
 
 def cell(p: Params) -> list[Row]:
@@ -43,8 +43,10 @@ def _ran(results: Results) -> list[tuple[str, str, dict[str, Any]]]:
     if "nees" not in frame:
         return []
     kept = frame[frame["nees"].notna()]
-    found = [(m, k, {"method": m, "knowledge": k}) for m, k in dict.fromkeys(zip(kept["method"], kept["knowledge"],
-                                                                                 strict=True))]  # fmt: skip
+    found = [
+        (m, k, {"method": m, "noise_model": k})
+        for m, k in dict.fromkeys(zip(kept["method"], kept["noise_model"], strict=True))
+    ]
     return sorted(found, key=lambda one: -(views.mean(results, one[2], "nees_inside") or 0.0))
 
 
@@ -55,11 +57,17 @@ def _table(results: Results) -> Table | None:
     body = []
     for method, known, where in _ran(results):
         inside = views.mean(results, where, "nees_inside")
-        body.append((
-            look(method).label, known, views.mean(results, where, "nees"), inside,
-            "yes" if inside is not None and inside >= GATE else "no", views.mean(results, where),
-        ))  # fmt: skip
-    header = ("Method", "Knowledge", "NEES", "In band", f"At least {GATE:g}", "RT-LE [m]")
+        body.append(
+            (
+                look(method).label,
+                known,
+                views.mean(results, where, "nees"),
+                inside,
+                "yes" if inside is not None and inside >= GATE else "no",
+                views.mean(results, where),
+            )
+        )
+    header = ("Method", "NoiseModel", "NEES", "In band", f"At least {GATE:g}", "RT-LE [m]")
     return Table(header, tuple(body), _caption(results), decimals=2) if body else None
 
 
@@ -84,8 +92,14 @@ def _figure(results: Results) -> Plot | None:
         for row, (method, _, where) in enumerate(ran):
             shown = look(method)
             each = np.nanmean(results.values("nees", where), axis=1)
-            panel.plot(each, np.full(len(each), row), linestyle="none", marker=shown.marker or "o", color=shown.color,
-                       alpha=0.8)  # fmt: skip
+            panel.plot(
+                each,
+                np.full(len(each), row),
+                linestyle="none",
+                marker=shown.marker or "o",
+                color=shown.color,
+                alpha=0.8,
+            )
         plain_log(panel.xaxis)
         labels = [look(method).label + ("" if known in USUAL else f", {known}") for method, known, _ in ran]
         panel.set(yticks=range(len(ran)), yticklabels=labels, ylim=(len(ran) - 0.4, -0.6), xlabel="NEES, one per ego")
@@ -95,8 +109,11 @@ def _figure(results: Results) -> Plot | None:
 def _findings(results: Results) -> Sequence[str]:
     from coopoc.study.style import look
 
-    good = [look(method).label for method, known, where in _ran(results)
-            if (views.mean(results, where, "nees_inside") or 0.0) >= GATE and known in USUAL]  # fmt: skip
+    good = [
+        look(method).label
+        for method, known, where in _ran(results)
+        if (views.mean(results, where, "nees_inside") or 0.0) >= GATE and known in USUAL
+    ]
     return [f"At least {GATE:g} of the steps in the band: {', '.join(good)}."] if good else []
 
 
@@ -108,8 +125,17 @@ STUDY = Study(
     prepare=weights.prepare,
     grid=_grid(),
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "backend": "gauss-newton", "egos": "auto", "runs": 20, "seed": 0,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "backend": "gauss-newton",
+        "egos": "auto",
+        "runs": 20,
+        "seed": 0,
         "train_seeds": 1,
     },
     shares=("max_neighbours",),
@@ -121,4 +147,4 @@ STUDY = Study(
     minutes=10,
     metrics={"rt_le_m": "lower", "nees": 3.0},
     reference=views.reference("consistency"),
-)  # fmt: skip
+)

@@ -45,8 +45,9 @@ def cell(p: Params) -> list[Row]:
         raw, kept = score(at), score(checkpoint.kept(at))
         found += [
             {"round": number, "run": r, "ego": ego, "rt_le_m": float(kept[r, e]), "raw_rt_le_m": float(raw[r, e])}
-            for e, ego in enumerate(who) for r in range(len(raw))
-        ]  # fmt: skip
+            for e, ego in enumerate(who)
+            for r in range(len(raw))
+        ]
     return found
 
 
@@ -89,10 +90,12 @@ def _figure(results: Results) -> Plot | None:
         return None
     ends = {f"individual {c}": _curve(results, name) for c, name in enumerate(weights.INDIVIDUAL, start=1)}
     return figures.convergence(
-        results, where=where, levels={name: curve[-1] for name, curve in ends.items() if curve},
+        results,
+        where=where,
+        levels={name: curve[-1] for name, curve in ends.items() if curve},
         caption="RT-LE after every round with the weights that validated best so far (mean over training seeds, band "
         f"from the lowest to the highest); dashed: individual nets at their end. {_conditions(results)}",
-    )  # fmt: skip
+    )
 
 
 def _clients(results: Results) -> Plot:
@@ -105,13 +108,21 @@ def _clients(results: Results) -> Plot:
 
 
 def _table(results: Results) -> Table | None:
+    from coopoc.study.pivot import pivot
+
     where = views.present(results, {"method": [FEDERATED, CENTRALISED]})
     if where is None:
         return None
-    return results.table(
-        rows="round", columns="method", value="rt_le_m", where=where, decimals=3, intervals=False,
+    return pivot(
+        results,
+        rows="round",
+        columns="method",
+        value="rt_le_m",
+        where=where,
+        decimals=3,
+        intervals=False,
         caption=f"RT-LE [m] after every round. {_conditions(results)}",
-    )  # fmt: skip
+    )
 
 
 def _findings(results: Results) -> Sequence[str]:
@@ -166,8 +177,16 @@ STUDY = Study(
     grid={"method": (FEDERATED, CENTRALISED, *weights.INDIVIDUAL), "train_seed": (0, 1, 2, 3, 4)},
     where=meaningful,
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 1, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "start": "gnss", "egos": "auto", "runs": 30, "seed": 0,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 1,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "start": "gnss",
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
         "train_seeds": 5,
     },
     tables={"rounds": _table},
@@ -180,4 +199,4 @@ STUDY = Study(
     minutes=2,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("convergence"),
-)  # fmt: skip
+)

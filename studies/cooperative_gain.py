@@ -13,7 +13,7 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
 from coopoc.evaluate.recursion import covariances, stages_of
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method, Track
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
@@ -35,9 +35,13 @@ LOSSES = (0.0, 0.3, 0.7)
 TRAINED = {"cooperative": True, "cooperative-newest": False}
 """Learned methods, whose weights are the same -> whether their messages are sums."""
 LINES = (
-    ("cooperative", "trained"), ("cooperative-newest", "trained"), ("joint", "nominal"), ("split-ci", "nominal"),
-    ("joint", "fitted"), ("lkf-sa", "identity"),
-)  # fmt: skip
+    ("cooperative", "trained"),
+    ("cooperative-newest", "trained"),
+    ("joint", "nominal"),
+    ("split-ci", "nominal"),
+    ("joint", "fitted"),
+    ("lkf-sa", "identity"),
+)
 BOUNDS = (("bound", "star"), ("bound", "with its past"))
 RECEIVERS = ("mixed", "changing")
 """Two receivers in five are POOR and the others GOOD; all are POOR in the middle third of the drive and else GOOD."""
@@ -49,15 +53,19 @@ def _grid() -> list[dict[str, Any]]:
     """Every K and loss with receivers that are alike, and receivers that differ at K = 0 and 6; bounds know no loss."""
     alike = {"receivers": "alike"}
     grid: list[dict[str, Any]] = [
-        {**alike, "max_neighbours": k, "loss": loss, "method": m, "knowledge": known}
-        for loss in LOSSES for k in NEIGHBOURS for m, known in (*LINES, *(BOUNDS if loss == 0 else ()))
+        {**alike, "max_neighbours": k, "loss": loss, "method": m, "noise_model": known}
+        for loss in LOSSES
+        for k in NEIGHBOURS
+        for m, known in (*LINES, *(BOUNDS if loss == 0 else ()))
         if k or loss == 0
-    ]  # fmt: skip
+    ]
     told = [*LINES[:3], ("joint", "told")]
     grid += [
-        {"receivers": which, "max_neighbours": k, "loss": 0.0, "method": m, "knowledge": known}
-        for which in RECEIVERS for k in (0, 6) for m, known in told
-    ]  # fmt: skip
+        {"receivers": which, "max_neighbours": k, "loss": 0.0, "method": m, "noise_model": known}
+        for which in RECEIVERS
+        for k in (0, 6)
+        for m, known in told
+    ]
     return grid
 
 
@@ -75,7 +83,7 @@ def cell(p: Params) -> list[Row]:
     """Rows of one method, K and loss, per training seed, ego and run; of a bound, one row per ego."""
     drive, who = scene.fleet(p["data"]), scene.egos(p["data"], str(p["egos"]))
     if p["method"] == "bound":
-        seen = past_bound if p["knowledge"] == "with its past" else posterior_bound
+        seen = past_bound if p["noise_model"] == "with its past" else posterior_bound
         found = {ego: seen(drive, scene.sensors(p), drive.index(ego), channel(p)) for ego in who}
         return [{"run": 0, "ego": ego, "rt_le_m": bound_rt_le(cov)} for ego, cov in found.items()]
     seen_by_all = recording(p)
@@ -94,12 +102,12 @@ def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
             (seed, weights.checkpoint("cooperative", p, seed).model) for seed in weights.seeds(p)
         ]
         return [(seed, CooperativeGain(m, TRAINED[p["method"]], p["method"])) for seed, m in models]
-    if p["knowledge"] == "told":
+    if p["noise_model"] == "told":
         drive = scene.fleet(p["data"])
-        process = Knowledge.nominal(seen.sensors).process_variance(seen)
+        process = NoiseModel.nominal(seen.sensors).process_variance(seen)
         truth = ToldNoise("told", seen.sensors, fix=np.square(gnss_std(p, drive))[None], process=process)
         return [(None, find("coopoc.methods", p["method"])(truth))]
-    return [(None, find("coopoc.methods", p["method"])(lineup.knowledge(p)))]
+    return [(None, find("coopoc.methods", p["method"])(lineup.noise_model(p)))]
 
 
 def _rows(track: Track, drive: Fleet, who: Sequence[str], extra: Mapping[str, Any]) -> list[Row]:
@@ -111,8 +119,9 @@ def _rows(track: Track, drive: Fleet, who: Sequence[str], extra: Mapping[str, An
     columns["nees_inside"] = np.broadcast_to(nees_inside(track, drive), columns["nees"].shape)
     return [
         {"run": r, "ego": ego, **extra, **{name: float(values[r, e]) for name, values in columns.items()}}
-        for e, ego in enumerate(who) for r in range(len(track.x))
-    ]  # fmt: skip
+        for e, ego in enumerate(who)
+        for r in range(len(track.x))
+    ]
 
 
 def channel(p: Params) -> V2X:
@@ -173,12 +182,14 @@ BOUND = (
 
 def _table(value: str, text: str, where: Mapping[str, Any], rows: Sequence[str], **options: Any) -> Any:
     def table(results: Results) -> Table | None:
+        from coopoc.study.pivot import pivot
+
         kept = views.present(results, where, value)
         if kept is None:
             return None
         caption = f"{text} {HEARS} {scene.conditions(results.settings)}"
-        return results.table(
-            rows=rows, columns="max_neighbours", value=value, where=kept, best=None, caption=caption, **options
+        return pivot(
+            results, rows=rows, columns="max_neighbours", value=value, where=kept, best=None, caption=caption, **options
         )
 
     return table
@@ -192,21 +203,28 @@ def _figure(results: Results) -> Plot | None:
     if not losses:
         return None
     with canvas(1, len(losses), width=2.1 + 2.0 * len(losses), height=3.2, sharey=True, squeeze=False) as (
-        figure, (panels,),
-    ):  # fmt: skip
+        figure,
+        (panels,),
+    ):
         for panel, loss in zip(panels, losses, strict=True):
             drawn = []
             for method, known in (*LINES[:-1], *BOUNDS):
                 points = _line(results, method, known, loss)
                 if not points:
                     continue
-                names = {"method": method, "knowledge": known}
+                names = {"method": method, "noise_model": known}
                 ks, found = zip(*points, strict=True)
                 style = strokes(names) | ({"linestyle": ":"} if known == "with its past" else {})
                 panel.plot(ks, [one.mean for one in found], **style)
                 if method != "bound":
-                    panel.fill_between(ks, [one.low for one in found], [one.high for one in found], alpha=0.12,
-                                       color=style["color"], linewidth=0)  # fmt: skip
+                    panel.fill_between(
+                        ks,
+                        [one.low for one in found],
+                        [one.high for one in found],
+                        alpha=0.12,
+                        color=style["color"],
+                        linewidth=0,
+                    )
                 drawn.append(names)
             panel.set(title=f"{100 * loss:g} % of messages lost", xlabel="Neighbours K", xticks=NEIGHBOURS)
         panels[0].set(ylabel="RT-LE [m]", ylim=(0, None))
@@ -223,7 +241,7 @@ def _line(results: Results, method: str, known: str, loss: float) -> list[tuple[
     points = []
     for k in NEIGHBOURS:
         at = 0.0 if k == 0 or method == "bound" else loss
-        where = {**ALIKE, "method": method, "knowledge": known, "max_neighbours": k, "loss": at}
+        where = {**ALIKE, "method": method, "noise_model": known, "max_neighbours": k, "loss": at}
         if views.present(results, where):
             points.append((k, results.interval("rt_le_m", where)))
     return points
@@ -240,7 +258,7 @@ def _finding(results: Results, loss: float) -> str:
         return ""
     most = int(results.select(where)["max_neighbours"].max())
     at = {**ALIKE, "loss": loss, "max_neighbours": most}
-    one, other = ({**at, "method": m, "knowledge": known} for m, known in (LINES[0], LINES[2]))
+    one, other = ({**at, "method": m, "noise_model": known} for m, known in (LINES[0], LINES[2]))
     if not views.present(results, other):
         return ""
     mine = results.interval("rt_le_m", one).mean
@@ -250,7 +268,7 @@ def _finding(results: Results, loss: float) -> str:
     return f"{100 * loss:g} % loss, K = {most}: the cooperative gain has {mine:.3f} m{seeds} and {verdict}."
 
 
-METHOD = ("loss", "method", "knowledge")
+METHOD = ("loss", "method", "noise_model")
 FILTERS = {**ALIKE, "method": list(dict.fromkeys(method for method, _ in LINES))}
 STUDY = Study(
     name="cooperative_gain",
@@ -261,23 +279,42 @@ STUDY = Study(
     prepare=prepare,
     grid=_grid(),
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "burst": 1.0, "egos": "auto", "runs": 30, "seed": 0,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "burst": 1.0,
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
         "train_seeds": 3,
     },
     shares=("receivers", "max_neighbours", "loss"),
     tables={
         "rt_le": _table("rt_le_m", f"RT-LE [m] against K. {BOUND}", ALIKE, METHOD, decimals=3),
-        "bytes": _table("bytes_per_second", "Payload that an ego receives [B/s].", FILTERS, METHOD, decimals=0,
-                        intervals=False),
+        "bytes": _table(
+            "bytes_per_second", "Payload that an ego receives [B/s].", FILTERS, METHOD, decimals=0, intervals=False
+        ),
         "nees": _table("nees", "NEES (3 is consistent).", FILTERS, METHOD, intervals=False),
-        "nees_inside": _table("nees_inside", "Share of steps whose run-averaged NEES is in its 99 % band (gate: 0.95).",
-                              FILTERS, METHOD, intervals=False),
+        "nees_inside": _table(
+            "nees_inside",
+            "Share of steps whose run-averaged NEES is in its 99 % band (gate: 0.95).",
+            FILTERS,
+            METHOD,
+            intervals=False,
+        ),
         "receivers": _table(
-            "rt_le_m", f"RT-LE [m] where two receivers in five have {POOR:g} m and the others {GOOD:g} m (mixed), and "
+            "rt_le_m",
+            f"RT-LE [m] where two receivers in five have {POOR:g} m and the others {GOOD:g} m (mixed), and "
             f"where all have {POOR:g} m in the middle third of the drive (changing); nominal filters are told the rms, "
-            "'told' ones each fix's own.", {"receivers": list(RECEIVERS)}, ("receivers", "method", "knowledge"),
-            decimals=3),
+            "'told' ones each fix's own.",
+            {"receivers": list(RECEIVERS)},
+            ("receivers", "method", "noise_model"),
+            decimals=3,
+        ),
     },
     figures={"rt_le": _figure},
     findings=_findings,
@@ -289,4 +326,4 @@ STUDY = Study(
     minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},
     reference=views.reference("cooperative_gain"),
-)  # fmt: skip
+)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Finding, Params, Row, Study
 
 from . import lineup, scene, views, weights
 
@@ -14,23 +14,29 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-ERRORS = {"white": (0.0, 0.0), "half own": (0.5, 0.0), "own": (0.9, 0.0), "own and common": (0.45, 0.45),
-          "common": (0.0, 0.9)}  # fmt: skip
+ERRORS = {
+    "white": (0.0, 0.0),
+    "half own": (0.5, 0.0),
+    "own": (0.9, 0.0),
+    "own and common": (0.45, 0.45),
+    "common": (0.0, 0.9),
+}
 """Name -> shares of a fix's variance that last: of each receiver, and of all vehicles alike."""
 NEIGHBOURS = (0, 2, 6, 10)
 SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"), ("recursive", "trained"))
 SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("drift", "nominal"))
-"""What nominal knowledge means: all but `drift` take the whole error of a fix as white, of the same variance."""
+"""What nominal noise model means: all but `drift` take the whole error of a fix as white, of the same variance."""
 BOUND = ("bound", "bound")
 
 
 def _grid() -> list[dict[str, Any]]:
     """Who talks to nobody at K = 0 only; the drift filter there, too, as the solo filter of coloured noise."""
     return [
-        {"own_share": own, "common_share": common, "max_neighbours": k, "method": method, "knowledge": known}
-        for own, common in ERRORS.values() for k in NEIGHBOURS
+        {"own_share": own, "common_share": common, "max_neighbours": k, "method": method, "noise_model": known}
+        for own, common in ERRORS.values()
+        for k in NEIGHBOURS
         for method, known in ((*SOLO, *SHARED[2:], BOUND) if k == 0 else (*SHARED, BOUND))
-    ]  # fmt: skip
+    ]
 
 
 def cell(p: Params) -> list[Row]:
@@ -54,8 +60,11 @@ def _against_k(number: views.Number, text: str, decimals: int) -> Any:
     def table(results: Results) -> Table | None:
         from coopoc.study.style import look
 
-        rows = [((name, look(method).label), {**case(name), "method": method, "knowledge": known})
-                for name in ERRORS for method, known in (*SOLO, *SHARED, BOUND)]  # fmt: skip
+        rows = [
+            ((name, look(method).label), {**case(name), "method": method, "noise_model": known})
+            for name in ERRORS
+            for method, known in (*SOLO, *SHARED, BOUND)
+        ]
         columns = [(f"K = {k}", {"max_neighbours": k}) for k in NEIGHBOURS]
         head = ("Errors of GNSS that last", "Method")
         return views.crossed(results, head, rows, columns, number, _caption(results, text), decimals)
@@ -84,32 +93,39 @@ def _figure(results: Results) -> Plot | None:
     if not cases:
         return None
     with canvas(1, len(cases), width=1.2 + 1.55 * len(cases), height=3.0, sharey=True, squeeze=False) as (
-        figure, (panels,),
-    ):  # fmt: skip
+        figure,
+        (panels,),
+    ):
         for panel, name in zip(panels, cases, strict=True):
             drawn = []
             for method, known in (*SOLO[1:], *SHARED, BOUND):
-                found = {k: views.rms(results, {**case(name), "method": method, "knowledge": known,
-                                          "max_neighbours": at(method, k)}) for k in NEIGHBOURS}  # fmt: skip
+                found = {
+                    k: views.rms(
+                        results, {**case(name), "method": method, "noise_model": known, "max_neighbours": at(method, k)}
+                    )
+                    for k in NEIGHBOURS
+                }
                 ran = {k: value for k, value in found.items() if value is not None}
                 if ran:
-                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": known}))
-                    drawn.append({"method": method, "knowledge": known})
+                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "noise_model": known}))
+                    drawn.append({"method": method, "noise_model": known})
             panel.set(title=name, xlabel="Neighbours K", xticks=NEIGHBOURS)
         panels[0].set(ylabel="rms RT-LE [m]", ylim=(0, None))
         legend(panels[-1], drawn)
     return Plot(figure, _caption(results, "rms over runs of RT-LE against the number of neighbours."))
 
 
-def _findings(results: Results) -> Sequence[str]:
-    found = [_finding(results, name) for name in ERRORS]
-    return [sentence for sentence in found if sentence]
+def _findings(results: Results) -> Sequence[Finding]:
+    found = [(_finding(results, name), name) for name in ERRORS]
+    return [Finding(sentence, key=name) for sentence, name in found if sentence]
 
 
 def _finding(results: Results, name: str) -> str:
     most = max((k for k in NEIGHBOURS if views.present(results, {"max_neighbours": k})), default=0)
-    value = {method: [views.rms(results, {**case(name), "method": method, "max_neighbours": k}) for k in (0, most)]
-             for method in ("kalman", "joint", "drift", "bound")}  # fmt: skip
+    value = {
+        method: [views.rms(results, {**case(name), "method": method, "max_neighbours": k}) for k in (0, most)]
+        for method in ("kalman", "joint", "drift", "bound")
+    }
     alone, joint, drift, bound = value["kalman"][0], value["joint"][1], value["drift"][1], value["bound"][1]
     if most == 0 or alone is None or joint is None or drift is None or bound is None:
         return ""
@@ -127,13 +143,24 @@ STUDY = Study(
     prepare=weights.prepare,
     grid=_grid(),
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "drift_time_s": 60.0, "egos": "auto", "runs": 30, "seed": 0,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "drift_time_s": 60.0,
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
         "train_seeds": 1,
     },
     shares=(*scene.LASTING, "max_neighbours"),
-    tables={"rms": _against_k(views.rms, "rms over runs of RT-LE [m].", 2),
-            "nees": _against_k(_nees, "NEES (3 is consistent).", 1)},
+    tables={
+        "rms": _against_k(views.rms, "rms over runs of RT-LE [m].", 2),
+        "nees": _against_k(_nees, "NEES (3 is consistent).", 1),
+    },
     figures={"rms": _figure},
     findings=_findings,
     recipe=weights.described,
@@ -148,4 +175,4 @@ STUDY = Study(
     minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},
     reference=views.reference("correlated_gnss"),
-)  # fmt: skip
+)

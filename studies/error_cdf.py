@@ -18,8 +18,16 @@ CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
 CLASSIC = (("gnss", "none"), ("kalman", "identity"), ("kalman", "fitted"), ("kalman", "nominal"), ("kalman", "oracle"))
 LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER))
-HEADER = ("Method", "Knowledge", "RT-LE [m]", "Seed std [m]", "Maximum [m]", "Reduction [m]",
-          "Reduction / fitted KF's", "Worse than GNSS [%]")  # fmt: skip
+HEADER = (
+    "Method",
+    "NoiseModel",
+    "RT-LE [m]",
+    "Seed std [m]",
+    "Maximum [m]",
+    "Reduction [m]",
+    "Reduction / fitted KF's",
+    "Worse than GNSS [%]",
+)
 
 
 def cell(p: Params) -> list[Row]:
@@ -29,7 +37,7 @@ def cell(p: Params) -> list[Row]:
 
 def meaningful(p: Params) -> bool:
     """No net of a client that is not there; of real data, which has its own noise, one case and no oracle."""
-    if scene.is_real(p["data"]) and ((p["scenario"], p["velocity_ratio"]) != CASES[0] or p["knowledge"] == "oracle"):
+    if scene.is_real(p["data"]) and ((p["scenario"], p["velocity_ratio"]) != CASES[0] or p["noise_model"] == "oracle"):
         return False
     return weights.trainable(p)
 
@@ -46,19 +54,27 @@ def _table(at: dict[str, Any]) -> Any:
 
         body = []
         gnss = views.mean(results, {**at, "method": "gnss"}, "max_error_m")
-        fitted = views.mean(results, {**at, "method": "kalman", "knowledge": "fitted"}, "max_error_m")
+        fitted = views.mean(results, {**at, "method": "kalman", "noise_model": "fitted"}, "max_error_m")
         filters = None if gnss is None or fitted is None else gnss - fitted
         for method, known in LINEUP:
-            where = {**at, "method": method, "knowledge": known}
+            where = {**at, "method": method, "noise_model": known}
             if not views.present(results, where):
                 continue
             worst = results.interval("max_error_m", where)
             less = None if gnss is None else gnss - worst.mean
             share = None if less is None or not filters else less / filters
-            body.append((
-                look(method).label, known, results.interval("rt_le_m", where), views.seed_std(results, where), worst,
-                less, share, 100 * results.interval("worse_than_gnss", where).mean,
-            ))  # fmt: skip
+            body.append(
+                (
+                    look(method).label,
+                    known,
+                    results.interval("rt_le_m", where),
+                    views.seed_std(results, where),
+                    worst,
+                    less,
+                    share,
+                    100 * results.interval("worse_than_gnss", where).mean,
+                )
+            )
         caption = (
             "Errors; reduction: of the mean maximum against GNSS, and its ratio to that of the fitted KF. "
             f"{scene.conditions({**results.settings, **at})}"
@@ -74,7 +90,7 @@ def _cdf(at: dict[str, Any]) -> Any:
 
         methods = ["gnss", "kalman", "okf", "fedkalmannet", "centralised", "individual1"]
         known = ["none", "identity", "fitted", "oracle", "trained"]
-        where = views.present(results, {**at, "method": methods, "knowledge": known}, "error_quantiles_m")
+        where = views.present(results, {**at, "method": methods, "noise_model": known}, "error_quantiles_m")
         text = "Distribution of the error over all steps; markers: mean of the per-run maxima."
         caption = f"{text} {scene.conditions({**results.settings, **at})}"
         return figures.cdf(results, where=where, log=True, caption=caption) if where else None
@@ -92,7 +108,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     names |= {f"net of client {client}": name for client, name in enumerate(weights.INDIVIDUAL, start=1)}
     found = {words: views.mean(results, {**at, "method": name}) for words, name in names.items()}
-    filters = {f"{known} KF": {**at, "method": "kalman", "knowledge": known} for known in ("fitted", "oracle")}
+    filters = {f"{known} KF": {**at, "method": "kalman", "noise_model": known} for known in ("fitted", "oracle")}
     found |= {words: views.mean(results, where) for words, where in filters.items()}
     if not views.listed(found):
         return ""
@@ -102,7 +118,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     if fed and centralised:
         text.append(f"Federated against centralised: {100 * (fed / centralised - 1):+.1f} %")
     if fed and found["fitted KF"]:
-        net = {**at, "method": "fedkalmannet", "knowledge": "trained"}
+        net = {**at, "method": "fedkalmannet", "noise_model": "trained"}
         text.append(f"The federated net {views.verdict(results, net, filters['fitted KF'], 'the fitted KF')}")
     if fed and oracle:
         blind = ", which does not know the bias" if scene.acting(p).gnss_bias[1] else ""
@@ -117,12 +133,20 @@ STUDY = Study(
     key=lineup.key,
     prepare=weights.prepare,
     grid=[
-        {"scenario": scenario, "velocity_ratio": ratio, "method": method, "knowledge": known}
-        for scenario, ratio in CASES for method, known in LINEUP
+        {"scenario": scenario, "velocity_ratio": ratio, "method": method, "noise_model": known}
+        for scenario, ratio in CASES
+        for method, known in LINEUP
     ],
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "velocity_reading": "axis",
-        "start": "gnss", "egos": "auto", "runs": 100, "seed": 0, "train_seeds": 5,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "velocity_reading": "axis",
+        "start": "gnss",
+        "egos": "auto",
+        "runs": 100,
+        "seed": 0,
+        "train_seeds": 5,
     },
     where=meaningful,
     shares=("scenario", "velocity_ratio"),
@@ -136,4 +160,4 @@ STUDY = Study(
     minutes=3,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("error_cdf"),
-)  # fmt: skip
+)

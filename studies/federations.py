@@ -1,4 +1,4 @@
-"""The federations that the aggregation study trains: clients that are alike, differ, lie or stay away."""
+"""The federations that the aggregation study trains: equal, heterogeneous, poisoned and absent clients."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from coopoc.errors import InputError
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.study.study import Params
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensing import observe
@@ -23,8 +23,19 @@ if TYPE_CHECKING:
     from coopoc.learned.federation.participation import Participation
     from coopoc.learned.training.clients import Client
 
-RULES = ("mean", "uniform", "fedprox", "fedavgm", "fedadam", "uncertainty", "median", "trimmed_mean", "krum",
-         "multi_krum", "geometric_median")  # fmt: skip
+RULES = (
+    "mean",
+    "uniform",
+    "fedprox",
+    "fedavgm",
+    "fedadam",
+    "uncertainty",
+    "median",
+    "trimmed_mean",
+    "krum",
+    "multi_krum",
+    "geometric_median",
+)
 WIRES = ("float16", "top-k", "8 bits", "4 bits")
 GRAPHS = ("ring", "v2x")
 CONDITIONS = {
@@ -57,32 +68,34 @@ def noise(p: Params) -> list[Sensors]:
 
 def clients(p: Params, seed: int) -> tuple[Client, ...]:
     """The clients of a condition for one training seed; the one in the middle is the bad one."""
-    from coopoc.learned.federation.participation import moved, unlike
+    from coopoc.learned.federation.participation import heterogeneous, poisoned
 
     count = int(p["members"])
     amounts = [SHARES[i % 3] if p["condition"] == "heterogeneous" else 1.0 for i in range(count)]
-    found = list(unlike(members(p), noise(p), amounts, seed=seed, piece=int(p["piece"])))
+    found = list(heterogeneous(members(p), noise(p), amounts, seed=seed, piece=int(p["piece"])))
     if p["condition"] == "poisoned data":
-        found[count // 2] = moved(found[count // 2], float(p["offset_m"]))
+        found[count // 2] = poisoned(found[count // 2], float(p["offset_m"]))
     return tuple(found)
 
 
 def participation(p: Params) -> Participation:
-    """Who takes part under a condition, and who lies."""
-    from coopoc.learned.federation.participation import Participation, Poison
+    """Participation and Byzantine clients under a condition."""
+    from coopoc.learned.federation.participation import Byzantine, Participation
 
     if p["condition"] == "poisoned update":
-        return Poison(who=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
+        return Byzantine(names=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
     return Participation(share=0.5 if p["condition"] == "half absent" else 1.0)
 
 
-def fitted(p: Params) -> Knowledge:
+def fitted(p: Params) -> NoiseModel:
     """The noise that all clients together have seen with training seed 0, as the Kalman filter takes it."""
     fleet, acting = members(p), noise(p)
     seen = {one: observe(fleet, one, V2X(0), seed=0) for one in dict.fromkeys(acting)}
-    gnss, velocity = (np.stack([getattr(seen[one], name)[:, :, i] for i, one in enumerate(acting)], axis=2)
-                      for name in ("gnss", "velocity"))  # fmt: skip
-    return Knowledge.fitted(replace(seen[acting[0]], gnss=gnss, velocity=velocity), fleet)
+    gnss, velocity = (
+        np.stack([getattr(seen[one], name)[:, :, i] for i, one in enumerate(acting)], axis=2)
+        for name in ("gnss", "velocity")
+    )
+    return NoiseModel.fitted(replace(seen[acting[0]], gnss=gnss, velocity=velocity), fleet)
 
 
 class Trained(NamedTuple):
@@ -119,13 +132,21 @@ def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]
     wires = dict(zip(WIRES, (Float16(), TopK(0.1), Quantised(8), Quantised(4)), strict=True))
     graph = {"ring": Ring(), "v2x": V2XGraph(members(p), float(p["radius_m"]))}.get(name)
     done = federate_many(
-        nets, groups, range(len(nets)), int(p["rounds"]), name if name in RULES else "mean", int(p["local_epochs"]),
-        participation=participation(p), compression=wires.get(name), topology=graph,
-    )  # fmt: skip
+        nets,
+        groups,
+        range(len(nets)),
+        int(p["rounds"]),
+        "mean" if name in (*WIRES, *GRAPHS) else name,
+        int(p["local_epochs"]),
+        participation=participation(p),
+        compression=wires.get(name),
+        topology=graph,
+    )
     found = []
     for fed in done:
-        sent, received = (sum(getattr(row, way) for row in fed.history) / len(fed.names)
-                          for way in ("sent_bytes", "received_bytes"))  # fmt: skip
+        sent, received = (
+            sum(getattr(row, way) for row in fed.history) / len(fed.names) for way in ("sent_bytes", "received_bytes")
+        )
         rejected, idle = sum(len(row.rejected) for row in fed.history), sum(row.note != "" for row in fed.history)
         last = fed.after(len(fed.history) - 1)
         found.append(Trained(fed.model, last, sent, received, rejected, idle, fed.seconds))
@@ -135,15 +156,17 @@ def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]
 def _pooled(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
     """Nets trained on all pieces in one place; the clients send their drives, six float32 a step, and get the net."""
     from coopoc.learned.nets.stack import flatten, unflatten
-    from coopoc.learned.training.clients import Pieces
+    from coopoc.learned.training.clients import Segments
     from coopoc.learned.training.fit import Task, fit_many
     from coopoc.learned.training.schedule import Schedule
 
-    def all_(group: Sequence[Client], part: str) -> Pieces:
-        return Pieces.join([getattr(client, part) for client in group])
+    def all_(group: Sequence[Client], part: str) -> Segments:
+        return Segments.join([getattr(client, part) for client in group])
 
-    tasks = [Task(net, all_(g, "training"), all_(g, "validation"), seed, long=all_(g, "long"))
-             for seed, (net, g) in enumerate(zip(nets, groups, strict=True))]  # fmt: skip
+    tasks = [
+        Task(net, all_(g, "training"), all_(g, "validation"), seed, long=all_(g, "long"))
+        for seed, (net, g) in enumerate(zip(nets, groups, strict=True))
+    ]
     sent, received = 4.0 * 6 * float(members(p).present.sum(axis=0).mean()), 4.0 * flatten(nets[:1]).numel()
     found = fit_many(tasks, Schedule(epochs=int(p["steps"])))
     last = [unflatten(fit.history[-1].weights[None], fit.model)[0] for fit in found]

@@ -19,10 +19,17 @@ FLEETS = ("town10", "town10-validation", "town04")
 NOISES = {"training": (0, 0.10), "scenario 1": (1, 0.15), "scenario 2": (2, 0.15), "scenario 2, 40 %": (2, 0.40)}
 """Name -> scenario and velocity noise; the last is beyond what anything was trained at."""
 METHODS = (
-    ("kalman", "oracle"), ("kalman", "nominal"), ("kalman", "fitted"), ("kalman-adaptive", "nominal"),
-    ("okf", "trained"), ("fedkalmannet", "trained"), ("magnitude", "trained"), ("split", "trained"),
-    ("recursive", "trained"), ("cooperative", "trained"),
-)  # fmt: skip
+    ("kalman", "oracle"),
+    ("kalman", "nominal"),
+    ("kalman", "fitted"),
+    ("kalman-adaptive", "nominal"),
+    ("okf", "trained"),
+    ("fedkalmannet", "trained"),
+    ("magnitude", "trained"),
+    ("split", "trained"),
+    ("recursive", "trained"),
+    ("cooperative", "trained"),
+)
 
 
 REAL = {"data": "real", "scenario": 0, "velocity_ratio": 0.10}
@@ -31,8 +38,8 @@ REAL = {"data": "real", "scenario": 0, "velocity_ratio": 0.10}
 
 def _grid() -> list[dict[str, Any]]:
     places = [at(fleet, noise) for fleet in FLEETS for noise in NOISES]
-    grid = [{**place, "method": m, "knowledge": known} for place in places for m, known in METHODS]
-    return grid + [{**REAL, "method": m, "knowledge": known} for m, known in METHODS if known != "oracle"]
+    grid = [{**place, "method": m, "noise_model": known} for place in places for m, known in METHODS]
+    return grid + [{**REAL, "method": m, "noise_model": known} for m, known in METHODS if known != "oracle"]
 
 
 def _meaningful(p: Params) -> bool:
@@ -62,7 +69,7 @@ def at(fleet: str, noise: str) -> dict[str, Any]:
 def multiple(results: Results, where: dict[str, Any]) -> float | None:
     """rms over runs of RT-LE over that of the oracle filter in the same place and noise."""
     place = {name: where[name] for name in ("data", "scenario", "velocity_ratio")}
-    oracle = views.rms(results, {**place, "method": "kalman", "knowledge": "oracle"})
+    oracle = views.rms(results, {**place, "method": "kalman", "noise_model": "oracle"})
     mine = views.rms(results, where)
     return None if oracle is None or mine is None else mine / oracle
 
@@ -72,8 +79,10 @@ def _table(results: Results) -> Table | None:
 
     rows = [((noise, fleet), at(fleet, noise)) for noise in NOISES for fleet in FLEETS]
     ran = [pair for pair in METHODS[1:] if views.present(results, {"method": pair[0]})]
-    columns = [(look(method).label + (f", {known}" if method == "kalman" else ""),
-                {"method": method, "knowledge": known}) for method, known in ran]  # fmt: skip
+    columns = [
+        (look(method).label + (f", {known}" if method == "kalman" else ""), {"method": method, "noise_model": known})
+        for method, known in ran
+    ]
     return views.crossed(results, ("Noise", "Fleet"), rows, columns, multiple, _caption(results), decimals=2)
 
 
@@ -92,13 +101,13 @@ def _real(results: Results) -> Table | None:
     from coopoc.study.tables import Table
 
     body: list[tuple[Any, ...]] = []
-    base = views.mean(results, {**REAL, "method": "kalman", "knowledge": "nominal"})
+    base = views.mean(results, {**REAL, "method": "kalman", "noise_model": "nominal"})
     for method, known in METHODS:
-        where = {**REAL, "method": method, "knowledge": known}
+        where = {**REAL, "method": method, "noise_model": known}
         error = views.mean(results, where)
         if error is not None and base is not None:
             body.append((look(method).label, known, error, error / base, views.mean(results, where, "nees")))
-    header = ("Method", "Knowledge", "RT-LE [m]", "Times the nominal KF's", "NEES")
+    header = ("Method", "NoiseModel", "RT-LE [m]", "Times the nominal KF's", "NEES")
     if not body:
         return None
     text = f"Alone, on real data. {scene.conditions({**results.settings, **_placed({**results.settings, **REAL})})}"
@@ -112,7 +121,7 @@ def _figure(results: Results) -> Plot | None:
     found: dict[tuple[str, str], dict[str, list[float]]] = {}
     for method, known in METHODS[1:]:
         for noise in NOISES:
-            each = [multiple(results, {**at(fleet, noise), "method": method, "knowledge": known}) for fleet in FLEETS]
+            each = [multiple(results, {**at(fleet, noise), "method": method, "noise_model": known}) for fleet in FLEETS]
             ran = [value for value in each if value is not None]
             if ran:
                 found.setdefault((method, known), {})[noise] = ran
@@ -122,7 +131,7 @@ def _figure(results: Results) -> Plot | None:
 def _findings(results: Results) -> Sequence[str]:
     found = []
     for method in ("fedkalmannet", "recursive"):
-        where = {"method": method, "knowledge": "trained"}
+        where = {"method": method, "noise_model": "trained"}
         home, away = (multiple(results, {**at(fleet, "scenario 2"), **where}) for fleet in ("town10", "town04"))
         beyond = multiple(results, {**at("town10", "scenario 2, 40 %"), **where})
         if home is not None and away is not None and beyond is not None:
@@ -142,8 +151,15 @@ STUDY = Study(
     grid=_grid(),
     where=_meaningful,
     settings={
-        "clients": "town10-clients", "weights": "runs/weights", "velocity_reading": "axis", "start": "gnss",
-        "egos": "auto", "runs": 30, "seed": 0, "train_seeds": 3, "real": "",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "velocity_reading": "axis",
+        "start": "gnss",
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
+        "train_seeds": 3,
+        "real": "",
     },
     shares=("data", "scenario", "velocity_ratio"),
     tables={"multiples": _table, "real": _real},
@@ -157,4 +173,4 @@ STUDY = Study(
     minutes=4,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("generalisation"),
-)  # fmt: skip
+)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Finding, Params, Row, Study
 
 from . import lineup, scene, views
 
@@ -24,13 +24,16 @@ NEIGHBOURS = (2, 10)
 def _grid() -> list[dict[str, Any]]:
     """One kind of error at a time; the solo filter and the bound, to which the heading is nothing, once."""
     exact = dict.fromkeys(KINDS, 0.0)
-    grid: list[dict[str, Any]] = [{**exact, "max_neighbours": 0, "method": "kalman", "knowledge": "nominal"}]
+    grid: list[dict[str, Any]] = [{**exact, "max_neighbours": 0, "method": "kalman", "noise_model": "nominal"}]
     cases = [exact, *({**exact, kind: size} for kind in KINDS for size in DEGREES[1:])]
     grid += [
-        {**case, "max_neighbours": k, "method": m, "knowledge": known}
-        for case in cases for k in NEIGHBOURS for m, known in LINES if case != exact or known != EXACT
-    ]  # fmt: skip
-    return grid + [{**exact, "max_neighbours": k, "method": "bound", "knowledge": "bound"} for k in NEIGHBOURS]
+        {**case, "max_neighbours": k, "method": m, "noise_model": known}
+        for case in cases
+        for k in NEIGHBOURS
+        for m, known in LINES
+        if case != exact or known != EXACT
+    ]
+    return grid + [{**exact, "max_neighbours": k, "method": "bound", "noise_model": "bound"} for k in NEIGHBOURS]
 
 
 def cell(p: Params) -> list[Row]:
@@ -41,7 +44,7 @@ def cell(p: Params) -> list[Row]:
 def at(kind: str, size: float, method: str, known: str, k: int) -> dict[str, Any]:
     """A selection; without an error all kinds of knowledge are one."""
     where = {**dict.fromkeys(KINDS, 0.0), kind: size, "max_neighbours": k, "method": method}
-    return {**where, "knowledge": known if size else "nominal"}
+    return {**where, "noise_model": known if size else "nominal"}
 
 
 def _table(value: str, text: str, decimals: int) -> Any:
@@ -56,7 +59,7 @@ def _table(value: str, text: str, decimals: int) -> Any:
                     found = [views.mean(results, at(kind, size, method, known, k), value) for size in DEGREES]
                     if any(number is not None for number in found):
                         body.append((words, k, look(method).label, known, *found))
-        header = ("Heading error", "K", "Method", "Knowledge", *(f"{size:g}°" for size in DEGREES))
+        header = ("Heading error", "K", "Method", "NoiseModel", *(f"{size:g}°" for size in DEGREES))
         return Table(header, tuple(body), _caption(results, text), decimals=decimals) if body else None
 
     return table
@@ -77,20 +80,21 @@ def _figure(results: Results) -> Plot | None:
     if not panels:
         return None
     with canvas(1, len(panels), width=1.4 + 1.75 * len(panels), height=3.0, sharey=True, squeeze=False) as (
-        figure, (axes,),
-    ):  # fmt: skip
+        figure,
+        (axes,),
+    ):
         for axis, (kind, k) in zip(axes, panels, strict=True):
             drawn = []
             for method, known in LINES:
                 found = {size: views.mean(results, at(kind, size, method, known, k)) for size in DEGREES}
                 ran = {size: value for size, value in found.items() if value is not None}
                 if ran:
-                    axis.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": known}))
-                    drawn.append({"method": method, "knowledge": known})
+                    axis.plot(list(ran), list(ran.values()), **strokes({"method": method, "noise_model": known}))
+                    drawn.append({"method": method, "noise_model": known})
             for name, level in (("kalman", 0), ("bound", k)):
                 value = views.mean(results, {"method": name, "max_neighbours": level})
                 if value is not None:
-                    look = {"method": name, "knowledge": "nominal" if name == "kalman" else "bound"}
+                    look = {"method": name, "noise_model": "nominal" if name == "kalman" else "bound"}
                     axis.axhline(value, **{**strokes(look), "marker": ""})
                     drawn.append(look)
             axis.set(title=f"{KINDS[kind].partition(',')[0]}, K = {k}", xlabel="Heading error [°]", xticks=DEGREES)
@@ -100,17 +104,22 @@ def _figure(results: Results) -> Plot | None:
     return Plot(figure, _caption(results, text))
 
 
-def _findings(results: Results) -> Sequence[str]:
+def _findings(results: Results) -> Sequence[Finding]:
     found = []
     for kind, words in KINDS.items():
         for k in NEIGHBOURS:
-            none, ignored, told = (views.mean(results, at(kind, size, "joint", known, k)) for size, known in
-                                   ((0.0, "nominal"), (4.0, EXACT), (4.0, "nominal")))  # fmt: skip
+            none, ignored, told = (
+                views.mean(results, at(kind, size, "joint", known, k))
+                for size, known in ((0.0, "nominal"), (4.0, EXACT), (4.0, "nominal"))
+            )
             alone = views.mean(results, {"method": "kalman", "max_neighbours": 0})
             if none is not None and ignored is not None and told is not None and alone is not None:
-                found.append(f"4° of {words.partition(',')[0]}, K = {k}: the joint filter goes from {none:.2f} m to "
-                             f"{ignored:.2f} m if it takes the heading as exact, {told:.2f} m if it is told; alone "
-                             f"{alone:.2f} m.")  # fmt: skip
+                text = (
+                    f"4° of {words.partition(',')[0]}, K = {k}: the joint filter goes from {none:.2f} m to "
+                    f"{ignored:.2f} m if it takes the heading as exact, {told:.2f} m if it is told; alone "
+                    f"{alone:.2f} m."
+                )
+                found.append(Finding(text, key=kind))
     return found
 
 
@@ -121,8 +130,15 @@ STUDY = Study(
     key=lineup.key,
     grid=_grid(),
     settings={
-        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0,
-        "egos": "auto", "runs": 30, "seed": 0, "train_seeds": 0,
+        "data": "town10",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
+        "train_seeds": 0,
     },
     shares=(*KINDS, "max_neighbours"),
     tables={"rt_le": _table("rt_le_m", "RT-LE [m].", 3), "nees": _table("nees", "NEES (3 is consistent).", 1)},
@@ -135,4 +151,4 @@ STUDY = Study(
     minutes=5,
     metrics={"rt_le_m": "lower", "nees": 3.0},
     reference=views.reference("heading_error"),
-)  # fmt: skip
+)

@@ -25,9 +25,9 @@ def _grid() -> list[dict[str, Any]]:
     """Latency without loss, and loss without latency; the solo filter once."""
     ways = [PERFECT, *({**PERFECT, "latency_s": late} for late in LATENCIES[1:])]
     ways += [{**PERFECT, "loss": loss, "burst": burst} for burst in BURSTS for loss in LOSSES[1:]]
-    grid: list[dict[str, Any]] = [{**PERFECT, "max_neighbours": 0, "method": "kalman", "knowledge": "nominal"}]
-    grid += [{**PERFECT, "max_neighbours": 6, "method": "bound", "knowledge": "bound"}]
-    together = {"max_neighbours": 6, "knowledge": "nominal"}
+    grid: list[dict[str, Any]] = [{**PERFECT, "max_neighbours": 0, "method": "kalman", "noise_model": "nominal"}]
+    grid += [{**PERFECT, "max_neighbours": 6, "method": "bound", "noise_model": "bound"}]
+    together = {"max_neighbours": 6, "noise_model": "nominal"}
     return grid + [{**way, **together, "method": method} for way in ways for method in METHODS[1:]]
 
 
@@ -39,10 +39,15 @@ def cell(p: Params) -> list[Row]:
 def _lines() -> list[tuple[str, str, list[tuple[float, dict[str, Any]]]]]:
     """Title, axis label and (value, channel) of each panel."""
     late = [(value, {**PERFECT, "latency_s": value}) for value in LATENCIES]
-    lossy = [[(100 * value, {**PERFECT, "loss": value, "burst": burst if value else 1.0}) for value in LOSSES]
-             for burst in BURSTS]  # fmt: skip
-    return [("late", "Latency [s]", late), ("lost one by one", "Lost [%]", lossy[0]),
-            (f"lost in runs of {BURSTS[1]:g}", "Lost [%]", lossy[1])]  # fmt: skip
+    lossy = [
+        [(100 * value, {**PERFECT, "loss": value, "burst": burst if value else 1.0}) for value in LOSSES]
+        for burst in BURSTS
+    ]
+    return [
+        ("late", "Latency [s]", late),
+        ("lost one by one", "Lost [%]", lossy[0]),
+        (f"lost in runs of {BURSTS[1]:g}", "Lost [%]", lossy[1]),
+    ]
 
 
 def _at(method: str, way: dict[str, Any]) -> dict[str, Any]:
@@ -84,7 +89,7 @@ def _figure(results: Results) -> Plot | None:
                 found = {value: views.mean(results, _at(method, way)) for value, way in ways}
                 ran = {value: number for value, number in found.items() if number is not None}
                 if ran:
-                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "knowledge": "fitted"}))
+                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method, "noise_model": "fitted"}))
                     drawn.append({"method": method})
             if bound is not None:
                 panel.axhline(bound, **strokes({"method": "bound"}))
@@ -100,8 +105,9 @@ def _findings(results: Results) -> Sequence[str]:
     found = []
     for title, label, ways in _lines():
         (_, none), (most, worst) = ways[0], ways[-1]
-        alone, best, left = (views.mean(results, _at(*pair)) for pair in
-                             (("kalman", none), ("joint", none), ("joint", worst)))  # fmt: skip
+        alone, best, left = (
+            views.mean(results, _at(*pair)) for pair in (("kalman", none), ("joint", none), ("joint", worst))
+        )
         if alone is not None and best is not None and left is not None:
             kept = (alone - left) / (alone - best)
             told = f"keeps {100 * kept:.0f} % of what six neighbours bring" if kept > 0 else "is worse than alone"
@@ -130,8 +136,15 @@ STUDY = Study(
     key=lineup.key,
     grid=_grid(),
     settings={
-        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0,
-        "egos": "auto", "runs": 20, "seed": 0, "train_seeds": 0,
+        "data": "town10",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "egos": "auto",
+        "runs": 20,
+        "seed": 0,
+        "train_seeds": 0,
     },
     shares=tuple(PERFECT),
     tables={"rt_le": _table},
@@ -141,4 +154,4 @@ STUDY = Study(
     minutes=15,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("latency_loss"),
-)  # fmt: skip
+)

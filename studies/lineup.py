@@ -14,7 +14,7 @@ from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row
@@ -35,30 +35,32 @@ def key(p: Params) -> dict[str, str]:
         InputError: a method that nobody has, or other settings that no cell can be computed with.
     """
     found = dict(scene.facts(p))
-    if p["method"] not in METHODS and p["method"] not in weights.LEARNED and p["method"] != "bound":
+    if p["method"] not in METHODS and not weights.is_trained(p["method"]) and p["method"] != "bound":
         find("coopoc.methods", p["method"])
-    if p["method"] in weights.LEARNED:
+    if weights.is_trained(p["method"]):
         found["weights"] = weights.key(p["method"], p)
-    if p.get("knowledge") == "fitted":
+    if p.get("noise_model") == "fitted":
         found["clients"] = scene.fleet(p["clients"]).digest
     return found
 
 
-def knowledge(p: Params) -> Knowledge | str:
+def noise_model(p: Params) -> NoiseModel | str:
     """What the cell's method assumes.
 
     Raises:
         InputError: an oracle for real data, whose noise nobody knows.
     """
-    if p["knowledge"] == "fitted":
+    if p["noise_model"] == "fitted":
         return weights.fitted(p)
-    if p["knowledge"] == "oracle":
+    if p["noise_model"] == "oracle":
         if scene.is_real(p["data"]):
-            raise InputError("knowledge", "'oracle'", "is for simulated noise", "Take nominal or fitted on real data.")
-        return Knowledge.oracle(scene.sensors(p), scene.fleet(p["data"]))
-    if p["knowledge"] == "heading taken as exact":
-        return Knowledge.nominal(replace(scene.sensors(p), heading_std=0.0, heading_bias_std=0.0))
-    return str(p["knowledge"])
+            raise InputError(
+                "noise_model", "'oracle'", "is for simulated noise", "Take nominal or fitted on real data."
+            )
+        return NoiseModel.oracle(scene.sensors(p), scene.fleet(p["data"]))
+    if p["noise_model"] == "heading taken as exact":
+        return NoiseModel.nominal(replace(scene.sensors(p), heading_std=0.0, heading_bias_std=0.0))
+    return str(p["noise_model"])
 
 
 def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
@@ -68,11 +70,11 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
         InputError: an unknown name.
     """
     name, known = p["method"], start(p)
-    if name in weights.LEARNED:
+    if weights.is_trained(name):
         together = name == "cooperative" and recording.v2x.max_neighbours > 0
         made = _together if together else _learned
         return [(seed, made(name, p, seed, known)) for seed in weights.seeds(p)]
-    method: Method = find("coopoc.methods", name)(knowledge(p))
+    method: Method = find("coopoc.methods", name)(noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=known)
     if isinstance(method, CooperativeMAP):

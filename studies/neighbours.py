@@ -29,14 +29,15 @@ def _grid() -> list[dict[str, Any]]:
     pairs += [("kalman", k) for k in ("identity", "nominal", "fitted")]
     shared = [(m, k) for m in lineup.COOPERATIVE for k in ("identity", "nominal", "fitted")]
     grid = [
-        {"max_neighbours": k, **IDEAL, "method": m, "knowledge": known}
-        for k in NEIGHBOURS for m, known in [*pairs, *shared]
-    ]  # fmt: skip
-    grid += [{"max_neighbours": k, **IDEAL, "method": "cooperative-map-5", "knowledge": "nominal"} for k in WINDOWED]
+        {"max_neighbours": k, **IDEAL, "method": m, "noise_model": known}
+        for k in NEIGHBOURS
+        for m, known in [*pairs, *shared]
+    ]
+    grid += [{"max_neighbours": k, **IDEAL, "method": "cooperative-map-5", "noise_model": "nominal"} for k in WINDOWED]
     tight = [{"rate_hz": rate, "cap_bytes_per_second": 0.0} for rate in RATES_HZ]
     tight += [{"rate_hz": 10.0, "cap_bytes_per_second": cap} for cap in CAPS]
     budget = [(m, k) for m, k in shared if m in ("lkf-sa", "joint")]
-    grid += [{"max_neighbours": 10, **t, "method": m, "knowledge": known} for t in tight for m, known in budget]
+    grid += [{"max_neighbours": 10, **t, "method": m, "noise_model": known} for t in tight for m, known in budget]
     return grid
 
 
@@ -46,7 +47,7 @@ def _meaningful(p: Params) -> bool:
     if p["max_neighbours"] >= len(scene.fleet(p["data"]).ids):
         return False
     return not (p["method"] == "bound" and scene.is_real(p["data"])) and not (
-        p["method"] == "joint" and p["knowledge"] == "identity"
+        p["method"] == "joint" and p["noise_model"] == "identity"
     )
 
 
@@ -55,14 +56,14 @@ def cell(p: Params) -> list[Row]:
     return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
 
 
-def _of(*knowledge: str, **more: Any) -> dict[str, Any]:
+def _of(*noise_model: str, **more: Any) -> dict[str, Any]:
     """Cells over the ideal channel with these kinds of knowledge, and those that have none."""
-    return {"knowledge": [*knowledge, "none", "trained", "bound"], **IDEAL, **more}
+    return {"noise_model": [*noise_model, "none", "trained", "bound"], **IDEAL, **more}
 
 
 FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
-NEES = "NEES against K (3 is consistent), nominal knowledge."
-INSIDE = "Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal knowledge."
+NEES = "NEES against K (3 is consistent), nominal noise model."
+INSIDE = "Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal noise model."
 BOUND = "The bound is for the rms over runs of causal estimates, over an ideal channel and without the bias."
 
 
@@ -75,33 +76,47 @@ def _table(known: str) -> Any:
     return _against_k("rt_le_m", _of(known), f"RT-LE [m] against K, {known} knowledge.")
 
 
-def _against_k(
-    value: str, wanted: dict[str, Any], text: str, rows: Sequence[str] = ("method",), **options: Any
-) -> Any:  # fmt: skip
+def _against_k(value: str, wanted: dict[str, Any], text: str, rows: Sequence[str] = ("method",), **options: Any) -> Any:
     """View of methods down, K across."""
 
     def table(results: Results) -> Table | None:
+        from coopoc.study.pivot import pivot
+
         where = views.present(results, wanted, value)
         if where is None:
             return None
-        return results.table(
-            rows=rows, columns="max_neighbours", value=value, where=where, intervals=False,
-            decimals=scene.decimals(results.settings), caption=_caption(results, text, where), **options,
-        )  # fmt: skip
+        return pivot(
+            results,
+            rows=rows,
+            columns="max_neighbours",
+            value=value,
+            where=where,
+            intervals=False,
+            decimals=scene.decimals(results.settings),
+            caption=_caption(results, text, where),
+            **options,
+        )
 
     return table
 
 
 def _budget(results: Results) -> Table | None:
     """None where there are no ten vehicles."""
-    wanted = {"method": ["lkf-sa", "joint"], "max_neighbours": 10, "knowledge": ["identity", "nominal", "fitted"]}
+    from coopoc.study.pivot import pivot
+
+    wanted = {"method": ["lkf-sa", "joint"], "max_neighbours": 10, "noise_model": ["identity", "nominal", "fitted"]}
     where = views.present(results, wanted)
     if where is None:
         return None
-    return results.table(
-        rows=["rate_hz", "cap_bytes_per_second"], columns=["method", "knowledge"], value="rt_le_m", where=where,
-        intervals=False, caption=_caption(results, "RT-LE [m] at K = 10 under rates and caps (0: no cap).", where),
-    )  # fmt: skip
+    return pivot(
+        results,
+        rows=["rate_hz", "cap_bytes_per_second"],
+        columns=["method", "noise_model"],
+        value="rt_le_m",
+        where=where,
+        intervals=False,
+        caption=_caption(results, "RT-LE [m] at K = 10 under rates and caps (0: no cap).", where),
+    )
 
 
 def _sweep(known: str) -> Any:
@@ -123,7 +138,7 @@ def _pareto(results: Results) -> Plot | None:
 
     chosen = ["gnss", "kalman", "okf", "fedkalmannet", "lkf-sa", "joint", "bound"]
     known = ["fitted", "identity", "none", "trained", "bound"]
-    where = views.present(results, {"method": chosen, "knowledge": known})
+    where = views.present(results, {"method": chosen, "noise_model": known})
     if where is None or not (results.select(where)["bytes_per_second"] > 0).any():
         return None
     names = [name for name in weights.trained(results) if name in TRAINED]
@@ -131,9 +146,12 @@ def _pareto(results: Results) -> Plot | None:
     if names:
         text += " Right: what a vehicle sends and receives in training, once."
     return figures.pareto(
-        results, along=("max_neighbours", "rate_hz", "cap_bytes_per_second"), where=where,
-        training=weights.training_bytes(results.settings, names), caption=_caption(results, text, where),
-    )  # fmt: skip
+        results,
+        along=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
+        where=where,
+        training=weights.training_bytes(results.settings, names),
+        caption=_caption(results, text, where),
+    )
 
 
 def _budgets(results: Results, where: dict[str, Any]) -> list[str]:
@@ -159,7 +177,7 @@ def _innovations(results: Results) -> Plot | None:
         {"Range": (found.range, 0.095, "m"), "Bearing": (found.bearing, 0.007, "rad")},
         caption=f"Innovations of the real robot-to-robot measurements against Vicon, and the Gaussian of 0.095 m and "
         f"0.007 rad; robust standard deviations {found.range_std:.4f} m and {found.bearing_std:.5f} rad.",
-    )  # fmt: skip
+    )
 
 
 STUDY = Study(
@@ -171,23 +189,38 @@ STUDY = Study(
     grid=_grid(),
     where=_meaningful,
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, "egos": "auto", "runs": 30, "seed": 0,
-        "train_seeds": 5, "backend": "gauss-newton",
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "egos": "auto",
+        "runs": 30,
+        "seed": 0,
+        "train_seeds": 5,
+        "backend": "gauss-newton",
     },
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
-        "rt_le_identity": _table("identity"), "rt_le_fitted": _table("fitted"), "rt_le_nominal": _table("nominal"),
+        "rt_le_identity": _table("identity"),
+        "rt_le_fitted": _table("fitted"),
+        "rt_le_nominal": _table("nominal"),
         "budget": _budget,
         "nees": _against_k("nees", _of("nominal", method=FILTERS), NEES, best=None),
         "nees_inside": _against_k("nees_inside", _of("nominal", method=FILTERS), INSIDE, best=None),
         "neighbours_errors": _against_k(
-            "neighbour_rt_le_m", _of("identity", "fitted", method=FILTERS[1:], max_neighbours=list(NEIGHBOURS[1:])),
-            "Error of what the egos think of their neighbours [m].", rows=("method", "knowledge"),
+            "neighbour_rt_le_m",
+            _of("identity", "fitted", method=FILTERS[1:], max_neighbours=list(NEIGHBOURS[1:])),
+            "Error of what the egos think of their neighbours [m].",
+            rows=("method", "noise_model"),
         ),
     },
     figures={
-        "rt_le_identity": _sweep("identity"), "rt_le_fitted": _sweep("fitted"), "bytes": _pareto,
+        "rt_le_identity": _sweep("identity"),
+        "rt_le_fitted": _sweep("fitted"),
+        "bytes": _pareto,
         "innovations": _innovations,
     },
     findings=findings,
@@ -201,4 +234,4 @@ STUDY = Study(
     minutes=5,
     metrics={"rt_le_m": "lower", "nees": 3.0},
     reference=views.reference("neighbours"),
-)  # fmt: skip
+)

@@ -41,12 +41,12 @@ def _table(start: str, reading: str) -> Any:
         for method, known in LINEUP:
             row: list[Any] = []
             for at in cases:
-                where = {**at, "method": method, "knowledge": known}
+                where = {**at, "method": method, "noise_model": known}
                 ran = views.present(results, where)
                 row += _numbers(results, where) if ran else [None] * 3
             if any(entry is not None for entry in row):
                 body.append((look(method).label, known, *row))
-        header = ["Method", "Knowledge"]
+        header = ["Method", "NoiseModel"]
         for at in cases:
             header += [f"{_name(results, at)} [m]", "Seed std [m]", "Worse than GNSS [%]"]
         digits = scene.decimals(results.settings)
@@ -74,11 +74,14 @@ def _findings(results: Results) -> Sequence[str]:
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
     names = {
-        "federated": ("fedkalmannet", "trained"), "centralised": ("centralised", "trained"), "OKF": ("okf", "trained"),
-        "fitted KF": ("kalman", "fitted"), "oracle KF": ("kalman", "oracle"),
-    }  # fmt: skip
+        "federated": ("fedkalmannet", "trained"),
+        "centralised": ("centralised", "trained"),
+        "OKF": ("okf", "trained"),
+        "fitted KF": ("kalman", "fitted"),
+        "oracle KF": ("kalman", "oracle"),
+    }
     found = {
-        words: views.mean(results, {**at, "method": method, "knowledge": known})
+        words: views.mean(results, {**at, "method": method, "noise_model": known})
         for words, (method, known) in names.items()
     }
     if not views.listed(found):
@@ -97,11 +100,17 @@ STUDY = Study(
     key=lineup.key,
     prepare=weights.prepare,
     grid=[
-        {**_of(start, reading), **case(*pair), "method": method, "knowledge": known}
-        for start, reading in CHOICES for pair in CASES for method, known in LINEUP
+        {**_of(start, reading), **case(*pair), "method": method, "noise_model": known}
+        for start, reading in CHOICES
+        for pair in CASES
+        for method, known in LINEUP
     ],
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "egos": "auto", "runs": 100,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "egos": "auto",
+        "runs": 100,
         "seed": 0,
         "train_seeds": 5,
     },
@@ -111,4 +120,4 @@ STUDY = Study(
     findings=_findings,
     limitations=("The true start is what KalmanNet's published loop assumes; no vehicle has it.",),
     minutes=30,
-)  # fmt: skip
+)

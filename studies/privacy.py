@@ -116,7 +116,7 @@ def cell(p: Params) -> list[Row]:
 def trained(p: Params) -> Trained:
     """Federations of all training seeds with the cell's epsilon, equal weights and everyone in every round."""
     from coopoc.learned.federation.federated import federate_many
-    from coopoc.learned.privacy.differential import Privacy, ceiling, epsilon, noise_for
+    from coopoc.learned.privacy.differential import Privacy, auc_bound, epsilon, noise_for
     from coopoc.learned.recipes import Setting, sensors
     from coopoc.learned.training.clients import clients
 
@@ -128,13 +128,23 @@ def trained(p: Params) -> Trained:
     clip = plan.clipped(z, count) if z else math.inf
     tap = Tap(Privacy(clip, z, delta, count) if z else None)
     made = federate_many(
-        [_net(p["method"], seed) for seed in seeds], groups, seeds, plan.rounds, "uniform", plan.local_epochs,
-        _schedule(plan), privacy=tap,
-    )  # fmt: skip
+        [_net(p["method"], seed) for seed in seeds],
+        groups,
+        seeds,
+        plan.rounds,
+        "uniform",
+        plan.local_epochs,
+        _schedule(plan),
+        privacy=tap,
+    )
     alone = z / math.sqrt(count)
-    price = {"clip": clip, "noise_multiplier": z, "ceiling": ceiling(z, plan.rounds),
-             "epsilon_alone": epsilon(alone, plan.rounds, 1.0, delta),
-             "ceiling_alone": ceiling(alone, plan.rounds)}  # fmt: skip
+    price = {
+        "clip": clip,
+        "noise_multiplier": z,
+        "ceiling": auc_bound(z, plan.rounds),
+        "epsilon_alone": epsilon(alone, plan.rounds, 1.0, delta),
+        "ceiling_alone": auc_bound(alone, plan.rounds),
+    }
     return Trained(made, groups, tap.sent, price)
 
 
@@ -144,23 +154,35 @@ def probed(made: Trained) -> list[Row]:
     Members are a client's training pieces, others its validation pieces: the same vehicle, never trained on. Scores
     are compared within a client: shifted and scaled by their mean and spread over all its candidates.
     """
-    from coopoc.learned.privacy.probe import verdict
+    from coopoc.learned.privacy.membership_inference import membership_inference
 
     rows = []
     for seen, score in ATTACKS:
         parts = [_standardised(*pair) for pair in _candidates(made, seen, score)]
         members, others = (np.concatenate(side) for side in zip(*parts, strict=True))
-        found = verdict(members, others)
-        rows.append({"measure": "probe", "run": 0, "ego": "all", "seen": seen, "score": score, "auc": found.auc,
-                     "auc_low": found.low, "auc_high": found.high, "found_at_1_percent": found.found,
-                     "members": found.members, "others": found.others})  # fmt: skip
+        found = membership_inference(members, others)
+        rows.append(
+            {
+                "measure": "probe",
+                "run": 0,
+                "ego": "all",
+                "seen": seen,
+                "score": score,
+                "auc": found.auc,
+                "auc_low": found.low,
+                "auc_high": found.high,
+                "found_at_1_percent": found.found,
+                "members": found.members,
+                "others": found.others,
+            }
+        )
     return rows
 
 
 def _candidates(made: Trained, seen: str, score: str) -> Iterator[list[Floats]]:
     """Scores of members and others of every client of every federation; zeros where a client never sent anything."""
-    from coopoc.learned.privacy.probe import gradient_scores, loss_scores
-    from coopoc.learned.training.clients import Pieces
+    from coopoc.learned.privacy.membership_inference import gradient_scores, loss_scores
+    from coopoc.learned.training.clients import Segments
 
     straight = partial(gradient_scores, mirrors=False)
     judge: Callable[..., Floats] = loss_scores if score == "loss" else straight
@@ -170,7 +192,7 @@ def _candidates(made: Trained, seen: str, score: str) -> Iterator[list[Floats]]:
             sent = made.sent.get((seed, client.name), {})
             alone = [(thetas[number - 1], thetas[number - 1] + update) for number, update in sent.items()]
             steps = alone if seen == "client" else list(pairwise(thetas))
-            both = Pieces.join([client.training, client.validation])
+            both = Segments.join([client.training, client.validation])
             scores = judge(federation.model, steps, both) if steps else np.zeros(len(both))
             yield np.split(scores, [len(client.training)])
 
@@ -183,9 +205,9 @@ def _standardised(members: Floats, others: Floats) -> tuple[Floats, Floats]:
 
 def _net(method: str, seed: int) -> Gain:
     from coopoc.learned.nets.gain_net import GainNet
-    from coopoc.learned.nets.okf import NoiseNumbers
+    from coopoc.learned.nets.okf import NoiseParameters
 
-    return GainNet(seed=seed) if method == "fedkalmannet" else NoiseNumbers(seed=seed)
+    return GainNet(seed=seed) if method == "fedkalmannet" else NoiseParameters(seed=seed)
 
 
 def _schedule(plan: Plan) -> Schedule:
@@ -203,8 +225,11 @@ def _scored(method: Method, p: Params, measure: str, **more: Any) -> list[Row]:
         if error.field != "x":  # the estimates of the track, of which one is not finite
             raise
         score = np.full((recording.runs, len(who)), LOST)
-    return [{"measure": measure, "run": r, "ego": ego, "rt_le_m": float(score[r, e]), **more}
-            for e, ego in enumerate(who) for r in range(len(score))]  # fmt: skip
+    return [
+        {"measure": measure, "run": r, "ego": ego, "rt_le_m": float(score[r, e]), **more}
+        for e, ego in enumerate(who)
+        for r in range(len(score))
+    ]
 
 
 def key(p: Params) -> dict[str, str]:
@@ -225,8 +250,16 @@ STUDY = Study(
     key=key,
     grid=_grid(),
     settings={
-        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "start": "gnss",
-        "egos": "auto", "runs": 10, "seed": 0, "train_seeds": 3, "delta": 1e-5,
+        "data": "town10",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "start": "gnss",
+        "egos": "auto",
+        "runs": 10,
+        "seed": 0,
+        "train_seeds": 3,
+        "delta": 1e-5,
     },
     tables=TABLES,
     figures=FIGURES,
@@ -245,4 +278,4 @@ STUDY = Study(
     minutes=15,
     metrics={"rt_le_m": "lower"},
     reference=views.reference("privacy"),
-)  # fmt: skip
+)

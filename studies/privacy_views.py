@@ -58,13 +58,22 @@ def _rows(results: Results, measure: str, **where: Any) -> pd.DataFrame:
 
 
 def _rt_le(results: Results) -> Table | None:
+    from coopoc.study.pivot import pivot
+
     where = views.present(results, {"measure": "rt_le", "method": TRAINED})
     if where is None:
         return None
-    return results.table(
-        rows="epsilon", columns=["clients", "method"], value="rt_le_m", where=where, best=None, decimals=2,
-        intervals=False, caption=_caption(results, "rt_le"),
-    )  # fmt: skip
+    return pivot(
+        results,
+        rows="epsilon",
+        columns=["clients", "method"],
+        value="rt_le_m",
+        where=where,
+        best=None,
+        decimals=2,
+        intervals=False,
+        caption=_caption(results, "rt_le"),
+    )
 
 
 def _price(results: Results) -> Table | None:
@@ -76,11 +85,29 @@ def _price(results: Results) -> Table | None:
     if frame.empty:
         return None
     each = frame.groupby(["epsilon", "clients", "method"], sort=False).first().reset_index()
-    body = [(f"{row.epsilon:g}", scene.fleet(row.clients).name, look(row.method).label, f"{row.clip:.3g}",
-             f"{row.noise_multiplier:.3g}", float(row.ceiling), f"{row.epsilon_alone:.3g}", float(row.ceiling_alone))
-            for row in _each(each)]  # fmt: skip
-    header = ("Epsilon of the sum", "Clients", "Method", "Clip", "z", "AUC at most", "Epsilon of single updates",
-              "AUC at most, single")  # fmt: skip
+    body = [
+        (
+            f"{row.epsilon:g}",
+            scene.fleet(row.clients).name,
+            look(row.method).label,
+            f"{row.clip:.3g}",
+            f"{row.noise_multiplier:.3g}",
+            float(row.ceiling),
+            f"{row.epsilon_alone:.3g}",
+            float(row.ceiling_alone),
+        )
+        for row in _each(each)
+    ]
+    header = (
+        "Epsilon of the sum",
+        "Clients",
+        "Method",
+        "Clip",
+        "z",
+        "AUC at most",
+        "Epsilon of single updates",
+        "AUC at most, single",
+    )
     return Table(header, tuple(body), _caption(results, "price"))
 
 
@@ -96,8 +123,9 @@ def _probe(results: Results) -> Table | None:
     for names, part in frame.groupby(["clients", "method", "epsilon"], sort=False):
         clients, method, epsilon = _names(names)
         known = {(row.seen, row.score): row for row in _each(part)}
-        entries = [Interval(r.auc, r.auc_low, r.auc_high, int(r.members + r.others))
-                   for r in (known[kind] for kind in kinds)]  # fmt: skip
+        entries = [
+            Interval(r.auc, r.auc_low, r.auc_high, int(r.members + r.others)) for r in (known[kind] for kind in kinds)
+        ]
         body.append((clients, look(method).label, f"{epsilon:g}", *entries, known[kinds[0]].found_at_1_percent))
     titles = [f"{seen}, {score}" for seen, score in kinds]
     header = ("Clients", "Method", "Epsilon", *titles, f"Members found at 1 % false alarms ({titles[0]})")
@@ -144,8 +172,9 @@ def _cost(results: Results) -> Plot | None:
                 x = [at[e] for e in seeds.index]
                 options = strokes({"method": method})
                 panel.plot(x, seeds.mean(axis=1), **options)
-                panel.fill_between(x, seeds.min(axis=1), seeds.max(axis=1), color=options["color"], alpha=0.15,
-                                   linewidth=0)  # fmt: skip
+                panel.fill_between(
+                    x, seeds.min(axis=1), seeds.max(axis=1), color=options["color"], alpha=0.15, linewidth=0
+                )
                 drawn.append({"method": method})
             drawn += _levels(results, panel, clients, at)
             _ticks(panel, at)
@@ -170,8 +199,9 @@ def _levels(results: Results, panel: Axes, clients: str, at: Mapping[float, floa
     for method in TRAINED:
         level = views.mean(results, {"measure": "untrained", "method": method, "clients": clients})
         if level is not None:
-            panel.plot(ends, [level, level], **{**strokes({"method": method}, thin=True), "marker": None,
-                                                "linestyle": ":"})  # fmt: skip
+            panel.plot(
+                ends, [level, level], **{**strokes({"method": method}, thin=True), "marker": None, "linestyle": ":"}
+            )
     return drawn
 
 

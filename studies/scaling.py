@@ -140,8 +140,10 @@ def _findings(results: Results) -> Sequence[str]:
         return []
     name = max(worst, key=lambda method: worst[method])
     verdict = "grows by less than 1.5 times" if worst[name] <= 1.5 else "grows by MORE than 1.5 times"
-    return [f"Cost per vehicle and step {verdict} from the smallest to the largest fleet: most for {name}, "
-            f"{worst[name]:.2f} times."]  # fmt: skip
+    return [
+        f"Cost per vehicle and step {verdict} from the smallest to the largest fleet: most for {name}, "
+        f"{worst[name]:.2f} times."
+    ]
 
 
 STUDY = Study(
@@ -151,8 +153,18 @@ STUDY = Study(
     key=key,
     grid=_grid(),
     settings={
-        "data": "town10", "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0,
-        "max_neighbours": 6, "steps": 60, "repeats": 3, "runs": 4, "seed": 0, "egos": "auto", "train_seeds": 0,
+        "data": "town10",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        "max_neighbours": 6,
+        "steps": 60,
+        "repeats": 3,
+        "runs": 4,
+        "seed": 0,
+        "egos": "auto",
+        "train_seeds": 0,
     },
     shares=("copies",),
     tables={"cost": _table},

@@ -11,16 +11,16 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from coopoc.data.registry import load, recorder
+from coopoc.data.registry import load_fleet, recorder
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.environment import revision
 from coopoc.study.study import Params
-from coopoc.world.attack import attacked
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
+from coopoc.world.spoofing import spoofed
 from coopoc.world.v2x import V2X
 
 Start = Literal["gnss", "true"]
@@ -31,7 +31,7 @@ CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "optimize", "eval
 @lru_cache(maxsize=4)
 def fleet(data: str) -> Fleet:
     """The fleet of a bundled name or a path."""
-    return load(data)
+    return load_fleet(data)
 
 
 def is_real(data: str) -> bool:
@@ -86,11 +86,13 @@ def sensors(p: Params) -> Sensors:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
     found = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
     return replace(
-        found, velocity_std_ratio=ratio, velocity_reading=reading,
+        found,
+        velocity_std_ratio=ratio,
+        velocity_reading=reading,
         gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)),
         heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
         heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
-    )  # fmt: skip
+    )
 
 
 def lasting(noise: Sensors, own: float, common: float) -> Sensors:
@@ -105,8 +107,12 @@ def lasting(noise: Sensors, own: float, common: float) -> Sensors:
     if own + common and not np.allclose(std, std[0]):
         raise InputError("gnss_std", noise.gnss_std, "must be the same on every axis here", "Use Sensors directly.")
     white = tuple((std * np.sqrt(1.0 - own - common)).tolist())
-    return replace(noise, gnss_std=white, gnss_drift_std=float(std[0] * np.sqrt(own)),
-                   gnss_common_std=float(std[0] * np.sqrt(common)))  # fmt: skip
+    return replace(
+        noise,
+        gnss_std=white,
+        gnss_drift_std=float(std[0] * np.sqrt(own)),
+        gnss_common_std=float(std[0] * np.sqrt(common)),
+    )
 
 
 def acting(p: Params) -> Sensors:
@@ -210,8 +216,8 @@ def recording(p: Params) -> Recording:
     who = egos(p["data"], str(p["egos"]))
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
     seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
-    share = float(p.get("attacked_share", 0.0))
-    return attacked(seen, share, seed=int(p["seed"]), honest=who) if share else seen
+    share = float(p.get("spoofed_share", 0.0))
+    return spoofed(seen, share, seed=int(p["seed"]), honest=who) if share else seen
 
 
 @lru_cache(maxsize=2)

@@ -15,9 +15,11 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
-    "bytes_per_second": ("on air", "per receiver"), "sent_bytes_per_second": ("on air", "broadcast"),
-    "payload_bytes_per_second": ("payload", "per receiver"), "sent_payload_bytes_per_second": ("payload", "broadcast"),
-}  # fmt: skip
+    "bytes_per_second": ("on air", "per receiver"),
+    "sent_bytes_per_second": ("on air", "broadcast"),
+    "payload_bytes_per_second": ("payload", "per receiver"),
+    "sent_payload_bytes_per_second": ("payload", "broadcast"),
+}
 """Columns of rows that hold what is moved to decide, as a ledger counts it."""
 SLAB = 2**25
 """Bytes of a Track, about: what many runs say is scored while the cache still holds it, and memory does not grow with
@@ -63,9 +65,10 @@ def scored(method: Method, recording: Recording, egos: Sequence[str], drive: Fle
     sums = [part.nees for part in parts if part.nees is not None]
     return Scores(
         {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns},
-        np.concatenate([part.quantiles for part in parts]), sum(part.seconds for part in parts),
+        np.concatenate([part.quantiles for part in parts]),
+        sum(part.seconds for part in parts),
         np.sum(sums, axis=0) if sums else None,
-    )  # fmt: skip
+    )
 
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
@@ -91,6 +94,9 @@ def _of(track: Track, recording: Recording, method: Method, drive: Fleet, quanti
     found = None if track.covariance is None else nees(track, drive)
     if found is not None:
         columns["nees"] = np.nanmean(found, axis=1)
-    levels = np.moveaxis(np.quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1) if quantiles else (
-        np.empty((*level.shape, 0)))  # fmt: skip
+    levels = (
+        np.moveaxis(np.quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1)
+        if quantiles
+        else (np.empty((*level.shape, 0)))
+    )
     return Scores(columns, levels, track.seconds, None if found is None else found.sum(axis=0))

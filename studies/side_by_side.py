@@ -24,14 +24,21 @@ def cell(p: Params) -> list[Row]:
 
 def _table(value: str, text: str, **options: Any) -> Any:
     def table(results: Results) -> Table | None:
+        from coopoc.study.pivot import pivot
+
         where = views.present(results, {}, value)
         if where is None:
             return None
         ran = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
-        return results.table(
-            rows=["method", "knowledge"], columns="max_neighbours", value=value, where={"method": ran},
-            caption=_caption(results, text), **options,
-        )  # fmt: skip
+        return pivot(
+            results,
+            rows=["method", "noise_model"],
+            columns="max_neighbours",
+            value=value,
+            where={"method": ran},
+            caption=_caption(results, text),
+            **options,
+        )
 
     return table
 
@@ -57,8 +64,10 @@ def _findings(results: Results) -> Sequence[str]:
 
     found = []
     for k in results.frame["max_neighbours"].unique() if len(results.frame) else ():
-        each = {(m, known): views.rms(results, {"method": m, "knowledge": known, "max_neighbours": k})
-                for m, known in results.frame[["method", "knowledge"]].drop_duplicates().to_numpy()}  # fmt: skip
+        each = {
+            (m, known): views.rms(results, {"method": m, "noise_model": known, "max_neighbours": k})
+            for m, known in results.frame[["method", "noise_model"]].drop_duplicates().to_numpy()
+        }
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
         ranked = sorted((value, pair) for pair, value in each.items() if value is not None and pair[0] != "bound")
         if ranked:
@@ -69,10 +78,20 @@ def _findings(results: Results) -> Sequence[str]:
 
 
 CONDITIONS: dict[str, Any] = {
-    "channel": "ideal", "rate_hz": 0.0, "cap_bytes_per_second": 0.0, "loss": None, "burst": None, "latency_s": None,
-    "attacked_share": 0.0, "own_share": 0.0, "common_share": 0.0, "drift_time_s": 60.0, "heading_std_deg": 0.0,
-    "heading_bias_deg": 0.0, "start": "gnss",
-}  # fmt: skip
+    "channel": "ideal",
+    "rate_hz": 0.0,
+    "cap_bytes_per_second": 0.0,
+    "loss": None,
+    "burst": None,
+    "latency_s": None,
+    "spoofed_share": 0.0,
+    "own_share": 0.0,
+    "common_share": 0.0,
+    "drift_time_s": 60.0,
+    "heading_std_deg": 0.0,
+    "heading_bias_deg": 0.0,
+    "start": "gnss",
+}
 """What else may be set: the channel (None: its own), what attacks, what lasts, how well the heading is known."""
 
 STUDY = Study(
@@ -81,11 +100,21 @@ STUDY = Study(
     cell=cell,
     key=lineup.key,
     prepare=weights.prepare,
-    grid={"max_neighbours": (0, 2, 6), "method": METHODS, "knowledge": ("nominal",)},
+    grid={"max_neighbours": (0, 2, 6), "method": METHODS, "noise_model": ("nominal",)},
     settings={
-        "data": "town10", "clients": "town10-clients", "weights": "runs/weights", "scenario": 2, "velocity_ratio": 0.15,
-        "velocity_reading": "axis", "radius_m": 30.0, **CONDITIONS, "backend": "gauss-newton", "egos": "auto",
-        "runs": 10, "seed": 0, "train_seeds": 1,
+        "data": "town10",
+        "clients": "town10-clients",
+        "weights": "runs/weights",
+        "scenario": 2,
+        "velocity_ratio": 0.15,
+        "velocity_reading": "axis",
+        "radius_m": 30.0,
+        **CONDITIONS,
+        "backend": "gauss-newton",
+        "egos": "auto",
+        "runs": 10,
+        "seed": 0,
+        "train_seeds": 1,
     },
     shares=("max_neighbours",),
     tables={
@@ -101,4 +130,4 @@ STUDY = Study(
         "Methods that know nothing of noise, or learned it, are the same under every knowledge.",
     ),
     minutes=1,
-)  # fmt: skip
+)

@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from coopoc.study.study import Finding
+
 if TYPE_CHECKING:
     from coopoc.study.results import Results
 
 NAMES = ("budget", "correlated_gnss", "latency_loss", "heading_error", "robustness", "consistency")
 TITLE = "What collaboration gives, and what it costs"
 PRIOR = {
-    "with the noise known": ("nominal", "trained", "none"), "with the noise fitted elsewhere": ("fitted", "trained"),
-}  # fmt: skip
+    "with the noise known": ("nominal", "trained", "none"),
+    "with the noise fitted elsewhere": ("fitted", "trained"),
+}
 """What a method may know: the sensors' true figures, or what vehicles learned while they drove alone."""
 
 
@@ -47,15 +50,18 @@ def survey(
 def stages(names: Sequence[str], out: Path, jobs: int, changes: Mapping[str, Any]) -> dict[str, Results]:
     """Results of studies that share their trained weights, one study after the other, each stage named on stderr."""
     from coopoc.plugins import find
-    from coopoc.study.run import run
+    from coopoc.study.run import run_study
 
     found: dict[str, Results] = {}
     for number, name in enumerate(names, start=1):
         print(f"coopoc: stage {number} of {len(names) + 1}: {name}", file=sys.stderr)
         study = find("coopoc.studies", name)
-        given = {key: value for key, value in {"weights": str(out / "weights"), **changes}.items()
-                 if key in study.settings or key in study.axes}  # fmt: skip
-        found[name] = run(study, out=out, jobs=jobs, settings=given, retry_failed=True)
+        given = {
+            key: value
+            for key, value in {"weights": str(out / "weights"), **changes}.items()
+            if key in study.settings or key in study.axes
+        }
+        found[name] = run_study(study, out=out, jobs=jobs, settings=given, retry_failed=True)
     print(f"coopoc: stage {len(names) + 1} of {len(names) + 1}: report", file=sys.stderr)
     return found
 
@@ -73,10 +79,11 @@ def answers(found: Mapping[str, Results]) -> dict[str, str]:
     for limit, words in LIMITS.items():
         if "budget" in found and (answer := _under(found["budget"], limit)):
             said[f"Which method with {words}?"] = answer
-    for name, (question, begins) in QUESTIONS.items():
-        told = [s for s in _findings(name, found[name]) if s.startswith(begins)] if name in found else []
-        if told:
-            said[question] = _sentence(" ".join(map(_sentence, told[:2])))
+    for name, (question, keys) in QUESTIONS.items():
+        given = _findings(name, found[name]) if name in found else []
+        texts = [str(f) for f in given if not keys or (isinstance(f, Finding) and f.key in keys)]
+        if texts:
+            said[question] = " ".join(map(_sentence, texts[:2]))
     return said
 
 
@@ -86,16 +93,16 @@ def _sentence(text: str) -> str:
 
 LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
 QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "correlated_gnss": ("If errors of GNSS last?", ("own:", "common:")),
-    "latency_loss": ("If messages are late or lost?", ("",)),
-    "heading_error": ("If the heading is wrong?", ("4° of bias",)),
-    "robustness": ("If neighbours lie?", ("",)),
-    "consistency": ("Whose covariance can be believed?", ("",)),
+    "correlated_gnss": ("If errors of GNSS last?", ("own", "common")),
+    "latency_loss": ("If messages are late or lost?", ()),
+    "heading_error": ("If the heading is wrong?", ("heading_bias_deg",)),
+    "robustness": ("If neighbours lie?", ()),
+    "consistency": ("Whose covariance can be believed?", ()),
 }
-"""Study -> question, and how the findings begin that answer it."""
+"""Study -> question, and the keys of the findings that answer it; none for all of them."""
 
 
-def _findings(name: str, results: Results) -> Sequence[str]:
+def _findings(name: str, results: Results) -> Sequence[Finding | str]:
     from coopoc.plugins import find
 
     study = find("coopoc.studies", name)
@@ -110,7 +117,7 @@ def _under(results: Results, limit: float) -> str:
 
     parts, ran = [], budget.choices(results)
     for words, known in PRIOR.items():
-        best = budget.best_under([one for one in ran if one.where["knowledge"] in known], limit)
+        best = budget.best_under([one for one in ran if one.where["noise_model"] in known], limit)
         if best is not None:
             k = best.where["max_neighbours"]
             use = f" with K = {k} and {best.size:.0f} B/s" if k else ""

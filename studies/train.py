@@ -17,6 +17,7 @@ def train(
     seed: Annotated[int, tyro.conf.arg(metavar="N")] = 0,
     start: Literal["gnss", "true"] = "gnss",
     reading: Literal["axis", "speed"] = "axis",
+    aggregate: Annotated[str | None, tyro.conf.arg(metavar="RULE")] = None,
     flower: bool = False,
     rounds: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
 ) -> None:
@@ -25,29 +26,34 @@ def train(
     Example: coopoc train fedkalmannet --seed 0
 
     Args:
-        recipe: fedkalmannet, centralised, individual or okf.
+        recipe: a name such as fedkalmannet (see coopoc list), or mine.py:NAME, a recipe or a net of yours.
         data: fleet of the clients, a name or a path.
         out: of the checkpoints.
         seed: of noise, split, start and batches.
         start: of the filter in training: the first fix or the true position.
         reading: of "10 % of the velocity": per axis or of the speed on every axis.
+        aggregate: aggregation rule of a federation, a name or mine.py:NAME; default: the recipe's.
         flower: train a federation on Flower's simulation engine, every client in a process of its own.
         rounds: of a federation on Flower; default: the recipe's.
     """
     from coopoc.errors import InputError
-    from coopoc.fleets import load
-    from coopoc.learned.recipes import train_all
+    from coopoc.fleets import load_fleet
+    from coopoc.learned.train import train_all
 
-    fleet = load(data)
+    fleet = load_fleet(data)
     if flower:
         from coopoc.learned import flower as engine
 
         config = {"recipe": recipe, "seed": seed, "start": start, "reading": reading}
-        made = engine.train(engine.job_of(config | ({} if rounds is None else {"rounds": rounds})), fleet, out)
+        changes = {"rounds": rounds, "aggregate": aggregate}
+        changes = {name: value for name, value in changes.items() if value is not None}
+        made = engine.train(engine.job_of(config | changes), fleet, out)
     elif rounds is not None:
         raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
     else:
-        made = train_all(fleet, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe])
+        made = train_all(
+            fleet, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe], aggregate=aggregate
+        )
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")
     print(f"coopoc: {len(made)} checkpoints are in {out}", file=sys.stderr)

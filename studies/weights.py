@@ -1,4 +1,4 @@
-"""The weights that a study needs: trained once for a setting, found again by everything that changes them."""
+"""The weights that a study needs: trained once for a setting, found again by a hash of everything that changes them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopoc.errors import InputError
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
+from coopoc.one_file import file_digest, from_file, in_file
 from coopoc.plugins import unknown
 from coopoc.study.study import Params
 from coopoc.world.sensing import observe
@@ -31,6 +32,14 @@ LEARNED = (*PAPER, "fedokf", "magnitude", "split", "recursive", "cooperative")
 """Methods that are trained."""
 
 
+class Setting(NamedTuple):
+    """Training seed, start of the filter, reading of "10 % of the velocity"."""
+
+    seed: int
+    start: Start
+    reading: VelocityReading
+
+
 def seeds(p: Params) -> range:
     """Training seeds of a study."""
     return range(int(p["train_seeds"]))
@@ -41,56 +50,65 @@ def trainable(p: Params) -> bool:
     return p["method"] not in INDIVIDUAL[len(fleet(p["clients"]).ids) :]
 
 
-def label(name: str, p: Params, seed: int) -> str:
-    """Name of a checkpoint, such as fedkalmannet-gnss-axis-0."""
-    return f"{name}-{start(p)}-{p['velocity_reading']}-{seed}"
+def is_trained(name: str) -> bool:
+    """Whether a method is trained first: by its name, or as a recipe or a net in a file, mine.py:NAME."""
+    return name in LEARNED or (in_file(name) and getattr(from_file(name, "method"), "trainable", False))
 
 
 def key(name: str, p: Params) -> str:
     """Hash of everything that changes the weights of a method, known before any training."""
-    return hashlib.sha256("".join(_key(name, p, seed) for seed in seeds(p)).encode()).hexdigest()
+    return hashlib.sha256("".join(_job(name, p, seed)[1] for seed in seeds(p)).encode()).hexdigest()
 
 
-def _key(name: str, p: Params, seed: int) -> str:
-    keys = _keys(p["clients"], start(p), p["velocity_reading"], int(p["train_seeds"]))
-    if label(name, p, seed) not in keys:
+def _recipe(name: str) -> str:
+    """The recipe of a method: individual2 is one of individual."""
+    return "individual" if name in INDIVIDUAL else name
+
+
+def _job(name: str, p: Params, seed: int) -> tuple[str, str]:
+    """Label and key of the checkpoint of a method for one training seed."""
+    if not is_trained(name) or not trainable({**p, "method": name}):
         raise unknown("trained method", name, LEARNED)
-    return keys[label(name, p, seed)]
+    digest = file_digest(name) if in_file(name) else ""
+    found = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
+    return found[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
 
 
 @lru_cache
-def _keys(clients: str, begin: Start, reading: VelocityReading, count: int) -> Mapping[str, str]:
-    from coopoc.learned.recipes import RECIPES, Setting, jobs_of
+def _jobs(recipe: str, digest: str, clients: str, setting: Setting) -> list[tuple[str, str]]:
+    """Labels and keys of the checkpoints of a recipe; `digest` is that of its file."""
+    from coopoc.learned.recipes import Setting as Trained
+    from coopoc.learned.recipes import jobs_of
 
     drives = fleet(clients)
-    settings = [Setting(seed, begin, reading) for seed in range(count)]
-    return {
-        job.label: job.key(drives) for setting in settings for name in RECIPES for job in jobs_of(name, setting, drives)
-    }
+    return [(job.label, job.key(drives)) for job in jobs_of(recipe, Trained(*setting), drives)]
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
     """Train what the cells need and is not there yet, with progress: `jobs` recipes at a time."""
-    from coopoc.learned.recipes import RECIPES, train_all
+    from coopoc.learned.train import train_all
 
     wanted: dict[tuple[str, str, int], list[Params]] = {}
     for p in cells:
-        if p["method"] in LEARNED:
+        if is_trained(p["method"]):
             wanted.setdefault((p["clients"], p["weights"], len(seeds(p))), []).append(p)
     for (clients, folder, count), asking in wanted.items():
-        named = {p["method"].rstrip("0123456789") for p in asking}
         train_all(
-            fleet(clients), folder, seeds=range(count), starts=sorted({start(p) for p in asking}),
-            readings=sorted({p["velocity_reading"] for p in asking}), recipes=[r for r in RECIPES if r in named],
+            fleet(clients),
+            folder,
+            seeds=range(count),
+            starts=sorted({start(p) for p in asking}),
+            readings=sorted({p["velocity_reading"] for p in asking}),
+            recipes=list(dict.fromkeys(_recipe(p["method"]) for p in asking)),
             jobs=jobs,
-        )  # fmt: skip
+        )
 
 
 @lru_cache(maxsize=64)
-def _checkpoint(path: Path, key: str) -> Checkpoint:
+def _checkpoint(path: Path, key: str, net: str) -> Checkpoint:
     from coopoc.learned.checkpoint import load
 
-    found = load(path)
+    found = load(path, net)
     if found.card.get("key") != key:
         raise InputError("weights", path, "were trained otherwise", "Train again, or use another folder.")
     return found
@@ -102,22 +120,28 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
     Raises:
         InputError: it is not there, or it is of another training than these parameters ask for.
     """
-    return _checkpoint(Path(p["weights"]) / f"{label(name, p, seed)}.safetensors", _key(name, p, seed))
+    net = ""
+    if in_file(name):
+        from coopoc.learned.recipes import recipe_of
+
+        net = recipe_of(name).net
+    label, key = _job(name, p, seed)
+    return _checkpoint(Path(p["weights"]) / f"{label}.safetensors", key, net if in_file(net) else "")
 
 
 @lru_cache
-def _fitted(clients: str, reading: VelocityReading) -> Knowledge:
+def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
     from coopoc.learned.recipes import Setting, sensors
 
     drives = fleet(clients)
     acting = sensors(Setting(reading=reading))
-    return Knowledge.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
+    return NoiseModel.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
 
 
 def trained(results: Results) -> list[str]:
     """The trained methods that a study has run."""
-    ran = set(results.frame["method"].unique()) if "method" in results.frame else set()
-    return [name for name in LEARNED if name in ran]
+    ran = results.frame["method"].unique() if "method" in results.frame else ()
+    return sorted((name for name in ran if is_trained(name)), key=lambda name: (*LEARNED, name).index(name))
 
 
 def ledger(p: Params, name: str) -> Ledger:
@@ -133,10 +157,10 @@ def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
 
 
 def described(results: Results) -> Mapping[str, str]:
-    """What the report says about the training of the methods that were run, from the cards of the first seed."""
+    """Descriptions of the training of the methods that were run, from the cards of the first seed."""
     cards = {name: checkpoint(name, results.settings, 0).card for name in trained(results)}
     nets = [card for name, card in cards.items() if name in PAPER and card["kind"] == "gain_net"]
-    told = {"nets": _nets(nets[0], len(seeds(results.settings)))} if nets else {}
+    texts = {"nets": _nets(nets[0], len(seeds(results.settings)))} if nets else {}
     for name, card in cards.items():
         plan = card["settings"]
         text = f"{plan['schedule']['epochs']} optimiser steps"
@@ -144,8 +168,8 @@ def described(results: Results) -> Mapping[str, str]:
             text = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
         seconds, clients = f"{card['seconds']:.0f} s per net", ", ".join(card["clients"])
         own = "" if name in PAPER else f"; {_own(card)}"
-        told[name] = f"{text}{own}; clients {clients}; {seconds}; key {card['key'][:12]}"
-    return told
+        texts[name] = f"{text}{own}; clients {clients}; {seconds}; key {card['key'][:12]}"
+    return texts
 
 
 def _own(card: Mapping[str, Any]) -> str:
@@ -171,6 +195,6 @@ def _nets(card: Mapping[str, Any], count: int) -> str:
     )
 
 
-def fitted(p: Params) -> Knowledge:
+def fitted(p: Params) -> NoiseModel:
     """Noise fitted on the recording that the nets of training seed 0 saw."""
     return _fitted(p["clients"], p["velocity_reading"])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopoc import Fleet, load
+from coopoc import Fleet, load_fleet
 from coopoc.data.table import write_table
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -59,5 +59,5 @@ def crossing() -> Fleet:
 def short_town(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Path of the first fifteen seconds of the bundled town, for studies that need no more."""
     path = tmp_path_factory.mktemp("town") / "short.csv"
-    write_table(load("town10").between(0, 150), path)
+    write_table(load_fleet("town10").between(0, 150), path)
     return str(path)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy import optimize, special, stats
 
-from coopoc import V2X, Fleet, InputError, Kalman, Knowledge, Recording, Sensors, load, observe
+from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
-from coopoc.methods.adaptive import ASSUMED, AdaptiveKalman, Belief
+from coopoc.kernels.solo import revised
+from coopoc.methods.adaptive import ASSUMED, AdaptiveKalman
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.variational import VariationalKalman
 
@@ -98,10 +99,12 @@ def test_one_set_of_defaults_is_as_good_as_knowing_the_noise(method, std: float)
 @pytest.mark.parametrize("method", BOTH, ids=named)
 def test_on_traffic_it_comes_near_the_filter_that_knows(method) -> None:
     """Two bundled vehicles in scenario 2, where a filter that believes the 1.5 m of the training is clearly worse."""
-    fleet = load("town10-validation").select([0, 12])
+    fleet = load_fleet("town10-validation").select([0, 12])
     recording = observe(fleet, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=20)
-    score = [rt_le(m(recording, [0, 1]), fleet).mean() for m in (method, Kalman("nominal"),
-             Kalman(Knowledge.nominal(Sensors())))]  # fmt: skip
+    score = [
+        rt_le(m(recording, [0, 1]), fleet).mean()
+        for m in (method, Kalman("nominal"), Kalman(NoiseModel.nominal(Sensors())))
+    ]
     assert score[0] < 1.01 * score[1]
     assert score[0] < 0.97 * score[2]
 
@@ -126,12 +129,11 @@ def test_the_fixed_point_maximises_the_evidence_bound(z: float, rho: float) -> N
     """scipy's optimiser over mean, variance and beta ends where the iterations end."""
     p, r, weight = 2.0, 5.0, 8.0
     method = VariationalKalman(rho=rho, iterations=200)
-    prior = Belief(*(np.array([v]) for v in (0.0, 0.0, p, r, weight)))
-    noise, new = method.revise(prior, np.array([z]), np.zeros(1))
-    bound = partial(evidence, z, p, r, rho * weight, float(new[0]))
+    noise, new = revised((0.0, 0.0, p, r, weight), z, 0.0, method.fixes)
+    bound = partial(evidence, z, p, r, rho * weight, new)
     best = optimize.minimize(lambda q: -bound(q), [z / 2, 0.0, 2.0], method="BFGS", options={"gtol": 1e-8})
-    gain = p / (p + noise[0])
-    assert np.exp(best.x[2]) / (new[0] / 2) == pytest.approx(noise[0], rel=1e-5)
+    gain = p / (p + noise)
+    assert np.exp(best.x[2]) / (new / 2) == pytest.approx(noise, rel=1e-5)
     assert best.x[0] == pytest.approx(gain * z, rel=1e-5)
     assert np.exp(best.x[1]) == pytest.approx((1 - gain) * p, rel=1e-5)
 
@@ -174,7 +176,7 @@ def test_late_fixes_do_not_count_as_noisy(method) -> None:
 def test_a_known_variance_gives_kalman_with_late_and_missing_fixes(method) -> None:
     sensors, draw = Sensors(), np.random.default_rng(4)
     ours = replace(method, assumed=sensors, prior_weight=np.inf).start()
-    theirs = Kalman(Knowledge.nominal(sensors)).start()
+    theirs = Kalman(NoiseModel.nominal(sensors)).start()
     for stream in (ours, theirs):
         stream.step(np.zeros(3), np.zeros(3), 0.1)
     for k in range(200):

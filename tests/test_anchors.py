@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopoc import V2X, Fleet, Gnss, Kalman, Knowledge, LaplacianKalman, Links, Sensors, observe
+from coopoc import GNSS, LKFSA, V2X, Fleet, Kalman, Links, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import max_error, rt_le
 from coopoc.world.recording import Recording
 
@@ -35,14 +35,14 @@ def score(method, recording: Recording, fleet: Fleet) -> float:
     return float(rt_le(late, fleet.between(1, len(fleet.t))).mean())
 
 
-def tuned(ratio: float = 1.0, gnss: float = 3.5) -> Knowledge:
-    return Knowledge("fitted", SENSORS, process_std=(0.0707 * ratio, 0.0707 * ratio, 0.001), gnss_std=(gnss,) * 3)
+def tuned(ratio: float = 1.0, gnss: float = 3.5) -> NoiseModel:
+    return NoiseModel("fitted", SENSORS, process_std=(0.0707 * ratio, 0.0707 * ratio, 0.001), gnss_std=(gnss,) * 3)
 
 
 @pytest.mark.parametrize(
     ("method", "ratio", "expected"),
     [
-        (Gnss(), 1.0, 6.06),
+        (GNSS(), 1.0, 6.06),
         (Kalman("identity"), 1.0, 4.06),
         (Kalman(tuned()), 1.0, 0.80),
         (Kalman(tuned(1.5)), 1.5, 0.93),
@@ -74,10 +74,10 @@ def test_laplacian_filter_anchors(
     neighbours: int, identity: float, ones: float, weighted: float, formation: Fleet
 ) -> None:
     recording = fixture(formation, neighbours)
-    pragmatic = Knowledge("fitted", SENSORS, process_std=(0.07, 0.07, 0.07), gnss_std=(3.5,) * 3)
-    assert score(LaplacianKalman("identity"), recording, formation) == pytest.approx(identity, rel=0.05)
-    assert score(LaplacianKalman("identity", transition="ones"), recording, formation) == pytest.approx(ones, rel=0.05)
-    assert score(LaplacianKalman(pragmatic), recording, formation) == pytest.approx(weighted, rel=0.05)
+    pragmatic = NoiseModel("fitted", SENSORS, process_std=(0.07, 0.07, 0.07), gnss_std=(3.5,) * 3)
+    assert score(LKFSA("identity"), recording, formation) == pytest.approx(identity, rel=0.05)
+    assert score(LKFSA("identity", transition="ones"), recording, formation) == pytest.approx(ones, rel=0.05)
+    assert score(LKFSA(pragmatic), recording, formation) == pytest.approx(weighted, rel=0.05)
 
 
 def test_scenario1_anchors(formation: Fleet) -> None:
@@ -89,7 +89,7 @@ def test_scenario1_anchors(formation: Fleet) -> None:
     sensors = replace(Sensors.paper_scenario1(), gnss_bias_mode="sample")
     recording = fixture(formation, 0, 1.5, sensors)
     for method, mean, largest, spread in (
-        (Gnss(), 3.38, 8.0, 0.0),
+        (GNSS(), 3.38, 8.0, 0.0),
         (Kalman("identity"), 2.46, 5.7, 0.0),
         (Kalman(tuned(1.5, gnss=1.8)), 1.42, 3.6, 0.15),
     ):

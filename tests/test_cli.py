@@ -34,8 +34,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_help_loads_nothing_heavy_and_lists_what_others_add(tmp_path: Path) -> None:
     heavy = ["torch", "pandas", "pyarrow", "matplotlib", "joblib", "scipy", "gtsam", "casadi", "cvxpy"]
-    code = ("import sys, coopoc.cli as c\ntry: c.main(['--help'])\nexcept SystemExit as e: "
-            f"print(e.code, sorted(set({heavy}) & set(sys.modules)))")  # fmt: skip
+    code = (
+        "import sys, coopoc.cli as c\ntry: c.main(['--help'])\nexcept SystemExit as e: "
+        f"print(e.code, sorted(set({heavy}) & set(sys.modules)))"
+    )
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[-1].startswith("0 []"), done.stdout
     own = coopoc("--help", cwd=tmp_path)
@@ -52,8 +54,19 @@ def test_each_command_explains_itself_with_an_example(tmp_path: Path, name: str)
 
 def test_tables_on_stdout(folder: Path) -> None:
     assert coopoc("table", "runs/small", "--format", "latex", cwd=folder).stdout.startswith(r"\begin{table}")
-    done = coopoc("table", "runs/small", "--rows", "max_neighbours", "--value", "max_error_m", "--where",
-                  "method=kalman,joint", "--format", "csv", cwd=folder)  # fmt: skip
+    done = coopoc(
+        "table",
+        "runs/small",
+        "--rows",
+        "max_neighbours",
+        "--value",
+        "max_error_m",
+        "--where",
+        "method=kalman,joint",
+        "--format",
+        "csv",
+        cwd=folder,
+    )
     header, *rows = done.stdout.splitlines()
     assert header == "Neighbours K,KF,KF low,KF high,Joint filter,Joint filter low,Joint filter high"
     assert len(rows) == 2
@@ -63,8 +76,14 @@ def test_tables_on_stdout(folder: Path) -> None:
 @pytest.mark.parametrize("format", ["markdown", "latex"])
 def test_a_reader_that_leaves_early_is_no_error(folder: Path, format: str) -> None:
     words = " ".join([*COMMAND, "table", "runs/small", "--format", format])
-    done = subprocess.run(["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"], cwd=folder, env=ENV,
-                          capture_output=True, text=True, timeout=60)  # fmt: skip
+    done = subprocess.run(
+        ["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"],
+        cwd=folder,
+        env=ENV,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -83,7 +102,8 @@ def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     done = coopoc("list", cwd=tmp_path)
     assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
     groups = [line.split(":")[0] for line in done.stdout.splitlines()]
-    assert groups == ["datasets", "methods", "studies", "backends", "recipes", "nets"]
+    open_sets = ["measurements", "recipes", "nets", "rules", "channels", "metrics"]
+    assert groups == ["datasets", "methods", "studies", "backends", *open_sets]
 
 
 def test_commands_of_others(tmp_path: Path) -> None:
@@ -160,9 +180,16 @@ def test_shards_are_merged_and_two_runs_compared(tmp_path: Path) -> None:
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> None:
     words = ["run", "small", "--jobs", jobs, "--set", "runs=2", "pause=0.4"]
-    process = subprocess.Popen([*COMMAND, *words], cwd=tmp_path, env=ENV, stdout=subprocess.PIPE,
-                               stderr=subprocess.PIPE, text=True, start_new_session=True,
-                               preexec_fn=_listen)  # fmt: skip
+    process = subprocess.Popen(
+        [*COMMAND, *words],
+        cwd=tmp_path,
+        env=ENV,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=_listen,
+    )
     cells = tmp_path / "runs/small/cells"
     for _ in range(1000):
         if cells.is_dir() and len(list(cells.glob("*.parquet"))) >= 3:  # both workers are at work

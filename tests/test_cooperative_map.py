@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopoc import V2X, Fleet, InputError, Knowledge, Method, Sensors, observe
+from coopoc import V2X, Fleet, InputError, Method, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.star import ACCELERATION_STD
@@ -18,11 +18,11 @@ from coopoc.world.spherical import to_vector
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
-METHODS = [CooperativeMAP(window=w, knowledge=k) for w in (1, 4) for k in ("identity", "nominal")]
+METHODS = [CooperativeMAP(window=w, noise_model=k) for w in (1, 4) for k in ("identity", "nominal")]
 
 
 def label(method: CooperativeMAP) -> str:
-    return f"{method.knowledge}-{method.window}"
+    return f"{method.noise_model}-{method.window}"
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def test_without_neighbours_it_is_the_egos_own_problem(crossing: Fleet, window: 
 
 def test_identity_snapshot_has_a_closed_form(recording: Recording) -> None:
     """Unit weights: each neighbour's fix minus its vector has variance 2, x = (z + 1/2 sum (z_j - v_j)) / (1 + K/2)."""
-    track = CooperativeMAP(knowledge="identity")(recording, [1])
+    track = CooperativeMAP(noise_model="identity")(recording, [1])
     for step in (0, 17, 45):
         links = recording.links.of(1)
         links = links[recording.links.step[links] == step]
@@ -92,10 +92,10 @@ def test_the_track_is_the_problems_solution(recording: Recording, window: int) -
     for run, step in ((0, 5), (1, 20), (2, 59)):
         problem = Problem.from_window(recording, step, 0, window, run)
         solution = solve(problem)
-        assert track.x[run, step, 0] == pytest.approx(solution.x[problem.hub[-1]], abs=2e-5)
-        assert track.covariance[run, step, 0] == pytest.approx(solution.covariance[problem.hub[-1]], abs=1e-5)
+        assert track.x[run, step, 0] == pytest.approx(solution.x[problem.separator[-1]], abs=2e-5)
+        assert track.covariance[run, step, 0] == pytest.approx(solution.covariance[problem.separator[-1]], abs=1e-5)
         here = recording.links.step[recording.links.of(0)] == step
-        assert track.neighbours[run, here] == pytest.approx(solution.x[problem.hub[-1] + 1 :], abs=2e-5)
+        assert track.neighbours[run, here] == pytest.approx(solution.x[problem.separator[-1] + 1 :], abs=2e-5)
 
 
 @pytest.mark.parametrize("backend", ["gtsam", "osqp"])
@@ -129,8 +129,10 @@ def test_a_fix_is_used_once_in_a_window(formation: Fleet) -> None:
 
 def test_more_neighbours_and_longer_windows_help(formation: Fleet) -> None:
     fleet = formation.between(0, 80)
-    by_k = [rt_le(CooperativeMAP()(observe(fleet, S2, V2X.ideal(k), runs=10, observers=[0]), [0]), fleet).mean()
-            for k in (0, 2, 10)]  # fmt: skip
+    by_k = [
+        rt_le(CooperativeMAP()(observe(fleet, S2, V2X.ideal(k), runs=10, observers=[0]), [0]), fleet).mean()
+        for k in (0, 2, 10)
+    ]
     assert by_k[0] > 1.2 * by_k[1] > 1.2 * 1.2 * by_k[2]
     recording = observe(fleet, S2, V2X.ideal(4), runs=10, observers=[0])
     by_window = [rt_le(CooperativeMAP(window=w)(recording, [0]), fleet).mean() for w in (1, 3, 10)]
@@ -165,7 +167,7 @@ def test_a_late_fix_is_brought_forward(formation: Fleet) -> None:
     """Two steps late: the neighbours' fixes enter at z + 2 dt u with variance sigma^2 + 4 times one step's."""
     fleet = formation.between(0, 20)
     recording = observe(fleet, S2, V2X(max_neighbours=3, latency=0.2), observers=[0])
-    track = CooperativeMAP(knowledge="nominal")(recording, [0])
+    track = CooperativeMAP(noise_model="nominal")(recording, [0])
     step, dt = 10, recording.dt
     problem = Problem.from_snapshot(recording, step, 0)
     fixes, relative = problem.factors
@@ -203,9 +205,9 @@ def test_vehicles_that_meet_are_solved_converted(crossing: Fleet) -> None:
 
 def test_fitted_knowledge_is_taken(crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=4), runs=2)
-    fitted = Knowledge.fitted(recording, crossing)
-    assert isinstance(CooperativeMAP(knowledge=fitted), Method)
-    assert rt_le(CooperativeMAP(window=3, knowledge=fitted)(recording, [0]), crossing).mean() < 3.0
+    fitted = NoiseModel.fitted(recording, crossing)
+    assert isinstance(CooperativeMAP(noise_model=fitted), Method)
+    assert rt_le(CooperativeMAP(window=3, noise_model=fitted)(recording, [0]), crossing).mean() < 3.0
 
 
 @pytest.mark.parametrize(
@@ -213,7 +215,7 @@ def test_fitted_knowledge_is_taken(crossing: Fleet) -> None:
     [
         (lambda r: CooperativeMAP(window=0), "window"),
         (lambda r: CooperativeMAP(backend="ipopt"), "backend"),
-        (lambda r: CooperativeMAP(knowledge="guess")(r, [0]), "knowledge"),
+        (lambda r: CooperativeMAP(noise_model="guess")(r, [0]), "noise_model"),
         (lambda r: CooperativeMAP()(r, ["nobody"]), "egos"),
     ],
 )

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from coopoc.data.carla import read_carla
-from coopoc.data.registry import load
+from coopoc.data.registry import load_fleet
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
@@ -21,7 +21,7 @@ Table = Callable[..., pd.DataFrame]
 
 @pytest.fixture(scope="module")
 def fleet() -> Fleet:
-    return load("town10").between(0, 250).select(range(0, 60, 3))
+    return load_fleet("town10").between(0, 250).select(range(0, 60, 3))
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def test_every_convention_is_found(
     tmp_path: Path, fleet: Fleet, table: Table, order: str, left: bool, degrees: bool, dt: float
 ) -> None:
     table(order, left, degrees, dt).to_csv(tmp_path / "carla.csv")
-    read = load(tmp_path / "carla.csv", format="carla")
+    read = load_fleet(tmp_path / "carla.csv", format="carla")
     np.testing.assert_allclose(read.position, fleet.position, atol=1e-9)
     np.testing.assert_allclose(read.velocity, fleet.velocity * 0.1 / dt, atol=1e-9)
     assert read.dt == dt
@@ -67,7 +67,7 @@ def test_the_spreadsheet_layout_is_read_by_position(tmp_path: Path, fleet: Fleet
     frame = table()
     frame.columns = pd.Index([f"feature {k}" for k in range(14)])
     frame.iloc[: 20 * 60].to_excel(tmp_path / "locations.xlsx")
-    read = load(tmp_path / "locations.xlsx", handedness="left")
+    read = load_fleet(tmp_path / "locations.xlsx", handedness="left")
     np.testing.assert_allclose(read.position, fleet.position[:60], atol=1e-9)
 
 
@@ -82,7 +82,7 @@ def test_stamps_may_be_given_and_rows_may_be_missing(tmp_path: Path, fleet: Flee
     frame = table()
     frame["t"] = np.repeat(fleet.t, 20)
     frame.drop(index=[45]).to_csv(tmp_path / "carla.csv")
-    read = load(tmp_path / "carla.csv", format="carla")
+    read = load_fleet(tmp_path / "carla.csv", format="carla")
     assert int((~read.present).sum()) == 1
     assert not read.present[2, 5]
     np.testing.assert_allclose(read.position[:, 0], fleet.position[:, 0], atol=1e-9)
@@ -132,9 +132,9 @@ def test_a_spreadsheet_without_a_row_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("case", BAD)
 def test_what_the_numbers_leave_open_is_asked_for(tmp_path: Path, table: Table, case: str) -> None:
-    change, options, thing, mend = BAD[case]
+    change, options, thing, hint = BAD[case]
     change(table()).to_csv(tmp_path / "carla.csv", index=case != "missing")
     with pytest.raises(InputError) as error:
         read_carla(tmp_path / "carla.csv", **options)
     assert thing in str(error.value)
-    assert mend in str(error.value)
+    assert hint in str(error.value)

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from coopoc.data import store
-from coopoc.data.registry import DATASETS, FLEETS, convert, detect, list_datasets, load
+from coopoc.data.registry import DATASETS, FLEETS, convert, detect, list_datasets, load_fleet
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
@@ -25,7 +25,7 @@ def test_the_four_fleets_are_bundled_in_less_than_4_mb() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
-    fleet, card = load(name), DATASETS[name].card()
+    fleet, card = load_fleet(name), DATASETS[name].card()
     assert fleet.digest == card.sha256
     assert (fleet.name, fleet.licence) == (name, card.map_licence)
     assert card.map in fleet.source
@@ -35,7 +35,7 @@ def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_velocity_is_exactly_the_step_over_dt(name: str) -> None:
-    fleet = load(name)
+    fleet = load_fleet(name)
     error = fleet.position[1:] - fleet.position[:-1] - fleet.dt * fleet.velocity[1:]
     assert np.nanmax(np.abs(error)) < 1e-12
     assert np.array_equal(fleet.velocity[0], fleet.velocity[1])
@@ -43,7 +43,7 @@ def test_velocity_is_exactly_the_step_over_dt(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_nobody_jumps(name: str) -> None:
-    fleet = load(name)
+    fleet = load_fleet(name)
     change = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2)
     assert np.nanmax(change) / fleet.dt < 8.0, "m/s^2: less than the grip of a dry road"
 
@@ -51,13 +51,13 @@ def test_nobody_jumps(name: str) -> None:
 @pytest.mark.parametrize("name", ["town10", "town10-validation", "town04"])
 def test_card_counts_the_neighbours_that_a_kd_tree_finds(name: str) -> None:
     """Independent check: SciPy's cKDTree."""
-    fleet, card = load(name), DATASETS[name].card()
+    fleet, card = load_fleet(name), DATASETS[name].card()
     counts = np.array([[len(n) - 1 for n in cKDTree(x).query_ball_point(x, 30.0)] for x in fleet.position[::25]])
     assert np.mean(np.minimum(counts, 10)) == pytest.approx(card.neighbours["mean"], rel=0.05)
 
 
 def test_town10_is_dense_and_urban() -> None:
-    fleet, card = load("town10"), DATASETS["town10"].card()
+    fleet, card = load_fleet("town10"), DATASETS["town10"].card()
     assert fleet.position.shape == (900, 60, 3)
     assert fleet.present.all()
     assert 5 <= card.neighbours["mean"] <= 7
@@ -69,7 +69,7 @@ def test_town10_is_dense_and_urban() -> None:
 
 def test_clients_have_the_papers_lengths_and_speeds() -> None:
     """Published values: section IV.A, 8.9-10.8, 9.2-10.9, 0.7-10.7 and 3.6-10.7 m/s; lengths from its figure."""
-    fleet = load("town10-clients")
+    fleet = load_fleet("town10-clients")
     assert fleet.present.sum(axis=0).tolist() == [1550, 4600, 1450, 1420]
     assert (np.diff(fleet.present.astype(int), axis=0) <= 0).all(), "present from the start, absent after the end"
     speed = np.linalg.norm(fleet.velocity, axis=2)
@@ -78,7 +78,7 @@ def test_clients_have_the_papers_lengths_and_speeds() -> None:
 
 
 def test_town04_is_hilly() -> None:
-    fleet = load("town04")
+    fleet = load_fleet("town04")
     assert np.ptp(fleet.position[..., 2]) > 10
     gap = fleet.position[:, None] - fleet.position[:, :, None]
     distance = np.linalg.norm(gap, axis=-1)
@@ -88,7 +88,7 @@ def test_town04_is_hilly() -> None:
 
 
 def test_fleets_are_disjoint() -> None:
-    for one, other in combinations(map(load, NAMES), 2):
+    for one, other in combinations(map(load_fleet, NAMES), 2):
         assert not set(one.ids) & set(other.ids)
         steps = min(len(one.t), len(other.t), 900)
         for x in np.moveaxis(one.position[:steps], 1, 0):
@@ -115,19 +115,19 @@ def test_storage_is_exact_deterministic_and_refuses_what_it_would_change(tmp_pat
 
 def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="town10-validation"):
-        load("town11")
+        load_fleet("town11")
     with pytest.raises(InputError, match="must be one of table, tum, fcd, carla, mrclam"):
-        load(tmp_path, format="bag")
+        load_fleet(tmp_path, format="bag")
     with pytest.raises(InputError, match=r"must end in \.csv"):
         detect(tmp_path / "drive.bag")
     with pytest.raises(InputError, match=r"options = \['columns'\]: town10 is bundled"):
-        load("town10", columns={})
+        load_fleet("town10", columns={})
     convert("town10-clients", tmp_path / "a.csv")
     with pytest.raises(InputError, match="vehicle_lenght"):
-        load(tmp_path / "a.csv", vehicle_lenght=4)
+        load_fleet(tmp_path / "a.csv", vehicle_lenght=4)
 
 
 def test_a_bundled_fleet_can_be_resampled() -> None:
-    fleet, coarse = load("town10"), load("town10", dt=0.3)
+    fleet, coarse = load_fleet("town10"), load_fleet("town10", dt=0.3)
     assert coarse.dt == 0.3
     np.testing.assert_allclose(coarse.position, fleet.position[::3], atol=1e-9)

@@ -98,10 +98,14 @@ def test_smoothing_solves_the_penalised_least_squares() -> None:
 @pytest.mark.parametrize(
     ("change", "thing"),
     [
-        ({"vehicles": 0}, "vehicles = 0"), ({"dt": 0.0}, "dt = 0"), ({"cutoff": -1.0}, "cutoff"),
-        ({"top_speed": (9.0, 8.0)}, "top_speed"), ({"steps": (10, 20)}, "steps"), ({"steps": 1}, "steps"),
+        ({"vehicles": 0}, "vehicles = 0"),
+        ({"dt": 0.0}, "dt = 0"),
+        ({"cutoff": -1.0}, "cutoff"),
+        ({"top_speed": (9.0, 8.0)}, "top_speed"),
+        ({"steps": (10, 20)}, "steps"),
+        ({"steps": 1}, "steps"),
     ],
-)  # fmt: skip
+)
 def test_a_recipe_that_nobody_can_drive_is_refused(change: dict[str, object], thing: str) -> None:
     with pytest.raises(InputError, match=thing):
         replace(TINY, **change)  # type: ignore[arg-type]

@@ -10,7 +10,7 @@ import pytest
 
 from coopoc.data.mrclam import MrclamLog, innovations, read_mrclam
 from coopoc.data.mrclam_recording import recording
-from coopoc.data.registry import load
+from coopoc.data.registry import load_fleet
 from coopoc.errors import InputError
 from coopoc.world.v2x import V2X
 
@@ -45,7 +45,7 @@ def test_measurements_are_counted_like_the_description(log: MrclamLog) -> None:
 
 @present
 def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log: MrclamLog) -> None:
-    fleet = load(FOLDER)
+    fleet = load_fleet(FOLDER)
     assert fleet.digest == log.fleet.digest
     assert fleet.dt == 0.1
     assert 750 < fleet.t[-1] < 772

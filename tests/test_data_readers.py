@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopoc.data.registry import convert, detect, load
+from coopoc.data.registry import convert, detect, load_fleet
 from coopoc.data.rows import assemble
 from coopoc.data.table import write_table
 from coopoc.data.tum import read_tum
@@ -22,12 +22,12 @@ GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,
 @pytest.mark.parametrize("name", ["town10-clients", "town04"])
 def test_tables_come_back_bit_by_bit(tmp_path: Path, name: str, out: str) -> None:
     written = convert(name, tmp_path / out)
-    assert load(tmp_path / out).digest == written.digest == load(name).digest
+    assert load_fleet(tmp_path / out).digest == written.digest == load_fleet(name).digest
 
 
 def test_tum_comes_back_with_derived_velocity(tmp_path: Path) -> None:
     written = convert("town10-clients", tmp_path / "folder")
-    read = load(tmp_path / "folder")
+    read = load_fleet(tmp_path / "folder")
     assert read.ids == written.ids
     np.testing.assert_array_equal(read.position, written.position)
     np.testing.assert_allclose(read.velocity, written.velocity, atol=1e-9)
@@ -46,7 +46,7 @@ def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
 
 def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(GOOD.replace("b,0.0,5,0,0\n", ""))
-    fleet = load(tmp_path / "a.csv")
+    fleet = load_fleet(tmp_path / "a.csv")
     assert fleet.present.tolist() == [[True, False], [True, True], [True, True]]
     np.testing.assert_allclose(fleet.velocity[1:, 1], [[0, 10, 0], [0, 10, 0]])
     assert "backward difference" in fleet.source
@@ -77,20 +77,20 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_a_bad_table_names_the_thing_and_the_mend(tmp_path: Path, case: str) -> None:
-    text, thing, mend = BAD[case]
+    text, thing, hint = BAD[case]
     (tmp_path / "drive.csv").write_text(text)
     with pytest.raises(InputError) as error:
-        load(tmp_path / "drive.csv")
+        load_fleet(tmp_path / "drive.csv")
     assert thing in str(error.value)
-    assert mend in str(error.value)
+    assert hint in str(error.value)
 
 
 def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(GOOD)
     with pytest.raises(InputError, match="dt = 0 s: must be > 0"):
-        load(tmp_path / "a.csv", dt=0)
+        load_fleet(tmp_path / "a.csv", dt=0)
     (tmp_path / "b.csv").write_text(GOOD.replace("b,0.1", "b,0.13"))
-    fleet = load(tmp_path / "b.csv", dt=0.05)
+    fleet = load_fleet(tmp_path / "b.csv", dt=0.05)
     np.testing.assert_allclose(fleet.position[:, 0, 0], [0, 0.5, 1, 1.5, 2], atol=1e-12)
     assert fleet.dt == 0.05
 
@@ -99,7 +99,7 @@ def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path: Path) ->
 def test_resampling_loses_no_vehicle(tmp_path: Path, stamp: str, thing: str) -> None:
     (tmp_path / "a.csv").write_text(GOOD + f"c,{stamp},9,9,9\n")
     with pytest.raises(InputError, match=thing):
-        load(tmp_path / "a.csv", dt=0.1)
+        load_fleet(tmp_path / "a.csv", dt=0.1)
 
 
 @pytest.mark.parametrize("out", ["fleet.csv", "fleet.parquet"])
@@ -107,8 +107,8 @@ def test_ids_that_look_like_numbers_stay_as_they_are(tmp_path: Path, out: str) -
     x = np.arange(12.0).reshape(2, 2, 3)
     fleet = Fleet(("007", "1e3"), [0, 0.1], x, x)
     write_table(fleet, tmp_path / out)
-    assert load(tmp_path / out).ids == ("007", "1e3")
-    assert load(tmp_path / out).digest == fleet.digest
+    assert load_fleet(tmp_path / out).ids == ("007", "1e3")
+    assert load_fleet(tmp_path / out).digest == fleet.digest
 
 
 def test_resampling_leaves_long_gaps_absent() -> None:
@@ -120,7 +120,7 @@ def test_resampling_leaves_long_gaps_absent() -> None:
 
 def test_columns_may_have_other_names(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(GOOD.replace("id,t,x", "car,time,x", 1))
-    fleet = load(tmp_path / "a.csv", columns={"id": "car", "t": "time"})
+    fleet = load_fleet(tmp_path / "a.csv", columns={"id": "car", "t": "time"})
     assert fleet.ids == ("a", "b")
 
 
@@ -143,10 +143,10 @@ def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str) -> None:
 
 def test_an_empty_tum_file_is_named_and_a_byte_order_mark_skipped(tmp_path: Path) -> None:
     (tmp_path / "car.tum").write_text(TUM, encoding="utf-8-sig")
-    assert load(tmp_path).ids == ("car",)
+    assert load_fleet(tmp_path).ids == ("car",)
     (tmp_path / "lost.tum").write_text("# t x y z qx qy qz qw\n")
     with pytest.raises(InputError, match=r"lost\.tum = 0 lines"):
-        load(tmp_path)
+        load_fleet(tmp_path)
 
 
 def test_an_empty_folder_is_no_tum_folder(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ FCD = """<fcd-export>
 def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_path: Path) -> None:
     """Closed form: a vehicle 4 m long that faces east has its middle 2 m west of its front bumper."""
     (tmp_path / "a.xml").write_text(FCD)
-    fleet = load(tmp_path / "a.xml", vehicle_length=4.0)
+    fleet = load_fleet(tmp_path / "a.xml", vehicle_length=4.0)
     np.testing.assert_allclose(fleet.position[:, 0], [[8, 5, 0], [8.7, 5, 0]], atol=1e-12)
     np.testing.assert_allclose(fleet.velocity[:, 0], [[7, 0, 0], [7, 0, 0]], atol=1e-12)
     half = np.sqrt(3) / 2
@@ -186,24 +186,31 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
 def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
     (tmp_path / "a.xml").write_text(text)
     with pytest.raises(InputError, match=thing):
-        load(tmp_path / "a.xml")
+        load_fleet(tmp_path / "a.xml")
 
 
 def test_formats_are_told_apart(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(GOOD)
     (tmp_path / "carla.csv").write_text(",".join(f"c{k}" for k in range(15)) + "\n")
     assert [detect(tmp_path / n) for n in ("table.csv", "carla.csv", "a.parquet", "a.xml", "a.xlsx", "a.txt")] == [
-        "table", "carla", "table", "fcd", "carla", "tum",
-    ]  # fmt: skip
+        "table",
+        "carla",
+        "table",
+        "fcd",
+        "carla",
+        "tum",
+    ]
 
 
 @pytest.mark.parametrize(
     ("header", "format"),
     [
-        ("id,t,x,y,z,yaw,vx,vy,vz", "carla"), ("ID,x,y,z,Yaw,Vx,Vy,Vz", "carla"), ("id,t,x,y,z,yaw", "table"),
+        ("id,t,x,y,z,yaw,vx,vy,vz", "carla"),
+        ("ID,x,y,z,Yaw,Vx,Vy,Vz", "carla"),
+        ("id,t,x,y,z,yaw", "table"),
         ("id,t,x,y,z," + ",".join("abcdefghi"), "table"),
     ],
-)  # fmt: skip
+)
 def test_a_table_with_yaw_and_velocity_has_a_frame_to_find(tmp_path: Path, header: str, format: str) -> None:
     for encoding in ("utf-8", "utf-8-sig"):
         (tmp_path / "a.csv").write_text(header + "\n", encoding=encoding)
@@ -211,5 +218,5 @@ def test_a_table_with_yaw_and_velocity_has_a_frame_to_find(tmp_path: Path, heade
 
 
 def test_an_unknown_vehicle_is_named_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match=r"must be an index in 0\.\.3 or one of the ids town10-clients-00"):
-        load("town10-clients").index("town10-99")
+    with pytest.raises(InputError, match=r"must be one of town10-clients-00, town10-clients-01"):
+        load_fleet("town10-clients").index("town10-99")

@@ -24,7 +24,7 @@ from coopoc import (
     rt_le,
 )
 from coopoc.methods.drift_filter import DriftFilter
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.sensing import gauss_markov
 
 WHITE = Sensors(gnss_std=(1.5, 1.5, 1.5))
@@ -52,8 +52,10 @@ def test_gauss_markov_has_the_stated_correlation() -> None:
 
 def test_drift_is_each_receivers_and_the_common_error_everyones() -> None:
     fleet = convoy()
-    apart, alike = (observe(fleet, replace(s, gnss_std=(0.0,) * 3), assumed=WHITE, runs=40).gnss - fleet.position
-                    for s in (OWN, COMMON))  # fmt: skip
+    apart, alike = (
+        observe(fleet, replace(s, gnss_std=(0.0,) * 3), assumed=WHITE, runs=40).gnss - fleet.position
+        for s in (OWN, COMMON)
+    )
     assert apart.std() == pytest.approx(2.0, rel=0.1)
     assert alike.std() == pytest.approx(2.0, rel=0.15)
     assert abs(np.corrcoef(apart[:, -1, 0, 0], apart[:, -1, 1, 0])[0, 1]) < 0.5
@@ -80,7 +82,7 @@ def test_alone_it_is_filterpys_augmented_filter() -> None:
     fleet = convoy(1)
     seen = observe(fleet, BOTH, V2X(0), runs=1, seed=3)
     track, keep = DriftFilter()(seen, [0]), np.exp(-0.1 / 5.0)
-    q = Knowledge.nominal(BOTH).process_variance(seen)[0, :, 0]
+    q = NoiseModel.nominal(BOTH).process_variance(seen)[0, :, 0]
     for axis in range(3):
         kf = KalmanFilter(dim_x=3, dim_z=1)
         kf.x, kf.P = np.array([[seen.gnss[0, 0, 0, axis]], [0.0], [0.0]]), np.diag([1e6, 4.0, 1.0])
@@ -117,8 +119,9 @@ def test_rms_and_nees_agree_with_the_bound() -> None:
 def test_neighbours_help_against_what_they_do_not_share() -> None:
     """The bound: own drifts average out over neighbours, the common one cannot."""
     fleet = convoy()
-    alone, together = ({s: bound_rt_le(posterior_bound(fleet, s, 0, V2X(k, 60.0))) for s in (OWN, COMMON)}
-                       for k in (0, 3))  # fmt: skip
+    alone, together = (
+        {s: bound_rt_le(posterior_bound(fleet, s, 0, V2X(k, 60.0))) for s in (OWN, COMMON)} for k in (0, 3)
+    )
     assert together[OWN] < 0.75 * alone[OWN]
     assert together[COMMON] > 0.9 * alone[COMMON]
     whole = fleet_bound(fleet, COMMON, V2X(3, 60.0))[:, 0]
@@ -126,7 +129,7 @@ def test_neighbours_help_against_what_they_do_not_share() -> None:
 
 
 def test_white_filters_take_the_whole_error_as_white() -> None:
-    known = Knowledge.nominal(BOTH)
+    known = NoiseModel.nominal(BOTH)
     assert known.gnss_std == pytest.approx((np.sqrt(1.5**2 + 4 + 1),) * 3)
     seen = observe(convoy(), BOTH, V2X(0), runs=20)
     assert np.nanmean(nees(Kalman()(seen, [0]), convoy())) > 6  # and are far too sure of themselves

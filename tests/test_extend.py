@@ -6,17 +6,22 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.errors import InputError
-from coopoc.fleets import load
+from coopoc.evaluate.catalogue import measure
+from coopoc.fleets import load_fleet
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file
-from coopoc.optimize import Problem, Status, solve
+from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
-from coopoc.study.run import plan, run
+from coopoc.study.run import plan, run_study
+from coopoc.world.channels import channel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extend.md"
 COOPOC = f"{sys.executable} -W error -m coopoc.cli"
@@ -57,11 +62,23 @@ def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
     assert float(alpha[1]) > float(bound[1])
 
 
+def test_a_cooperative_filter_with_a_4d_state(folder: Path, formation: Fleet) -> None:
+    """A compass that cannot err is the joint filter; one that does is found out, and the joint filter pays for it."""
+    compass = from_file(f"{folder}/compass.py:Compass")
+    fleet, sensors = formation.between(0, 100), Sensors.paper_scenario2()
+    exact = observe(fleet, sensors, V2X(max_neighbours=4, loss=0.2), runs=3, observers=[0])
+    known, joint = compass("nominal", prior_std=1e-9), JointFilter(exact=False)
+    np.testing.assert_allclose(known(exact, [0]).x, joint(exact, [0]).x, atol=1e-6)
+    turned = observe(fleet, replace(sensors, heading_bias_std=0.15), V2X(max_neighbours=4), runs=10, observers=[0])
+    found, paid = (rt_le(method(turned, [0]), fleet).mean() for method in (compass("nominal", prior_std=0.15), joint))
+    assert found < paid
+
+
 def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (command,) = commands("--data ring.py:ring")
     assert "egos of ring.py:ring" in shell(command, folder)
     monkeypatch.chdir(folder)
-    assert len(load("ring.py:ring").ids) == 12
+    assert len(load_fleet("ring.py:ring").ids) == 12
 
 
 def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,10 +94,89 @@ def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.Monke
     assert mine.x == pytest.approx(ours.x, abs=1e-8)
     early = solve(problem, "least_squares.py:BACKEND", throw=False, max_iterations=1)
     assert early.status is not Status.SOLVED  # it may claim what it likes
-    with pytest.raises(InputError, match=r"rounds = 3: is no option of least_squares\.py:BACKEND"):
+    with pytest.raises(InputError, match=r"rounds = 3: is no option of least-squares"):
         solve(problem, "least_squares.py:BACKEND", rounds=3)
     with pytest.raises(InputError, match=r"is a function, no Backend"):
-        solve(problem, "least_squares.py:build")
+        solve(problem, "least_squares.py:prepare")
+
+
+def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (block,) = [text for text in blocks("python") if '"lidar.py:elevation"' in text]
+    script = folder / "own_measurement.py"
+    script.write_text(block)
+    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    assert done.stdout.startswith("SOLVED"), done.stderr
+    monkeypatch.chdir(folder)
+    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    problem = problem.add("lidar.py:elevation", ("ego", "b"), 0.2, std=0.01)
+    try:
+        for backend in ("gauss-newton", "gtsam", "osqp", "casadi", "least_squares.py:BACKEND"):
+            dx, dy, dz = np.diff(solve(problem, backend).x, axis=0)[0]
+            assert np.arctan2(dz, np.hypot(dx, dy)) == pytest.approx(0.2, abs=0.01)
+        bounded = solve(problem.constrain("lidar.py:elevation", ("ego", "b"), upper=0.18), "casadi")
+        dx, dy, dz = np.diff(bounded.x, axis=0)[0]
+        assert np.arctan2(dz, np.hypot(dx, dy)) == pytest.approx(0.18, abs=1e-6)
+        source = folder / "lidar.py"
+        edited = source.read_text().replace("m.atan2(dz,", "m.atan2(-dz,")
+        source.write_text(edited)
+        dz = np.diff(solve(problem.add("lidar.py:elevation", ("ego", "b"), 0.2, std=0.01)).x, axis=0)[0, 2]
+        assert dz < 0  # both rows have the formula of the edited file
+        with pytest.raises(InputError, match=r"is no measurement.*@measurement"):
+            problem.add("least_squares.py:prepare", ("ego", "b"), 0.2, std=0.01)
+    finally:
+        MEASUREMENTS.pop("elevation", None)
+    with pytest.raises(InputError, match="Did you mean spherical"):
+        problem.add("sperical", ("ego", "b"), [9.0, 0.0, 1.5], std=0.1)
+
+
+@pytest.mark.parametrize(
+    ("word", "names"),
+    [
+        ("channel(name", ["ideal", "cam", "rain.py:rain"]),
+        ("measure(name", ["rt_le_m", "nees", "late.py:final_error_m"]),
+    ],
+)
+def test_a_channel_and_a_metric_go_by_their_file(folder: Path, word: str, names: list[str]) -> None:
+    (block,) = [text for text in blocks("python") if word in text]
+    script = folder / f"own_{word[:4]}.py"
+    script.write_text(block)
+    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert [row[0] for row in rows] == names, done.stderr
+    assert all(float(row[1]) > 0 for row in rows)
+
+
+def test_a_channel_and_a_metric_keep_their_promise(tmp_path: Path, crossing: Fleet) -> None:
+    (tmp_path / "own.py").write_text(
+        "def none(k):\n    return k\ndef flat(track, fleet):\n    return track.x[0, 0, 0]\n"
+    )
+    track = GNSS()(observe(crossing, Sensors()))
+    with pytest.raises(InputError, match="returned int, no V2X"):
+        channel(f"{tmp_path}/own.py:none")
+    with pytest.raises(InputError, match=r"must have shape \(R, E\) = \(1, 1\)"):
+        measure(f"{tmp_path}/own.py:flat", track, crossing)
+    with pytest.raises(InputError, match=r"channel = 'camm': .*Did you mean cam\?"):
+        channel("camm")
+    with pytest.raises(InputError, match=r"metric = 'rt_le': .*Did you mean rt_le_m\?"):
+        measure("rt_le", track, crossing)
+    assert measure("nees", Kalman()(observe(crossing, Sensors())), crossing).shape == (1, 1)
+
+
+def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_path: Path) -> None:
+    """In `federate`, in the study of rules, in `coopoc train`; an unknown rule is named with the nearest one."""
+    (block,) = [text for text in blocks("python") if "own_rules.py:ClippedMean" in text]
+    script = folder / "own_federation.py"
+    script.write_text(block + "\nassert not all(fed.history[0].weights == fed.history[2].weights)\n")
+    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (command,) = commands("own_rules.py:best_half")
+    assert "| best half " in shell(command, folder)
+    wrong = f"{COOPOC} train fedkalmannet --aggregate own_rules.py:best_hlaf --out {tmp_path}"
+    done = subprocess.run(wrong.split(), cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "Did you mean own_rules.py:best_half?" in done.stderr
 
 
 def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:
@@ -92,8 +188,10 @@ def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:
 def test_a_notebook_gets_a_frame_and_a_table(folder: Path) -> None:
     (block,) = [text for text in blocks("python") if "results.frame" in text]
     script = folder / "notebook.py"
-    script.write_text(f"if __name__ == '__main__':\n{re.sub('^', '    ', block, flags=re.MULTILINE)}\n"
-                      "    assert gain.low > 0, gain\n    assert '<table>' in table._repr_html_()\n")  # fmt: skip
+    script.write_text(
+        f"if __name__ == '__main__':\n{re.sub('^', '    ', block, flags=re.MULTILINE)}\n"
+        "    assert gain.low > 0, gain\n    assert '<table>' in table._repr_html_()\n"
+    )
     subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, check=True)
 
 
@@ -107,7 +205,15 @@ def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
     env = {"PYTHONPATH": f"{tmp_path}{os.pathsep}{folder}"}
     listed, ran = (command for command in blocks("sh")[-1].splitlines())
     names = shell(listed, tmp_path, **env)
-    groups = {"methods": "alpha", "datasets": "ring", "backends": "least-squares", "studies": "rates"}
+    groups = {
+        "methods": "alpha",
+        "datasets": "ring",
+        "backends": "least-squares",
+        "channels": "rain",
+        "metrics": "final_error_m",
+        "rules": "best-half",
+        "studies": "rates",
+    }
     for group, name in groups.items():
         assert re.search(rf"^{group}: .*\b{name}\b", names, flags=re.MULTILINE), names
     assert "egos of ring" in shell(ran, tmp_path, **env)
@@ -115,15 +221,17 @@ def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
 
 def test_cells_follow_the_contents_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    text = ("import coopoc as co\nSCALE = 1\ndef cell(p):\n"
-            "    return [{'run': 0, 'ego': 'a', 'rt_le_m': SCALE * p['x']}]\n"
-            "STUDY = co.Study('own', 'What?', cell, {'x': (1.0, 2.0)})\n")  # fmt: skip
+    text = (
+        "import coopoc as co\nSCALE = 1\ndef cell(p):\n"
+        "    return [{'run': 0, 'ego': 'a', 'rt_le_m': SCALE * p['x']}]\n"
+        "STUDY = co.Study('own', 'What?', cell, {'x': (1.0, 2.0)})\n"
+    )
     (tmp_path / "own.py").write_text(text)
-    assert run("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 3.0
+    assert run_study("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 3.0
     assert plan("own.py:STUDY")["to_compute"] == 0
     (tmp_path / "own.py").write_text(text.replace("SCALE = 1", "SCALE = 5"))
     assert plan("own.py:STUDY")["to_compute"] == 2
-    assert run("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 15.0
+    assert run_study("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 15.0
 
 
 def test_a_method_may_ask_for_the_whole_fleet(tmp_path: Path) -> None:
@@ -139,6 +247,6 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"method = 'gone\.py:X': names a file that is not there"):
         find("coopoc.methods", "gone.py:X")
     with pytest.raises(InputError, match=r"is a int, no Study"):
-        run(f"{tmp_path}/own.py:ALPHA")
+        run_study(f"{tmp_path}/own.py:ALPHA")
     with pytest.raises(TypeError):
-        load(f"{tmp_path}/own.py:ALPHA")
+        load_fleet(f"{tmp_path}/own.py:ALPHA")

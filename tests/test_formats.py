@@ -12,7 +12,7 @@ import pytest
 from scipy.io import mmread
 from scipy.spatial.transform import Rotation
 
-from coopoc.formats import read_graph, write_graph
+from coopoc.formats import load_graph, write_graph
 from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.formats.kitti import read_kitti, write_kitti
@@ -76,7 +76,7 @@ def random_graph(dimension: int, seed: int) -> Graph:
 
 def written(graph: Graph, path: Path) -> Graph:
     write_graph(graph, path)
-    return read_graph(path)
+    return load_graph(path)
 
 
 COUNTS = {  # poses, points, relative poses, relative points, ranges, robots: by awk from the files
@@ -94,7 +94,7 @@ COUNTS = {  # poses, points, relative poses, relative points, ranges, robots: by
 @pytest.mark.parametrize("name", COUNTS)
 def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(shared: Path, tmp_path: Path, name: str) -> None:
     start = time.process_time()
-    graph = read_graph(shared / "pyfg" / f"{name}.pyfg")
+    graph = load_graph(shared / "pyfg" / f"{name}.pyfg")
     assert time.process_time() - start < 2
     edges = (len(graph.relative_pose), len(graph.relative_point), len(graph.ranges))
     assert (graph.is_pose.sum(), (~graph.is_pose).sum(), *edges, "".join(graph.robots)) == COUNTS[name]
@@ -104,7 +104,7 @@ def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(shared: Path, tmp_p
 def test_pyfg_numbers_are_what_cora_made_of_them(shared: Path) -> None:
     """CORA's expected matrices: rows of X_gt are R_i^T, then bearings of ranges, then positions."""
     folder = shared / "pyfg/cora_unit/small_ra_slam_problem"
-    graph = read_graph(folder / "factor_graph.pyfg")
+    graph = load_graph(folder / "factor_graph.pyfg")
     x = mmread(folder / "X_gt.mm").toarray()
     np.testing.assert_allclose(graph.rotation[:6].swapaxes(-1, -2).reshape(12, 2), x[:12], atol=1e-15)
     np.testing.assert_array_equal(graph.position, x[17:])
@@ -116,7 +116,7 @@ def test_pyfg_numbers_are_what_cora_made_of_them(shared: Path) -> None:
 
 def test_relative_poses_and_points_are_in_the_frame_of_the_first(shared: Path) -> None:
     """MR.CLAM against its own Vicon truth: R_i^T (p_j - p_i) is what was measured, to the noise that it claims."""
-    graph = read_graph(shared / "pyfg/mrclam6.pyfg")
+    graph = load_graph(shared / "pyfg/mrclam6.pyfg")
     for edges, bound in ((graph.relative_pose, 0.02), (graph.relative_point, 0.2)):
         i, j = edges.nodes.T
         seen = np.einsum("mji,mj->mi", graph.rotation[i], graph.position[j] - graph.position[i])
@@ -155,7 +155,7 @@ def test_every_g2o_record_comes_back_to_rounding(tmp_path: Path, dimension: int,
 
 
 def test_pyfg_becomes_g2o_and_back_but_for_the_stamps(shared: Path, tmp_path: Path) -> None:
-    graph = read_graph(shared / "pyfg/mrclam5a.pyfg").stamped(np.nan)
+    graph = load_graph(shared / "pyfg/mrclam5a.pyfg").stamped(np.nan)
     assert_same(written(graph, tmp_path / "a.g2o"), graph, rtol=1e-12)
 
 
@@ -203,8 +203,9 @@ def test_we_read_what_gtsam_writes(tmp_path: Path, dimension: int) -> None:
     gtsam = pytest.importorskip("gtsam")
     rng = np.random.default_rng(dimension)
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    pose, between, size = ((gtsam.Pose2, gtsam.BetweenFactorPose2, 3) if dimension == 2
-                           else (gtsam.Pose3, gtsam.BetweenFactorPose3, 6))  # fmt: skip
+    pose, between, size = (
+        (gtsam.Pose2, gtsam.BetweenFactorPose2, 3) if dimension == 2 else (gtsam.Pose3, gtsam.BetweenFactorPose3, 6)
+    )
     for key in range(4):
         values.insert(key, pose.Expmap(rng.normal(size=size)))
     for i, j in ((0, 1), (1, 2), (2, 3), (3, 1)):
@@ -213,7 +214,7 @@ def test_we_read_what_gtsam_writes(tmp_path: Path, dimension: int) -> None:
             between(i, j, pose.Expmap(rng.normal(size=size)), gtsam.noiseModel.Gaussian.Covariance(root @ root.T))
         )
     gtsam.writeG2o(factors, values, str(tmp_path / "a.g2o"))
-    graph = read_graph(tmp_path / "a.g2o")
+    graph = load_graph(tmp_path / "a.g2o")
     assert graph.names == ("A0", "A1", "A2", "A3")
     _assert_gtsam_agrees(graph, factors, values, {f"A{k}": k for k in range(4)}, atol=2e-5)  # it writes 6 to 12 digits
 
@@ -224,7 +225,7 @@ def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it() -> None:
     path = Path(gtsam.__file__).parent / "Data/known_landmark_localization_20.g2o"
     if not path.is_file():
         pytest.skip("this GTSAM does not ship the file")
-    graph = read_graph(path)
+    graph = load_graph(path)
     factors, values = gtsam.readG2o(str(path), True)
     _assert_gtsam_agrees(graph, factors, values, {f"A{k}": k for k in range(20)}, atol=1e-5)  # six-digit quaternions
     seen = [factors.at(k) for k in range(factors.size()) if "BearingRange" in type(factors.at(k)).__name__]

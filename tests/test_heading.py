@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopoc import V2X, Fleet, Sensors, observe, run
-from coopoc.methods.knowledge import Knowledge
+from coopoc import V2X, Fleet, Sensors, observe, run_study
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies import heading_error as study
 from coopoc.studies import views
 from coopoc.world.spherical import wrap
@@ -35,19 +35,28 @@ def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing: Fleet) -> No
 
 def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
     both = replace(NOISE, heading_bias_std=0.12, azimuth_std=0.0)
-    known = Knowledge.nominal(replace(both, azimuth_std=1e-12))
+    known = NoiseModel.nominal(replace(both, azimuth_std=1e-12))
     assert known.sensors is not None
     assert known.sensors.azimuth_std == pytest.approx(0.13)
-    assert Knowledge.nominal(Sensors()).sensors == Sensors()
+    assert NoiseModel.nominal(Sensors()).sensors == Sensors()
 
 
 def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path, short_town: str) -> None:
-    wanted = {"data": short_town, "runs": 3, "egos": "2", "heading_std_deg": "0.0,8.0", "heading_bias_deg": "0.0,8.0",
-              "max_neighbours": "0,10", "method": "kalman,joint,bound"}  # fmt: skip
-    results = run("heading_error", tmp_path, settings=wanted, progress=False)
+    wanted = {
+        "data": short_town,
+        "runs": 3,
+        "egos": "2",
+        "heading_std_deg": "0.0,8.0",
+        "heading_bias_deg": "0.0,8.0",
+        "max_neighbours": "0,10",
+        "method": "kalman,joint,bound",
+    }
+    results = run_study("heading_error", tmp_path, settings=wanted, progress=False)
     for kind in study.KINDS:
-        none, told, ignored = (views.mean(results, study.at(kind, size, "joint", known, 10), "nees")
-                               for size, known in ((0.0, "nominal"), (8.0, "nominal"), (8.0, study.EXACT)))  # fmt: skip
+        none, told, ignored = (
+            views.mean(results, study.at(kind, size, "joint", known, 10), "nees")
+            for size, known in ((0.0, "nominal"), (8.0, "nominal"), (8.0, study.EXACT))
+        )
         assert none is not None
         assert told is not None
         assert ignored is not None

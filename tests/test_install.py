@@ -37,7 +37,7 @@ def outside(site: Path, tmp_path: Path, *command: str) -> str:
 def test_everything_imports_from_the_wheel(site: Path, tmp_path: Path) -> None:
     code = """
 import coopoc, coopoc.learned, coopoc.studies, coopoc.data, joblib
-from coopoc.data.registry import load
+from coopoc.data.registry import load_fleet as load
 from coopoc.learned.recipes import load_method
 print(load_method("fedkalmannet").name)
 print(coopoc.__file__, coopoc.learned.__file__, coopoc.studies.__file__, coopoc.data.__file__)

@@ -1,4 +1,4 @@
-"""Compiled covariance intersection against the NumPy reference, and against scipy.optimize and numpy.linalg."""
+"""The compiled fusion of covariance intersection against scipy.optimize and numpy.linalg."""
 
 from __future__ import annotations
 
@@ -7,33 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from test_kernels import CHANNELS, S2, assert_same, in_numpy
 
-from coopoc import V2X, CovarianceIntersection, Fleet, Knowledge, Sensors, observe
-
-pytest.importorskip("numba")
-KNOWN = {"identity": "identity", "nominal": "nominal", "fitted": Knowledge("fitted", S2, (0.3, 0.2, 0.01)),
-         "sure": Knowledge("fitted", S2, (1e-9, 1e-9, 1e-9), gnss_std=(1e-8, 1e-8, 1e-8))}  # fmt: skip
-
-
-@pytest.mark.parametrize("channel", [*CHANNELS, V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3)], ids=str)
-@pytest.mark.parametrize("knowledge", KNOWN)
-@pytest.mark.parametrize("split", [True, False])
-@pytest.mark.parametrize("criterion", ["trace", "det"])
-def test_the_filter_is_the_reference(
-    crossing: Fleet, channel: V2X, knowledge: str, split: bool, criterion: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neighbours join and leave, messages are lost, late and turned away; fixes that leave nothing to depend on."""
-    recording = observe(crossing.between(0, 30), S2, channel, runs=2)
-    method = CovarianceIntersection(KNOWN[knowledge], split, criterion)
-    assert_same(method(recording, [0, 3]), in_numpy(monkeypatch, method, recording, [0, 3]))
-
-
-def test_other_sensors_are_the_reference(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    for sensors in (Sensors(range_std=1e-2, azimuth_std=1e-3, inclination_std=1e-3), Sensors(range_std=20.0),
-                    Sensors(gnss_std=(0.01, 0.01, 0.02))):  # fmt: skip
-        recording, method = observe(crossing, sensors, V2X(max_neighbours=4)), CovarianceIntersection(split=True)
-        assert_same(method(recording, [0, 3]), in_numpy(monkeypatch, method, recording, [0, 3]))
+from coopoc.kernels.fusion import Fusion, add_up, best_weight, describe, fuse
 
 
 def covariance(rng: np.random.Generator) -> Any:
@@ -49,13 +24,12 @@ def packed(full: Any) -> tuple[float, ...]:
 @pytest.mark.parametrize("least_det", [False, True])
 def test_a_source_and_the_best_weight_are_those_of_numpy_and_scipy(seed: int, least_det: bool) -> None:
     """Information by numpy.linalg.inv, its derivatives by differences of it, the weight by minimize_scalar."""
-    from coopoc.kernels.intersection import add_up, best_weight, describe, fuse
-
     rng = np.random.default_rng(seed)
     parts = [(covariance(rng), covariance(rng)) for _ in range(1 + seed % 4)]
     source, fixed, sums, gap = np.empty((5, 22)), np.zeros(9), np.empty(18), rng.normal(size=(5, 3))
     fix, gap[0] = rng.uniform(0.1, 1.0, 3), 0.0
     fixed[[0, 3, 5]], fixed[6:] = fix, fix * [1.0, -2.0, 3.0]
+    fusion = Fusion(source, gap, fixed, sums, np.zeros(3))
     for j, (dependent, independent) in enumerate(parts):
         assert not describe(packed(dependent), packed(independent), True, source, j)
 
@@ -66,20 +40,21 @@ def test_a_source_and_the_best_weight_are_those_of_numpy_and_scipy(seed: int, le
         cov = np.linalg.inv(np.diag(fix) + sum(pieces(w)))
         return float(np.linalg.slogdet(cov)[1] if least_det else np.trace(cov))
 
-    add_up(source, len(parts), fixed, sums, 0.4)
+    add_up(fusion, len(parts), 0.4)
     total = np.array([packed(np.diag(fix) + sum(pieces(w))) for w in (0.4 - 1e-4, 0.4, 0.4 + 1e-4)])
     assert sums[:6] == pytest.approx(total[1], rel=1e-12)
     assert sums[6:12] == pytest.approx((total[2] - total[0]) / 2e-4, rel=1e-5, abs=1e-6)
     assert sums[12:] == pytest.approx((total[2] - 2 * total[1] + total[0]) / 1e-8, rel=1e-4, abs=1e-4)
-    w = best_weight(source, len(parts), fixed, sums, least_det, False, 0.5)
+    w = best_weight(fusion, len(parts), least_det, False, 0.5)
     best = minimize_scalar(size, bounds=(1e-9, 1 - 1e-9), method="bounded", options={"xatol": 1e-10})
     assert w == pytest.approx(best.x, abs=1e-4)
     assert size(min(w, 1 - 1e-12)) <= best.fun + 1e-9
-    at = np.zeros(3)
-    dependent, independent = fuse(source, len(parts), fixed, sums, 0.4, gap, at)
+    dependent, independent = fuse(fusion, len(parts), 0.4)
     each = pieces(0.4)
     cov = np.linalg.inv(np.diag(fix) + sum(each))
-    assert at == pytest.approx(cov @ (fixed[6:] + sum(e @ g for e, g in zip(each, gap, strict=False))), abs=1e-12)
+    assert fusion.at == pytest.approx(
+        cov @ (fixed[6:] + sum(e @ g for e, g in zip(each, gap, strict=False))), abs=1e-12
+    )
     wanted = cov @ (np.diag(fix) + sum(e @ i @ e for e, (_, i) in zip(each, parts, strict=True))) @ cov
     assert independent == pytest.approx(packed(wanted), abs=1e-12)
     assert dependent == pytest.approx(packed(cov - wanted), abs=1e-12)

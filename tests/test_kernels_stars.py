@@ -1,49 +1,29 @@
-"""Compiled Laplacian and pseudo-fix filters against the NumPy reference, filterpy and numpy.linalg."""
+"""Laplacian and pseudo-fix filters against filterpy and numpy.linalg; tests/test_oracles_star.py has the oracles."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from test_kernels import CHANNELS, S2, assert_same, in_numpy
 
-from coopoc import V2X, Fleet, Knowledge, LaplacianKalman, Msmv, observe
-from coopoc.kernels.laplacian import BLOCK
+from coopoc import LKFSA, MSMV, V2X, Fleet, NoiseModel, Sensors, observe
+from coopoc.kernels.lanes import LANES
 from coopoc.world.spherical import to_vector, vector_cov
 
-pytest.importorskip("numba")
-KNOWN = {"identity": "identity", "nominal": "nominal", "fitted": Knowledge("fitted", S2, (0.3, 0.2, 0.01)),
-         "still": Knowledge("fitted", S2, (1e-30, 1e-60, 1e-30))}  # fmt: skip
-RUNS = BLOCK + 1
-"""One block and a run of the next."""
+S2 = Sensors.paper_scenario2()
+KNOWN = {
+    "identity": "identity",
+    "nominal": "nominal",
+    "fitted": NoiseModel("fitted", S2, (0.3, 0.2, 0.01)),
+    "still": NoiseModel("fitted", S2, (1e-30, 1e-60, 1e-30)),
+}
+RUNS = LANES + 1
+"""One group and a run of the next."""
 
 
-@pytest.mark.parametrize("channel", [*CHANNELS, V2X(max_neighbours=6, latency=0.3, rate=5.0)], ids=str)
-@pytest.mark.parametrize("knowledge", KNOWN)
-@pytest.mark.parametrize("kind", [LaplacianKalman, Msmv])
-def test_the_filter_is_the_reference(
-    crossing: Fleet, channel: V2X, knowledge: str, kind: type, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neighbours join and leave; messages are prompt, late alike in all runs, lost, and turned away."""
-    recording = observe(crossing.between(0, 40), S2, channel, runs=RUNS)
-    method = kind(KNOWN[knowledge])
-    assert_same(method(recording, [0, 3]), in_numpy(monkeypatch, method, recording, [0, 3]))
-
-
-@pytest.mark.parametrize("method", [LaplacianKalman("nominal"), LaplacianKalman("identity"), Msmv("nominal")], ids=str)
-def test_vehicles_that_appear_and_vanish(method, crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    position, velocity = crossing.position.copy(), crossing.velocity.copy()
-    position[:20, 2:5], velocity[:20, 2:5] = np.nan, np.nan
-    position[40:, 4:7], velocity[40:, 4:7] = np.nan, np.nan
-    recording = observe(replace(crossing, position=position, velocity=velocity), S2, V2X(max_neighbours=5), runs=2)
-    assert_same(method(recording, [0]), in_numpy(monkeypatch, method, recording, [0]))
-
-
-@pytest.mark.parametrize("knowledge", ["identity", "fitted"])
-def test_a_run_does_not_depend_on_those_beside_it(crossing: Fleet, knowledge: str) -> None:
-    method, channel = LaplacianKalman(KNOWN[knowledge]), V2X(max_neighbours=4)
+@pytest.mark.parametrize("noise_model", ["identity", "fitted"])
+def test_a_run_does_not_depend_on_those_beside_it(crossing: Fleet, noise_model: str) -> None:
+    method, channel = LKFSA(KNOWN[noise_model]), V2X(max_neighbours=4)
     many, few = (method(observe(crossing, S2, channel, runs=runs), [0]) for runs in (RUNS, 3))
     assert np.array_equal(many.x[:3], few.x)
 
@@ -52,8 +32,8 @@ def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
     """Per axis, over the star of a formation that never changes, from its first estimate on."""
     fleet = formation.select(range(4)).between(0, 40)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    known = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-    track = LaplacianKalman(known)(recording, [0])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = LKFSA(known)(recording, [0])
     assert track.covariance is not None
     order, laplacian = [0, *recording.links.neighbour[:3]], np.diag([3.0, 1.0, 1.0, 1.0])
     laplacian[0, 1:] = laplacian[1:, 0] = -1.0
@@ -73,7 +53,7 @@ def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
             else:  # filterpy's own update would lose seven digits to the flat prior
                 weight = peer.H.T @ np.linalg.inv(noise)
                 peer.P = np.linalg.inv(np.eye(4) / 1e6 + weight @ peer.H)
-                first = (z[4] + np.array([0.0, *z[1:4]]))
+                first = z[4] + np.array([0.0, *z[1:4]])
                 peer.x = first + peer.P @ weight @ (z - peer.H @ first)
             assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
             assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
@@ -83,7 +63,7 @@ def test_pseudo_fixes_are_fused_as_information(formation: Fleet) -> None:
     """The first step in closed form: fix, and each neighbour's fix less the sighting, weighted by their covariances."""
     fleet = formation.select(range(4)).between(0, 2)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track = Msmv("nominal")(recording, [0])
+    track = MSMV("nominal")(recording, [0])
     assert track.covariance is not None
     at = recording.links.of(0)[:3]
     fixes, seen = recording.gnss[1, 0], recording.relative[1, at]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,62 @@ def test_imports_run_one_way(path: Path) -> None:
         if floor in FLOORS and target in FLOORS:
             assert FLOORS.index(target) <= FLOORS.index(floor), f"{path} imports {name}"
             assert {floor, target} != {"formats", "world"}, f"{path} imports {name}: the two stand side by side"
+
+
+FOLDERS = {"coopoc.learned": "learned", "coopoc.studies": "studies", "coopoc.data": "data"}
+"""Packages that stand in a folder of their own, as pyproject.toml maps them."""
+
+
+def modules(package: str) -> dict[str, Path]:
+    """Dotted name -> file of every module in a package."""
+    folder = ROOT / FOLDERS.get(package, package.replace(".", "/"))
+    found = {".".join([package, *p.relative_to(folder).with_suffix("").parts]): p for p in folder.rglob("*.py")}
+    return {name.removesuffix(".__init__"): path for name, path in found.items()}
+
+
+def imported(name: str, path: Path, known: set[str]) -> set[str]:
+    """Modules among `known` that a module imports anywhere: at its top, in a function, or for types only."""
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*base, *([node.module] if node.module else [])])
+            names = {f"{source}.{alias.name}" for alias in node.names}
+            found |= names if names & known else {source}
+    return found & known - {name}
+
+
+def circles(package: str) -> list[list[str]]:
+    """Modules of a package that import each other in a circle, whatever place an import stands at."""
+    files = modules(package)
+    arrows = {name: imported(name, path, set(files)) for name, path in files.items()}
+    reached = {name: set(targets) for name, targets in arrows.items()}
+    for middle in arrows:
+        for targets in reached.values():
+            if middle in targets:
+                targets |= reached[middle]
+    found = {tuple(sorted({name, *(o for o in reached[name] if name in reached[o])})) for name in reached}
+    return sorted(list(group) for group in found if group[0] in reached[group[-1]] and len(group) > 1)
+
+
+@pytest.mark.parametrize(
+    "package", ["coopoc.study", "coopoc.data", "coopoc.world", "coopoc.formats", "coopoc.evaluate"]
+)
+def test_no_file_imports_in_a_circle(package: str) -> None:
+    assert circles(package) == []
+
+
+def test_a_circle_is_found() -> None:
+    """Three files in a circle, one of them inside a function, and a fourth that only leads to them."""
+    files = {"a": "from . import b", "b": "def f():\n    from .c import x", "c": "import p.a", "d": "from . import a"}
+    with tempfile.TemporaryDirectory(dir=ROOT / "tests", prefix="circle_") as folder:
+        package = f"tests.{Path(folder).name}"
+        for name, text in files.items():
+            (Path(folder) / f"{name}.py").write_text(text.replace("p.a", f"{package}.a"))
+        assert circles(package) == [[f"{package}.{name}" for name in "abc"]]
 
 
 def test_import_is_light() -> None:

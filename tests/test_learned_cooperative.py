@@ -22,7 +22,7 @@ from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch, clients
 from coopoc.learned.training.schedule import Schedule
 from coopoc.methods.covariance_intersection import CovarianceIntersection
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.world.recording import Recording
 
@@ -126,8 +126,13 @@ def test_a_known_start_is_certain() -> None:
 def test_training_alone_gives_the_noise_of_a_fleet_that_is_never_told(tmp_path: Path) -> None:
     """Federated on one second-long pieces: the loss falls, the covariance holds, and a checkpoint reads the same."""
     fleet = around(1300)
-    fed = federate(NoiseNet(), clients(fleet, noise="wide", piece=60), rounds=2, local_epochs=4,
-                   schedule=Schedule(batch=8, learning_rate=0.01, weight_decay=0.01))  # fmt: skip
+    fed = federate(
+        NoiseNet(),
+        clients(fleet, noise="wide", piece=60),
+        rounds=2,
+        local_epochs=4,
+        schedule=Schedule(batch=8, learning_rate=0.01, weight_decay=0.01),
+    )
     assert fed.best.number > 0
     assert fed.history[1].sent_bytes == 4 * 100 + 4
     seen = drive(around(300), V2X(max_neighbours=0), 30)
@@ -173,7 +178,7 @@ def rms(method: Method, seen: Recording, fleet: Fleet) -> float:
 def test_with_the_same_knowledge_it_is_the_joint_filter(sums: bool) -> None:
     """In a formation, where nobody comes or goes, and with a message at every step."""
     seen = drive(formation_fleet(6, 60), V2X(5))
-    known = Knowledge.nominal(NOISE)
+    known = NoiseModel.nominal(NOISE)
     mine, joint = CooperativeGain(known, sums)(seen), JointFilter(known)(seen)
     np.testing.assert_allclose(mine.x, joint.x, atol=1e-6)
     np.testing.assert_allclose(mine.covariance, joint.covariance, atol=1e-6)  # type: ignore[arg-type]
@@ -182,7 +187,7 @@ def test_with_the_same_knowledge_it_is_the_joint_filter(sums: bool) -> None:
 def test_with_few_messages_sums_do_better() -> None:
     """At two messages a second newest fixes are worth as much to both; sums hold five times as many."""
     fleet = formation_fleet(6, 200)
-    seen, known = drive(fleet, V2X(5, rate=2.0), 10), Knowledge.nominal(NOISE)
+    seen, known = drive(fleet, V2X(5, rate=2.0), 10), NoiseModel.nominal(NOISE)
     joint, newest, sums = (
         rms(m, seen, fleet) for m in (JointFilter(known), CooperativeGain(known, False), CooperativeGain(known))
     )
@@ -194,10 +199,14 @@ def test_with_few_messages_sums_do_better() -> None:
 def test_told_noise_serves_other_filters_of_a_star(v2x: V2X) -> None:
     """Constants told fix by fix are constants, with messages of any age."""
     seen = drive(crossing_fleet(), v2x)
-    known = Knowledge.nominal(NOISE)
+    known = NoiseModel.nominal(NOISE)
     shape = seen.gnss.shape
-    told = ToldNoise("told", NOISE, fix=np.broadcast_to(known.gnss_variance, shape).copy(),
-                     process=np.broadcast_to(known.process_variance(seen), shape).copy())  # fmt: skip
+    told = ToldNoise(
+        "told",
+        NOISE,
+        fix=np.broadcast_to(known.gnss_variance, shape).copy(),
+        process=np.broadcast_to(known.process_variance(seen), shape).copy(),
+    )
     np.testing.assert_allclose(JointFilter(told)(seen).x, JointFilter(known)(seen).x, atol=1e-12)
 
 
@@ -205,11 +214,12 @@ def test_sums_say_what_lost_messages_said() -> None:
     """With exact motion and sightings two vehicles are one: the estimate is the mean of all fixes of both, of the other
     one up to its last message, however many were lost."""
     fleet = formation_fleet(2, 60)
-    exact = Sensors((2.0,) * 3, velocity_std_ratio=0.0, velocity_floor=1e-7, range_std=1e-4, azimuth_std=1e-5,
-                    inclination_std=1e-5)  # fmt: skip
+    exact = Sensors(
+        (2.0,) * 3, velocity_std_ratio=0.0, velocity_floor=1e-7, range_std=1e-4, azimuth_std=1e-5, inclination_std=1e-5
+    )
     silent = replace(exact, range_std=0.0, azimuth_std=0.0, inclination_std=0.0)
     seen = observe(fleet, silent, V2X(1, loss=0.7), runs=5, seed=2, assumed=exact)
-    track = CooperativeGain(Knowledge.nominal(exact))(seen)
+    track = CooperativeGain(NoiseModel.nominal(exact))(seen)
     error, newest = seen.gnss - fleet.position, np.full(5, -1)
     for t in range(60):
         (link,) = np.flatnonzero((seen.links.step == t) & (seen.links.observer == 0))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import copy
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,12 +12,11 @@ import torch
 from torch import Tensor
 
 from coopoc import InputError
-from coopoc.kernels.compile import numba_is_there, part
+from coopoc.kernels.compile import part
 from coopoc.learned import Gain, GainNet
-from coopoc.learned.engine import rollout as engine
 from coopoc.learned.engine.arithmetic import sigmoid, tanh
+from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.stack import flatten
-from coopoc.learned.training import schedule as schedule_module
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core, row_threads
 from coopoc.learned.training.schedule import Moving, Schedule, advance
@@ -43,15 +40,17 @@ def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float6
 
 def plain(nets: list[GainNet], data: Batch, dt: float | Tensor) -> Tensor:
     """(T, S, B, 3) of the reference, a net after the other."""
-    rows = [net.reference(data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], dt)
-            for s, net in enumerate(nets)]  # fmt: skip
+    rows = [
+        Recurrent.forward(net, data.gnss[:, s].transpose(0, 1), data.velocity[:, s].transpose(0, 1), data.x0[s], dt)
+        for s, net in enumerate(nets)
+    ]
     return torch.stack([row.transpose(0, 1) for row in rows], 1)
 
 
 def gradients(nets: list[GainNet], data: Batch, dt: float | Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Estimates and gradients of the squared error, of the engine and by torch's autograd through the reference."""
     theta = flatten(nets).requires_grad_()
-    found = engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, dt)
+    found = nets[0].rollout(theta, data.gnss, data.velocity, data.x0, dt)
     (found - data.truth).square().sum(-1).mean((0, 2)).sum().backward()
     expected = plain(nets, data, dt)
     (expected - data.truth).square().sum(-1).mean((0, 2)).sum().backward()
@@ -91,7 +90,7 @@ def test_gradcheck(models: int, lanes: int, magnitudes: bool) -> None:
     data, dt = batch(models, lanes, 6, gaps=0.3), torch.linspace(0.05, 0.2, 6)
 
     def run(theta: Tensor) -> Tensor:
-        return engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, dt)
+        return nets[0].rollout(theta, data.gnss, data.velocity, data.x0, dt)
 
     theta = flatten(nets)
     torch.manual_seed(2)
@@ -142,12 +141,12 @@ def test_a_net_is_an_ordinary_module() -> None:
     """Two steps of torch.optim.Adam through forward end where they end through the reference."""
     data, ends = batch(1, 3, 20), []
     gnss, velocity, truth = (a[:, 0].transpose(0, 1) for a in data[:3])
-    for way in ("forward", "reference"):
+    for way in (GainNet.forward, Recurrent.forward):
         net = GainNet(2, 1).double()
         adam = torch.optim.Adam(net.parameters(), lr=1e-2)
         for _ in range(2):
             adam.zero_grad()
-            (getattr(net, way)(gnss, velocity, data.x0[0], 0.1) - truth).square().mean().backward()
+            (way(net, gnss, velocity, data.x0[0], 0.1) - truth).square().mean().backward()
             adam.step()
         ends.append(flatten([net]))
     torch.testing.assert_close(ends[0], ends[1], rtol=1e-8, atol=1e-10)
@@ -161,7 +160,7 @@ def test_a_model_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> N
     def run(rows: slice, count: int) -> tuple[Tensor, Tensor]:
         theta = flatten(nets[rows]).requires_grad_()
         with row_threads(count):
-            x = engine.rollout(theta, nets[0], data.gnss[:, rows], data.velocity[:, rows], data.x0[rows], 0.1)
+            x = nets[0].rollout(theta, data.gnss[:, rows], data.velocity[:, rows], data.x0[rows], 0.1)
             (gradient,) = torch.autograd.grad((x - data.truth[:, rows]).square().sum(), theta)
         return x.detach(), gradient
 
@@ -171,27 +170,26 @@ def test_a_model_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> N
     assert torch.equal(stacked[0][:, 3:4], alone[0])
     assert torch.equal(stacked[1][3:4], alone[1])
     one = Batch(*(part[:, 3:4] for part in data[:3]), data.x0[3:4], 0.1)
-    for whole, cut in zip(nets[0].loss_and_gradient(flatten(nets), data),
-                           nets[0].loss_and_gradient(flatten(nets[3:4]), one), strict=True):  # fmt: skip
+    for whole, cut in zip(
+        nets[0].loss_and_gradient(flatten(nets), data), nets[0].loss_and_gradient(flatten(nets[3:4]), one), strict=True
+    ):
         assert torch.equal(whole[3:4], cut)
 
 
 def test_without_gradients_the_answer_is_the_same() -> None:
     nets, data = [GainNet(seed=s) for s in range(2)], batch(2, 3, 40, torch.float32)
     theta = flatten(nets)
-    silent = engine.rollout(theta, nets[0], data.gnss, data.velocity, data.x0, 0.1)
-    assert torch.equal(silent, engine.rollout(theta.requires_grad_(), nets[0], data.gnss, data.velocity, data.x0, 0.1))
+    silent = nets[0].rollout(theta, data.gnss, data.velocity, data.x0, 0.1)
+    assert torch.equal(silent, nets[0].rollout(theta.requires_grad_(), data.gnss, data.velocity, data.x0, 0.1))
 
 
-@pytest.mark.parametrize("numba", [True, False])
-def test_an_optimiser_step_is_that_of_torch(numba: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_optimiser_step_is_that_of_torch() -> None:
     """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the loss with penalties; other rows stay."""
-    if not numba:
-        monkeypatch.setattr(schedule_module, "_compiled", lambda: None)
     torch.manual_seed(0)
-    schedule, rates = Schedule(weight_decay=0.3, l2=0.1, proximal=0.2, clip=1.0), [1e-2, 2e-2, 3e-2]
+    schedule, rates = Schedule(weight_decay=0.3, l2=0.1, proximal=0.2, clip=1.0), np.array([1e-2, 2e-2, 3e-2])
     theta = torch.randn(5, 50, dtype=torch.float64)
     began, first, second, start = theta + 1, torch.zeros_like(theta), torch.zeros_like(theta), theta.clone()
+    state, indices = Moving(theta, began, first, second), np.array([0, 2, 3])
     rows, leaves = [0, 2, 3], [theta[row].clone().requires_grad_() for row in (0, 3)]
     optimisers = [torch.optim.AdamW([leaf], rates[2 * i], weight_decay=0.3) for i, leaf in enumerate(leaves)]
     for step in range(1, 5):
@@ -204,13 +202,14 @@ def test_an_optimiser_step_is_that_of_torch(numba: bool, monkeypatch: pytest.Mon
             optimiser.step()
         gradient[1, step] = torch.inf if step % 2 else torch.nan
         losses = torch.ones(3, dtype=torch.float64)
-        found = advance(theta, gradient, began, first, second, losses, rows, step, rates, schedule)
+        found = advance(state, gradient, losses, indices, step, rates, schedule)
         assert found.tolist() == [True, False, True]
     torch.testing.assert_close(theta[[0, 3]], torch.stack(leaves).detach(), rtol=1e-10, atol=1e-12)
     assert torch.equal(theta[[1, 2, 4]], start[[1, 2, 4]])
     assert not first[[1, 2, 4]].any()
     still, lost = theta.clone(), torch.tensor([torch.inf], dtype=torch.float64)
-    assert not advance(theta, torch.zeros(1, 50).double(), began, first, second, lost, [3], 5, [0.1], schedule).any()
+    nothing = torch.zeros(1, 50).double()
+    assert not advance(state, nothing, lost, np.array([3]), 5, np.array([0.1]), schedule).any()
     assert torch.equal(theta, still)
 
 
@@ -233,7 +232,7 @@ def test_descent_is_that_of_torch() -> None:
         assert taken.tolist() == [True, False, True]
         for row, net in leaves.items():
             gnss, velocity, truth = (part[:, row].transpose(0, 1) for part in data[:3])
-            loss = (net.reference(gnss, velocity, data.x0[row], 0.1) - truth).square().sum(-1).mean()
+            loss = (Recurrent.forward(net, gnss, velocity, data.x0[row], 0.1) - truth).square().sum(-1).mean()
             torch.testing.assert_close(losses[row], loss.detach(), rtol=1e-10, atol=1e-12)
             weights, began = torch.nn.utils.parameters_to_vector(net.parameters()), started[(0, 1, 3)[row]]
             optimisers[row].zero_grad()
@@ -276,35 +275,12 @@ def test_what_does_not_fit_is_named() -> None:
     data, net = batch(1, 2, 5), GainNet(2, 1)
     theta = flatten([net])
     with pytest.raises(InputError, match="theta"):
-        engine.rollout(theta[:, :-1], net, data.gnss, data.velocity, data.x0, 0.1)
+        net.rollout(theta[:, :-1], data.gnss, data.velocity, data.x0, 0.1)
     with pytest.raises(InputError, match="theta"):
-        engine.rollout(theta.half(), net, data.gnss, data.velocity, data.x0, 0.1)
+        net.rollout(theta.half(), data.gnss, data.velocity, data.x0, 0.1)
     with pytest.raises(InputError, match="velocity"):
-        engine.rollout(theta, net, data.gnss, data.velocity[1:], data.x0, 0.1)
+        net.rollout(theta, data.gnss, data.velocity[1:], data.x0, 0.1)
     with pytest.raises(InputError, match="truth"):
         net.loss_and_gradient(theta, data._replace(truth=data.truth[1:]))
     with pytest.raises(InputError, match="dt"):
-        engine.rollout(theta, net, data.gnss, data.velocity, data.x0, torch.ones(4))
-
-
-def test_without_numba_plain_torch_serves_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    nets, data = [GainNet(2, 1, seed=s).double() for s in range(2)], batch(2, 2, 8, gaps=0.2)
-    theta = flatten(nets)
-    expected = nets[0].loss_and_gradient(theta, data)
-    monkeypatch.setitem(sys.modules, "numba", None)
-    numba_is_there.cache_clear()
-    try:
-        with pytest.warns(UserWarning, match=r"pip install 'coopoc\[fast\]'"):
-            found = nets[0].loss_and_gradient(theta, data)
-        again = nets[0].loss_and_gradient(theta, data)
-    finally:
-        numba_is_there.cache_clear()
-    for one, two, three in zip(expected, found, again, strict=True):
-        torch.testing.assert_close(one, two, rtol=1e-8, atol=1e-12)
-        assert torch.equal(two, three)
-
-
-def test_importing_the_package_imports_no_numba() -> None:
-    code = "import sys, coopoc, coopoc.learned; print('numba' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+        net.rollout(theta, data.gnss, data.velocity, data.x0, torch.ones(4))

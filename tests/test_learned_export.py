@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 import torch
 
-from coopoc import V2X, InputError, Sensors, load, observe
+from coopoc import V2X, InputError, Sensors, load_fleet, observe
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import MissingLibraryError
-from coopoc.learned import GainNet, OptimisedKF, checkpoint
+from coopoc.learned import GainNet, LearnedGain, OptimisedKF, checkpoint
 from coopoc.learned.export import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx, to_torchscript
+from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.recipes import WEIGHTS
-from coopoc.learned.stream import gain_stream
 
 pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # of torch.jit.load
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
@@ -69,7 +69,7 @@ def test_a_whole_drive_has_the_error_of_the_net(
     kind: str, shipped: checkpoint.Checkpoint, request: pytest.FixtureRequest
 ) -> None:
     """900 steps of four vehicles and two runs as eight lanes at once: RT-LE within 1e-4 m of torch's own steps."""
-    fleet = load("town10").select([0, 12, 24, 36])
+    fleet = load_fleet("town10").select([0, 12, 24, 36])
     seen = observe(fleet, Sensors.paper_scenario2(), V2X(max_neighbours=0), runs=2)
     net, origin = shipped.model, np.tile(fleet.position[0], (2, 1))
     assert isinstance(net, GainNet)
@@ -77,11 +77,14 @@ def test_a_whole_drive_has_the_error_of_the_net(
     found = rolled(steps(request.getfixturevalue(kind)), net, gnss - origin, velocity, seen.dt) + origin
     near, speed = (torch.tensor(a, dtype=torch.float32).transpose(0, 1) for a in (gnss - origin, velocity))
     with torch.no_grad():
-        own = net.reference(near[:, 1:], speed[:, 1:], near[:, 0], seen.dt).transpose(0, 1).double().numpy() + origin
+        own = (
+            Recurrent.forward(net, near[:, 1:], speed[:, 1:], near[:, 0], seen.dt).transpose(0, 1).double().numpy()
+            + origin
+        )
     truth = np.concatenate([fleet.position, fleet.position], axis=1)
     score = [np.sqrt(np.mean(((x - truth[1:]) ** 2).sum(-1), axis=0)) for x in (found[1:], own)]
     np.testing.assert_allclose(score[0], score[1], atol=1e-4)
-    stream, alone = gain_stream(net), []
+    stream, alone = LearnedGain(net).start(), []
     for t in range(900):
         alone.append(stream.step(seen.gnss[1, t, 2], seen.velocity[1, t, 2], seen.dt)[0])
     assert np.sqrt(np.mean(((np.array(alone)[1:] - truth[1:, 6]) ** 2).sum(-1))) == pytest.approx(score[0][6], abs=1e-4)
@@ -118,8 +121,9 @@ def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(InputError, match="export = differs by nan"):
         agree(net, lambda arrays: [np.full_like(a, np.nan) for a in good(arrays)])
     other = steps(to_torchscript(GainNet(2, 1, seed=1), tmp_path / "other.pt"))
-    monkeypatch.setattr(torch.jit, "load", lambda part: lambda *given: [torch.from_numpy(a) for a in other(
-        [a.numpy() for a in given])])  # fmt: skip
+    monkeypatch.setattr(
+        torch.jit, "load", lambda part: lambda *given: [torch.from_numpy(a) for a in other([a.numpy() for a in given])]
+    )
     with pytest.raises(InputError, match="export"):
         to_torchscript(net, tmp_path / "bad.pt")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["good.pt", "other.pt"]
@@ -170,8 +174,9 @@ def test_the_documented_program_needs_onnxruntime_and_numpy_only(file: Path, tmp
     (tmp_path / "fedkalmannet.onnx").write_bytes(file.read_bytes())
     ban = "import sys\nfor name in ('torch', 'coopoc', 'onnx'):\n    sys.modules[name] = None\n"
     (tmp_path / "run.py").write_text(ban + block)
-    out = subprocess.run([sys.executable, "-W", "error", "run.py"], cwd=tmp_path, capture_output=True, text=True,
-                         check=True).stdout  # fmt: skip
+    out = subprocess.run(
+        [sys.executable, "-W", "error", "run.py"], cwd=tmp_path, capture_output=True, text=True, check=True
+    ).stdout
     x = np.array([float(word) for word in re.findall(r"-?\d+\.\d+", out)])
     assert x.shape == (3,)
     assert np.linalg.norm(x - [1090.0, 2000.0, 0.0]) < 3.0, "it drove 10 s at 9 m/s"

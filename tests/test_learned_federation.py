@@ -12,14 +12,16 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
-from coopoc import Fleet, InputError, Sensors, load
+from coopoc import Fleet, InputError, Sensors, load_fleet
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.compression import Compression, Float16, Quantised, TopK
-from coopoc.learned.federation.federated import Federation, adapt, federate_many, ledger, local_fit
+from coopoc.learned.federation.federated import federate_many
+from coopoc.learned.federation.history import Federation, ledger
+from coopoc.learned.federation.local import adapt, local_fit
 from coopoc.learned.federation.means import FedProx
-from coopoc.learned.federation.participation import Participation, Poison, moved, unlike
-from coopoc.learned.federation.robust_rules import MultiKrum
+from coopoc.learned.federation.participation import Byzantine, Participation, heterogeneous, poisoned
+from coopoc.learned.federation.robust import Krum
 from coopoc.learned.federation.rule import Rule
 from coopoc.learned.federation.server import SERVER, Group, Standing
 from coopoc.learned.federation.topology import (
@@ -133,8 +135,9 @@ def test_a_client_alone_is_its_row_of_the_stack(four: tuple[Client, ...], share:
 
 def test_a_client_alone_says_why_it_broke(four: tuple[Client, ...]) -> None:
     broken = replace(four[0].training, gnss=torch.full_like(four[0].training.gnss, torch.nan))
-    weights, loss, reason = local_fit(Steady(), flatten([Steady()])[0], replace(four[0], training=broken), 0, 1, 2,
-                                      Schedule(epochs=1, epoch="pass"))  # fmt: skip
+    weights, loss, reason = local_fit(
+        Steady(), flatten([Steady()])[0], replace(four[0], training=broken), 0, 1, 2, Schedule(epochs=1, epoch="pass")
+    )
     assert torch.equal(weights, torch.full((3,), 0.3))
     assert np.isnan(loss)
     assert reason == "loss or gradient not finite at step 1"
@@ -162,8 +165,10 @@ def test_the_proximal_term_is_that_of_fedprox(four: tuple[Client, ...]) -> None:
 
 def test_fedprox_keeps_clients_near(four: tuple[Client, ...]) -> None:
     """The rule sets the term by itself, as the schedule would."""
-    step = [float((trained(four, 1, aggregate=rule).history[1].weights - 0.3).norm())
-            for rule in ("mean", FedProx(1.0), FedProx(1e3))]  # fmt: skip
+    step = [
+        float((trained(four, 1, aggregate=rule).history[1].weights - 0.3).norm())
+        for rule in ("mean", FedProx(1.0), FedProx(1e3))
+    ]
     assert step[0] >= step[1] > step[2]
     by_schedule = trained(four, 1, schedule=Schedule(learning_rate=0.02, proximal=1.0))
     assert torch.equal(by_schedule.history[1].weights, trained(four, 1, aggregate=FedProx(1.0)).history[1].weights)
@@ -203,7 +208,7 @@ def test_a_round_with_nobody_changes_nothing(four: tuple[Client, ...]) -> None:
     for topology in (None, Ring()):
         fed = trained(four, 2, participation=Participation(dropout=1.0), topology=topology)
         assert all(torch.equal(row.weights, fed.history[0].weights) for row in fed.history)
-        assert fed.history[1].note == "nobody answered: the weights stay"
+        assert fed.history[1].note == "no client answered: weights unchanged"
         assert fed.best.number == 0
         assert fed.history[1].sent_bytes == 0
 
@@ -252,6 +257,7 @@ def test_bad_answers_are_rejected_and_training_goes_on(number: int, faults: dict
 
 def test_a_client_that_was_never_heard_does_not_choose_the_weights(four: tuple[Client, ...]) -> None:
     """Its pieces are not finite, so that its loss is infinite in every round; the others' best round is kept."""
+
     def without_fixes(pieces: Any) -> Any:
         return replace(pieces, gnss=torch.full_like(pieces.gnss, torch.nan))
 
@@ -273,7 +279,9 @@ def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None
     group = clients(drives(5), piece=10)
     fed = trained(group, 6, aggregate="krum", participation=Participation(dropout=0.3), seed=1)
     stayed = [row for row in fed.history[1:] if row.note]
-    assert {row.note[1:] for row in stayed} == {" answers count, Krum(byzantine=1) takes at least 5: the weights stay"}
+    assert {row.note[1:] for row in stayed} == {
+        " answers accepted, Krum(byzantine=1, keep=1) takes at least 5: weights unchanged"
+    }
     assert len(stayed) < 6
     for before, row in zip(fed.history, fed.history[1:], strict=False):
         assert torch.equal(before.weights, row.weights) == (row.note != "")
@@ -282,11 +290,11 @@ def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"aggregate": "krum"}, r"Krum\(byzantine=1\) with 4 clients a round: takes at least 5"),
-        ({"aggregate": MultiKrum(0, keep=3), "participation": Participation(0.5)}, "with 2 clients a round"),
+        ({"aggregate": "krum"}, r"Krum\(byzantine=1, keep=1\) with 4 clients a round: takes at least 5"),
+        ({"aggregate": Krum(0, keep=3), "participation": Participation(0.5)}, "with 2 clients a round"),
         ({"topology": Ring(), "aggregate": "median"}, "aggregate = median"),
         ({"topology": Ring(), "compression": Float16()}, "compression = Float16"),
-        ({"topology": Pairs((("c0", "c1"),))}, r"without a way from c0 to \['c2', 'c3'\]"),
+        ({"topology": Pairs((("c0", "c1"),))}, r"without a path from c0 to \['c2', 'c3'\]"),
         ({"topology": Pairs((("c0", "x"),))}, "pairs = "),
         ({"topology": V2XGraph(drives(2), 1e9)}, "vehicle = 'c2'"),
         ({"rounds": 0}, "rounds = 0"),
@@ -318,9 +326,7 @@ def test_participation_refuses_what_cannot_be(field: str, options: dict[str, flo
     ("compression", "size"),
     [(None, 12), (Float16(), 6), (TopK(0.4), 12), (Quantised(5), 6)],
 )
-def test_the_ledger_counts_every_byte(
-    four: tuple[Client, ...], compression: Compression | None, size: int
-) -> None:
+def test_the_ledger_counts_every_byte(four: tuple[Client, ...], compression: Compression | None, size: int) -> None:
     """Three weights and one loss up, three weights down, per round; who drops out has received and not sent."""
     fed = trained(four, 3, compression=compression, participation=Participation(dropout=0.4), seed=1)
     told, air = ledger(fed), ledger(fed, overhead=100)
@@ -358,9 +364,9 @@ class Clipped:
         assert updates.shape == (len(names), 3)
         return updates * torch.clamp(self.norm / updates.norm(dim=1, keepdim=True), max=1.0)
 
-    def check(self, rule: str | Rule) -> None:
+    def check(self, rule: Rule) -> None:
         """Uniform weights only."""
-        if rule != "uniform":
+        if rule.mean_by != "uniform":
             raise InputError("aggregate", rule, 'must be "uniform" with clipping', "Take uniform.")
 
 
@@ -448,7 +454,7 @@ def test_whoever_is_absent_keeps_its_weights(four: tuple[Client, ...]) -> None:
 
 def test_the_training_fleet_is_a_connected_graph_within_the_papers_radius() -> None:
     """Against distances taken pair by pair."""
-    fleet = load("town10-clients")
+    fleet = load_fleet("town10-clients")
     links = connected(V2XGraph(fleet, 30.0), fleet.ids)
     for i, j in ((0, 1), (1, 2), (2, 3), (0, 3), (0, 2)):
         gap = np.linalg.norm(fleet.position[:, i] - fleet.position[:, j], axis=-1)
@@ -459,29 +465,36 @@ def test_clients_may_differ_in_sensors_and_in_amount() -> None:
     """Each has the noise of its own sensors, its keyed draws, and its part of the pieces."""
     fleet = drives(3, 2100)
     good, poor = Sensors(gnss_std=(0.5, 0.5, 0.5)), Sensors(gnss_std=(4, 4, 4), velocity_std_ratio=0.2)
-    found = unlike(fleet, [good, poor, good], [1.0, 0.5, 0.25], piece=20, seed=6)
+    found = heterogeneous(fleet, [good, poor, good], [1.0, 0.5, 0.25], piece=20, seed=6)
     whole = clients(fleet, poor, piece=20, seed=6)
     assert [len(c.training) for c in found] == [80, 40, 20]
     assert torch.equal(found[1].training.gnss, whole[1].training.gnss[:40])
     assert torch.equal(found[1].long.gnss, whole[1].long.gnss)
     for client, std in zip(found, (0.5, 4.0, 0.5), strict=True):
         assert float((client.training.gnss - client.training.truth).std()) == pytest.approx(std, rel=0.1)
-    for field, sensors, shares in (("sensors", [good], [1, 1, 1]), ("shares", [good] * 3, [1, 1]),
-                                   ("shares", [good] * 3, [1, 1, 0])):  # fmt: skip
+    for field, sensors, shares in (
+        ("sensors", [good], [1, 1, 1]),
+        ("shares", [good] * 3, [1, 1]),
+        ("shares", [good] * 3, [1, 1, 0]),
+    ):
         with pytest.raises(InputError, match=field):
-            unlike(fleet, sensors, shares, piece=20)
+            heterogeneous(fleet, sensors, shares, piece=20)
 
 
 def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
     """A moved truth moves the client's minimum by as much; a turned update is the mirror image of the honest one."""
-    shifted = moved(four[0], 10.0)
-    torch.testing.assert_close(shifted.training.truth - four[0].training.truth,
-                               torch.full_like(shifted.training.truth, 10.0), rtol=0, atol=1e-5)  # fmt: skip
+    shifted = poisoned(four[0], 10.0)
+    torch.testing.assert_close(
+        shifted.training.truth - four[0].training.truth,
+        torch.full_like(shifted.training.truth, 10.0),
+        rtol=0,
+        atol=1e-5,
+    )
     assert torch.equal(shifted.training.gnss, four[0].training.gnss)
-    honest, liar = trained(four[:1], 1), trained(four[:1], 1, participation=Poison(who=("c0",), scale=-1.0))
+    honest, liar = trained(four[:1], 1), trained(four[:1], 1, participation=Byzantine(names=("c0",), scale=-1.0))
     torch.testing.assert_close(liar.history[1].weights - 0.3, 0.3 - honest.history[1].weights)
-    hurt = trained(four, 6, participation=Poison(who=("c0",), scale=-20.0))
-    kept = trained(four, 6, participation=Poison(who=("c0",), scale=-20.0), aggregate="median")
+    hurt = trained(four, 6, participation=Byzantine(names=("c0",), scale=-20.0))
+    kept = trained(four, 6, participation=Byzantine(names=("c0",), scale=-20.0), aggregate="median")
     assert not hurt.history[-1].rejected
     losses = [fed.validation_loss(fed.history[-1]) for fed in (kept, hurt)]
     assert losses[0] < losses[1]
@@ -502,7 +515,7 @@ def test_a_net_is_federated_the_same_way(aggregate: str) -> None:
 @pytest.mark.parametrize("noise", ["static", "fresh", "wide"])
 def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
     """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses on one draw."""
-    group = unlike(drives(3), [Sensors()] * 3, [1.0, 0.5, 0.2], piece=10, noise=noise)
+    group = heterogeneous(drives(3), [Sensors()] * 3, [1.0, 0.5, 0.2], piece=10, noise=noise)
     kinds, theta = [[c.training for c in group], [c.long for c in group]], torch.tensor([[0.2], [0.4], [0.6]])
     theta = theta.repeat(1, 3)
     together = Judge(kinds, Steady())(theta)

@@ -27,9 +27,10 @@ import torch
 from coopoc import V2X, Fleet, observe
 from coopoc.data.table import write_table
 from coopoc.learned import federate, load
-from coopoc.learned.federation.federated import Federation, local_fit
-from coopoc.learned.flower.job import data, job_of, local, net
-from coopoc.learned.recipes import Job, sensors
+from coopoc.learned.federation.history import Federation
+from coopoc.learned.federation.local import local_fit
+from coopoc.learned.flower.job import job_of, local
+from coopoc.learned.recipes import Job, job_clients, sensors, untrained
 
 ROOT = Path(__file__).resolve().parents[1]
 TINY = {"local-epochs": 1, "piece": 10, "net-in-mult": 2, "net-out-mult": 1}
@@ -38,7 +39,7 @@ LEAK = """
 from flwr.app import ArrayRecord, ConfigRecord
 from flwr.clientapp import ClientApp
 
-from coopoc import load
+from coopoc import load_fleet
 from coopoc.learned.flower import client_app, server_app
 from coopoc.learned.flower.client import configured
 
@@ -56,7 +57,7 @@ def evaluate(message, context):
 def train(message, context):
     reply = honest(message, context)
     own, _ = configured(context)
-    there = load(context.node_config["data"]).position[:, 0]
+    there = load_fleet(context.node_config["data"]).position[:, 0]
     reply.content["drive"] = ArrayRecord([there, there.astype("f4"), own.training.gnss.numpy()])
     reply.content["words"] = ConfigRecord({"drive": str(there.round(3).tolist())})
     return reply
@@ -138,21 +139,24 @@ def until(true: Callable[[], bool], seconds: float = 300, alive: subprocess.Pope
 
 def whole(job: Job, fleet: Fleet) -> Federation:
     """The federation in this process."""
-    recipe, seed, own = job.recipe, job.setting.seed, data(job, fleet)
-    return federate(net(job), own, recipe.rounds, recipe.aggregate, recipe.local_epochs, seed, recipe.schedule)
+    recipe, seed, own = job.recipe, job.setting.seed, job_clients(job, fleet)
+    return federate(untrained(job), own, recipe.rounds, recipe.aggregate, recipe.local_epochs, seed, recipe.schedule)
 
 
 def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
     """The card of a checkpoint whose weights are, round by round, NumPy's average of what those who counted made, and
     those of `federate`, bit by bit, as long as nobody is missing."""
     recipe, seed, expected, found = job.recipe, job.setting.seed, whole(job, fleet), load(path)
-    own = data(job, fleet)
+    own = job_clients(job, fleet)
     assert found.history is not None
     missing = False
     for row, theta, before in zip(found.card["history"][1:], found.history[1:], found.history[:-1], strict=True):
         gone = row["absent"].keys() | row["rejected"].keys()
-        made = [local_fit(net(job), before, client, seed, row["round"], recipe.rounds, local(job))[0].numpy()
-                for client in own if client.name not in gone]  # fmt: skip
+        made = [
+            local_fit(untrained(job), before, client, seed, row["round"], recipe.rounds, local(job))[0].numpy()
+            for client in own
+            if client.name not in gone
+        ]
         sizes = [len(client.training) for client in own if client.name not in gone]
         assert theta.numpy() == pytest.approx(np.average(np.stack(made).astype(float), axis=0, weights=sizes), abs=1e-6)
         missing |= bool(gone)
@@ -181,6 +185,37 @@ def test_the_script_survives_the_death_of_a_node(tmp_path: Path, mark: str) -> N
     assert len(re.findall(r"^ +\d ", done.stdout, flags=re.MULTILINE)) == 4
 
 
+def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path: Path, mark: str) -> None:
+    """Krum needs five clients: the ServerApp raises, and the exit status is not zero."""
+    write_table(drives(1), tmp_path / "one.parquet")
+    command = script(tmp_path / "site", "--data", tmp_path / "one.parquet", "--change", f"aggregate=krum {CHANGE}")
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode != 0
+    assert "the run failed" in done.stderr
+    assert "must be >= 5 for Krum" in (tmp_path / "site" / "run.log").read_text()
+
+
+def test_a_killed_superlink_continues_after_its_last_round(tmp_path: Path, mark: str, example: Any) -> None:
+    """SIGKILL of the SuperLink and all that it started, after round 1; new ones end at the weights of `federate`."""
+    fleet, out = drives(2), tmp_path / "fedkalmannet.safetensors"
+    words = [f'change="rounds=3 {CHANGE}"', "nodes=2", f'out="{out}"']
+    with example.deployment(tmp_path / "first", tls=False) as site:
+        example.join(site, each(fleet))
+        run = example.submit(site, words)
+        until(lambda: "round 1:" in example.log(site, "run"), alive=run)
+        for pid in example.family(site.started[:1]):
+            os.kill(pid, signal.SIGKILL)
+    done = len(load(out).card["history"])
+    assert 2 <= done <= 4
+    assert out.with_name(f"{out.name}.progress").exists()
+    with example.deployment(tmp_path / "second", tls=False) as site:
+        example.join(site, each(fleet))
+        example.finished(example.submit(site, words), "flwr run")
+        example.completed(site)
+    card = checked(out, job_of({"recipe": "fedkalmannet", "rounds": 3, **TINY}), fleet)
+    assert [row["round"] for row in card["history"]] == [0, 1, 2, 3]
+
+
 def test_the_script_stops_everything_on_ctrl_c(tmp_path: Path, mark: str) -> None:
     with subprocess.Popen(script(tmp_path), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         until(lambda: (tmp_path / "node-4.log").exists())
@@ -202,10 +237,16 @@ def test_only_registered_keys_over_tls_come_in(tmp_path: Path, mark: str, exampl
         example.certificates(others["misled"])
         authority = ["--root-certificates", str(tmp_path / "ca.pem")]
         who = {
-            "stranger": example.identity(site, others["stranger"]), "keyless": authority, "plain": ["--insecure"],
-            "misled": ["--root-certificates", str(others["misled"] / "ca.pem"), "--auth-supernode-private-key",
-                       str(others["misled"] / "key")],
-        }  # fmt: skip
+            "stranger": example.identity(site, others["stranger"]),
+            "keyless": authority,
+            "plain": ["--insecure"],
+            "misled": [
+                "--root-certificates",
+                str(others["misled"] / "ca.pem"),
+                "--auth-supernode-private-key",
+                str(others["misled"] / "key"),
+            ],
+        }
         refused = {name: example.supernode(site, name, options) for name, options in who.items()}
         out = tmp_path / "fedkalmannet.safetensors"
         run = example.submit(site, [f'change="rounds=2 {CHANGE}"', "nodes=2", f'out="{out}"'])
@@ -223,7 +264,7 @@ def test_only_registered_keys_over_tls_come_in(tmp_path: Path, mark: str, exampl
 def test_the_search_finds_a_drive_in_any_form(kind: str, audit: Any) -> None:
     job, noise = job_of({"recipe": "fedkalmannet", **TINY}), np.random.default_rng(0).bytes(10_001)
     drive = audit.moved(drives(1))
-    (own,) = data(job, drive)
+    (own,) = job_clients(job, drive)
     secret, there = audit.Secret.of(own), drive.position[40:43, 0]
     assert secret.found(noise) == set()
     assert secret.found(noise + there.astype(kind).tobytes() + noise) == {kind}
@@ -242,10 +283,14 @@ def test_no_drive_leaves_its_client(tmp_path: Path, mark: str, example: Any, aud
     if not readable:
         pytest.skip("the memory of other processes cannot be read here: kernel.yama.ptrace_scope")
     strange, plain = audit.moved(drives(1)), drives(2).select(["c1"])
-    both = Fleet(("c0", "c1"), plain.t, np.concatenate([strange.position, plain.position], 1),
-                 np.concatenate([strange.velocity, plain.velocity], 1))  # fmt: skip
+    both = Fleet(
+        ("c0", "c1"),
+        plain.t,
+        np.concatenate([strange.position, plain.position], 1),
+        np.concatenate([strange.velocity, plain.velocity], 1),
+    )
     job = job_of({"recipe": "fedkalmannet", "rounds": 1, **TINY})
-    secret, leaky = audit.Secret.of(data(job, strange)[0]), tmp_path / "leaky"
+    secret, leaky = audit.Secret.of(job_clients(job, strange)[0]), tmp_path / "leaky"
     leaky.mkdir()
     (leaky / "pyproject.toml").write_text((example.APP / "pyproject.toml").read_text())
     (leaky / "apps.py").write_text(LEAK)

@@ -26,14 +26,21 @@ from flwr.serverapp import Grid, ServerApp
 from flwr.supercore.task_identity import TaskIdentity
 
 from coopoc.learned import clients, federate
-from coopoc.learned.flower.job import job_of, net
+from coopoc.learned.flower.job import job_of
 from coopoc.learned.flower.privacy import secure_client_app, secure_server_app
 from coopoc.learned.flower.simulation import partition
 from coopoc.learned.privacy.differential import Privacy
-from coopoc.learned.recipes import sensors
+from coopoc.learned.recipes import sensors, untrained
 
-TINY = {"recipe": "fedkalmannet", "rounds": 2, "local-epochs": 1, "net-in-mult": 2, "net-out-mult": 1, "piece": 10,
-        "batch": 4}  # fmt: skip
+TINY = {
+    "recipe": "fedkalmannet",
+    "rounds": 2,
+    "local-epochs": 1,
+    "net-in-mult": 2,
+    "net-out-mult": 1,
+    "piece": 10,
+    "batch": 4,
+}
 LENGTHS = (60, 90, 130, 70)
 
 
@@ -90,8 +97,8 @@ def led(app: ServerApp, grid: Grid) -> None:
 
 @pytest.mark.parametrize("aggregate", ["mean", "fedavgm", "private"])
 def test_secagg_plus_gives_the_weights_of_federate(aggregate: str) -> None:
-    """Weighted mean, momentum at the server, and clipped and noised updates: to the fixed point's 1e-6."""
-    privacy = Privacy(0.05, 1.0, clients=4) if aggregate == "private" else None
+    """Weighted mean, momentum at the server, and clipped updates: to the fixed point's 1e-6."""
+    privacy = Privacy(0.05, 0.0, clients=4, keyed=False) if aggregate == "private" else None
     rule = "uniform" if privacy else aggregate
     job, drives, found = job_of(TINY | {"aggregate": rule}), fleet(), dict[int, torch.Tensor]()
     group = clients(drives, sensors(job.setting), seed=job.setting.seed, piece=10)
@@ -99,11 +106,23 @@ def test_secagg_plus_gives_the_weights_of_federate(aggregate: str) -> None:
     grid = Local(secure_client_app(partial(partition, fleet=drives, job=job), privacy), 4)
     led(secure_server_app(job, 4, found.__setitem__, largest), grid)
     recipe = job.recipe
-    ours = federate(net(job), group, 2, rule, 1, job.setting.seed, recipe.schedule, privacy=privacy)
+    ours = federate(untrained(job), group, 2, rule, 1, job.setting.seed, recipe.schedule, privacy=privacy)
     assert sorted(found) == [1, 2]
     for number, theta in found.items():
         torch.testing.assert_close(theta, ours.history[number].weights, rtol=0, atol=1e-6)
     assert float((found[2] - ours.history[0].weights).norm()) > 0.01
+
+
+def test_deployed_noise_is_secret_and_of_the_promised_size() -> None:
+    """Two runs differ; each round's mean is the clipped one plus noise of standard deviation z S / C."""
+    job, drives, found = job_of(TINY | {"aggregate": "uniform", "rounds": 1}), fleet(), list[torch.Tensor]()
+    for z in (0.0, 1.0, 1.0):
+        privacy = Privacy(0.05, z, clients=4, keyed=False)
+        grid = Local(secure_client_app(partial(partition, fleet=drives, job=job), privacy), 4)
+        led(secure_server_app(job, 4, lambda number, theta: found.append(theta)), grid)
+    noise = [(theta - found[0]).numpy() / (0.05 / 4) for theta in found[1:]]
+    assert all(stats.kstest(n, "norm").pvalue > 1e-6 for n in noise)
+    assert abs(np.corrcoef(*noise)[0, 1]) < 6 / np.sqrt(len(noise[0]))
 
 
 def test_what_a_client_sends_is_masked() -> None:
@@ -113,11 +132,15 @@ def test_what_a_client_sends_is_masked() -> None:
     led(secure_server_app(job, 4, lambda number, theta: None, 12), grid)
     arrays = [array for m in grid.heard for record in m.content.array_records.values() for array in record.values()]
     assert not arrays
-    sent = [record[Key.MASKED_PARAMETERS] for m in grid.heard for record in m.content.config_records.values()
-            if Key.MASKED_PARAMETERS in record]  # fmt: skip
+    sent = [
+        record[Key.MASKED_PARAMETERS]
+        for m in grid.heard
+        for record in m.content.config_records.values()
+        if Key.MASKED_PARAMETERS in record
+    ]
     words = [np.load(BytesIO(data)).ravel() for parts in sent for data in parts]
     weights = [w / 2.0**32 for w in words if w.size > 1]
-    assert [w.size for w in weights] == [sum(p.numel() for p in net(job).parameters())] * 4
+    assert [w.size for w in weights] == [sum(p.numel() for p in untrained(job).parameters())] * 4
     assert all(stats.kstest(w, "uniform").pvalue > 1e-7 for w in weights)
     assert {w.dtype for w in words} == {np.dtype(np.int64)}  # twice the bytes of a float32
 
@@ -137,7 +160,7 @@ def test_a_client_that_is_gone_is_left_out() -> None:
     grid = Local(secure_client_app(partial(partition, fleet=drives, job=job)), 4, silent=(2, 2))
     led(secure_server_app(job, 4, found.__setitem__), grid)
     group = clients(drives.select([0, 2, 3]), sensors(job.setting), seed=job.setting.seed, piece=10)
-    ours = federate(net(job), group, 1, "uniform", 1, job.setting.seed, job.recipe.schedule)
+    ours = federate(untrained(job), group, 1, "uniform", 1, job.setting.seed, job.recipe.schedule)
     torch.testing.assert_close(found[1], ours.history[1].weights, rtol=0, atol=1e-6)
 
 
@@ -147,4 +170,6 @@ def test_what_cannot_be_is_named() -> None:
     with pytest.raises(InputError, match="aggregate"):
         secure_server_app(job_of(TINY | {"aggregate": "median"}), 4, lambda number, theta: None)
     with pytest.raises(InputError, match="clients = None"):
-        secure_client_app(privacy=Privacy(1.0, 1.0))
+        secure_client_app(privacy=Privacy(1.0, 1.0, keyed=False))
+    with pytest.raises(InputError, match="keyed = True: must be False in a deployment"):
+        secure_client_app(privacy=Privacy(1.0, 1.0, clients=4))

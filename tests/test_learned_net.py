@@ -12,6 +12,7 @@ from torch import nn
 from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.learned.method import DIVERGED
+from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core
 from coopoc.methods.track import Method
@@ -92,7 +93,7 @@ def test_wiring_and_features_as_published() -> None:
     net, data = GainNet(start_gain=None, seed=3).double(), batch(1, 4, 12)
     gnss, velocity = data.gnss[:, 0].transpose(0, 1), data.velocity[:, 0].transpose(0, 1)
     expected = Published(net)(gnss, velocity, data.x0[0], 0.1)
-    for found in (net(gnss, velocity, data.x0[0], 0.1), net.reference(gnss, velocity, data.x0[0], 0.1)):
+    for found in (net(gnss, velocity, data.x0[0], 0.1), Recurrent.forward(net, gnss, velocity, data.x0[0], 0.1)):
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 

@@ -10,7 +10,7 @@ from filterpy.kalman import KalmanFilter
 
 from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.evaluate.metrics import nees
-from coopoc.learned import OptimisedKF, Pieces, clients, fit_okf
+from coopoc.learned import OptimisedKF, Segments, clients, fit_okf
 from coopoc.learned.training.okf_fit import _stacked, fit_okf_many
 
 
@@ -98,7 +98,7 @@ def test_padding_does_not_weigh() -> None:
     (client,) = clients(walk(900), Sensors(), piece=20)
     few, many = client.training.take(range(3)), client.training
     alone = fit_okf(few, few, steps=5).validation_loss
-    stacked = fit_okf_many([(few, few), (many, Pieces.join([few, few]))], steps=5)
+    stacked = fit_okf_many([(few, few), (many, Segments.join([few, few]))], steps=5)
     np.testing.assert_allclose(stacked[0].validation_loss, alone, rtol=1e-10)
     np.testing.assert_allclose(stacked[1].validation_loss[0], alone[0], rtol=1e-10)
 

@@ -1,4 +1,4 @@
-"""Privacy against closed forms, integrals and an audit; masks against RFC vectors; the probe against scipy."""
+"""Privacy against closed forms, integrals and an audit; masks against RFC vectors; attacks against scipy."""
 
 from __future__ import annotations
 
@@ -19,16 +19,22 @@ from scipy.optimize import brentq
 
 from coopoc import Fleet, InputError
 from coopoc.errors import MissingLibraryError
-from coopoc.learned import Client, GainNet, Pieces, Schedule, clients, federate
+from coopoc.learned import Client, GainNet, Schedule, Segments, clients, federate
 from coopoc.learned.federation.aggregate import rule
 from coopoc.learned.federation.means import mean
 from coopoc.learned.federation.server_rules import FedAvgM
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.privacy import masks
-from coopoc.learned.privacy.differential import Privacy, ceiling, epsilon, noise_for
-from coopoc.learned.privacy.masks import RESOLUTION, decode, encode, pair_seed, public, stretched
-from coopoc.learned.privacy.probe import Verdict, gradient_scores, loss_scores, renoised, verdict
-from coopoc.learned.privacy.secure import SHARE, STAGES, Party, SecureMean, secure_sum, traffic, unmask
+from coopoc.learned.privacy.differential import Privacy, auc_bound, epsilon, noise_for
+from coopoc.learned.privacy.masks import RESOLUTION, decode, encode, pair_seed, prg, public_key
+from coopoc.learned.privacy.membership_inference import (
+    AttackResult,
+    gradient_scores,
+    loss_scores,
+    membership_inference,
+    renoised,
+)
+from coopoc.learned.privacy.secure import SHARE, STAGES, Party, SecureAggregation, secure_sum, traffic, unmask
 from coopoc.learned.privacy.shamir import PRIME, join, split
 
 DELTA = 1e-5
@@ -46,7 +52,7 @@ def small() -> GainNet:
     return GainNet(2, 1)
 
 
-# The price
+# Epsilon
 
 
 def gaussian_delta(z: float, eps: float) -> float:
@@ -94,8 +100,8 @@ def test_the_ceiling_is_the_auc_of_the_best_attack() -> None:
     """A client's clip among the noise of T rounds, told from noise alone by their sum: the U statistic of scipy."""
     noise = np.random.default_rng(0).normal(0, 3.0, (2, 4000, 9)).sum(-1)
     found = stats.mannwhitneyu(noise[0] + 9.0, noise[1]).statistic / 4000**2
-    assert ceiling(3.0, 9) == pytest.approx(found, abs=0.015)
-    assert ceiling(0.0, 1) == 1.0
+    assert auc_bound(3.0, 9) == pytest.approx(found, abs=0.015)
+    assert auc_bound(0.0, 1) == 1.0
 
 
 def test_an_audit_stays_below_the_promise() -> None:
@@ -105,10 +111,14 @@ def test_an_audit_stays_below_the_promise() -> None:
     rounds, delta = 6_000, 1e-2
     names = ["a", "b"]
     sums = [
-        np.array([float(privacy.protect(torch.tensor([[first], [-7.0]]), names, seed, 1).sum())
-                  for seed in range(begin, begin + rounds)])
+        np.array(
+            [
+                float(privacy.protect(torch.tensor([[first], [-7.0]]), names, seed, 1).sum())
+                for seed in range(begin, begin + rounds)
+            ]
+        )
         for first, begin in ((0.0, 0), (50.0, rounds))
-    ]  # fmt: skip
+    ]
     promised = epsilon(1.0, 1, 1.0, delta)
     seen = []
     for threshold in np.linspace(-1.0, 2.0, 31):
@@ -165,14 +175,14 @@ def test_missing_clients_take_their_noise_with_them() -> None:
         ("share", lambda: epsilon(1.0, 1, 0.0)),
         ("epsilon", lambda: noise_for(0.0, 1)),
         ("aggregate", lambda: Privacy(1.0, 1.0).check("mean")),
-        ("aggregate", lambda: Privacy(1.0, 1.0).check(SecureMean("fedadam"))),
-        ("aggregate", lambda: SecureMean("median")),
+        ("aggregate", lambda: Privacy(1.0, 1.0).check(SecureAggregation("fedadam"))),
+        ("aggregate", lambda: SecureAggregation("median")),
         ("threshold", lambda: secure_sum(np.zeros((3, 2)), threshold=4)),
         ("update of client 1", lambda: secure_sum(np.array([[0.0], [np.nan], [0.0]]))),
         ("update of client 2", lambda: secure_sum(np.array([[0.0], [0.0], [-43.0]]))),
         ("threshold", lambda: split(1, 3, 4)),
-        ("members", lambda: verdict(np.array([]), np.ones(3))),
-        ("others", lambda: verdict(np.ones(3), np.array([np.nan]))),
+        ("members", lambda: membership_inference(np.array([]), np.ones(3))),
+        ("others", lambda: membership_inference(np.ones(3), np.array([np.nan]))),
     ],
 )
 def test_what_cannot_be_is_named(field: str, call: Callable[[], object]) -> None:
@@ -187,7 +197,7 @@ def test_an_absent_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cryptography.hazmat.primitives.ciphers", None)
     masks._crypto.cache_clear()
     with pytest.raises(MissingLibraryError, match=r"cryptography.*coopoc\[privacy\]"):
-        public(bytes(32))
+        public_key(bytes(32))
 
 
 def test_federate_with_privacy() -> None:
@@ -218,11 +228,11 @@ def test_keys_and_masks_are_those_of_the_standards() -> None:
     """X25519 with scalar and coordinate 9: RFC 7748, section 5.2, first iteration. ChaCha20's key stream of key, nonce
     and counter zero: RFC 8439, appendix A.1, test vector 1."""
     nine = (9).to_bytes(32, "little")
-    assert public(nine).hex() == "422c8e7a6227d7bca1350b3e2bb7279f7897b87bb6854b783c60e80311ae3079"
+    assert public_key(nine).hex() == "422c8e7a6227d7bca1350b3e2bb7279f7897b87bb6854b783c60e80311ae3079"
     stream = "76b8e0ada0f13d90405d6ae55386bd28bdd219b8a08ded1aa836efcc8b770dc7"
-    assert stretched(bytes(32), 8).astype("<u4").tobytes().hex() == stream
+    assert prg(bytes(32), 8).astype("<u4").tobytes().hex() == stream
     other = bytes(range(32))
-    assert pair_seed(nine, public(other)) == pair_seed(other, public(nine))
+    assert pair_seed(nine, public_key(other)) == pair_seed(other, public_key(nine))
 
 
 def test_fixed_point_wraps_and_returns() -> None:
@@ -296,14 +306,18 @@ def test_too_few_survivors_are_counted(stage: str, words: str) -> None:
 def played(late: int | None) -> tuple[dict[int, np.ndarray], dict[int, dict[int, int]], dict[int, Party], list[int]]:  # type: ignore[type-arg]
     """A protocol of four played by hand: uploads, what survivors reveal, the parties, and all message lengths."""
     parties = {x: Party(x, 3) for x in range(1, 5)}
-    letters = {x: party.keys() for x, party in parties.items()}
-    boxes = {x: party.shares(letters) for x, party in parties.items()}
-    uploads = {x: p.upload(encode(np.full(7000, 0.5)), letters, sorted(boxes)) for x, p in parties.items()}
+    keys = {x: party.keys() for x, party in parties.items()}
+    boxes = {x: party.shares(keys) for x, party in parties.items()}
+    uploads = {x: p.upload(encode(np.full(7000, 0.5)), keys, sorted(boxes)) for x, p in parties.items()}
     uploaded = [x for x in parties if x != late]
     mine = {x: {sender: boxes[sender][x] for sender in boxes} for x in uploaded}
-    revealed = {x: parties[x].reveal(mine[x], letters, uploaded) for x in uploaded}
-    first = [len(letters[1].mask) + len(letters[1].box), sum(len(box) for x, box in boxes[1].items() if x != 1),
-             uploads[1].nbytes, SHARE * len(revealed[1])]  # fmt: skip
+    revealed = {x: parties[x].reveal(mine[x], keys, uploaded) for x in uploaded}
+    first = [
+        len(keys[1].mask) + len(keys[1].box),
+        sum(len(box) for x, box in boxes[1].items() if x != 1),
+        uploads[1].nbytes,
+        SHARE * len(revealed[1]),
+    ]
     return uploads, revealed, parties, first
 
 
@@ -319,36 +333,36 @@ def test_a_late_upload_stays_hidden() -> None:
     """The server has declared client 2 absent and got its mask key; what then arrives is still uniform, under the own
     seed, of which the survivors' shares give nothing. The sum of the others is not disturbed."""
     uploads, revealed, parties, _ = played(late=2)
-    letters = {x: party.keys() for x, party in parties.items()}
+    keys = {x: party.keys() for x, party in parties.items()}
     shares = {x: shown[2] for x, shown in revealed.items()}
     key = join(shares).to_bytes(32)
     assert key == parties[2].mask_key
     bare = uploads[2].copy()
     for other in (1, 3, 4):
-        pair = stretched(pair_seed(key, letters[other].mask), 7000)
+        pair = prg(pair_seed(key, keys[other].mask), 7000)
         bare += np.negative(pair) if other > 2 else pair
-    np.testing.assert_array_equal(bare - stretched(parties[2].own_seed, 7000), encode(np.full(7000, 0.5)))
+    np.testing.assert_array_equal(bare - prg(parties[2].own_seed, 7000), encode(np.full(7000, 0.5)))
     assert stats.chisquare(np.bincount(bare.view(np.uint8), minlength=256)).pvalue > 1e-7
-    masks = unmask(revealed, letters, [1, 3, 4], 7000, 3)
+    masks = unmask(revealed, keys, [1, 3, 4], 7000, 3)
     total = decode(np.sum([uploads[x] for x in (1, 3, 4)], axis=0, dtype=np.uint32) - masks)
     assert total.tolist() == [1.5] * 7000
 
 
-def test_secure_mean_is_the_rule_that_it_hides() -> None:
+def test_secure_aggregation_is_the_rule_that_it_hides() -> None:
     draw = torch.Generator().manual_seed(0)
     theta, weights = torch.randn(50, generator=draw), torch.randn(5, 50, generator=draw)
     sizes, losses = torch.tensor([12, 36, 11, 11, 3]), torch.ones(5)
     for name in ("mean", "uniform", "fedprox", "fedavgm", "fedadam"):
-        ours, plain = SecureMean(name), rule(name)
+        ours, plain = SecureAggregation(name), rule(name)
         found, state = ours(ours.start(theta), theta, weights, sizes, losses)
         expected, kept = plain(plain.start(theta), theta, weights, sizes, losses)
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
         for a, b in zip(state, kept, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
-    equal = SecureMean(FedAvgM(1.0, 0.0), equal=True)
+    equal = SecureAggregation(FedAvgM(1.0, 0.0), equal=True)
     found = equal(equal.start(theta), theta, weights, sizes, losses)[0]
     torch.testing.assert_close(found, weights.mean(0), rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(SecureMean()((), theta, weights, sizes, losses)[0], mean(weights, sizes))
+    torch.testing.assert_close(SecureAggregation()((), theta, weights, sizes, losses)[0], mean(weights, sizes))
 
 
 def test_federate_with_masks_and_privacy() -> None:
@@ -356,8 +370,8 @@ def test_federate_with_masks_and_privacy() -> None:
     group = clients(drives(), piece=10)
     made = [
         federate(small(), group, 2, aggregate, 1, schedule=Schedule(batch=4), privacy=Privacy(0.05, 1.0)).history[-1]
-        for aggregate in ("uniform", SecureMean("uniform"), SecureMean("uniform"))
-    ]  # fmt: skip
+        for aggregate in ("uniform", SecureAggregation("uniform"), SecureAggregation("uniform"))
+    ]
     torch.testing.assert_close(made[1].weights, made[0].weights, rtol=0, atol=1e-5)
     assert torch.equal(made[1].weights, made[2].weights)
     count = len(group)
@@ -367,14 +381,14 @@ def test_federate_with_masks_and_privacy() -> None:
     assert made[1].received_bytes - made[0].received_bytes == sum(received)
 
 
-# The probe
+# Membership inference
 
 
 def test_auc_is_that_of_mann_and_whitney() -> None:
     """Area by scipy's U; its interval by the standard error of Hanley and McNeil, 1982; exact at the ends."""
     draw = np.random.default_rng(3)
     members, others = draw.normal(0.8, 1, 150).round(1), draw.normal(0, 1, 200).round(1)
-    found = verdict(members, others)
+    found = membership_inference(members, others)
     u = stats.mannwhitneyu(members, others).statistic
     assert found.auc == pytest.approx(u / (150 * 200))
     a = found.auc
@@ -382,7 +396,7 @@ def test_auc_is_that_of_mann_and_whitney() -> None:
     error = math.sqrt((a * (1 - a) + 149 * (q1 - a * a) + 199 * (q2 - a * a)) / (150 * 200))
     assert [found.low, found.high] == pytest.approx([a - 1.96 * error, a + 1.96 * error], abs=0.015)
     assert found.found == np.mean(members > np.sort(others)[-3])
-    assert verdict(np.ones(3), np.zeros(4)) == Verdict(1.0, 1.0, 1.0, 1.0, 3, 4)
+    assert membership_inference(np.ones(3), np.zeros(4)) == AttackResult(1.0, 1.0, 1.0, 1.0, 3, 4)
 
 
 @pytest.fixture(scope="module")
@@ -396,11 +410,11 @@ def overfitted() -> tuple[GainNet, Client, list[torch.Tensor]]:
     return model, client, [row.weights for row in made.history]
 
 
-def judged(seen: list[torch.Tensor], model: GainNet, members: Pieces, others: Pieces) -> list[Verdict]:
+def judged(seen: list[torch.Tensor], model: GainNet, members: Segments, others: Segments) -> list[AttackResult]:
     pairs = list(pairwise(seen))
     return [
-        verdict(*(loss_scores(model, pairs, part) for part in (members, others))),
-        verdict(*(gradient_scores(model, pairs, part, mirrors=False) for part in (members, others))),
+        membership_inference(*(loss_scores(model, pairs, part) for part in (members, others))),
+        membership_inference(*(gradient_scores(model, pairs, part, mirrors=False) for part in (members, others))),
     ]
 
 
@@ -409,8 +423,10 @@ def test_what_was_overfitted_is_found(overfitted: tuple[GainNet, Client, list[to
     by_loss, by_gradient = judged(seen, model, client.training, client.validation)
     assert by_loss.auc > 0.8
     assert by_gradient.auc > 0.6
-    path = verdict(loss_scores(model, [(seen[0], seen[1])], client.training),
-                   loss_scores(model, [(seen[0], seen[1])], renoised(client.training)))  # fmt: skip
+    path = membership_inference(
+        loss_scores(model, [(seen[0], seen[1])], client.training),
+        loss_scores(model, [(seen[0], seen[1])], renoised(client.training)),
+    )
     assert path.auc > 0.6
 
 

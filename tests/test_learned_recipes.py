@@ -12,21 +12,20 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
-from coopoc import V2X, Fleet, Gnss, InputError, Kalman, Sensors, observe
-from coopoc import load as load_fleet
+from coopoc import GNSS, V2X, Fleet, InputError, Kalman, Sensors, load_fleet, observe
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import (
     Checkpoint,
     GainNet,
     LearnedGain,
-    NoiseNumbers,
+    NoiseParameters,
     OptimisedKF,
     Schedule,
     load,
     load_method,
     save,
     train_all,
-)  # fmt: skip
+)
 from coopoc.learned.checkpoint import read_card
 from coopoc.learned.nets.recursive import RecursiveGain
 from coopoc.learned.nets.split import SplitGain
@@ -65,7 +64,7 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 
 
 def test_okf_round_trip(tmp_path: Path) -> None:
-    numbers = NoiseNumbers()
+    numbers = NoiseParameters()
     with torch.no_grad():
         numbers.logs.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.1, 0.1, 0.01], [1.5, 1.6, 1.7]]).log())
     method = numbers.method("okf")
@@ -74,8 +73,10 @@ def test_okf_round_trip(tmp_path: Path) -> None:
     again = load_method(tmp_path / "okf.safetensors")
     assert isinstance(again, OptimisedKF)
     assert (again.process_std, again.velocity_ratio, again.gnss_std) == (
-        method.process_std, method.velocity_ratio, method.gnss_std,
-    )  # fmt: skip
+        method.process_std,
+        method.velocity_ratio,
+        method.gnss_std,
+    )
 
 
 @pytest.mark.parametrize("net", [RecursiveGain(5, seed=2), SplitGain(5, seed=2), GainNet(2, 1, magnitudes=True)])
@@ -178,7 +179,7 @@ def test_shipped_weights_hold_over_unseen_drives(name: str) -> None:
     recording = observe(some, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=3)
     found, egos = method(recording, range(6)), range(6)
     assert rt_le(found, some).max() < 2.0
-    assert rt_le(found, some).mean() < 0.3 * rt_le(Gnss()(recording, egos), some).mean()
+    assert rt_le(found, some).mean() < 0.3 * rt_le(GNSS()(recording, egos), some).mean()
     assert found.notes == ()
 
 
@@ -187,8 +188,11 @@ def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
     checkpoint = load(recipes.WEIGHTS / f"{name}.safetensors")
     card = checkpoint.card
     assert card["sha256"] == digest(checkpoint)
-    (job,) = (job for job in recipes.jobs_of(card["recipe"], recipes.Setting(), load_fleet("town10-clients"))
-              if job.client == card["client"])  # fmt: skip
+    (job,) = (
+        job
+        for job in recipes.jobs_of(card["recipe"], recipes.Setting(), load_fleet("town10-clients"))
+        if job.client == card["client"]
+    )
     assert card["settings"] == json.loads(json.dumps(asdict(job.recipe) | asdict(job.setting)))
     assert set(card["metrics"]) == set(SENSORS)
     times = {case: row["times_oracle"] for case, row in card["metrics"].items()}
@@ -199,10 +203,11 @@ def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["fedokf", "recursive"])
 def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
-    """To 1e-6 with the versions and the machine that the card names; elsewhere training ends within a few percent."""
+    """To 1e-5 with the versions and the kind of machine that the card names, a few last bits of float32 after thousands
+    of steps on another processor of that kind; elsewhere training ends within a few percent."""
     card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
     same = card["environment"]["torch"] == torch.__version__ and card["machine"] == machine()
-    assert differences(name, progress=False)[name] < (1e-6 if same else 0.3)
+    assert differences(name, progress=False)[name] < (1e-5 if same else 0.3)
 
 
 def test_metrics_are_those_of_the_validation_fleet() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Ledger, Sensors, break_even, load, observe
+from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Ledger, Sensors, break_even, load_fleet, observe
 from coopoc.evaluate.ledger import of_drive, of_track, of_training
 from coopoc.evaluate.neighbourhoods import clique, star
 from coopoc.learned import load as load_weights
@@ -107,7 +107,7 @@ def test_break_even_of_the_papers_training() -> None:
 
 def test_cards_tell_what_their_trainings_moved() -> None:
     """By hand: 20 rounds of 12 numbers down, 12 and a loss up; drives of six numbers a step, and weights back once."""
-    drives = load("town10-clients")
+    drives = load_fleet("town10-clients")
     fed, pooled = (load_weights(WEIGHTS / f"{name}.safetensors").card for name in ("fedkalmannet", "okf"))
     told, count = card_ledger(fed, drives), len(fed["clients"])
     rounds, size = len(fed["history"]) - 1, 4 * fed["parameters"]
@@ -131,8 +131,9 @@ def test_the_page_of_the_budget_runs() -> None:
 def test_ledgers_add_up_by_name() -> None:
     rng = np.random.default_rng(0)
     once = of_training(["a", "b"], [10.0, 20.0], [30.0, 40.0])
-    drives = [of_drive(names, 5.0, *rng.uniform(1, 9, (2, 3, 2)), FIX_AND_VELOCITY, 96)
-              for names in (("a", "b"), ("b", "c"))]  # fmt: skip
+    drives = [
+        of_drive(names, 5.0, *rng.uniform(1, 9, (2, 3, 2)), FIX_AND_VELOCITY, 96) for names in (("a", "b"), ("b", "c"))
+    ]
     both = once + drives[0] + drives[1]
     assert both.names == ("a", "b", "c")
     assert both.seconds.tolist() == [5.0, 10.0, 5.0]

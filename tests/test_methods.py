@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from coopoc import V2X, Fleet, Gnss, InputError, JointFilter, Kalman, Knowledge, LaplacianKalman, Msmv, Sensors, observe
+from coopoc import GNSS, LKFSA, MSMV, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.star import FORGOTTEN
 from coopoc.world.spherical import spherical, to_vector
@@ -16,22 +16,22 @@ from coopoc.world.spherical import spherical, to_vector
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 COOPERATIVE = [
-    LaplacianKalman("identity"),
-    LaplacianKalman("identity", membership="reset"),
-    LaplacianKalman("nominal"),
+    LKFSA("identity"),
+    LKFSA("identity", membership="reset"),
+    LKFSA("nominal"),
     JointFilter("identity"),
     JointFilter("nominal"),
     JointFilter("nominal", exact=False),
-    Msmv("identity"),
-    Msmv("nominal"),
+    MSMV("identity"),
+    MSMV("nominal"),
 ]
-METHODS = [Gnss(), Kalman("identity"), Kalman("nominal"), *COOPERATIVE]
+METHODS = [GNSS(), Kalman("identity"), Kalman("nominal"), *COOPERATIVE]
 
 
 def label(method: object) -> str:
-    knowledge = getattr(method, "knowledge", "")
+    noise_model = getattr(method, "noise_model", "")
     extra = [str(getattr(method, f)) for f in ("membership", "exact") if hasattr(method, f)]
-    return "-".join([method.name, str(knowledge), *extra])  # type: ignore[attr-defined]
+    return "-".join([method.name, str(noise_model), *extra])  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("method", METHODS, ids=label)
@@ -71,7 +71,7 @@ def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> Non
 @pytest.mark.parametrize("method", COOPERATIVE, ids=label)
 def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=0), runs=3)
-    solo = Kalman(method.knowledge)(recording, [0, 1])
+    solo = Kalman(method.noise_model)(recording, [0, 1])
     assert method(recording, [0, 1]).x == pytest.approx(solo.x, abs=2e-4)  # the flat prior weighs 1e-6 of a fix
     assert (method(recording, [0]).received_bytes == 0).all()
 
@@ -80,7 +80,7 @@ def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
 def test_no_message_ever_is_at_best_the_solo_filter(method, crossing: Fleet) -> None:
     """All messages lost: on-board sightings of vehicles that say nothing must not move the ego much."""
     recording = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=3)
-    track, solo = method(recording, [0]), Kalman(method.knowledge)(recording, [0])
+    track, solo = method(recording, [0]), Kalman(method.noise_model)(recording, [0])
     assert (track.received_bytes == 0).all()
     if "reset" not in label(method):
         assert rt_le(track, crossing).mean() < 1.2 * rt_le(solo, crossing).mean()
@@ -89,7 +89,7 @@ def test_no_message_ever_is_at_best_the_solo_filter(method, crossing: Fleet) -> 
 def test_solo_filter_equals_filterpy(crossing: Fleet) -> None:
     """Independent check: filterpy's KalmanFilter on the same numbers."""
     recording = observe(crossing, S2, runs=1)
-    known = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
     track = Kalman(known)(recording, [2])
     peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     peer.B, peer.H = 0.1 * np.eye(3), np.eye(3)
@@ -107,7 +107,7 @@ def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
     """Independent check: filterpy's KalmanFilter over the stacked star of a formation that never changes."""
     fleet = formation.select(range(4)).between(0, 40)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
-    known = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
     track = JointFilter(known, exact=False)(recording, [0])
     n, order = 4, [0, *recording.links.neighbour[:3]]
     sight = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
@@ -133,7 +133,7 @@ def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
 def test_laplacian_form_equals_the_batch_least_squares(formation: Fleet) -> None:
     """Independent check: numpy.linalg.lstsq on [L; I] at the first step, where the filter has no past."""
     recording = observe(formation.between(0, 2), S2, V2X(max_neighbours=4), runs=1, observers=[0])
-    track = LaplacianKalman("identity")(recording, [0])
+    track = LKFSA("identity")(recording, [0])
     order = [0, *recording.links.neighbour[:4]]
     laplacian = np.diag([4.0, 1, 1, 1, 1])
     laplacian[0, 1:] = laplacian[1:, 0] = -1
@@ -149,7 +149,7 @@ def test_laplacian_form_equals_the_batch_least_squares(formation: Fleet) -> None
 def test_neighbours_are_better_located_than_by_their_fix(formation: Fleet) -> None:
     fleet = formation.between(0, 200)
     recording = observe(fleet, S2, V2X(max_neighbours=6), runs=4, observers=[0])
-    for method in (JointFilter("nominal"), LaplacianKalman("identity"), Msmv("nominal")):
+    for method in (JointFilter("nominal"), LKFSA("identity"), MSMV("nominal")):
         assert (neighbour_rt_le(method(recording, [0]), recording, fleet) < 3.5 * np.sqrt(3)).all()
 
 
@@ -204,19 +204,19 @@ def test_a_known_start_has_no_nees(formation: Fleet) -> None:
 
 def test_fitted_knowledge_finds_the_acting_noise(formation: Fleet) -> None:
     training = observe(formation, Sensors(gnss_std=(1.0, 2.0, 3.0), velocity_reading="speed"), runs=2)
-    fitted = Knowledge.fitted(training, formation)
+    fitted = NoiseModel.fitted(training, formation)
     assert fitted.gnss_std == pytest.approx((1.0, 2.0, 3.0), rel=0.02)
     assert fitted.process_std == pytest.approx((0.1, 0.1, 0.1), rel=0.02)
 
 
 def test_bad_knowledge_is_named(crossing: Fleet) -> None:
     recording = observe(crossing, S2)
-    with pytest.raises(InputError, match="knowledge = 'guess'"):
+    with pytest.raises(InputError, match="noise_model = 'guess'"):
         Kalman("guess")(recording)
     with pytest.raises(InputError, match="process_std"):
-        Knowledge("mine", S2, process_std=(0.1, 0.1, 0.0))
+        NoiseModel("mine", S2, process_std=(0.1, 0.1, 0.0))
     with pytest.raises(InputError, match="membership = 'rest'"):
-        LaplacianKalman(membership="rest")  # type: ignore[arg-type]
+        LKFSA(membership="rest")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="x0"):
         Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -10,16 +11,17 @@ from filterpy.kalman import KalmanFilter
 from scipy import stats
 from scipy.optimize import least_squares, minimize
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Knowledge, Method, Sensors, load, observe
+from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Method, NoiseModel, Sensors, load_fleet, observe
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.catalogue import METHODS as CATALOGUE
 from coopoc.methods.fixed_lag import FixedLagSmoother
-from coopoc.methods.knowledge import resolve
 from coopoc.methods.moving_horizon import MovingHorizon
-from coopoc.methods.star import ACCELERATION_STD, StarStep, star_steps
-from coopoc.methods.window import Window, advance, settle, sweep
-from coopoc.methods.window_problem import limited, solution_of, window_problem
+from coopoc.methods.noise_model import resolve
+from coopoc.methods.star import ACCELERATION_STD, assumptions, measurements
+from coopoc.methods.window import points_of, steps_of
+from coopoc.methods.window_problem import Arrival, arrival_of, limited, solution_of, window_problem
+from coopoc.optimize.window import WindowStep
 from coopoc.world.inbox import inbox
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import spherical, to_vector, wrap
@@ -28,16 +30,16 @@ S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 METHODS = [
     FixedLagSmoother(3),
-    FixedLagSmoother(3, knowledge="identity"),
+    FixedLagSmoother(3, noise_model="identity"),
     FixedLagSmoother(3, smoothed=True),
     MovingHorizon(4),
-    MovingHorizon(4, knowledge="identity"),
+    MovingHorizon(4, noise_model="identity"),
 ]
 LATE = V2X(max_neighbours=4, loss=0.2, latency=0.2)
 
 
 def label(method: FixedLagSmoother | MovingHorizon) -> str:
-    return f"{method.name}-{method.knowledge}{'-smoothed' * getattr(method, 'smoothed', False)}"
+    return f"{method.name}-{method.noise_model}{'-smoothed' * getattr(method, 'smoothed', False)}"
 
 
 @pytest.mark.parametrize("method", METHODS, ids=label)
@@ -81,7 +83,7 @@ def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> Non
 @pytest.mark.parametrize("method", [m for m in METHODS if not getattr(m, "smoothed", False)], ids=label)
 def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=0), runs=3)
-    solo = Kalman(method.knowledge)(recording, [0, 1])
+    solo = Kalman(method.noise_model)(recording, [0, 1])
     track = method(recording, [0, 1])
     assert track.x == pytest.approx(solo.x, abs=2e-4)  # the flat prior weighs 1e-6 of a fix
     assert (track.received_bytes == 0).all()
@@ -103,13 +105,13 @@ def test_bytes_are_those_of_the_inbox(crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("v2x", [V2X(4), V2X(4, loss=0.3), V2X(4, rate=2.0)], ids=["ideal", "lossy", "slow"])
-@pytest.mark.parametrize("knowledge", ["identity", "nominal"])
-def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, knowledge: str, crossing: Fleet) -> None:
+@pytest.mark.parametrize("noise_model", ["identity", "nominal"])
+def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model: str, crossing: Fleet) -> None:
     """The law of performance.md 1.2 and methods.md 6.9; JointFilter is held against filterpy in test_methods."""
     recording = observe(crossing.between(0, 30), S2, v2x, runs=2)
-    peer = JointFilter(knowledge, exact=False)(recording, [0, 3])
-    lags = [FixedLagSmoother(lag, knowledge=knowledge, exact=False) for lag in (1, 10)]
-    horizons = [MovingHorizon(n, knowledge=knowledge, exact=False) for n in (1, 5)]
+    peer = JointFilter(noise_model, exact=False)(recording, [0, 3])
+    lags = [FixedLagSmoother(lag, noise_model=noise_model, exact=False) for lag in (1, 10)]
+    horizons = [MovingHorizon(n, noise_model=noise_model, exact=False) for n in (1, 5)]
     for method in (*lags, *horizons):
         track = method(recording, [0, 3])
         assert track.x == pytest.approx(peer.x, abs=1e-8)
@@ -129,9 +131,11 @@ def test_no_lag_is_the_joint_filter(formation: Fleet) -> None:
 def test_fixed_lag_equals_gtsam(crossing: Fleet, smoothed: bool) -> None:
     """Independent check: gtsam.IncrementalFixedLagSmoother, newest and late points and their covariances."""
     recording = observe(crossing.between(0, 15), S2, V2X(max_neighbours=3, loss=0.2), runs=2)
-    for knowledge, exact, close in (("identity", True, 1e-8), ("nominal", False, 1e-7), ("nominal", True, 0.15)):
-        ours, theirs = (FixedLagSmoother(3, backend, smoothed, knowledge, exact)(recording, [0])
-                        for backend in ("gauss-newton", "gtsam"))  # fmt: skip
+    for noise_model, exact, close in (("identity", True, 1e-8), ("nominal", False, 1e-7), ("nominal", True, 0.15)):
+        ours, theirs = (
+            FixedLagSmoother(3, backend, smoothed, noise_model, exact)(recording, [0])
+            for backend in ("gauss-newton", "gtsam")
+        )
         assert theirs.x == pytest.approx(ours.x, abs=close)
         assert theirs.covariance == pytest.approx(ours.covariance, abs=close)
         assert theirs.neighbours == pytest.approx(ours.neighbours, abs=2 * close, nan_ok=True)
@@ -142,8 +146,8 @@ def test_fixed_lag_equals_gtsam(crossing: Fleet, smoothed: bool) -> None:
 def test_a_lag_of_the_whole_drive_is_filterpys_smoother(crossing: Fleet) -> None:
     """Independent check: filterpy's rts_smoother on one vehicle."""
     recording = observe(crossing.between(0, 30), S2, V2X(max_neighbours=0), runs=1)
-    known = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-    track = FixedLagSmoother(40, smoothed=True, knowledge=known)(recording, [2])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = FixedLagSmoother(40, smoothed=True, noise_model=known)(recording, [2])
     peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     peer.B, peer.H = 0.1 * np.eye(3), np.eye(3)
     peer.Q, peer.R = np.diag(np.square(known.process_std)), np.diag(known.gnss_variance)
@@ -161,34 +165,42 @@ def test_a_lag_of_the_whole_drive_is_filterpys_smoother(crossing: Fleet) -> None
     assert track.covariance[0, :, 0] == pytest.approx(spread, abs=1e-4)
 
 
-def stars_of(recording: Recording, known: Knowledge) -> list[StarStep]:
-    return list(star_steps(recording, 0, inbox(recording, 0, FixedLagSmoother().message), known))
+class Last(NamedTuple):
+    """The last window of a run over an ideal channel: its steps, arrival cost, points, and what made them."""
+
+    sights: list[WindowStep]
+    arrival: Arrival
+    points: np.ndarray
+    horizon: Any
+    span: tuple[int, int]
 
 
-def windows(recording: Recording, known: Knowledge, length: int, exact: bool) -> Window:
-    """The last window of a drive over an ideal channel."""
-    window: Window | None = None
-    for star in stars_of(recording, known):
-        stars = [*(part.star for part in window.slices), star] if window else [star]
-        window = advance(window, stars, length, known)
-        window = settle(window, known, 10)[0] if exact else sweep(window, known, exact=False)
-    assert window is not None
-    return window
+def last_window(recording: Recording, known: NoiseModel, length: int, exact: bool, run: int) -> Last:
+    from coopoc.kernels.horizon import Settings, advance, each_group, empty
+
+    box, steps = inbox(recording, 0, FixedLagSmoother().message), len(recording.t)
+    seen, assumed = measurements(recording, 0, box), assumptions(recording, known)
+    seen = seen._replace(newest=seen.newest.copy(), fresh=np.zeros_like(box.fresh))
+    settings = Settings(length, exact, 10 if exact else 0, 0.03, 10.0, False)
+    (runs, horizon), span = next(each_group(seen, length)), (steps - length, steps - 1)
+    advance(horizon, seen, assumed, box.arrival, settings, runs, (0, steps), empty(seen))
+    sights = steps_of(horizon.window, recording, box, run, span)
+    points = points_of(horizon.window, run, span)
+    return Last(sights, arrival_of(horizon, run, span[0]), points, horizon, span)
 
 
-def whitened(x: np.ndarray, window: Window, run: int) -> np.ndarray:
-    """Residuals of a window as they stand in the text books, from the stars and the arrival cost alone."""
-    counts = [len(part.star.kept) for part in window.slices]
+def whitened(x: np.ndarray, window: Last) -> np.ndarray:
+    """Residuals of a window as they stand in the text books, from its steps and the arrival cost alone."""
+    counts = [len(sight.previous) for sight in window.sights]
     points = np.split(x.reshape(-1, 3), np.cumsum(counts)[:-1])
     arrival, rows = window.arrival, []
-    root = np.linalg.cholesky(arrival.information[run] + 1e-12 * np.eye(3 * counts[0]))
-    rows.append(root.T @ (points[0] - arrival.at[run]).ravel() - np.linalg.solve(root, arrival.pull[run]))
-    for k, (part, here) in enumerate(zip(window.slices, points, strict=True)):
-        star = part.star
-        rows.append((here - star.fix[run]) / np.sqrt(star.fix_variance[0]))
+    root = np.linalg.cholesky(arrival.information + 1e-12 * np.eye(3 * counts[0]))
+    rows.append(root.T @ (points[0] - arrival.at).ravel() - np.linalg.solve(root, arrival.eta))
+    for k, (sight, here) in enumerate(zip(window.sights, points, strict=True)):
+        rows.append((here - sight.fix) / sight.fix_std)
         if k:
-            rows.append((here - points[k - 1][star.kept] - star.moved[run]) / np.sqrt(star.process[run]))
-        gap = np.stack(spherical(*(here[1:] - here[0]).T), axis=-1) - star.relative[run]
+            rows.append((here - points[k - 1][sight.previous] - sight.moved) / sight.moved_std)
+        gap = np.stack(spherical(*(here[1:] - here[0]).T), axis=-1) - sight.relative
         rows.append(np.concatenate([gap[:, :1], wrap(gap[:, 1:])], axis=1) / S2.relative_std)
     return np.concatenate([r.ravel() for r in rows])
 
@@ -197,11 +209,12 @@ def test_the_window_is_at_its_minimum(formation: Fleet) -> None:
     """Independent check: scipy.optimize.least_squares on the whole window with its arrival cost, from the truth."""
     fleet = formation.select(range(4)).between(0, 12)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track, window = MovingHorizon(4)(recording, [0]), windows(recording, resolve("nominal", recording), 5, True)
+    track, known = MovingHorizon(4)(recording, [0]), resolve("nominal", recording)
     order = [0, *recording.links.neighbour[:3]]
     start = fleet.position[7:12, order].ravel()
     for run in range(2):
-        found = least_squares(whitened, start, args=(window, run), xtol=1e-12, ftol=1e-12)
+        window = last_window(recording, known, 5, True, run)
+        found = least_squares(whitened, start, args=(window,), xtol=1e-12, ftol=1e-12)
         assert track.x[run, -1, 0] == pytest.approx(found.x.reshape(5, 4, 3)[-1, 0], abs=5e-4)
         cov = np.linalg.inv(found.jac.T @ found.jac)[-12:-9, -12:-9]
         assert track.covariance[run, -1, 0] == pytest.approx(cov, abs=2e-3)
@@ -211,7 +224,7 @@ def test_late_messages_stand_at_their_true_time(formation: Fleet) -> None:
     """Independent check: numpy.linalg.lstsq over all steps, rows written out from the arrivals of the messages."""
     fleet = formation.select(range(4)).between(0, 9)
     recording = observe(fleet, S2, V2X(max_neighbours=3, latency=0.2, loss=0.3), runs=3, observers=[0])
-    track, dt, now = MovingHorizon(12, knowledge="identity")(recording, [0]), recording.dt, 8
+    track, dt, now = MovingHorizon(12, noise_model="identity")(recording, [0]), recording.dt, 8
     for run in range(3):
         rows, right = [], []
         place = {(v, s): 4 * s + v for s in range(now + 1) for v in range(4)}
@@ -223,8 +236,10 @@ def test_late_messages_stand_at_their_true_time(formation: Fleet) -> None:
             right.append(value / std)
 
         links = recording.links
-        arrived = {(int(n), int(s)): 0 <= a <= now for n, s, a in
-                   zip(links.neighbour, links.step, recording.arrival[run], strict=True)}  # fmt: skip
+        arrived = {
+            (int(n), int(s)): 0 <= a <= now
+            for n, s, a in zip(links.neighbour, links.step, recording.arrival[run], strict=True)
+        }
         arrived |= {(0, s): True for s in range(now + 1)}
         for s in range(now + 1):
             for link in np.flatnonzero(links.step == s):
@@ -244,7 +259,7 @@ def test_late_messages_stand_at_their_true_time(formation: Fleet) -> None:
 
 def test_a_late_message_is_worth_more_in_its_place() -> None:
     """In traffic that brakes, at 1 s of latency: fixes that are brought forward make a filter over-confident."""
-    fleet = load("town10").between(300, 400)
+    fleet = load_fleet("town10").between(300, 400)
     recording = observe(fleet, S2, V2X(max_neighbours=4, latency=1.0), runs=5, observers=[12])
     late, forward = MovingHorizon(10)(recording, [12]), JointFilter()(recording, [12])
     assert late.notes == ()
@@ -280,8 +295,9 @@ def test_smoothing_is_held_to_the_smoothing_bound(formation: Fleet) -> None:
     sensors = replace(S2, velocity_reading="speed")
     fleet, v2x = formation.select(range(4)).between(0, 60), V2X(max_neighbours=3)
     recording = observe(fleet, sensors, v2x, runs=20, observers=[0])
-    scores = [np.sqrt((rt_le(FixedLagSmoother(lag, smoothed=True)(recording, [0]), fleet) ** 2).mean())
-              for lag in (0, 3, 10)]  # fmt: skip
+    scores = [
+        np.sqrt((rt_le(FixedLagSmoother(lag, smoothed=True)(recording, [0]), fleet) ** 2).mean()) for lag in (0, 3, 10)
+    ]
     assert (
         scores[0] > scores[1] > scores[2] > 0.9 * bound_rt_le(posterior_bound(fleet, sensors, 0, v2x, smoothing=True))
     )
@@ -290,9 +306,10 @@ def test_smoothing_is_held_to_the_smoothing_bound(formation: Fleet) -> None:
 @pytest.mark.parametrize("backend", ["osqp", "casadi", "gtsam"])
 def test_backends_solve_the_same_windows(crossing: Fleet, backend: str) -> None:
     recording = observe(crossing.between(0, 12), S2, V2X(max_neighbours=3, latency=0.2), runs=1)
-    for knowledge, exact, close in (("nominal", False, 1e-6), ("nominal", True, 2e-3)):
-        ours, theirs = (MovingHorizon(4, b, knowledge=knowledge, exact=exact)(recording, [0])
-                        for b in ("gauss-newton", backend))  # fmt: skip
+    for noise_model, exact, close in (("nominal", False, 1e-6), ("nominal", True, 2e-3)):
+        ours, theirs = (
+            MovingHorizon(4, b, noise_model=noise_model, exact=exact)(recording, [0]) for b in ("gauss-newton", backend)
+        )
         assert theirs.x == pytest.approx(ours.x, abs=close)
         assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-9)
         assert theirs.notes == (f"{backend} loops over the runs",)
@@ -303,15 +320,15 @@ def test_a_road_is_solved_with_the_whole_arrival_cost(crossing: Fleet, backend: 
     """Independent check: the dense KKT system of the linear window with its arrival cost and every height 0.3 m."""
     recording = observe(crossing.between(0, 14), S2, V2X(max_neighbours=4), runs=1)
     known = resolve("nominal", recording)
-    window = windows(recording, known, 4, False)
-    problem = limited(window_problem(window.slices, known, False), recording.dt, 0.3, None)
-    x = np.concatenate([part.point for part in window.slices], axis=1)[0]
-    solution = solution_of(problem, window.arrival, 0, x, backend)
-    r, jacobian = problem.pick(0).whiten(x)
-    hessian, gradient, m = (jacobian.T @ jacobian).toarray(), jacobian.T @ r, window.arrival.at[0].size
-    hessian[:m, :m] += window.arrival.information[0]
-    gradient[:m] += window.arrival.information[0] @ (x.ravel()[:m] - window.arrival.at[0].ravel())
-    gradient[:m] -= window.arrival.pull[0]
+    window = last_window(recording, known, 4, False, 0)
+    problem = window_problem(window.horizon, window.sights, known, False, 0, window.span)
+    problem, x = limited(problem, recording.dt, 0.3, None), window.points
+    solution = solution_of(problem, window.arrival, x, backend)
+    r, jacobian = problem.whiten(x)
+    hessian, gradient, m = (jacobian.T @ jacobian).toarray(), jacobian.T @ r, window.arrival.at.size
+    hessian[:m, :m] += window.arrival.information
+    gradient[:m] += window.arrival.information @ (x.ravel()[:m] - window.arrival.at.ravel())
+    gradient[:m] -= window.arrival.eta
     assert np.abs(gradient).max() < 1e-6  # the elimination's own answer
     flat = np.eye(x.size)[2::3]
     kkt = np.block([[hessian, flat.T], [flat, np.zeros((len(flat),) * 2)]])
@@ -326,15 +343,20 @@ def test_a_top_speed_is_scipys_constrained_minimum(formation: Fleet) -> None:
     fleet = formation.select(range(2)).between(0, 3)
     recording = observe(fleet, S2, V2X(max_neighbours=1), runs=1, observers=[0], seed=3)
     track = MovingHorizon(2, "casadi", top_speed=9.8)(recording, [0])
-    window = windows(recording, resolve("nominal", recording), 3, True)
-    start = np.concatenate([part.point[0] for part in window.slices])
+    window = last_window(recording, resolve("nominal", recording), 3, True, 0)
+    start = window.points
 
     def room(x: np.ndarray) -> np.ndarray:
         step = np.diff(x.reshape(3, 2, 3), axis=0) / recording.dt
         return (9.8**2 - np.square(step).sum(axis=-1)).ravel()
 
-    found = minimize(lambda x: 0.5 * np.square(whitened(x, window, 0)).sum(), start.ravel(), method="SLSQP",
-                     constraints={"type": "ineq", "fun": room}, options={"maxiter": 500, "ftol": 1e-12})  # fmt: skip
+    found = minimize(
+        lambda x: 0.5 * np.square(whitened(x, window)).sum(),
+        start.ravel(),
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": room},
+        options={"maxiter": 500, "ftol": 1e-12},
+    )
     assert room(start.ravel()).min() < 0
     assert track.x[0, -1, 0] == pytest.approx(found.x.reshape(3, 2, 3)[-1, 0], abs=5e-3)
 

@@ -8,18 +8,20 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from oracles.whole_fleet import rows
 from scipy import optimize, stats
 
-from coopoc import V2X, Fleet, InputError, Kalman, Knowledge, Recording, Sensors, observe, posterior_bound
+from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe, posterior_bound
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
+from coopoc.kernels.fleet_graph import measurement
+from coopoc.kernels.relative import components
 from coopoc.methods.admm import ConsensusADMM
 from coopoc.methods.batch_smoother import BatchSmoother
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.central_filter import CentralFilter
 from coopoc.methods.diffusion import Diffusion
 from coopoc.methods.gbp import GaussianBeliefPropagation
-from coopoc.methods.network import sighting, whitened
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
 from coopoc.world.sensing import find_links
@@ -29,8 +31,8 @@ from coopoc.world.v2x import FIX_AND_VELOCITY, Message
 S2 = Sensors.paper_scenario2()
 SPEED = replace(S2, velocity_reading="speed")
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
-KNOWN = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.05), gnss_std=(3.0, 3.5, 4.0))
-LINEAR = Knowledge("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.0, 3.0))
+KNOWN = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.05), gnss_std=(3.0, 3.5, 4.0))
+LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.0, 3.0))
 """Relative vectors of unit covariance: all methods are then linear, and numpy.linalg.lstsq says what is right."""
 CAUSAL = [
     GaussianBeliefPropagation(),
@@ -61,7 +63,7 @@ def gappy(fleet: Fleet) -> Fleet:
 
 
 def dense(
-    recording: Recording, known: Knowledge, last: dict[int, int]
+    recording: Recording, known: NoiseModel, last: dict[int, int]
 ) -> tuple[dict[tuple[int, int], int], np.ndarray, np.ndarray]:
     """Least squares of vehicle i's steps up to last[i] by numpy.linalg.lstsq: index of (t, i), solution, covariance."""
     present = np.isfinite(recording.gnss[0, :, :, 0])
@@ -97,16 +99,18 @@ def block(cov: np.ndarray, k: int) -> np.ndarray:
 
 def test_the_linearised_sighting_is_the_spherical_measurement() -> None:
     """Independent checks: SciPy's finite differences, and the converted covariance at the measured vector."""
-    known = Knowledge.nominal(S2)
     vector, relative = np.array([6.0, -8.0, 1.5]), np.array([11.0, -0.8, 1.5])
-    root, residual = whitened(vector, relative, known)
+    root, residual = rows(vector, relative, S2, False)
     expected = optimize.approx_fprime(vector, lambda v: np.array(spherical(*v)) / S2.relative_std, 1e-6)
     assert root == pytest.approx(expected, abs=1e-5)
     assert residual * S2.relative_std == pytest.approx(relative - np.array(spherical(*vector)))
     at = to_vector(relative)
-    weight, pull = sighting(at, relative, known)
-    assert np.linalg.inv(weight) == pytest.approx(vector_cov(relative, S2.relative_std), rel=1e-9)
-    assert pull == pytest.approx(np.zeros(3), abs=1e-9)
+    seen = tuple(components(relative[None, None], np.array([0]))[0, 0].tolist())
+    for converted in (True, False):
+        weight, eta = measurement(tuple(at.tolist()), seen, S2.relative_std, S2.min_range, converted)
+        cov = np.linalg.inv(np.reshape(weight, (3, 3)))
+        assert cov == pytest.approx(vector_cov(relative, S2.relative_std), rel=1e-9)
+        assert eta == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 @pytest.mark.parametrize("fleet", ["whole", "gappy"])
@@ -152,8 +156,11 @@ def test_exact_smoother_equals_scipys_minimum_and_its_covariance(crossing: Fleet
         vector = x[links.step, links.neighbour] - x[links.step, links.observer]
         seen = recording.relative[0] - np.stack(spherical(*vector.T), axis=-1)
         seen[:, 1] = (seen[:, 1] + np.pi) % (2 * np.pi) - np.pi
-        parts = [(x - recording.gnss[0]) / KNOWN.gnss_std, (np.diff(x, axis=0) - moved) / KNOWN.process_std,
-                 seen / S2.relative_std]  # fmt: skip
+        parts = [
+            (x - recording.gnss[0]) / KNOWN.gnss_std,
+            (np.diff(x, axis=0) - moved) / KNOWN.process_std,
+            seen / S2.relative_std,
+        ]
         return np.concatenate([p.ravel() for p in parts])
 
     best = optimize.least_squares(residual, fleet.position.ravel(), xtol=1e-12, ftol=1e-12)
@@ -286,9 +293,10 @@ def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> Non
 
 @pytest.mark.parametrize("method", [m for m in METHODS_HERE if m.name != "diffusion"], ids=label)
 @pytest.mark.parametrize(
-    "channel", [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0), V2X(max_neighbours=4, latency=2.0)],
+    "channel",
+    [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0), V2X(max_neighbours=4, latency=2.0)],
     ids=["no neighbours", "all lost", "too late"],
-)  # fmt: skip
+)
 def test_nobody_to_talk_to_is_the_solo_filter(method, channel: V2X, crossing: Fleet) -> None:
     """The smoother's last step is the filter's; its first is better."""
     recording = observe(crossing, S2, channel, runs=3)
@@ -394,15 +402,17 @@ def test_who_is_seen_may_answer() -> None:
     met = exchange(observe(fleet, S2, V2X(max_neighbours=1)), message)
     assert met.first.tolist() == [0, 1, 0, 1]
     assert met.second.tolist() == [1, 2, 1, 2]
-    assert (met.sight < 0).tolist() == [False, True, False, True]
-    assert (met.sight_back < 0).tolist() == [False, False, False, False]
-    assert met.to_first.all()
-    assert met.to_second.all()
+    assert (met.link < 0).tolist() == [False, True, False, True]
+    assert (met.link_back < 0).tolist() == [False, False, False, False]
+    assert (met.at_first >= 0).all()
+    assert (met.at_second >= 0).all()
     assert met.received_bytes.tolist() == met.sent_bytes.tolist() == [[200.0, 400.0, 200.0]]
-    capped = exchange(observe(still([[0, 0, 0], [9, 0, 0], [20, 0, 0]], 100), S2,
-                              V2X(max_neighbours=1, bytes_per_second=1000.0)), message)  # fmt: skip
-    near, far = (capped.to_first[0, capped.second == v].mean() for v in (1, 2))
-    back = capped.to_second[0, capped.second == 1].mean()
+    capped = exchange(
+        observe(still([[0, 0, 0], [9, 0, 0], [20, 0, 0]], 100), S2, V2X(max_neighbours=1, bytes_per_second=1000.0)),
+        message,
+    )
+    near, far = ((capped.at_first[0, capped.second == v] >= 0).mean() for v in (1, 2))
+    back = (capped.at_second[0, capped.second == 1] >= 0).mean()
     assert near == back == 1.0
     assert far == 0.09  # whom b sees comes first and takes the whole cap; ten messages are in the bucket at first
 
@@ -410,8 +420,8 @@ def test_who_is_seen_may_answer() -> None:
 def test_loss_is_that_of_the_channel(formation: Fleet) -> None:
     lossy = observe(formation.between(0, 200), S2, V2X(max_neighbours=10, radius=1e3, loss=0.3), runs=2)
     met = exchange(lossy, GaussianBeliefPropagation().message)
-    assert met.to_first.mean() == pytest.approx(0.7, abs=0.02)
-    assert (met.to_first & met.to_second).mean() == pytest.approx(0.49, abs=0.02)
+    assert (met.at_first >= 0).mean() == pytest.approx(0.7, abs=0.02)
+    assert (met.both >= 0).mean() == pytest.approx(0.49, abs=0.02)
 
 
 def fleet_marginals(fleet: Fleet, steps: int, v2x: V2X) -> gtsam.Marginals:
@@ -465,10 +475,15 @@ def test_the_fleet_knows_more_than_a_star(crossing: Fleet) -> None:
 
 def test_bad_settings_are_named() -> None:
     for method, bad in (
-        (GaussianBeliefPropagation, {"rounds": 0}), (GaussianBeliefPropagation, {"damping": 1.0}),
-        (GaussianBeliefPropagation, {"carry": "all"}), (ConsensusADMM, {"rho": 0.0}), (ConsensusADMM, {"rounds": 1.5}),
-        (Diffusion, {"rounds": -1}), (BatchSmoother, {"exact_steps": -1}), (Message, {"name": "x", "numbers": -1}),
-    ):  # fmt: skip
+        (GaussianBeliefPropagation, {"rounds": 0}),
+        (GaussianBeliefPropagation, {"damping": 1.0}),
+        (GaussianBeliefPropagation, {"carry": "all"}),
+        (ConsensusADMM, {"rho": 0.0}),
+        (ConsensusADMM, {"rounds": 1.5}),
+        (Diffusion, {"rounds": -1}),
+        (BatchSmoother, {"exact_steps": -1}),
+        (Message, {"name": "x", "numbers": -1}),
+    ):
         field = next(name for name in bad if name != "name")
         with pytest.raises(InputError, match=field):
             method(**bad)  # type: ignore[operator]

@@ -8,16 +8,35 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, LaplacianKalman, Recording, Sensors, observe, rt_le
+from coopoc import (
+    LKFSA,
+    MSMV,
+    V2X,
+    CovarianceIntersection,
+    Fleet,
+    InputError,
+    JointFilter,
+    Kalman,
+    Recording,
+    Sensors,
+    observe,
+    rt_le,
+)
 from coopoc.learned import CooperativeGain, GainNet, LearnedGain, NoiseNet, RecursiveFilter, RecursiveGain
 from coopoc.learned.nets.cooperative import ToldNoise
-from coopoc.methods.catalogue import METHODS
 from coopoc.methods.drift_filter import DriftFilter
-from coopoc.methods.knowledge import Knowledge
+from coopoc.methods.noise_model import NoiseModel
 
 SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RecursiveFilter(RecursiveGain()), NoiseNet().method("noise"))
-STARS = (JointFilter(), JointFilter(exact=False), LaplacianKalman("nominal"), DriftFilter(),
-         CooperativeGain(NoiseNet()))  # fmt: skip
+STARS = (
+    JointFilter(),
+    JointFilter(exact=False),
+    LKFSA("nominal"),
+    DriftFilter(),
+    CooperativeGain(NoiseNet()),
+    MSMV("nominal"),
+    CovarianceIntersection(split=True),
+)
 
 
 def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> Recording:
@@ -32,10 +51,16 @@ def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> 
 def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None:
     seen = holed(observe(crossing, Sensors(), V2X(0), runs=1), 0.4)
     track = Kalman()(seen, [1])
-    q = np.broadcast_to(Knowledge.nominal(seen.sensors).process_variance(seen), seen.gnss.shape)[0, :, 1]
+    q = np.broadcast_to(NoiseModel.nominal(seen.sensors).process_variance(seen), seen.gnss.shape)[0, :, 1]
     kf = KalmanFilter(dim_x=3, dim_z=3)
-    kf.x, kf.P, kf.H, kf.R, kf.F, kf.B = (seen.gnss[0, 0, 1][:, None], 2.25 * np.eye(3), np.eye(3), 2.25 * np.eye(3),
-                                          np.eye(3), 0.1 * np.eye(3))  # fmt: skip
+    kf.x, kf.P, kf.H, kf.R, kf.F, kf.B = (
+        seen.gnss[0, 0, 1][:, None],
+        2.25 * np.eye(3),
+        np.eye(3),
+        2.25 * np.eye(3),
+        np.eye(3),
+        0.1 * np.eye(3),
+    )
     for t in range(1, len(crossing.t)):
         kf.predict(u=seen.velocity[0, t, 1][:, None], Q=np.diag(q[t]))
         if np.isfinite(seen.gnss[0, t, 1]).all():
@@ -55,21 +80,11 @@ def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  
 def test_a_missing_fix_is_one_of_boundless_variance(crossing: Fleet) -> None:
     """And not one at the origin: the joint filter that is told 10^12 m^2 of those fixes gives the same answer."""
     whole = observe(crossing, Sensors(), V2X(4, 80.0), runs=2)
-    some, known = holed(whole, 0.5), Knowledge.nominal(whole.sensors)
+    some, known = holed(whole, 0.5), NoiseModel.nominal(whole.sensors)
     r = np.where(np.isnan(some.gnss), 1e12, 1.5**2)
     process = np.broadcast_to(known.process_variance(whole), whole.gnss.shape)
     told = ToldNoise("told", whole.sensors, fix=r, process=process)
     np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(told)(whole, [0]).x, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["gnss", "msmv-r", "ci", "gbp", "cooperative-map", "mhe", "central-filter"])
-def test_who_needs_every_fix_says_which_is_missing(crossing: Fleet, name: str) -> None:
-    seen = observe(crossing, Sensors(), V2X(4, 80.0), runs=1)
-    with pytest.raises(InputError, match=r"no fix at step|at every step"):
-        METHODS[name]("nominal")(holed(seen, 0.4), [0])
-    if name != "gnss":
-        with pytest.raises(InputError, match="at every step"):
-            METHODS[name]("nominal")(holed(seen, 0.4, slice(1, None)), [0])
 
 
 def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:

@@ -7,15 +7,31 @@ hold against SciPy, GTSAM's marginals and numpy.linalg.lstsq; under an active bo
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from coopoc import V2X, InputError, Sensors, load, observe
-from coopoc.optimize import Problem, Solution, Status, backends, pose, solve
+from coopoc import V2X, InputError, Sensors, load_fleet, observe
+from coopoc.optimize import (
+    Backend,
+    Loss,
+    Problem,
+    Solution,
+    Status,
+    backends,
+    pose,
+    solve,
+    solve_batch,
+    solve_gnc_batch,
+)
+from coopoc.optimize.backend import capability_table, require_backend
 from coopoc.optimize.space import exp
 
 
@@ -25,13 +41,15 @@ def range_only() -> Problem:
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (6, 3)) * [1, 1, 0.3]])
     names = ("ego", *(f"v{k}" for k in range(6)))
     ranges = np.linalg.norm(truth[1:], axis=1) + rng.normal(size=6)
-    problem = Problem(names, hub=(0,)).add("position", names, truth + 3.5 * rng.normal(size=truth.shape), std=3.5)
+    problem = Problem(names, separator=(0,)).add("position", names, truth + 3.5 * rng.normal(size=truth.shape), std=3.5)
     return problem.add("range", [("ego", n) for n in names[1:]], ranges[:, None], std=1.0)
 
 
 def spherical() -> Problem:
     """A snapshot of town10 with up to ten neighbours, range, azimuth and inclination."""
-    seen = observe(load("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=1, observers=[24])
+    seen = observe(
+        load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=1, observers=[24]
+    )
     return Problem.from_snapshot(seen, 30, 24)
 
 
@@ -43,7 +61,7 @@ def drive(dimension: int, kind: str) -> Problem:
     at = at + 0.5 * rng.normal(size=at.shape)
     truth = pose(at, turn[:, 0] if d == 2 else turn)
     names = [f"{robot}{k}" for robot in "AB" for k in range(6)]
-    problem = Problem(names, x0=truth, dimension=d, poses=names, held=("A0",))
+    problem = Problem(names, x0=truth, dimension=d, poses=names, fixed=("A0",))
     space, p, R = problem.space, problem.space.position(truth), problem.space.rotation(truth)
     pairs = [(i, i + 1) for i in (*range(5), *range(6, 11))] + [(0, 6)]
     z = []
@@ -82,13 +100,20 @@ CASES: dict[str, Callable[[], Problem]] = {
     "linear": linear,
     "active bound": bounded,
 }
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "extend.md").read_text()
+OWN: dict[str, Any] = {}
+exec(next(text for text in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "# least_squares.py" in text), OWN)
+PLUG_IN: Backend = OWN["BACKEND"]
+"""The backend that docs/extend.md shows."""
+EVERY: dict[str, str | Backend] = {**{name: name for name in backends()}, PLUG_IN.name: PLUG_IN}
 UNSUPPORTED = {
+    ("least-squares", "active bound"): "cannot be solved by least-squares",
     ("cvxpy", "spherical K = 10"): "spherical",
     ("cvxpy", "SE(2) window"): "relative_pose",
     ("cvxpy", "SE(3) window"): "relative_pose",
-    ("gauss-newton", "active bound"): "cannot be held by gauss-newton",
-    ("gtsam", "active bound"): "cannot be held by gtsam",
-    ("cvxpy", "active bound"): "cannot be held by cvxpy",
+    ("gauss-newton", "active bound"): "cannot be solved by gauss-newton",
+    ("gtsam", "active bound"): "cannot be solved by gtsam",
+    ("cvxpy", "active bound"): "cannot be solved by cvxpy",
 }
 """Pairs that are refused, and what the refusal names."""
 RELAXED = {("cvxpy", "range-only"), ("cvxpy", "SE(2) chordal")}
@@ -108,13 +133,13 @@ def reference(name: str) -> Solution:
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("backend", backends())
+@pytest.mark.parametrize("backend", EVERY)
 def test_every_backend_agrees_or_is_refused_by_name(backend: str, name: str) -> None:
     if (backend, name) in UNSUPPORTED:
         with pytest.raises(InputError, match=UNSUPPORTED[backend, name]):
-            solve(case(name), backend)
+            solve(case(name), EVERY[backend])
         return
-    ours, theirs = reference(name), solve(case(name), backend)
+    ours, theirs = reference(name), solve(case(name), EVERY[backend])
     assert theirs.status is Status.SOLVED
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)
@@ -136,8 +161,13 @@ def test_the_active_bound_is_scipys() -> None:
     problem, found = case("active bound"), reference("active bound")
     bound = problem.constraints[0].lower[:, 2]
     floor = [(None, None), (None, None), (bound[0], None)] * 8
-    theirs = minimize(lambda x: problem.cost(x.reshape(8, 3)), found.x.ravel() + 0.1, method="SLSQP", bounds=floor,
-                      options={"ftol": 1e-14, "maxiter": 1000})  # fmt: skip
+    theirs = minimize(
+        lambda x: problem.cost(x.reshape(8, 3)),
+        found.x.ravel() + 0.1,
+        method="SLSQP",
+        bounds=floor,
+        options={"ftol": 1e-14, "maxiter": 1000},
+    )
     assert (found.position[:, 2] <= bound + 1e-6).any()
     assert found.cost == pytest.approx(theirs.fun, rel=1e-8)
     assert found.x.ravel() == pytest.approx(theirs.x, abs=1e-3)
@@ -149,12 +179,52 @@ ISLAND = APART.add("displacement", [("a", "b"), ("c", "d")], [[4, 0, 0], [1, 0, 
 ONE_PLACE = Problem(("a", "b"), x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
 
 
+@pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure"])
+@pytest.mark.parametrize("name", ["spherical K = 10", "SE(2) window", "SE(3) window"])
+@pytest.mark.parametrize("backend", EVERY)
+def test_every_backend_agrees_on_robust_losses(backend: str, name: str, loss: str) -> None:
+    """From the least-squares solution, so that all descend into one minimum."""
+    plain = case(name)
+    robust = replace(plain.factors[-1], loss=Loss(loss, 1.5))
+    problem = replace(plain, factors=(*plain.factors[:-1], robust), x0=reference(name).x)
+    if backends_lacking(backend, problem):
+        with pytest.raises(InputError, match=f"cannot be solved by {backend}"):
+            solve(problem, EVERY[backend])
+        return
+    ours, theirs = solve(problem), solve(problem, EVERY[backend])
+    assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
+    assert theirs.x == pytest.approx(ours.x, abs=1e-6)
+
+
+def backends_lacking(backend: str, problem: Problem) -> list[str]:
+    return require_backend(EVERY[backend]).capabilities.lacking(problem)
+
+
+def test_a_plug_in_solves_batches_outliers_and_every_snapshot() -> None:
+    """It is called once per realisation, by solve_batch and by graduated non-convexity too."""
+    seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(6), runs=2, observers=[5])
+    for step in range(0, 40, 4):
+        stars = Problem.from_snapshot(seen, step, 5, run=None)
+        batch, ours = solve_batch(stars, PLUG_IN), solve_batch(stars)
+        assert batch.converged.all()
+        assert batch.x == pytest.approx(ours.x, abs=1e-6)
+        assert solve(stars.pick(1), PLUG_IN).x == pytest.approx(ours.x[1], abs=1e-6)
+    wrong = stars.add("position", 1, stars.factors[0].z[:, [1]] + 40.0, std=3.5)
+    found, ours = (solve_gnc_batch(wrong, [0, 2], backend=b) for b in (PLUG_IN, "gauss-newton"))
+    assert found.weights == pytest.approx(ours.weights, abs=1e-9)
+    assert found.x == pytest.approx(ours.x, abs=1e-6)
+
+
+def test_the_capabilities_of_the_documentation_are_the_declared_ones() -> None:
+    assert capability_table() in (Path(__file__).resolve().parents[1] / "docs" / "optimize.md").read_text()
+
+
 @pytest.mark.parametrize("backend", backends())
 def test_what_cannot_be_solved_is_said_by_every_backend(backend: str) -> None:
     for problem, free in ((NO_FIX, {"a", "b", "c"}), (ISLAND, {"c", "d"})):
         found = solve(problem, backend, throw=False)
         assert found.status is Status.RANK_DEFICIENT
-        assert set(found.free) == free
+        assert set(found.unobservable) == free
         with pytest.raises(InputError, match=r"must be observable.*Add a position factor"):
             solve(problem, backend)
     with pytest.raises(InputError, match=r"a and b coincide.*keeps them apart"):

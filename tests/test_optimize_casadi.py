@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -19,7 +18,7 @@ from coopoc.optimize.backends.casadi_programme import programme
 from coopoc.optimize.initial import initial_guess
 from coopoc.world.recording import Recording
 
-METHODS = ["auto", "fatrop", "ipopt", "sqp"]
+METHODS = ["auto", "fatrop", "ipopt"]
 ROBUST = [Loss("huber", 1.0), Loss("cauchy", 2.0), Loss("geman-mcclure", 3.0)]
 
 
@@ -43,8 +42,10 @@ def flat_graph(seed: int, loss: Loss | None = None) -> Problem:
     start = np.concatenate([pose(at + rng.normal(0, 0.5, at.shape), turn + rng.normal(0, 0.2, n)), pose(marks + 0.5)])
     names = (*(f"p{i}" for i in range(n)), "m0", "m1")
     i, j = np.array([*((k, k + 1) for k in range(n - 1)), (0, 5), (3, 9)]).T
-    relative = pose(rotate(-turn[i], at[j] - at[i]) + rng.normal(0, 0.1, (len(i), 2)),
-                    turn[j] - turn[i] + rng.normal(0, 0.03, len(i)))  # fmt: skip
+    relative = pose(
+        rotate(-turn[i], at[j] - at[i]) + rng.normal(0, 0.1, (len(i), 2)),
+        turn[j] - turn[i] + rng.normal(0, 0.03, len(i)),
+    )
     a, b = (k.ravel() for k in np.meshgrid(np.arange(0, n, 2), np.arange(2), indexing="ij"))
     gap = rotate(-turn[a], marks[b] - at[a])
     seen = np.stack([np.linalg.norm(gap, axis=1), np.arctan2(gap[:, 1], gap[:, 0])], axis=1)
@@ -65,9 +66,11 @@ def space_graph(seed: int, kind: str = "relative_pose", far: float = 1.0) -> Pro
     pairs = np.array([*((k, k + 1) for k in range(n - 1)), (0, 5), (3, 9), (2, 7)])
     i, j = pairs.T
     noise = Rotation.from_rotvec(rng.normal(0, 0.03, (len(i), 3)))
-    relative = pose(turn[i].inv().apply(at[j] - at[i]) + rng.normal(0, 0.1, (len(i), 3)),
-                    (turn[i].inv() * turn[j] * noise).as_rotvec())  # fmt: skip
-    problem = Problem(tuple(f"p{k}" for k in range(n)), poses=range(n), x0=start, held=(0,))
+    relative = pose(
+        turn[i].inv().apply(at[j] - at[i]) + rng.normal(0, 0.1, (len(i), 3)),
+        (turn[i].inv() * turn[j] * noise).as_rotvec(),
+    )
+    problem = Problem(tuple(f"p{k}" for k in range(n)), poses=range(n), x0=start, fixed=(0,))
     return problem.add(kind, pairs.tolist(), relative, std=0.1)
 
 
@@ -75,7 +78,7 @@ def ranges_only(seed: int) -> Problem:
     rng = np.random.default_rng(seed)
     truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (8, 3)) * [1, 1, 0.2]])
     names = tuple("abcdefghi")
-    problem = Problem(names, hub=(0,)).add("position", names, truth + rng.normal(0, 3, truth.shape), std=3.0)
+    problem = Problem(names, separator=(0,)).add("position", names, truth + rng.normal(0, 3, truth.shape), std=3.0)
     z = np.linalg.norm(truth[1:], axis=1) + rng.normal(0, 0.5, 8)
     return problem.add("range", [("a", name) for name in names[1:]], z[:, None], std=0.5)
 
@@ -88,16 +91,19 @@ CASES = {
     "snapshot": lambda rec: Problem.from_snapshot(rec, 10, 0, 1),
     "window": lambda rec: Problem.from_window(rec, 20, 0, 5),
     "full roots": lambda rec: Problem.from_snapshot(rec, 5, 0).add(
-        "displacement", (0, 1), [20.0, 3.0, 0.0], sqrt_information=[[2, 0, 0], [0.5, 1, 0], [0.1, 0.2, 1]]),
+        "displacement", (0, 1), [20.0, 3.0, 0.0], sqrt_information=[[2, 0, 0], [0.5, 1, 0], [0.1, 0.2, 1]]
+    ),
     "ranges only": lambda rec: ranges_only(1),
     "plane graph": lambda rec: flat_graph(0),
     "space graph": lambda rec: space_graph(0),
     "chordal graph": lambda rec: space_graph(1, "relative_pose_chordal"),
     "far graph": lambda rec: space_graph(0, far=3.0),
-    **{f"snapshot {loss.name}": lambda rec, loss=loss: robust(Problem.from_snapshot(rec, 10, 0), loss)
-       for loss in ROBUST},
+    **{
+        f"snapshot {loss.name}": lambda rec, loss=loss: robust(Problem.from_snapshot(rec, 10, 0), loss)
+        for loss in ROBUST
+    },
     **{f"plane graph {loss.name}": lambda rec, loss=loss: flat_graph(1, loss) for loss in ROBUST},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -108,8 +114,11 @@ def test_it_ends_where_gauss_newton_ends(dense: Recording, case: str, method: st
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)
     assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-6)
-    assert theirs.extras["return_status"] in ("Solve_Succeeded", "Solved_To_Acceptable_Level",
-                                              "Search_Direction_Becomes_Too_Small")  # fmt: skip
+    assert theirs.extras["return_status"] in (
+        "Solve_Succeeded",
+        "Solved_To_Acceptable_Level",
+        "Search_Direction_Becomes_Too_Small",
+    )
     assert theirs.extras["rounds"] == (2 if problem.poses else 1)
 
 
@@ -138,8 +147,14 @@ def test_a_graph_of_poses_is_scipys(seed: int, method: str) -> None:
         bearing = wrap(np.arctan2(gap[:, 1], gap[:, 0]) - sights.z[:, 1])
         z0 = angle(prior.z)
         first = [*rotate(-z0, at[:1] - prior.z[:, :2])[0] / 0.1, *wrap(turn[:1] - z0) / 0.05]
-        return np.concatenate([first, (np.concatenate([moved, turned], axis=1) / [0.1, 0.1, 0.03]).ravel(),
-                               (np.linalg.norm(gap, axis=1) - sights.z[:, 0]) / 0.2, bearing / 0.03])  # fmt: skip
+        return np.concatenate(
+            [
+                first,
+                (np.concatenate([moved, turned], axis=1) / [0.1, 0.1, 0.03]).ravel(),
+                (np.linalg.norm(gap, axis=1) - sights.z[:, 0]) / 0.2,
+                bearing / 0.03,
+            ]
+        )
 
     start = np.concatenate([problem.x0[:, :2].ravel(), angle(problem.x0)[:n]])
     found = least_squares(residual, start, jac="3-point", xtol=1e-15, ftol=1e-15, gtol=1e-13)
@@ -171,8 +186,11 @@ def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
     problem = Problem.from_snapshot(dense, 3, 0)
     solve(replace(problem, x0=solve(problem).x + 0.1), "casadi", method=method)
     assert programme.cache_info()[:2] == (4, 1)
-    for other in (robust(problem, ROBUST[0]), problem.constrain("position", 0, [1, *[-np.inf] * 2], [1, *[np.inf] * 2]),
-                  replace(problem, x0=solve(problem).x, held=(1,))):  # fmt: skip
+    for other in (
+        robust(problem, ROBUST[0]),
+        problem.constrain("position", 0, [1, *[-np.inf] * 2], [1, *[np.inf] * 2]),
+        replace(problem, x0=solve(problem).x, fixed=(1,)),
+    ):
         before = programme.cache_info().misses
         solve(other, "casadi", method=method)
         assert programme.cache_info().misses == before + 1
@@ -193,7 +211,8 @@ def test_a_kind_of_the_same_name_is_another_structure() -> None:
     found = []
     for power in (1, 2):
         measurement("reach", arity=2, components=("coordinate",))(
-            lambda x, y, z, m=np, power=power: ((x * x + y * y + z * z) ** power,))  # fmt: skip
+            lambda x, y, z, m=np, power=power: ((x * x + y * y + z * z) ** power,)
+        )
         try:
             stds = np.outer([1e-3, 1.0], np.ones(3))
             problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [2, 0, 0]], std=stds)
@@ -218,9 +237,12 @@ def test_ranges_end_where_ipopt_and_scipy_end(start: float | None) -> None:
         assert found.x == pytest.approx(ipopt.x, abs=1e-6)
         if start is None:
             scipys = least_squares(
-                lambda v, p=problem: p.whiten(v.reshape(9, 3))[0], initial_guess(problem).ravel(),
-                lambda v, p=problem: p.whiten(v.reshape(9, 3))[1].toarray(), xtol=1e-15, ftol=1e-15,
-            )  # fmt: skip
+                lambda v, p=problem: p.whiten(v.reshape(9, 3))[0],
+                initial_guess(problem).ravel(),
+                lambda v, p=problem: p.whiten(v.reshape(9, 3))[1].toarray(),
+                xtol=1e-15,
+                ftol=1e-15,
+            )
             assert found.cost == pytest.approx(scipys.cost, rel=1e-9)
 
 
@@ -228,8 +250,12 @@ def test_inequalities_and_many_numbers_are_ipopts(dense: Recording) -> None:
     problem = ranges_only(0)
     equal = problem.constrain("range", ("a", "b"), lower=12.0, upper=12.0)
     long = Problem.from_window(dense, 20, 0, 1 + DENSE // 33)
-    for case, method in ((problem, "fatrop"), (equal, "fatrop"), (long, "ipopt"),
-                         (problem.constrain("range", ("a", "b"), upper=12.0), "ipopt")):  # fmt: skip
+    for case, method in (
+        (problem, "fatrop"),
+        (equal, "fatrop"),
+        (long, "ipopt"),
+        (problem.constrain("range", ("a", "b"), upper=12.0), "ipopt"),
+    ):
         solution = solve(case, "casadi")
         assert solution.status is Status.SOLVED
         assert solution.extras["method"] == method
@@ -256,7 +282,7 @@ def test_an_answer_that_is_none_is_found_out(monkeypatch: pytest.MonkeyPatch, de
 def test_what_is_held_does_not_move(dense: Recording) -> None:
     problem = Problem.from_snapshot(dense, 10, 0)
     start = solve(problem).x + 0.3
-    held = replace(problem, x0=start, held=(0, 4))
+    held = replace(problem, x0=start, fixed=(0, 4))
     for method in METHODS:
         solution = solve(held, "casadi", method=method)
         assert (solution.x[[0, 4]] == start[[0, 4]]).all()
@@ -281,29 +307,17 @@ def test_the_limit_of_iterations(method: str) -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"method": "snopt"}, "must be one of"), ({"max_iterations": -1}, "must be a whole number"),
-     ({"tolerance": 0}, "must be a number > 0")],
-)  # fmt: skip
+    [
+        ({"method": "snopt"}, "must be one of"),
+        ({"max_iterations": -1}, "must be a whole number"),
+        ({"tolerance": 0}, "must be a number > 0"),
+    ],
+)
 def test_wrong_options(options: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words):
         solve(ranges_only(0), "casadi", **options)
 
 
 def test_a_truncated_loss_is_refused_with_the_way_out() -> None:
-    with pytest.raises(InputError, match=r"no second derivative.*gauss-newton"):
+    with pytest.raises(InputError, match=r"loss truncated: cannot be solved by casadi, only by .*gauss-newton"):
         solve(robust(ranges_only(0), Loss("truncated", 3.0)), "casadi")
-
-
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
-@pytest.mark.parametrize("method", METHODS)
-def test_compiled_and_interpreted_programmes_agree(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
-    problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
-    problem = problem.add("range", ("a", "b"), 7.0, std=0.3).constrain("range", ("a", "b"), 8.0, 8.0)
-    programme.cache_clear()
-    compiled = solve(problem, "casadi", method=method, codegen=True)
-    assert compiled.x == pytest.approx(solve(problem, "casadi", method=method).x, abs=1e-12)
-    assert programme.cache_info().misses == 2
-    monkeypatch.setattr(casadi_programme.shutil, "which", lambda name: None)
-    programme.cache_clear()
-    with pytest.raises(InputError, match="needs gcc"):
-        solve(problem, "casadi", method=method, codegen=True)

@@ -127,7 +127,7 @@ def ring(steps: int, d: int, seed: int = 0) -> Problem:
     at[:, :2] = 0.2 * steps * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     truth = pose(at, angle if d == 2 else np.stack([0 * angle, 0 * angle, angle], axis=1))
     names = tuple(f"x{k}" for k in range(steps))
-    problem = Problem(names, x0=truth, dimension=d, poses=names, held=(0,))  # type: ignore[arg-type]
+    problem = Problem(names, x0=truth, dimension=d, poses=names, fixed=(0,))  # type: ignore[arg-type]
     pairs = [(k, (k + 1) % steps) for k in range(steps)]
     turned = truth[:, d:].reshape(-1, d, d)
     z = np.array([np.concatenate([turned[i].T @ (at[j] - at[i]), (turned[i].T @ turned[j]).ravel()]) for i, j in pairs])
@@ -197,7 +197,7 @@ def test_weights_that_differ_between_axes_are_averaged_where_poses_turn() -> Non
     turn = np.array([0.0, 0.7, -1.1])
     at: Floats = np.array([[0.0, 0.0], [4.0, 1.0], [3.0, -2.0]])
     truth = pose(at, turn)
-    problem = Problem(("a", "b", "c"), x0=truth, dimension=2, poses=(0, 1, 2), held=(0,))
+    problem = Problem(("a", "b", "c"), x0=truth, dimension=2, poses=(0, 1, 2), fixed=(0,))
     turned = truth[:, 2:].reshape(-1, 2, 2)
     relative = pose(np.einsum("ji,j->i", turned[0], at[1]), turn[1])
     local = turned[1].T @ (at[2] - at[1])

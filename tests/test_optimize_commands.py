@@ -30,8 +30,16 @@ def file(tmp_path: Path) -> Path:
     odometry = PoseEdges([[0, 1], [1, 2]], moved, [[0.2], [-0.1]], [np.diag([0.01, 0.01, 1e-4])] * 2, [0.1, 0.2])
     distance = np.linalg.norm(position[:3] - position[3], axis=1)
     ranges = RangeEdges([[0, 3], [1, 3], [2, 3]], distance, [0.01] * 3, [0.0, 0.1, 0.2])
-    graph = Graph(2, ("A0", "A1", "A2", "L0"), [True] * 3 + [False], position, angle, [0.0, 0.1, 0.2, np.nan],
-                  relative_pose=odometry, ranges=ranges)  # fmt: skip
+    graph = Graph(
+        2,
+        ("A0", "A1", "A2", "L0"),
+        [True] * 3 + [False],
+        position,
+        angle,
+        [0.0, 0.1, 0.2, np.nan],
+        relative_pose=odometry,
+        ranges=ranges,
+    )
     path = tmp_path / "drive.pyfg"
     write_graph(graph, path)
     return path

@@ -19,8 +19,10 @@ def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:
         for k, nodes in enumerate(factor.nodes.tolist()):
             gap = v[:, nodes[-1]] - (v[:, nodes[0]] if len(nodes) == 2 else 0)
             h = ca.vertcat(*MEASUREMENTS[factor.kind].formula(gap[0], gap[1], gap[2], ca)) - factor.z[k]
-            h = [ca.atan2(ca.sin(h[c]), ca.cos(h[c])) if angle else h[c]
-                 for c, angle in enumerate(factor.measurement.angles())]  # fmt: skip
+            h = [
+                ca.atan2(ca.sin(h[c]), ca.cos(h[c])) if angle else h[c]
+                for c, angle in enumerate(factor.measurement.angles())
+            ]
             cost += 0.5 * ca.sumsqr(ca.DM(factor.root[k]) @ ca.vertcat(*h))
     return np.asarray(ca.Function("H", [v], [ca.hessian(cost, ca.vec(v))[0]])(x.T))
 

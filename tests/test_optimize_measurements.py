@@ -52,12 +52,12 @@ def test_derivative_equals_casadis(kind: str, dimension: int) -> None:
 @pytest.mark.parametrize("kind", ["relative_pose", "relative_pose_chordal"])
 def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
     """By the position and by a right turn R Exp(w), w = 0, for a small and for any error of the rotation."""
-    known, space = MEASUREMENTS[kind], Space(dimension, turning=True)
+    known, space = MEASUREMENTS[kind], Space(dimension, has_rotation=True)
     v, w = ca.SX.sym("v", dimension), ca.SX.sym("w", space.angles)
     turn, d = ca.SX.sym("R", dimension, dimension), dimension
     skew = ca.skew(w) if d == 3 else ca.vertcat(ca.horzcat(0, -w), ca.horzcat(w, 0))
     turned = turn @ (ca.SX.eye(d) + skew)
-    z = ca.SX.sym("z", space.width)
+    z = ca.SX.sym("z", space.ambient)
     local = [*ca.vertsplit(v), *(turned[i, j] for i in range(d) for j in range(d))]
     formula = ca.vertcat(*known.residual(local, ca.vertsplit(z), [], Symbolic))
     slopes = [ca.substitute(ca.jacobian(formula, s), w, 0) for s in (v, w)]
@@ -78,7 +78,7 @@ def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
 
 
 def test_a_relative_pose_is_scipys_logarithm() -> None:
-    known, space = MEASUREMENTS["relative_pose"], Space(3, turning=True)
+    known, space = MEASUREMENTS["relative_pose"], Space(3, has_rotation=True)
     z = space.join(VECTORS[::-1], ROTATIONS[::-1])
     found = known.difference(VECTORS, ROTATIONS, z, np.empty((50, 0)))
     back = Rotation.from_matrix(ROTATIONS[::-1]).inv()
@@ -88,7 +88,7 @@ def test_a_relative_pose_is_scipys_logarithm() -> None:
 
 @pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
 def test_torch_runs_the_same_formula(kind: str) -> None:
-    known, space = MEASUREMENTS[kind], Space(3, turning=True)
+    known, space = MEASUREMENTS[kind], Space(3, has_rotation=True)
     z = space.join(VECTORS, ROTATIONS[::-1]) if known.compares_poses else np.zeros((50, known.size()))
     rotation = ROTATIONS if known.frame == "relative" else None
     constants = np.full((50, known.constants), 0.1)
@@ -109,7 +109,7 @@ def test_dual_arithmetic_equals_casadis() -> None:
     for i, vector in enumerate(VECTORS):
         value, slope = (np.asarray(a).ravel() for a in reference(vector))
         assert ours.value[i] == pytest.approx(value[0], rel=1e-12)
-        assert ours.slope[:, i] == pytest.approx(slope, rel=1e-11, abs=1e-12)
+        assert ours.derivative[:, i] == pytest.approx(slope, rel=1e-11, abs=1e-12)
 
 
 def test_angles_wrap() -> None:
@@ -143,9 +143,13 @@ def test_a_decorated_function_is_all_it_takes() -> None:
 
 @pytest.mark.parametrize(
     ("options", "words"),
-    [({"arity": 3}, "arity = 3"), ({"components": ("length",)}, "'coordinate', 'distance', 'angle'"),
-     ({"components": ()}, "one per number"), ({"linear": True}, "the vector itself")],
-)  # fmt: skip
+    [
+        ({"arity": 3}, "arity = 3"),
+        ({"components": ("length",)}, "'coordinate', 'distance', 'angle'"),
+        ({"components": ()}, "one per number"),
+        ({"linear": True}, "the vector itself"),
+    ],
+)
 def test_a_measurement_that_cannot_be(options: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words):
         measurement("odd", **{"arity": 2, "components": ("distance",), **options})

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import approx_fprime, least_squares
 from scipy.stats import chi2
 
-from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, graduate, graduate_batch, solve
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, solve, solve_gnc, solve_gnc_batch
 from coopoc.optimize.curvature import is_minimum
 from coopoc.optimize.gnc import SURROGATES
 
@@ -88,7 +88,7 @@ def sighted(name: str, seed: int) -> Problem:
     anchors = np.array([[0, 0, 0], [30, 0, 2], [0, 30, 4], [30, 30, 9.0]])
     truth = rng.uniform(8, 22, (2, 3)) * [1, 1, 0.5]
     x0 = np.concatenate([anchors, truth + rng.normal(0, 0.5, (2, 3))])
-    problem = Problem(("a", "b", "c", "d", "p", "q"), x0=x0, held=("a", "b", "c", "d"))
+    problem = Problem(("a", "b", "c", "d", "p", "q"), x0=x0, fixed=("a", "b", "c", "d"))
     pairs = [(a, 4 + p) for a in range(4) for p in range(2)] + [(4, 5)]
     vector = np.array([[*anchors, *truth][j] - [*anchors, *truth][i] for i, j in pairs])
     for kind, std in (("range", 0.3), ("azimuth", 0.03), ("inclination", 0.03)):
@@ -115,8 +115,10 @@ def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
     loss, ours = geman_mcclure if name == "geman-mcclure" else name, solve(problem)
     near = ours.x[4:] + np.random.default_rng(seed).normal(0, 0.1, (2, 3))
     exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-12}
-    tries = [least_squares(residual, start.ravel(), "3-point", loss=loss, f_scale=1.2, **exact)
-             for start in (problem.x0[4:], near)]  # fmt: skip
+    tries = [
+        least_squares(residual, start.ravel(), "3-point", loss=loss, f_scale=1.2, **exact)
+        for start in (problem.x0[4:], near)
+    ]
     best = min(tries, key=lambda found: found.cost)
     assert ours.cost == pytest.approx(best.cost, rel=1e-9)
     assert ours.x[4:].ravel() == pytest.approx(best.x, abs=1e-5)
@@ -175,7 +177,7 @@ def test_gtsam_doubts_the_same_measurements(wrong: int) -> None:
         params.setRelativeCostTol(0.0)
         theirs = gtsam.GncLMOptimizer(graph, values(start), params)
         result = theirs.optimize()
-        ours = graduate(problem, suspects=[3])
+        ours = solve_gnc(problem, candidates=[3])
         assert np.array_equal(ours.extras["weights"], theirs.getWeights()[-12:])
         assert np.array_equal(ours.extras["weights"][:wrong], np.zeros(wrong))
         assert ours.x == pytest.approx(np.stack([result.atPoint3(k) for k in range(12)]), abs=1e-3)
@@ -188,7 +190,7 @@ def test_geman_mcclure_ends_where_its_loss_is_least() -> None:
     """solve with Loss("geman-mcclure", c) started at the result has nowhere to go, and its cost is GTSAM's GNC's."""
     for seed in range(3):
         problem = native(seed, 5)
-        ours = graduate(problem, [3], loss="geman-mcclure")
+        ours = solve_gnc(problem, [3], loss="geman-mcclure")
         loss = Loss("geman-mcclure", np.sqrt(chi2.ppf(0.99, 3)))
         stated = replace(problem, factors=(*problem.factors[:3], replace(problem.factors[3], loss=loss)), x0=ours.x)
         least = solve(stated)
@@ -204,12 +206,12 @@ def test_geman_mcclure_ends_where_its_loss_is_least() -> None:
 @pytest.mark.parametrize("backend", ["gtsam", "osqp"])
 def test_any_backend_and_any_weighting_may_solve_the_rounds(backend: str) -> None:
     problem = native(1, 4)
-    ours, theirs = graduate(problem, [3]), graduate(problem, [3], backend=backend)
+    ours, theirs = solve_gnc(problem, [3]), solve_gnc(problem, [3], backend=backend)
     assert theirs.backend == backend
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)
     assert np.array_equal(theirs.extras["weights"], ours.extras["weights"])
     root = replace(problem.factors[3], std=None, sqrt_information=np.eye(3))
-    by_root = graduate(replace(problem, factors=(*problem.factors[:3], root)), [(3, range(12))], backend=backend)
+    by_root = solve_gnc(replace(problem, factors=(*problem.factors[:3], root)), [(3, range(12))], backend=backend)
     assert by_root.x == pytest.approx(ours.x, abs=1e-6)
     inside = Problem(problem.names, problem.factors[:3], problem.x0)
     kept = np.flatnonzero(ours.extras["weights"]).tolist()
@@ -228,10 +230,10 @@ def test_a_batch_is_each_of_its_realisations() -> None:
     batch = replace(each[0], factors=tuple(factors), x0=np.stack([p.x0 for p in each]))
     groups = np.repeat(np.arange(6), 2)
     for loss in SURROGATES:
-        found = graduate_batch(batch, [3], loss=loss, groups=groups)
+        found = solve_gnc_batch(batch, [3], loss=loss, groups=groups)
         assert found.converged.all()
         for b in range(3):
-            alone = graduate(batch.pick(b), [3], loss=loss, groups=groups)
+            alone = solve_gnc(batch.pick(b), [3], loss=loss, groups=groups)
             assert found.x[b] == pytest.approx(alone.x, abs=1e-6)
             assert found.weights[b] == pytest.approx(alone.extras["weights"], abs=1e-6)
             assert found.covariance[b] == pytest.approx(alone.covariance, abs=1e-6)

@@ -10,7 +10,7 @@ from latex import compiled
 
 from coopoc.errors import InputError
 from coopoc.study.report import report
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 
 VOID = {"meta", "link", "img"}
 
@@ -49,7 +49,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
         study = importlib.import_module("small_study").STUDY
-        run(study, out, settings={"trouble": str(out / "trouble")}, progress=False)
+        run_study(study, out, settings={"trouble": str(out / "trouble")}, progress=False)
     cards = {"circle": {"vehicles": 5, "licence": "<none> & free"}}
     path = report([out / "small"], out / "page" / "report.html", "Circles & <more>", ["A lead."], cards)
     page = Page()
@@ -71,11 +71,28 @@ def test_nothing_outside_the_file_is_needed(made: tuple[Path, Page]) -> None:
 
 @pytest.mark.parametrize(
     "words",
-    ["What is a neighbour worth on a circle?", "Key findings", "KF: ", "Settings and seeds", "Recipe",
-     "nothing here learns", "Limitations", "Nobody drives in circles.", "Environment", "numpy", "Failed cells: 1",
-     "FloatingPointError: the filter diverged at step 3", "K = 1, KF", "RT-LE [m] at a GNSS noise of 3.5 m.",
-     "A lead.", "<none> & free", "Circles & <more>", "Training", "Pause"],
-)  # fmt: skip
+    [
+        "What is a neighbour worth on a circle?",
+        "Key findings",
+        "KF: ",
+        "Settings and seeds",
+        "Recipe",
+        "nothing here learns",
+        "Limitations",
+        "No vehicle drives in circles.",
+        "Environment",
+        "numpy",
+        "Failed cells: 1",
+        "FloatingPointError: the filter diverged at step 3",
+        "K = 1, KF",
+        "RT-LE [m] at a GNSS noise of 3.5 m.",
+        "A lead.",
+        "<none> & free",
+        "Circles & <more>",
+        "Training",
+        "Pause",
+    ],
+)
 def test_it_says(made: tuple[Path, Page], words: str) -> None:
     assert words in made[1].text
 

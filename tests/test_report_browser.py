@@ -13,9 +13,10 @@ import pytest
 
 from coopoc.errors import MissingLibraryError
 from coopoc.study import pdf
+from coopoc.study.pivot import pivot
 from coopoc.study.report import report
 from coopoc.study.results import Results
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 from coopoc.study.tables import Table
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install 'coopoc[dev]'")
@@ -24,10 +25,10 @@ WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
 def _known(known: str) -> Any:
-    """The study's table under a name that ends in a knowledge; its rows are those that this knowledge ran."""
+    """The study's table under a name that ends in a noise model; its rows are those of this noise model."""
 
     def table(results: Results) -> Table:
-        return results.table("method", "max_neighbours", "rt_le_m", caption=f"RT-LE [m], {known} knowledge.")
+        return pivot(results, "method", "max_neighbours", "rt_le_m", caption=f"RT-LE [m], {known} noise model.")
 
     return table
 
@@ -36,8 +37,12 @@ def _numbers(results: Results) -> Table:
     """Numbers whose order as text is another one, what is missing, intervals, and durations."""
     wide = results.interval("rt_le_m", method="kalman", max_neighbours=0)
     narrow = results.interval("rt_le_m", method="joint", max_neighbours=2)
-    rows = (("b 10", -1.0, wide, "2.0 h"), ("a", None, None, "5 s"), ("b 9", 10.25, narrow, "10 min"),
-            ("c", -2.0, 0.5, "inf"))  # fmt: skip
+    rows = (
+        ("b 10", -1.0, wide, "2.0 h"),
+        ("a", None, None, "5 s"),
+        ("b 9", 10.25, narrow, "10 min"),
+        ("c", -2.0, 0.5, "inf"),
+    )
     return Table(("Name", "Number", "Interval", "Duration"), rows, "Made to be sorted.")
 
 
@@ -56,7 +61,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     tables = {f"rt_le_{k}": _known(k) for k in ("identity", "fitted", "nominal")}
     figures = {f"rt_le_{k}": small.figures["rt_le"] for k in ("identity", "fitted")}
     study = replace(small, tables={**tables, "numbers": _numbers, "wide": _wide, **small.tables}, figures=figures)
-    run(study, out, progress=False)
+    run_study(study, out, progress=False)
     return report([out / "small"], out / "report.html", cards={"circle": {"vehicles": 5, "name": "a" * 120}})
 
 
@@ -96,7 +101,7 @@ def _column(page: Any, table: str, index: int) -> list[str]:
 
 
 def _shown(page: Any) -> list[str]:
-    return [panel.get_attribute("data-knowledge") for panel in page.locator(".panel").all() if panel.is_visible()]
+    return [panel.get_attribute("data-noise_model") for panel in page.locator(".panel").all() if panel.is_visible()]
 
 
 def test_a_row_under_the_pointer_is_marked(page: Any) -> None:

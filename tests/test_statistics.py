@@ -24,8 +24,14 @@ def test_ratio_agrees_with_scipy_bootstrap() -> None:
     b = rng.gamma(9.0, 0.2, 300)
     a = 0.8 * b + rng.normal(0, 0.1, 300)
     ours = paired_ratio(a, b, resamples=20000)
-    theirs = stats.bootstrap((a, b), lambda x, y, axis=-1: x.mean(axis) / y.mean(axis), paired=True, rng=1,
-                             n_resamples=20000, method="percentile").confidence_interval  # fmt: skip
+    theirs = stats.bootstrap(
+        (a, b),
+        lambda x, y, axis=-1: x.mean(axis) / y.mean(axis),
+        paired=True,
+        rng=1,
+        n_resamples=20000,
+        method="percentile",
+    ).confidence_interval
     width = theirs.high - theirs.low
     assert abs(ours.low - theirs.low) < 0.05 * width
     assert abs(ours.high - theirs.high) < 0.05 * width

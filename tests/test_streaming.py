@@ -14,33 +14,33 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Knowledge, Sensors, observe
+from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
-from coopoc.learned.stream import gain_stream, okf_stream
 from coopoc.methods.adaptive import AdaptiveKalman
-from coopoc.methods.star_stream import Sighting, StarStream
+from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.methods.variational import VariationalKalman
 from coopoc.world.inbox import Inbox, inbox
-from coopoc.world.recording import Links, Recording
+from coopoc.world.links import Links
+from coopoc.world.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
 S2 = Sensors.paper_scenario2()
-FITTED = Knowledge("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+FITTED = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
 OKF = OptimisedKF((0.05, 0.04, 0.01), (0.1, 0.12, 0.05), (1.5, 1.6, 1.7))
 NET = GainNet(2, 1)
 SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
     "identity": (Kalman("identity"), Kalman("identity").start),
-    "nominal": (Kalman("nominal"), Kalman(Knowledge.nominal(S2)).start),
+    "nominal": (Kalman("nominal"), Kalman(NoiseModel.nominal(S2)).start),
     "fitted": (Kalman(FITTED), Kalman(FITTED).start),
     "adaptive": (AdaptiveKalman(), AdaptiveKalman().start),
     "variational": (VariationalKalman(), VariationalKalman().start),
-    "okf": (OKF, lambda x0=None: okf_stream(OKF, x0)),
+    "okf": (OKF, lambda x0=None: OKF.start(x0)),
 }
 STARTS: dict[str, Callable[..., Any]] = {
     **{name: start for name, (_, start) in SOLO.items()},
-    "net": lambda x0=None: gain_stream(NET, x0),
-    "joint": JointFilter(Knowledge.nominal(S2)).start,
+    "net": lambda x0=None: LearnedGain(NET).start(x0),
+    "joint": JointFilter(NoiseModel.nominal(S2)).start,
     "edge": JointFilter(FITTED, exact=False).start,
 }
 U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
@@ -77,14 +77,14 @@ def test_a_known_start_is_the_track_from_there(name: str, crossing: Fleet) -> No
 def test_a_net_step_by_step_is_its_track(known: bool, crossing: Fleet) -> None:
     recording, x0 = observe(crossing, S2, V2X(max_neighbours=0)), crossing.position[0, 3]
     track = LearnedGain(NET, x0=x0[None] if known else None)(recording, [3])
-    stream = gain_stream(NET, x0 if known else None)
+    stream = LearnedGain(NET).start(x0 if known else None)
     for t in range(known, len(recording.t)):
         x, cov = stream.step(recording.gnss[0, t, 3], recording.velocity[0, t, 3], recording.dt)
         assert cov is None
         np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-5)
 
 
-def sightings(recording: Recording, box: Inbox, run: int, t: int) -> list[Sighting]:
+def sightings(recording: Recording, box: Inbox, run: int, t: int) -> list[RelativeMeasurement]:
     """What an ego sees at step t, with the messages that are new to it, as a `Recording` and an `Inbox` tell it."""
     seen = []
     for k in range(box.start[t], box.start[t + 1]):
@@ -92,9 +92,12 @@ def sightings(recording: Recording, box: Inbox, run: int, t: int) -> list[Sighti
         j, sent = recording.links.neighbour[link], box.newest[run, k]
         said: dict[str, Any] = {}
         if box.fresh[run, k]:
-            said = {"gnss": recording.gnss[run, sent, j], "velocity": recording.velocity[run, sent, j],
-                    "age": (t - sent) * recording.dt}  # fmt: skip
-        seen.append(Sighting(recording.ids[j], recording.relative[run, link], **said))
+            said = {
+                "gnss": recording.gnss[run, sent, j],
+                "velocity": recording.velocity[run, sent, j],
+                "age": (t - sent) * recording.dt,
+            }
+        seen.append(RelativeMeasurement(recording.ids[j], recording.relative[run, link], **said))
     return seen
 
 
@@ -122,7 +125,7 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
     assert len(set(recording.neighbours(0).tolist())) > 2
     method = JointFilter("nominal", exact=exact)
     track, box = method(recording, [0]), inbox(recording, 0, method.message)
-    stream = JointFilter(Knowledge.nominal(recording.sensors), exact).start(max_age=recording.v2x.max_age)
+    stream = JointFilter(NoiseModel.nominal(recording.sensors), exact).start(max_age=recording.v2x.max_age)
     for t in range(len(recording.t)):
         seen = sightings(recording, box, 1, t)
         x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
@@ -133,7 +136,7 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
             np.testing.assert_allclose(stream.neighbours[s.id], track.neighbours[1, k], atol=1e-9)
 
 
-def peer(x: Floats, known: Knowledge) -> Any:
+def peer(x: Floats, known: NoiseModel) -> Any:
     """filterpy's filter of a position with a velocity as input."""
     found = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     found.x, found.P = x.copy(), np.diag(known.gnss_variance)
@@ -229,7 +232,7 @@ def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float)
     truth = np.cumsum(draw.normal(0, q, steps + 1))
     at = [t - late if t % 2 and t >= late else t for t in range(steps + 1)]
     fixes = truth[at] + draw.normal(0, r, steps + 1)
-    known = Knowledge("constant", process_std=(q, q, q), gnss_std=(r, r, r))
+    known = NoiseModel("constant", process_std=(q, q, q), gnss_std=(r, r, r))
     full, prompt = Kalman(known).start(), Kalman(known).start()
     for t in range(steps + 1):
         stale = at[t] < t
@@ -255,7 +258,7 @@ def test_a_late_fix_is_nearly_used_up() -> None:
 def test_a_net_is_as_good_far_from_the_origin() -> None:
     """float32 resolves 1 m at 1e7 m; the origin moves along."""
     draw, far = np.random.default_rng(2), np.array([1e7, -2e7, 0.0])
-    here, there = gain_stream(NET), gain_stream(NET)
+    here, there = LearnedGain(NET).start(), LearnedGain(NET).start()
     for k in range(50):
         z = Z + 0.9 * k + draw.normal(0, 2, 3)
         np.testing.assert_allclose(there.step(z + far, U, 0.1)[0] - far, here.step(z, U, 0.1)[0], atol=1e-5)
@@ -285,7 +288,7 @@ def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str
     with pytest.raises(InputError, match=f"^{field} = "):
         one.step(**{"gnss": Z, "velocity": U, "dt": 0.1} | given)
     np.testing.assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
-    assert one.past.seen == other.past.seen
+    assert one.history.seen == other.history.seen
 
 
 def test_history_is_as_long_as_asked_for() -> None:
@@ -293,7 +296,7 @@ def test_history_is_as_long_as_asked_for() -> None:
     for _ in range(100):
         stream.step(Z, U, 0.1)
     stream.step(Z, U, 0.1, fix_age=0.5)
-    assert len(stream.past.steps) == 5
+    assert len(stream.history) == 5
     with pytest.raises(InputError, match=r"fix_age = 0.61 s: must be in 0..0.5 s"):
         stream.step(Z, U, 0.1, fix_age=0.61)
 
@@ -304,40 +307,41 @@ def test_bad_starts_are_named() -> None:
         "interval": lambda: Kalman("identity").start(interval=0.0),
         "history": lambda: Kalman("identity").start(history=-1.0),
         "max_age": lambda: JointFilter("identity").start(max_age=np.nan),
-        "knowledge": lambda: JointFilter("nominal").start(),
+        "noise_model": lambda: JointFilter("nominal").start(),
     }.items():
         with pytest.raises(InputError, match=f"^{field} = "):
             make()
-    oracle = Kalman(Knowledge.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
-    with pytest.raises(InputError, match=r"knowledge = 'oracle'.*Knowledge.nominal"):
+    oracle = Kalman(NoiseModel.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
+    with pytest.raises(InputError, match=r"noise_model = 'oracle'.*NoiseModel.nominal"):
         oracle.start()
 
 
 def test_bad_sightings_are_named() -> None:
+    with pytest.raises(InputError, match=r"^relative = "):
+        RelativeMeasurement("b", [-1.0, 0.0, 1.5])
     for field, wrong in {
         "relative": {"relative": [1.0, 2.0]},
-        "sighting": {"relative": [-1.0, 0.0, 1.5]},
         "velocity": {"gnss": Z},
         "neighbour's gnss": {"gnss": [1.0, np.nan, 0.0], "velocity": U},
         "neighbour's velocity": {"velocity": [np.inf, 0.0, 0.0]},
         "age": {"velocity": U, "age": -1.0},
     }.items():
         with pytest.raises(InputError, match=f"^{field} = "):
-            Sighting("b", **{"relative": [9.0, 0.0, 1.5]} | wrong)
-    seen = Sighting("b", [9.0, 0.0, 1.5])
+            RelativeMeasurement("b", **{"relative": [9.0, 0.0, 1.5]} | wrong)
+    seen = RelativeMeasurement("b", [9.0, 0.0, 1.5])
     with pytest.raises(InputError, match="neighbours"):
         JointFilter("identity").start().step(Z, U, 0.1, neighbours=[seen, seen])
 
 
 def test_neighbours_help_while_the_fix_is_missing() -> None:
     """A tunnel for the ego only: a sighting of a vehicle with fixes keeps its covariance bounded, alone it grows."""
-    known = Knowledge.nominal(Sensors())
+    known = NoiseModel.nominal(Sensors())
     helped, alone = (JointFilter(known).start() for _ in range(2))
     assert isinstance(helped, StarStream)
     for k in range(100):
         z = 0.1 * k * U
         fix = z if k < 10 else None
-        seen = Sighting("b", [10.0, 0.0, np.pi / 2], gnss=z + np.array([10.0, 0.0, 0.0]), velocity=U)
+        seen = RelativeMeasurement("b", [10.0, 0.0, np.pi / 2], gnss=z + np.array([10.0, 0.0, 0.0]), velocity=U)
         x, cov = helped.step(fix, U, 0.1, neighbours=[seen])
         _, lonely = alone.step(fix, U, 0.1)
     np.testing.assert_allclose(x, z, atol=1e-6)
@@ -345,7 +349,7 @@ def test_neighbours_help_while_the_fix_is_missing() -> None:
 
 
 def test_learned_methods_start_their_streams() -> None:
-    for method, stream in ((LearnedGain(NET), gain_stream(NET, Z)), (OKF, okf_stream(OKF, Z))):
+    for method, stream in ((LearnedGain(NET), LearnedGain(NET).start(Z)), (OKF, OKF.start(Z))):
         filter = method.start(Z)
         for _ in range(3):
             np.testing.assert_array_equal(filter.step(Z + 1.0, U, 0.1)[0], stream.step(Z + 1.0, U, 0.1)[0])

@@ -26,7 +26,7 @@ from coopoc.plugins import find
 from coopoc.studies import claims, convergence, error_cdf, neighbours, paper, scene, weights
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 from coopoc.study.study import Params, Study
 
 WEIGHTS = Path(__file__).resolve().parents[1] / "learned" / "weights"
@@ -35,7 +35,7 @@ CLASSIC = {"method": "gnss,kalman,lkf-sa,joint,bound", "runs": 4, "egos": "2", "
 
 @pytest.fixture(scope="module")
 def town10() -> co.Fleet:
-    return co.load("town10")
+    return co.load_fleet("town10")
 
 
 def study(name: str, **changes: object) -> Study:
@@ -50,13 +50,13 @@ def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Res
 
 def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     """Only what is asked for is made: no weights for classical methods, and views of what was run."""
-    results = run(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)
+    results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)
     assert results.failed == 0
     assert not (tmp_path / "weights").exists()
     ideal = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
     bound = [results.interval("rt_le_m", method="bound", max_neighbours=k, **ideal).mean for k in (0, 2, 6)]
     joint = [
-        results.interval("rt_le_m", method="joint", knowledge="nominal", max_neighbours=k, **ideal).mean
+        results.interval("rt_le_m", method="joint", noise_model="nominal", max_neighbours=k, **ideal).mean
         for k in (0, 2, 6)
     ]
     assert bound == sorted(bound, reverse=True)
@@ -66,7 +66,7 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     assert "LKF-SA falls from K = 2 to 6" in said
     assert "order" not in said  # there is no net to order
     rms = np.sqrt(
-        (results.values("rt_le_m", method="joint", knowledge="nominal", max_neighbours=6) ** 2).mean(1)
+        (results.values("rt_le_m", method="joint", noise_model="nominal", max_neighbours=6) ** 2).mean(1)
     ).mean()
     assert "K = 6, rms over runs: KF alone" in said
     assert f"joint filter {rms:.3g} m, bound {bound[-1]:.3g} m." in said
@@ -83,35 +83,61 @@ def test_neighbours_of_solo_filters_alone_ends_well(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     shown = published(tmp_path / "runs" / "neighbours")
-    assert [view["name"] for view in shown["tables"]] == ["rt_le_identity", "rt_le_fitted", "rt_le_nominal", "nees",
-                                                           "nees_inside"]  # fmt: skip
+    assert [view["name"] for view in shown["tables"]] == [
+        "rt_le_identity",
+        "rt_le_fitted",
+        "rt_le_nominal",
+        "nees",
+        "nees_inside",
+    ]
     assert shown["findings"] == []
 
 
 @pytest.mark.parametrize("rate", [10.0, 2.0])
 def test_the_bound_receives_what_the_channel_sends(rate: float) -> None:
     """As many bytes as the joint filter counts by itself, at every step and at a fifth of them."""
-    p = {**study("neighbours", runs=1, egos="1").settings, "max_neighbours": 4, "rate_hz": rate,
-         "cap_bytes_per_second": 0.0}  # fmt: skip
-    (bound,) = neighbours.cell({**p, "method": "bound", "knowledge": "bound"})
-    (joint,) = neighbours.cell({**p, "method": "joint", "knowledge": "nominal"})
+    p = {
+        **study("neighbours", runs=1, egos="1").settings,
+        "max_neighbours": 4,
+        "rate_hz": rate,
+        "cap_bytes_per_second": 0.0,
+    }
+    (bound,) = neighbours.cell({**p, "method": "bound", "noise_model": "bound"})
+    (joint,) = neighbours.cell({**p, "method": "joint", "noise_model": "nominal"})
     assert bound["bytes_per_second"] == pytest.approx(joint["bytes_per_second"], rel=0.1)
 
 
 def lkf(*levels: float) -> pd.DataFrame:
     """RT-LE of LKF-SA under identity covariances at K = 0, 1, ..., five runs of two egos."""
-    return pd.DataFrame([
-        {"method": "lkf-sa", "knowledge": "identity", "rate_hz": 10.0, "cap_bytes_per_second": 0.0, "max_neighbours": k,
-         "ego": ego, "run": run, "rt_le_m": level + 0.01 * (run + ego)}
-        for k, level in enumerate(levels) for ego in range(2) for run in range(5)
-    ])  # fmt: skip
+    return pd.DataFrame(
+        [
+            {
+                "method": "lkf-sa",
+                "noise_model": "identity",
+                "rate_hz": 10.0,
+                "cap_bytes_per_second": 0.0,
+                "max_neighbours": k,
+                "ego": ego,
+                "run": run,
+                "rt_le_m": level + 0.01 * (run + ego),
+            }
+            for k, level in enumerate(levels)
+            for ego in range(2)
+            for run in range(5)
+        ]
+    )
 
 
 @pytest.mark.parametrize(
     ("levels", "words"),
-    [((3.0,), None), ((3.0, 2.0), "LKF-SA (K = 1) 2.02 m."), ((3.0, 2.0, 1.0), "falls from K = 1 to 2"),
-     ((3.0, 1.0, 1.004), "does NOT fall"), ((3.0, 1.0, 2.0), "does NOT fall")],
-)  # fmt: skip
+    [
+        ((3.0,), None),
+        ((3.0, 2.0), "LKF-SA (K = 1) 2.02 m."),
+        ((3.0, 2.0, 1.0), "falls from K = 1 to 2"),
+        ((3.0, 1.0, 1.004), "does NOT fall"),
+        ((3.0, 1.0, 2.0), "does NOT fall"),
+    ],
+)
 def test_a_fall_with_k_is_claimed_only_if_it_was_seen(levels: tuple[float, ...], words: str | None) -> None:
     said = claims.findings(drawn("neighbours", lkf(*levels), "method", "max_neighbours"))
     assert [words in said[0]] == [True] if words else said == []
@@ -121,11 +147,17 @@ def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
     """The fitted KF at about 1 m, and a federated net that differs from it by a constant for each training seed."""
     both = {"scenario": 1, "velocity_ratio": 0.15, **at}
     noise = np.random.default_rng(0).uniform(0.9, 1.1, (2, runs))
-    rows = [{**both, "method": "kalman", "knowledge": "fitted", "ego": e, "run": r, "rt_le_m": noise[e, r]}
-            for e in range(2) for r in range(runs)]  # fmt: skip
-    rows += [{**row, "method": "fedkalmannet", "knowledge": "trained", "train_seed": s, "rt_le_m": row["rt_le_m"] + gap}
-             for s, gap in enumerate(net) for row in rows]  # fmt: skip
-    return drawn("error_cdf", pd.DataFrame(rows), "method", "knowledge", "scenario", "velocity_ratio")
+    rows = [
+        {**both, "method": "kalman", "noise_model": "fitted", "ego": e, "run": r, "rt_le_m": noise[e, r]}
+        for e in range(2)
+        for r in range(runs)
+    ]
+    rows += [
+        {**row, "method": "fedkalmannet", "noise_model": "trained", "train_seed": s, "rt_le_m": row["rt_le_m"] + gap}
+        for s, gap in enumerate(net)
+        for row in rows
+    ]
+    return drawn("error_cdf", pd.DataFrame(rows), "method", "noise_model", "scenario", "velocity_ratio")
 
 
 @pytest.mark.parametrize(
@@ -157,7 +189,7 @@ def test_nothing_is_claimed_where_the_interval_is_not_finite() -> None:
 def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:
     """The shipped weights of a method as the first seed's checkpoint of a training that these parameters ask for."""
     shipped = load(WEIGHTS / f"{name}.safetensors")
-    drives = co.load(str(p["clients"]))
+    drives = co.load_fleet(str(p["clients"]))
     (job,) = jobs_of(name, Setting(0, p["start"], p["velocity_reading"]), drives)
     card, history = {**shipped.card, "key": job.key(drives)}, None
     if isinstance(shipped.model, GainNet):
@@ -186,7 +218,7 @@ def test_only_what_the_cells_name_is_trained(tmp_path: Path) -> None:
 
 
 def test_there_are_as_many_individual_nets_as_clients(tmp_path: Path) -> None:
-    write_table(co.load("town10-clients").select([0, 2]), tmp_path / "two.csv")
+    write_table(co.load_fleet("town10-clients").select([0, 2]), tmp_path / "two.csv")
     for name in ("convergence", "error_cdf"):
         cells = study(name, clients=str(tmp_path / "two.csv"), train_seeds=1).cells()
         named = {c.given["method"] for c in cells}
@@ -198,8 +230,11 @@ def test_there_are_as_many_individual_nets_as_clients(tmp_path: Path) -> None:
 def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_path: Path, town10: co.Fleet) -> None:
     """The start moves the result; the last row is the net itself from that start."""
     for start in ("gnss", "true"):
-        p = {**study("convergence", weights=str(tmp_path), start=start, runs=2, egos="1", train_seeds=1).settings,
-             "method": "fedkalmannet", "train_seed": 0}  # fmt: skip
+        p = {
+            **study("convergence", weights=str(tmp_path), start=start, runs=2, egos="1", train_seeds=1).settings,
+            "method": "fedkalmannet",
+            "train_seed": 0,
+        }
         net = plant(tmp_path, "fedkalmannet", p, rounds=2)
         found = convergence.cell(p)
         assert [row["round"] for row in found] == [0, 0, 1, 1, 2, 2]
@@ -211,11 +246,20 @@ def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_pat
 
 def test_a_known_start_is_scored(tmp_path: Path) -> None:
     """The covariance of a known start is zero, which must not stop the cells that report one."""
-    wanted = study("open_choices", start="true", velocity_reading="axis", scenario=2, method="kalman,okf",
-                   knowledge="oracle,trained", runs=2, egos="town10-00+town10-24", train_seeds=1,
-                   weights=str(tmp_path / "weights"))  # fmt: skip
+    wanted = study(
+        "open_choices",
+        start="true",
+        velocity_reading="axis",
+        scenario=2,
+        method="kalman,okf",
+        noise_model="oracle,trained",
+        runs=2,
+        egos="town10-00+town10-24",
+        train_seeds=1,
+        weights=str(tmp_path / "weights"),
+    )
     plant(tmp_path / "weights", "okf", {**wanted.settings, "start": "true", "velocity_reading": "axis"})
-    results = run(wanted, out=tmp_path, progress=False)
+    results = run_study(wanted, out=tmp_path, progress=False)
     assert results.failed == 0
     assert results.interval("nees", method="kalman", velocity_ratio=0.15).mean == pytest.approx(3, rel=0.5)
     (table,) = published(tmp_path / "open_choices")["tables"]
@@ -230,9 +274,9 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10: co.Fleet
     for k in (1, 4, 10):
         seen = co.observe(town10, sensors, co.V2X(max_neighbours=k), runs=8, observers=egos)
         for method in (
-            co.Gnss(),
+            co.GNSS(),
             load_method("fedkalmannet"),
-            co.LaplacianKalman("identity"),
+            co.LKFSA("identity"),
             co.JointFilter("nominal"),
         ):
             each = rt_le(method(seen, egos), town10)
@@ -279,16 +323,24 @@ def test_train_command_makes_a_checkpoint_that_loads(tmp_path: Path) -> None:
 
 def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path: Path) -> None:
     """MR.CLAM set 6: K <= 4, real range and bearing, labels on every table, no bound; what was fitted elsewhere."""
-    results = run(
-        study("neighbours", data=str(shared / "mrclam" / "MRCLAM_Dataset6"), method="gnss,kalman,joint,bound",
-              max_neighbours="0,4", runs=2, egos="2", weights=str(tmp_path / "weights")),
-        out=tmp_path, progress=False,
-    )  # fmt: skip
+    results = run_study(
+        study(
+            "neighbours",
+            data=str(shared / "mrclam" / "MRCLAM_Dataset6"),
+            method="gnss,kalman,joint,bound",
+            max_neighbours="0,4",
+            runs=2,
+            egos="2",
+            weights=str(tmp_path / "weights"),
+        ),
+        out=tmp_path,
+        progress=False,
+    )
     assert results.frame["max_neighbours"].max() == 4
     assert "bound" not in set(results.frame["method"])
     assert (tmp_path / "neighbours" / "figures" / "innovations.png").stat().st_size > 10_000
-    kalman = results.interval("rt_le_m", method="kalman", knowledge="nominal", max_neighbours=0)
-    joint = results.interval("rt_le_m", method="joint", knowledge="nominal", max_neighbours=4)
+    kalman = results.interval("rt_le_m", method="kalman", noise_model="nominal", max_neighbours=0)
+    joint = results.interval("rt_le_m", method="joint", noise_model="nominal", max_neighbours=4)
     assert joint.mean < kalman.mean < 0.12
     shown = published(tmp_path / "neighbours")
     assert all("GNSS is simulated" in view["caption"] for view in shown["tables"])
@@ -297,8 +349,11 @@ def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path:
 
 def test_real_measurements_are_one_case_without_an_oracle(shared: Path, tmp_path: Path) -> None:
     data = str(shared / "mrclam" / "MRCLAM_Dataset6")
-    run(study("error_cdf", data=data, method="gnss,kalman", runs=2, egos="robot1", train_seeds=1), tmp_path,
-        progress=False)  # fmt: skip
+    run_study(
+        study("error_cdf", data=data, method="gnss,kalman", runs=2, egos="robot1", train_seeds=1),
+        tmp_path,
+        progress=False,
+    )
     shown = published(tmp_path / "error_cdf")
     assert [view["name"] for view in shown["tables"]] == ["scenario1_15"]
     assert [view["name"] for view in shown["figures"]] == ["cdf_scenario1_15"]
@@ -307,7 +362,7 @@ def test_real_measurements_are_one_case_without_an_oracle(shared: Path, tmp_path
     assert "2 runs, 1 ego of MRCLAM_Dataset6, 1 training seed." in shown["tables"][0]["caption"]
     p = {**study("error_cdf", data=data, egos="1").settings, "scenario": 1, "velocity_ratio": 0.15, "method": "kalman"}
     with pytest.raises(co.InputError, match="oracle"):
-        error_cdf.cell({**p, "knowledge": "oracle"})
+        error_cdf.cell({**p, "noise_model": "oracle"})
 
 
 def test_another_measurement_between_robots_is_another_cell(shared: Path, tmp_path: Path) -> None:

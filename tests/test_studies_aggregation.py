@@ -17,10 +17,19 @@ from coopoc.learned.federation.federated import federate
 from coopoc.studies import aggregation, federations
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 
-TINY = {"members": 6, "runs": 2, "egos": "2", "train_seeds": 2, "rounds": 2, "local_epochs": 1, "steps": 4,
-        "in_mult": 2, "out_mult": 1}  # fmt: skip
+TINY = {
+    "members": 6,
+    "runs": 2,
+    "egos": "2",
+    "train_seeds": 2,
+    "rounds": 2,
+    "local_epochs": 1,
+    "steps": 4,
+    "in_mult": 2,
+    "out_mult": 1,
+}
 PARAMETERS = 390 * 2 + 504 * 1 + 1818
 
 
@@ -65,7 +74,7 @@ def test_a_cell_is_the_federation_of_its_seed() -> None:
     assert rows[0]["sent_kb"] == pytest.approx(2 * 4 * (PARAMETERS + 1) / 1e3)
     assert rows[0]["received_kb"] == pytest.approx(2 * 4 * PARAMETERS / 1e3)
     fed = federate(GainNet(2, 1, seed=1), federations.clients(p, 1), 2, "mean", 1, seed=1)
-    fleet = co.load("town10")
+    fleet = co.load_fleet("town10")
     seen = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(0), runs=2, observers=["town10-00", "town10-30"])
     by_hand = rt_le(fed.model.method("x")(seen, ["town10-00", "town10-30"]), fleet)
     federations.trained.cache_clear()
@@ -94,7 +103,7 @@ def test_pooled_data_costs_the_drive_and_the_net() -> None:
 def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
     wanted = {**TINY, "runs": 1, "method": "mean,8 bits,v2x,kalman,bound", "condition": "iid,poisoned update"}
     study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
-    results = run(study, out=tmp_path, progress=False)
+    results = run_study(study, out=tmp_path, progress=False)
     assert results.failed == 0
     shown = published(tmp_path / "aggregation")
     assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]
@@ -108,14 +117,17 @@ def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("gaps", "words"),
-    [((-0.1, -0.11, -0.12), "Better than the mean over training seeds (95 %): median -0.110 m; worse: no rule."),
-     ((0.1, 0.11, 0.12), "Better than the mean over training seeds (95 %): no rule; worse: median +0.110 m."),
-     ((-0.1, 0.12, 0.05), "Better than the mean over training seeds (95 %): no rule; worse: no rule.")],
-)  # fmt: skip
+    [
+        ((-0.1, -0.11, -0.12), "Better than the mean over training seeds (95 %): median -0.110 m; worse: no rule."),
+        ((0.1, 0.11, 0.12), "Better than the mean over training seeds (95 %): no rule; worse: median +0.110 m."),
+        ((-0.1, 0.12, 0.05), "Better than the mean over training seeds (95 %): no rule; worse: no rule."),
+    ],
+)
 def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps: tuple[float, ...], words: str) -> None:
     at = {"condition": "iid", "scenario": 1}
-    places: list[dict[str, Any]] = [{"train_seed": s, "ego": e, "run": r}
-                                    for s in range(3) for e in range(2) for r in range(3)]  # fmt: skip
+    places: list[dict[str, Any]] = [
+        {"train_seed": s, "ego": e, "run": r} for s in range(3) for e in range(2) for r in range(3)
+    ]
     rows = [{**at, **place, "method": "mean", "rt_le_m": 1.0 + 0.1 * place["ego"]} for place in places]
     rows += [{**row, "method": "median", "rt_le_m": row["rt_le_m"] + gaps[row["train_seed"]]} for row in rows]
     axes, settings = ("condition", "method", "scenario"), dict(aggregation.STUDY.settings)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopoc import V2X, InputError, JointFilter, Results, load, observe, run
+from coopoc import V2X, InputError, JointFilter, Results, load_fleet, observe, run_study
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.statistics import Interval, paired_difference
@@ -25,19 +25,27 @@ SIZES = ("payload_bytes_per_second", "bytes_per_second")
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
     wanted = {**QUICK, "data": short_town}
-    return run("budget", tmp_path_factory.mktemp("budget"), settings=wanted, progress=False)
+    return run_study("budget", tmp_path_factory.mktemp("budget"), settings=wanted, progress=False)
 
 
 @pytest.fixture(scope="module")
 def tight(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
     """Under caps and schedules, and a training: the shipped weights."""
     folder, shipped = tmp_path_factory.mktemp("weights"), load_weights(WEIGHTS / "fedokf.safetensors")
-    drives = load("town10-clients")
+    drives = load_fleet("town10-clients")
     (job,) = jobs_of("fedokf", Setting(), drives)
     save(folder / f"{job.label}.safetensors", Checkpoint(shipped.model, {**shipped.card, "key": job.key(drives)}))
-    wanted = {"data": short_town, "runs": 2, "egos": "2", "max_neighbours": "0,10", "method": "joint,fedokf",
-              "knowledge": "nominal,trained", "weights": str(folder), "train_seeds": 1}  # fmt: skip
-    return run("budget", tmp_path_factory.mktemp("tight"), settings=wanted, progress=False)
+    wanted = {
+        "data": short_town,
+        "runs": 2,
+        "egos": "2",
+        "max_neighbours": "0,10",
+        "method": "joint,fedokf",
+        "noise_model": "nominal,trained",
+        "weights": str(folder),
+        "train_seeds": 1,
+    }
+    return run_study("budget", tmp_path_factory.mktemp("tight"), settings=wanted, progress=False)
 
 
 def rows(table: Table | None) -> list[tuple[object, ...]]:
@@ -46,12 +54,12 @@ def rows(table: Table | None) -> list[tuple[object, ...]]:
 
 
 def at(**where: object) -> dict[str, object]:
-    return {"max_neighbours": 2, **study.FREE, "method": "joint", "knowledge": "nominal", **where}
+    return {"max_neighbours": 2, **study.FREE, "method": "joint", "noise_model": "nominal", **where}
 
 
 def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: str) -> None:
     """By hand: 32 B at 10 Hz from each of the neighbours that are there; a CAM carries 350 B more."""
-    drive = load(short_town)
+    drive = load_fleet(short_town)
     egos = [drive.index(ego) for ego in scene.egos(short_town, "2")]
     near = len(find_links(drive, egos, 2, 30.0, 2.0)) / len(egos) / len(drive.t)
     ideal = [views.mean(results, at(channel="ideal"), kind) for kind in SIZES]
@@ -65,7 +73,7 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
 def test_channels_keep_their_order(results: Results) -> None:
     error = {name: views.mean(results, at(channel=name)) for name in scene.CHANNELS}
     assert error["ideal"] == min(error.values())  # type: ignore[type-var]
-    assert views.mean(results, at(method="bound", knowledge="bound", channel="ideal")) is not None
+    assert views.mean(results, at(method="bound", noise_model="bound", channel="ideal")) is not None
 
 
 def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None:
@@ -88,7 +96,7 @@ def test_a_channel_that_is_not_there_is_named() -> None:
 
 def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_town: str) -> None:
     """The row of a cap, by hand."""
-    fleet = load(short_town)
+    fleet = load_fleet(short_town)
     egos, errors = scene.egos(short_town, "2"), []
     for schedule in tables.SCHEDULES:
         channel = V2X(10, bytes_per_second=200.0, schedule=schedule)
@@ -112,7 +120,7 @@ def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short
     """From the card and a track, by hand: 20 rounds of 9 numbers and a loss up and 9 down; a CAM of 350 B and 32 B."""
     egos = scene.egos(short_town, "2")
     channel = scene.channel({"channel": "cam", "max_neighbours": 10})
-    seen = observe(load(short_town), scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
+    seen = observe(load_fleet(short_town), scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
     account = of_track(JointFilter()(seen, egos), seen, JointFilter().message)
     card = load_weights(WEIGHTS / "fedokf.safetensors").card
     once = (len(card["history"]) - 1) * 4 * (2 * card["parameters"] + 1)

@@ -6,14 +6,20 @@ from pathlib import Path
 
 import pytest
 
-from coopoc import run
+from coopoc import run_study
 from coopoc.studies import latency_loss, robustness, views
 
 
 def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
-    wanted = {"data": short_town, "runs": 3, "egos": "1", "method": "kalman,joint", "latency_s": "0.0,0.3",
-              "loss": "0.0,0.6"}  # fmt: skip
-    results = run("latency_loss", tmp_path, settings=wanted, progress=False)
+    wanted = {
+        "data": short_town,
+        "runs": 3,
+        "egos": "1",
+        "method": "kalman,joint",
+        "latency_s": "0.0,0.3",
+        "loss": "0.0,0.6",
+    }
+    results = run_study("latency_loss", tmp_path, settings=wanted, progress=False)
     perfect, late, lossy = (
         views.mean(results, {**latency_loss.PERFECT, "method": "joint", **change})
         for change in ({}, {"latency_s": 0.3}, {"loss": 0.6})
@@ -28,9 +34,15 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short
 
 
 def test_who_trusts_everybody_is_led_astray_and_who_is_careful_is_not(tmp_path: Path, short_town: str) -> None:
-    wanted = {"data": short_town, "runs": 1, "egos": "1", "method": "kalman,joint,cooperative-map-gnc",
-              "max_neighbours": "0,4", "attacked_share": "0.0,0.4"}  # fmt: skip
-    results = run("robustness", tmp_path, settings=wanted, progress=False)
+    wanted = {
+        "data": short_town,
+        "runs": 1,
+        "egos": "1",
+        "method": "kalman,joint,cooperative-map-gnc",
+        "max_neighbours": "0,4",
+        "spoofed_share": "0.0,0.4",
+    }
+    results = run_study("robustness", tmp_path, settings=wanted, progress=False)
     alone, trusting, careful, unharmed = (
         views.mean(results, robustness.at(method, 4, share))
         for method, share in (("kalman", 0.4), ("joint", 0.4), *(("cooperative-map-gnc", s) for s in (0.4, 0.0)))

@@ -17,13 +17,13 @@ from coopoc.learned.recipes import Setting, jobs_of
 from coopoc.studies import cooperative_gain
 from coopoc.studies.cooperative_gain import STUDY, past_bound
 from coopoc.study.publish import views as published
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A folder with a net that is taken for a trained one: training has its own tests."""
-    folder, clients = tmp_path_factory.mktemp("weights"), co.load("town10-clients")
+    folder, clients = tmp_path_factory.mktemp("weights"), co.load_fleet("town10-clients")
     (job,) = jobs_of("cooperative", Setting(), clients)
     save(folder / f"{job.label}.safetensors", Checkpoint(NoiseNet(), {"key": job.key(clients)}))
     return str(folder)
@@ -32,9 +32,17 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_views_say_what_was_run(tmp_path: Path, weights: str) -> None:
     """On eight vehicles of six seconds."""
     write_table(crossing_fleet(), tmp_path / "crossing.csv")
-    study = STUDY.override({"runs": 4, "train_seeds": 1, "weights": weights, "data": str(tmp_path / "crossing.csv"),
-                            "max_neighbours": "0,6", "loss": "0.0,0.7"})  # fmt: skip
-    results = run(study, out=tmp_path, progress=False)
+    study = STUDY.override(
+        {
+            "runs": 4,
+            "train_seeds": 1,
+            "weights": weights,
+            "data": str(tmp_path / "crossing.csv"),
+            "max_neighbours": "0,6",
+            "loss": "0.0,0.7",
+        }
+    )
+    results = run_study(study, out=tmp_path, progress=False)
     assert results.failed == 0
     at = {"receivers": "alike", "max_neighbours": 6, "method": "cooperative"}
     heard = [results.interval("bytes_per_second", {**at, "loss": loss}).mean for loss in (0.0, 0.7)]
@@ -50,9 +58,9 @@ def test_views_say_what_was_run(tmp_path: Path, weights: str) -> None:
 
 def test_nothing_is_shown_of_what_was_not_run(tmp_path: Path) -> None:
     write_table(crossing_fleet(steps=20), tmp_path / "crossing.csv")
-    chosen = {"method": "joint", "knowledge": "nominal", "receivers": "alike", "loss": "0.3"}
+    chosen = {"method": "joint", "noise_model": "nominal", "receivers": "alike", "loss": "0.3"}
     study = STUDY.override({"runs": 2, "data": str(tmp_path / "crossing.csv"), **chosen})
-    results = run(study, out=tmp_path, progress=False)
+    results = run_study(study, out=tmp_path, progress=False)
     assert results.failed == 0
     shown = published(tmp_path / "cooperative_gain")
     assert [view["name"] for view in shown["tables"]] == ["rt_le", "bytes", "nees", "nees_inside"]
@@ -78,10 +86,10 @@ def test_bound_with_the_past_is_lower_where_they_do(crossing: co.Fleet) -> None:
 def test_receivers_differ_as_the_caption_says(receivers: str) -> None:
     """Noise of every fix over 20 runs, and what nominal filters are told of all."""
     p = {**STUDY.settings, "runs": 20, "egos": "1", "receivers": receivers, "max_neighbours": 0, "loss": 0.0}
-    fleet, seen = co.load("town10"), cooperative_gain.recording(p)
+    fleet, seen = co.load_fleet("town10"), cooperative_gain.recording(p)
     acting = np.sqrt(np.square(seen.gnss - fleet.position).mean(axis=(0, 3)))
     poor = np.zeros((900, 60), dtype=bool)
-    poor[300:600 if receivers == "changing" else 300] = True
+    poor[300 : 600 if receivers == "changing" else 300] = True
     if receivers == "mixed":
         poor[:, [c for c in range(60) if c % 5 < 2]] = True
     assert acting[poor].mean() == pytest.approx(5.0, rel=0.01)

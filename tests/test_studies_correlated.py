@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopoc import InputError, Sensors, run
+from coopoc import InputError, Sensors, run_study
 from coopoc.studies import correlated_gnss as study
 from coopoc.studies import scene, views
 
@@ -16,9 +16,11 @@ QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 
 
 def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path, short_town: str) -> None:
     wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
-    results = run("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
-    value = {name: [views.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
-             for name in ("white", "own", "common")}  # fmt: skip
+    results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
+    value = {
+        name: [views.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
+        for name in ("white", "own", "common")
+    }
     own, common = value["own"], value["common"]
     assert own[0] is not None
     assert own[1] is not None
@@ -27,7 +29,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     assert common[1] is not None
     assert common[1] > 0.8 * common[0]
     told = study._findings(results)
-    assert [sentence.split(":")[0] for sentence in told] == ["white", "own", "common"]
+    assert [str(finding).split(":")[0] for finding in told] == ["white", "own", "common"]
     folder = tmp_path / "correlated_gnss"
     assert "Cramér-Rao bound" in (folder / "tables" / "rms.md").read_text()
     assert (folder / "figures" / "rms.pdf").stat().st_size > 5_000

@@ -19,7 +19,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.studies import privacy, scene, weights
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 
 EPSILONS = (1.0, 1000.0, math.inf)
 
@@ -28,7 +28,7 @@ EPSILONS = (1.0, 1000.0, math.inf)
 def few(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Three vehicles of a bundled fleet for 31 s: three pieces each."""
     path = tmp_path_factory.mktemp("clients") / "few.csv"
-    write_table(co.load("town04").between(0, 310).select([0, 1, 2]), path)
+    write_table(co.load_fleet("town04").between(0, 310).select([0, 1, 2]), path)
     return str(path)
 
 
@@ -40,7 +40,7 @@ def ran(few: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Resul
     grid = [{"clients": few, "method": m, "epsilon": e} for m in privacy.PLANS for e in EPSILONS]
     grid += [{"clients": few, "method": m, "epsilon": math.inf} for m in ("kalman", "bound")]
     study = replace(privacy.STUDY, grid=grid).override({"runs": 2, "egos": "1", "train_seeds": 2})
-    results = run(study, out, progress=False)
+    results = run_study(study, out, progress=False)
     own.undo()
     return out / "privacy", results
 
@@ -49,9 +49,7 @@ def mean(results: Results, **where: object) -> float:
     return results.interval("rt_le_m", measure="rt_le", **where).mean
 
 
-def test_without_privacy_it_is_federate_and_the_references_are_the_filters(
-    ran: tuple[Path, Results], few: str
-) -> None:
+def test_without_privacy_it_is_federate_and_the_references_are_the_filters(ran: tuple[Path, Results], few: str) -> None:
     results = ran[1]
     assert results.failed == 0
     p = {**results.settings, "clients": few, "method": "kalman", "epsilon": math.inf}
@@ -60,7 +58,9 @@ def test_without_privacy_it_is_federate_and_the_references_are_the_filters(
     assert results.values("rt_le_m", method="kalman") == pytest.approx(score.T)
     bound = bound_rt_le(posterior_bound(drive, scene.sensors(p), 0, scene.channel(p)))
     assert results.values("rt_le_m", method="bound") == pytest.approx(bound)
-    made = federate(GainNet(seed=1), clients(co.load(few), seed=1), 2, "uniform", 1, 1, Schedule(learning_rate=3e-3))
+    made = federate(
+        GainNet(seed=1), clients(co.load_fleet(few), seed=1), 2, "uniform", 1, 1, Schedule(learning_rate=3e-3)
+    )
     for measure, number in (("rt_le", 2), ("untrained", 0)):
         score = rt_le(LearnedGain(made.after(number))(recording, who), drive)  # type: ignore[arg-type]
         found = results.values("rt_le_m", measure=measure, method="fedkalmannet", epsilon=math.inf, train_seed=1)
@@ -115,7 +115,7 @@ def test_views(ran: tuple[Path, Results]) -> None:
 def test_views_of_references_alone(few: str, tmp_path: Path) -> None:
     grid = [{"clients": few, "method": m, "epsilon": math.inf} for m in ("kalman", "bound")]
     study = replace(privacy.STUDY, grid=grid).override({"runs": 2, "egos": "1"})
-    assert run(study, tmp_path, progress=False).failed == 0
+    assert run_study(study, tmp_path, progress=False).failed == 0
     shown = published(tmp_path / "privacy")
     assert [shown[kind] for kind in ("tables", "figures", "findings")] == [[], [], []]
 

@@ -11,15 +11,21 @@ from coopoc.study.report import report
 
 
 def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: pytest.CaptureFixture[str]) -> None:
-    few = {"data": short_town, "runs": 2, "egos": "2", "method": "gnss,kalman,joint,bound", "max_neighbours": "0,4",
-           "train_seeds": 1}  # fmt: skip
+    few = {
+        "data": short_town,
+        "runs": 2,
+        "egos": "2",
+        "method": "gnss,kalman,joint,bound",
+        "max_neighbours": "0,4",
+        "train_seeds": 1,
+    }
     found = survey.stages(("budget",), tmp_path, 1, {**few, "channel": "ideal"})
     two = {**few, "method": "kalman,joint,bound", "max_neighbours": "0,2"}
     found |= survey.stages(("heading_error",), tmp_path, 1, two)
     assert "stage 1 of 2: heading_error" in capsys.readouterr().err
     said = survey.answers(found)
     alone, together, bound = (
-        views.rms(found["budget"], {"method": method, "knowledge": known, "max_neighbours": k, "rate_hz": 0.0})
+        views.rms(found["budget"], {"method": method, "noise_model": known, "max_neighbours": k, "rate_hz": 0.0})
         for method, known, k in (("kalman", "nominal", 0), ("joint", "nominal", 4), ("bound", "bound", 4))
     )
     assert alone is not None

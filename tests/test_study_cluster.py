@@ -15,7 +15,7 @@ import pytest
 
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.study.compute import WorkerDiedError
-from coopoc.study.run import plan, run
+from coopoc.study.run import plan, run_study
 from coopoc.study.study import Study
 
 pytest.importorskip("distributed")
@@ -82,11 +82,17 @@ def tables(folder: Path) -> dict[str, bytes]:
 def test_a_worker_that_is_killed_in_mid_run_changes_no_table(
     study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path
 ) -> None:
-    whole = run(study, tmp_path / "whole", progress=False)
+    whole = run_study(study, tmp_path / "whole", progress=False)
     first, _ = worker(), worker()
     words = ["run", "small", "--out", str(tmp_path), "--cluster", scheduler, "--set", "pause=0.3"]
-    driver = subprocess.Popen([sys.executable, "-m", "coopoc.cli", *words], cwd=tmp_path, env=ENV, text=True,
-                              stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+    driver = subprocess.Popen(
+        [sys.executable, "-m", "coopoc.cli", *words],
+        cwd=tmp_path,
+        env=ENV,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
     folder = tmp_path / "small"
     wait_for(lambda: len(list(folder.glob("cells/*.parquet"))) >= 2)
     os.kill(first.pid, signal.SIGKILL)
@@ -111,15 +117,15 @@ def test_failures_come_back_as_rows_and_a_killer_ends_the_run(
     changes = {"trouble": str(trouble)}
     for _ in range(2):
         worker()
-    failed = run(study, tmp_path, settings=changes, progress=False, cluster=scheduler)
+    failed = run_study(study, tmp_path, settings=changes, progress=False, cluster=scheduler)
     row = failed.failures.iloc[0]
     assert (failed.failed, row["reason"]) == (1, "FloatingPointError: the filter diverged at step 3")
     assert "small_study.py" in row["traceback"]
     trouble.write_text("kill")
     for _ in range(2):
         worker()
-    with pytest.raises(WorkerDiedError, match=r"does not go on \(KilledWorker.*Finished cells are kept"):
-        run(study, tmp_path, settings=changes, progress=False, cluster=scheduler, retry_failed=True)
+    with pytest.raises(WorkerDiedError, match=r"stopped \(KilledWorker.*Finished cells are kept"):
+        run_study(study, tmp_path, settings=changes, progress=False, cluster=scheduler, retry_failed=True)
     assert plan(study, tmp_path, changes)["finished"] == 8
 
 
@@ -130,9 +136,9 @@ def test_a_run_ends_when_no_worker_is_left(
     (tmp_path / "trouble").write_text("kill")
     worker()
     with pytest.raises(WorkerDiedError, match="no worker is left for 2 s"):
-        run(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False, cluster=scheduler)
+        run_study(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False, cluster=scheduler)
     (tmp_path / "trouble").unlink()
-    found = run(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False)
+    found = run_study(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False)
     assert (found.failed, found.pending) == (0, 0)
 
 
@@ -143,7 +149,7 @@ def test_a_cluster_that_cannot_compute_is_named_before_any_work(
 
     def refused(match: str, address: str = scheduler) -> None:
         with pytest.raises(InputError, match=match):
-            run(study, tmp_path / "new", progress=False, cluster=address)
+            run_study(study, tmp_path / "new", progress=False, cluster=address)
         assert not (tmp_path / "new").exists()
 
     refused("has no Dask scheduler", "tcp://127.0.0.1:9")
@@ -161,5 +167,5 @@ def test_a_cluster_that_cannot_compute_is_named_before_any_work(
 def test_dask_is_asked_for_only_by_who_needs_it(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingLibraryError, match=r"--cluster needs dask.*pip install 'coopoc\[cluster\]'"):
-        run(study, tmp_path, progress=False, cluster="tcp://127.0.0.1:8786")
-    assert run(study, tmp_path, progress=False).failed == 0
+        run_study(study, tmp_path, progress=False, cluster="tcp://127.0.0.1:8786")
+    assert run_study(study, tmp_path, progress=False).failed == 0

@@ -13,7 +13,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.study.compare import Comparison, compare, unpaired
 from coopoc.study.results import Results
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import FORMATS
 
@@ -34,7 +34,7 @@ def cell(p: Params) -> list[Row]:
 def runner(folder: Path, cell: Callable[[Params], list[Row]] = cell) -> Callable[..., Path]:
     def ran(name: str, **settings: Any) -> Path:
         study = Study("demo", "?", cell, GRID, SETTINGS)
-        run(study, folder / name, settings=settings, progress=False)
+        run_study(study, folder / name, settings=settings, progress=False)
         return folder / name / "demo"
 
     return ran
@@ -102,8 +102,8 @@ def test_noise_alone_is_seldom_called_a_change(tmp_path: Path, seed: int) -> Non
         return [{"run": r, "ego": "v", "rt_le_m": x} for r, x in enumerate(draws)]
 
     study = Study("noise", "?", noise, {"k": tuple(range(100))}, {"seed": 0, "stream": 0})
-    run(study, tmp_path / "a", progress=False)
-    run(study, tmp_path / "b", settings={"seed": seed, "stream": 1}, progress=False)
+    run_study(study, tmp_path / "a", progress=False)
+    run_study(study, tmp_path / "b", settings={"seed": seed, "stream": 1}, progress=False)
     found = compare(tmp_path / "a/noise", tmp_path / "b/noise")
     assert 0 < changes(found)["Change"].isin(["higher", "lower"]).sum() < 17
     assert "by chance alone about 5.0 would" in found.changes.notes[0]
@@ -136,7 +136,7 @@ def test_runs_that_only_one_has_are_left_out_and_said_so(ran: Callable[..., Path
 def test_an_axis_that_became_a_setting_still_matches(tmp_path: Path) -> None:
     ran = runner(tmp_path)
     wide = Study("demo", "?", cell, {**GRID, "shift": (0.0, 0.5)}, {k: v for k, v in SETTINGS.items() if k != "shift"})
-    run(wide, tmp_path / "wide", progress=False)
+    run_study(wide, tmp_path / "wide", progress=False)
     found = compare(ran("a", shift=0.5), tmp_path / "wide/demo")
     assert changes(found)["Change"].tolist() == ["same"] * 4
     assert found.cells is not None
@@ -146,8 +146,11 @@ def test_an_axis_that_became_a_setting_still_matches(tmp_path: Path) -> None:
 def test_training_seeds_are_pairs_too_and_their_spread_is_shown(tmp_path: Path) -> None:
     def trained(p: Params) -> list[Row]:
         rng = np.random.default_rng(p["seed"])
-        return [{"train_seed": s, "run": r, "ego": "v", "rt_le_m": rng.normal() + p["shift"] * (s + 1)}
-                for s in range(3) for r in range(20)]  # fmt: skip
+        return [
+            {"train_seed": s, "run": r, "ego": "v", "rt_le_m": rng.normal() + p["shift"] * (s + 1)}
+            for s in range(3)
+            for r in range(20)
+        ]
 
     ran = runner(tmp_path, trained)
     found = changes(compare(ran("a"), ran("b", shift=0.1)))
@@ -192,7 +195,7 @@ def test_every_format_holds_every_part(ran: Callable[..., Path], form: str) -> N
 
 def test_what_cannot_be_compared_is_named(ran: Callable[..., Path], tmp_path: Path) -> None:
     a, b = ran("a"), ran("b")
-    run(Study("other", "?", cell, GRID, SETTINGS), tmp_path, progress=False)
+    run_study(Study("other", "?", cell, GRID, SETTINGS), tmp_path, progress=False)
     with pytest.raises(InputError, match="hold different studies, demo and other"):
         compare(a, tmp_path / "other")
     with pytest.raises(InputError, match=r"holds no manifest\.json"):

@@ -19,25 +19,43 @@ from coopoc.world.fleet import Fleet
 def results() -> Results:
     rng = np.random.default_rng(0)
     rows = []
-    lines = [("gnss", "identity", 6.0, 0), ("kalman", "identity", 4.0, 0), ("kalman", "fitted", 0.9, 0),
-             ("joint", "fitted", 0.7, 320),
-             ("fedkalmannet", "trained", 1.1, 0), ("bound", "nominal", 0.5, 320)]  # fmt: skip
-    for method, knowledge, level, bytes_each in lines:
+    lines = [
+        ("gnss", "identity", 6.0, 0),
+        ("kalman", "identity", 4.0, 0),
+        ("kalman", "fitted", 0.9, 0),
+        ("joint", "fitted", 0.7, 320),
+        ("fedkalmannet", "trained", 1.1, 0),
+        ("bound", "nominal", 0.5, 320),
+    ]
+    for method, noise_model, level, bytes_each in lines:
         for k in (0, 2, 10):
             for run in range(5):
                 errors = np.abs(rng.normal(size=200)) * level
-                rows.append({"method": method, "knowledge": knowledge, "max_neighbours": k, "ego": "a", "run": run,
-                             "rt_le_m": level * rng.uniform(0.9, 1.1) / (1 + 0.02 * k * bool(bytes_each)),
-                             "bytes_per_second": float(k * bytes_each),
-                             "error_quantiles_m": np.quantile(errors, np.linspace(0, 1, 51)).tolist()})  # fmt: skip
-    axes = ("method", "knowledge", "max_neighbours")
+                rows.append(
+                    {
+                        "method": method,
+                        "noise_model": noise_model,
+                        "max_neighbours": k,
+                        "ego": "a",
+                        "run": run,
+                        "rt_le_m": level * rng.uniform(0.9, 1.1) / (1 + 0.02 * k * bool(bytes_each)),
+                        "bytes_per_second": float(k * bytes_each),
+                        "error_quantiles_m": np.quantile(errors, np.linspace(0, 1, 51)).tolist(),
+                    }
+                )
+    axes = ("method", "noise_model", "max_neighbours")
     return Results("demo", "?", axes, {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
 
 
 @pytest.fixture(scope="module")
 def rounds() -> Results:
-    rows = [{"method": m, "train_seed": s, "round": k, "ego": "a", "run": r, "rt_le_m": 1 + s / 10 + 3 * np.exp(-k / 3)}
-            for m in ("fedkalmannet", "centralised") for s in range(3) for k in range(6) for r in range(2)]  # fmt: skip
+    rows = [
+        {"method": m, "train_seed": s, "round": k, "ego": "a", "run": r, "rt_le_m": 1 + s / 10 + 3 * np.exp(-k / 3)}
+        for m in ("fedkalmannet", "centralised")
+        for s in range(3)
+        for k in range(6)
+        for r in range(2)
+    ]
     return Results("demo", "?", ("method", "train_seed", "round"), {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
 
 
@@ -81,7 +99,7 @@ def test_no_two_methods_look_alike() -> None:
 
 
 def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
-    axes = figures.sweep(results, "max_neighbours", where={"knowledge": ["fitted", "nominal"]}).figure.axes[0]
+    axes = figures.sweep(results, "max_neighbours", where={"noise_model": ["fitted", "nominal"]}).figure.axes[0]
     drawn = {line.get_color(): line for line in axes.lines}
     assert set(drawn) == {look(m).color for m in ("kalman", "joint", "bound")}
     expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()

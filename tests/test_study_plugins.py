@@ -33,6 +33,19 @@ def test_an_entry_point_is_one_object_or_a_mapping_of_several(site: Path) -> Non
         plugins.find("some.group", "wav")
 
 
+@pytest.mark.parametrize("group", [group for group in plugins.GROUPS if group != "coopoc.commands"])
+def test_every_open_set_takes_a_file_of_ones_own_and_names_what_is_wrong_with_it(tmp_path: Path, group: str) -> None:
+    (tmp_path / "mine.py").write_text("def huber(x):\n    return x\n")
+    own, noun = f"{tmp_path / 'mine.py'}:huber", plugins.GROUPS[group]
+    assert plugins.find(group, own)(3) == 3
+    with pytest.raises(InputError, match=rf"{noun} = .*hubr': is not in the file, which has huber\. Did you mean"):
+        plugins.find(group, own.replace("huber", "hubr"))
+    with pytest.raises(InputError, match=rf"{noun} = .*names a file that is not there"):
+        plugins.find(group, own.replace("mine.py", "none.py"))
+    with pytest.raises(InputError, match=rf"{noun} = 'no such thing': must be one of .*List all with: coopoc list"):
+        plugins.find(group, "no such thing")
+
+
 def test_what_cannot_be_loaded_hides_nothing_else(site: Path) -> None:
     install(site, "broken", "[some.group]\nbroken = no_such_module:THING\nfine = math:pi\n")
     assert plugins.names("some.group") == ("broken", "fine")

@@ -7,24 +7,29 @@ import pandas as pd
 import pytest
 
 from coopoc.errors import InputError
+from coopoc.study.pivot import pivot
 from coopoc.study.results import Results
 
 
-def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "knowledge", "k")) -> Results:
+def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "noise_model", "k")) -> Results:
     return Results("demo", "?", axes, {}, frame, pd.DataFrame(), 0, {})
 
 
 @pytest.fixture
 def rows() -> list[dict[str, Any]]:
     rng = np.random.default_rng(0)
-    return [{"method": m, "knowledge": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
-            for m, kn in (("gnss", "identity"), ("kalman", "identity"), ("kalman", "fitted"), ("bound", "nominal"))
-            for k in (0, 4) for ego in ("b", "a") for run in range(6)]  # fmt: skip
+    return [
+        {"method": m, "noise_model": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
+        for m, kn in (("gnss", "identity"), ("kalman", "identity"), ("kalman", "fitted"), ("bound", "nominal"))
+        for k in (0, 4)
+        for ego in ("b", "a")
+        for run in range(6)
+    ]
 
 
 def test_means_are_those_of_pandas(rows: list[dict[str, Any]]) -> None:
     frame = pd.DataFrame(rows)
-    by = ["method", "knowledge", "k"]
+    by = ["method", "noise_model", "k"]
     summary = results(frame).summary(by, "rt_le_m").set_index(by)["mean"]
     expected = frame.groupby(by)["rt_le_m"].mean()
     for name, value in expected.items():
@@ -34,7 +39,7 @@ def test_means_are_those_of_pandas(rows: list[dict[str, Any]]) -> None:
 
 def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(rows: list[dict[str, Any]]) -> None:
     frame = pd.DataFrame(rows)
-    where = {"knowledge": "identity", "k": 0}
+    where = {"noise_model": "identity", "k": 0}
     straight = results(frame).values("rt_le_m", where, method="gnss")
     mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
     assert straight.shape == (2, 6)
@@ -46,17 +51,17 @@ def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(rows: list[
 def test_training_seeds_are_averaged_before_the_interval(rows: list[dict[str, Any]]) -> None:
     one = pd.DataFrame(rows).query("method == 'gnss'")
     many = pd.concat([one.assign(train_seed=s, rt_le_m=one["rt_le_m"] + s) for s in (0, 1, 2)])
-    found = results(many, ("method", "knowledge", "k", "train_seed")).interval("rt_le_m", k=0)
+    found = results(many, ("method", "noise_model", "k", "train_seed")).interval("rt_le_m", k=0)
     assert found.mean == pytest.approx(one.query("k == 0")["rt_le_m"].mean() + 1)
     assert found.n == 12
 
 
 def test_what_would_be_mixed_is_named(rows: list[dict[str, Any]]) -> None:
     found = results(pd.DataFrame(rows))
-    with pytest.raises(InputError, match="knowledge = identity, fitted: would be averaged together"):
+    with pytest.raises(InputError, match="noise_model = identity, fitted: would be averaged together"):
         found.interval("rt_le_m", method="kalman", k=0)
     with pytest.raises(InputError, match=r"k = 0, 4: would be averaged together\. Name k in where, rows or columns"):
-        found.summary(["method", "knowledge"], "rt_le_m")
+        found.summary(["method", "noise_model"], "rt_le_m")
     with pytest.raises(InputError, match=r"column = 'metod'.*Did you mean method\?"):
         found.summary(["metod"], "rt_le_m")
     with pytest.raises(InputError, match=r"metric = 'rt_le'.*Did you mean rt_le_m\?"):
@@ -68,9 +73,9 @@ def test_what_would_be_mixed_is_named(rows: list[dict[str, Any]]) -> None:
 def test_an_ego_without_all_its_runs_is_left_out_and_said_so(rows: list[dict[str, Any]]) -> None:
     frame = pd.DataFrame(rows)
     gone = frame.drop(frame.query("method == 'gnss' and k == 0 and ego == 'b' and run == 3").index)
-    summary = results(gone).summary(["method", "knowledge", "k"], "rt_le_m")
+    summary = results(gone).summary(["method", "noise_model", "k"], "rt_le_m")
     assert summary.query("method == 'gnss' and k == 0")[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
-    table = results(gone).table(["k"], "method", "rt_le_m", where={"knowledge": ["identity"]})
+    table = pivot(results(gone), ["k"], "method", "rt_le_m", where={"noise_model": ["identity"]})
     assert "1 egos are left out" in table.notes[0]
 
 
@@ -88,7 +93,7 @@ def test_a_seed_that_diverged_is_not_averaged_away(rows: list[dict[str, Any]]) -
 
 def test_values_that_no_row_has_together_are_no_empty_table(rows: list[dict[str, Any]]) -> None:
     with pytest.raises(InputError, match=r"where = .*gnss.*must have a row with all of these"):
-        results(pd.DataFrame(rows)).table("k", "method", "rt_le_m", where={"method": "gnss", "knowledge": "fitted"})
+        pivot(results(pd.DataFrame(rows)), "k", "method", "rt_le_m", where={"method": "gnss", "noise_model": "fitted"})
 
 
 def test_words_are_no_metric(rows: list[dict[str, Any]]) -> None:
@@ -100,7 +105,7 @@ def test_words_are_no_metric(rows: list[dict[str, Any]]) -> None:
 
 def test_the_bound_is_not_the_best_under_any_knowledge(rows: list[dict[str, Any]]) -> None:
     frame = pd.DataFrame(rows).assign(rt_le_m=lambda f: np.where(f["method"] == "bound", 0.1, f["rt_le_m"]))
-    table = results(frame).table("k", ["method", "knowledge"], "rt_le_m", intervals=False)
+    table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m", intervals=False)
     assert table.header[-1] == "Cramér-Rao bound, nominal"
     for line in table.to_markdown().splitlines()[2:4]:
         assert line.count("**") == 2
@@ -108,9 +113,9 @@ def test_the_bound_is_not_the_best_under_any_knowledge(rows: list[dict[str, Any]
 
 
 def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str, Any]]) -> None:
-    frame = pd.DataFrame(rows).query("knowledge == 'identity'").copy()
+    frame = pd.DataFrame(rows).query("noise_model == 'identity'").copy()
     frame["nees"] = np.where(frame["method"] == "gnss", np.nan, 3.0)
-    table = results(frame).table("k", "method", "nees")
+    table = pivot(results(frame), "k", "method", "nees")
     assert table.rows[0][1] is None
     assert table.notes == ()
     with pytest.raises(InputError, match="nees = no finite value"):
@@ -135,7 +140,7 @@ def test_csv_and_parquet_hold_every_digit(rows: list[dict[str, Any]], tmp_path: 
 
 def test_tables_over_several_columns(rows: list[dict[str, Any]]) -> None:
     frame = pd.DataFrame(rows).query("method == 'kalman'")
-    table = results(frame).table("k", ["method", "knowledge"], "rt_le_m", along="column")
+    table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m", along="column")
     assert table.header == ("K", "KF, identity", "KF, fitted")
     assert table.along == "column"
-    assert table.rows[1][2].mean == pytest.approx(frame.query("k == 4 and knowledge == 'fitted'")["rt_le_m"].mean())
+    assert table.rows[1][2].mean == pytest.approx(frame.query("k == 4 and noise_model == 'fitted'")["rt_le_m"].mean())

@@ -14,7 +14,7 @@ import pytest
 
 from coopoc.study import store
 from coopoc.study.manifest import read
-from coopoc.study.run import plan, run
+from coopoc.study.run import plan, run_study
 from coopoc.study.study import Study
 
 DISTRIBUTION = Path(__file__).parent / "distribution"
@@ -39,13 +39,13 @@ def cells(folder: Path) -> dict[str, tuple[int, bytes]]:
 def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path) -> None:
     """Thirty cells; each process goes on where the one before was killed: at its start, in a cell, or in a file."""
     settings = {"max_neighbours": ",".join(map(str, range(10)))}
-    whole = run(study, tmp_path / "whole", settings=settings, progress=False)
+    whole = run_study(study, tmp_path / "whole", settings=settings, progress=False)
     rng = np.random.default_rng(6)
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["coopoc.study.run", "coopoc.study.figures"])
     folder, before = tmp_path / "small", {}
     for more, moment in zip(rng.integers(0, 6, 10), rng.uniform(0.0, 0.1, 10), strict=True):
-        process = processes.Process(target=run, args=("small", tmp_path, 1, settings, False))
+        process = processes.Process(target=run_study, args=("small", tmp_path, 1, settings, False))
         process.start()
         while process.is_alive() and len(list(folder.glob("cells/*.parquet"))) < len(before) + more:
             time.sleep(0.002)
@@ -57,7 +57,7 @@ def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path
         assert all(store.load(folder, name.removesuffix(".parquet")) is not None for name in after)
         before = after
     assert len(before) >= 10
-    resumed = run(study, tmp_path, settings=settings, progress=False)
+    resumed = run_study(study, tmp_path, settings=settings, progress=False)
     after = cells(folder)
     assert {name: after[name] for name in before} == before
     assert len(after) == 30
@@ -68,9 +68,11 @@ def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path
 
 
 def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(study: Study, tmp_path: Path) -> None:
-    run(study, tmp_path, progress=False)
+    run_study(study, tmp_path, progress=False)
     whole = views(tmp_path / "small")
-    process = multiprocessing.get_context("forkserver").Process(target=run, args=("small", tmp_path, 1, {}, False))
+    process = multiprocessing.get_context("forkserver").Process(
+        target=run_study, args=("small", tmp_path, 1, {}, False)
+    )
     (tmp_path / "small/tables/rt_le.md").unlink()
     process.start()
     while not (tmp_path / "small/tables/rt_le.md").exists():
@@ -78,7 +80,7 @@ def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(s
     process.kill()
     process.join()
     (tmp_path / "small/views.json").write_text("")
-    run(study, tmp_path, progress=False)
+    run_study(study, tmp_path, progress=False)
     assert views(tmp_path / "small") == whole
 
 
@@ -103,14 +105,21 @@ def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
     mount = "mount -t tmpfs -o size=10m tmpfs disk"
     if subprocess.run([*shell, mount], cwd=tmp_path, capture_output=True, timeout=20).returncode:
         pytest.skip("this system lets nobody mount a disk of their own")
-    done = subprocess.run([*shell, f"{mount}\n{script}"], cwd=tmp_path, env={**ENV, "RUN": " ".join(COMMAND)},
-                          capture_output=True, text=True, timeout=120)  # fmt: skip
+    done = subprocess.run(
+        [*shell, f"{mount}\n{script}"],
+        cwd=tmp_path,
+        env={**ENV, "RUN": " ".join(COMMAND)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     return (done.stdout + done.stderr).splitlines()
 
 
 def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterwards(study: Study, tmp_path: Path) -> None:
     table = " ".join([*COMMAND[:-2], "table", "disk/small"])
-    said = in_a_small_disk(f"""
+    said = in_a_small_disk(
+        f"""
         mount -o remount,size=32k disk
         $RUN --out disk > /dev/null; echo "full: $?"
         mkdir kept; cp -a disk/small/cells kept
@@ -120,24 +129,26 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
         $RUN --out disk; echo "read-only: $?"
         {table} | head -1
         cp -a disk/small .
-    """, tmp_path)  # fmt: skip
+    """,
+        tmp_path,
+    )
     assert {"full: 1", "room: 0", "read-only: 2"} <= set(said)
     message = next(line for line in said if "No space left" in line)
-    assert "No space left on device. What is finished is kept: make room and repeat: 'disk/small/cells/" in message
+    assert "No space left on device. Finished cells are kept: make room and repeat: 'disk/small/cells/" in message
     assert "coopoc: out = disk/small: cannot be written (Read-only file system). Choose another --out." in said
     assert any(line.startswith("| Neighbours K") for line in said)
     kept, after = cells(tmp_path / "kept"), cells(tmp_path / "small")
     assert 0 < len(kept) < 9
     assert {name: after[name] for name in kept} == kept
     assert not list((tmp_path / "small").glob("failed/*"))
-    run(study, tmp_path / "whole", progress=False)
+    run_study(study, tmp_path / "whole", progress=False)
     assert views(tmp_path / "small") == views(tmp_path / "whole/small")
 
 
 def test_a_manifest_survives_whoever_is_killed_while_writing_it(study: Study, tmp_path: Path) -> None:
-    run(study, tmp_path, progress=False)
+    run_study(study, tmp_path, progress=False)
     left = tmp_path / "small" / ".manifest.json.abc.part"
     left.write_text('{"half": ')
-    assert read(tmp_path / "small")["study"] == "small"
-    run(study, tmp_path, progress=False)
+    assert read(tmp_path / "small").study == "small"
+    run_study(study, tmp_path, progress=False)
     assert not left.exists()

@@ -17,7 +17,7 @@ from coopoc.study import store
 from coopoc.study.compute import WorkerDiedError, compute, schedule
 from coopoc.study.publish import views
 from coopoc.study.results import Results
-from coopoc.study.run import plan, run
+from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
 
 DISTRIBUTION = Path(__file__).parent / "distribution"
@@ -38,27 +38,45 @@ def files(folder: Path, kind: str = "cells") -> dict[str, tuple[int, bytes]]:
 
 
 def command(out: Path, *settings: str, jobs: int = 1) -> list[str]:
-    return [sys.executable, "-m", "coopoc.cli", "run", "small", "--out", str(out), "--jobs", str(jobs), "--set",
-            "pause=0.12", *settings]  # fmt: skip
+    return [
+        sys.executable,
+        "-m",
+        "coopoc.cli",
+        "run",
+        "small",
+        "--out",
+        str(out),
+        "--jobs",
+        str(jobs),
+        "--set",
+        "pause=0.12",
+        *settings,
+    ]
 
 
 def start(out: Path, jobs: int) -> "subprocess.Popen[bytes]":
     env = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
-    return subprocess.Popen(command(out, jobs=jobs), env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-                            cwd=out, start_new_session=True)  # fmt: skip
+    return subprocess.Popen(
+        command(out, jobs=jobs),
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=out,
+        start_new_session=True,
+    )
 
 
 def wait_for(folder: Path, count: int) -> None:
-    for _ in range(1000):
+    for _ in range(5000):
         if folder.is_dir() and len(list(folder.glob("*.parquet"))) >= count:
             return
         time.sleep(0.02)
-    raise AssertionError("no cell was finished in 20 s")
+    raise AssertionError("no cell was finished in 100 s")
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_killed_run_resumes_to_the_last_digit(study: Study, tmp_path: Path, jobs: int) -> None:
-    whole = run(study, tmp_path / "whole", settings={"pause": 0.12}, progress=False)
+    whole = run_study(study, tmp_path / "whole", settings={"pause": 0.12}, progress=False)
     process = start(tmp_path, jobs)
     wait_for(tmp_path / "small" / "cells", 2)
     os.kill(process.pid, signal.SIGKILL)
@@ -67,7 +85,7 @@ def test_a_killed_run_resumes_to_the_last_digit(study: Study, tmp_path: Path, jo
     before = files(tmp_path / "small")
     finished = {name: content for name, content in before.items() if name.endswith(".parquet")}
     assert 2 <= len(finished) < 9
-    resumed = run(study, tmp_path, settings={"pause": 0.12}, progress=False)
+    resumed = run_study(study, tmp_path, settings={"pause": 0.12}, progress=False)
     after = files(tmp_path / "small")
     assert {name: after[name] for name in finished} == finished
     pd.testing.assert_frame_equal(numbers(resumed.frame), numbers(whole.frame), check_exact=True)
@@ -77,8 +95,8 @@ def test_a_killed_run_resumes_to_the_last_digit(study: Study, tmp_path: Path, jo
 
 
 def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -> None:
-    one = run(study, tmp_path / "one", jobs=1, progress=False)
-    two = run(study, tmp_path / "two", jobs=2, progress=False)
+    one = run_study(study, tmp_path / "one", jobs=1, progress=False)
+    two = run_study(study, tmp_path / "two", jobs=2, progress=False)
     pd.testing.assert_frame_equal(numbers(one.frame), numbers(two.frame), check_exact=True)
     for name in ("tables/rt_le.csv", "tables/rt_le.tex", "figures/rt_le.pdf", "figures/rt_le.png", "figures/rt_le.svg"):
         assert (tmp_path / "one/small" / name).read_bytes() == (tmp_path / "two/small" / name).read_bytes()
@@ -90,7 +108,7 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
     changes = {"trouble": str(trouble)}
-    first = run(study, tmp_path, settings=changes, progress=False)
+    first = run_study(study, tmp_path, settings=changes, progress=False)
     assert first.failed == 1
     row = first.failures.iloc[0]
     assert (row["method"], row["max_neighbours"], row["status"]) == ("kalman", 1, "failed")
@@ -100,9 +118,9 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     assert "–" in (tmp_path / "small/tables/rt_le.md").read_text()
     finished, failed = files(tmp_path / "small"), files(tmp_path / "small", "failed")
     trouble.unlink()
-    assert run(study, tmp_path, settings=changes, progress=False).failed == 1
+    assert run_study(study, tmp_path, settings=changes, progress=False).failed == 1
     assert files(tmp_path / "small", "failed") == failed
-    second = run(study, tmp_path, settings=changes, progress=False, retry_failed=True)
+    second = run_study(study, tmp_path, settings=changes, progress=False, retry_failed=True)
     assert second.failed == 0
     assert len(second.frame) == 9 * 2 * 4
     assert not list((tmp_path / "small/failed").iterdir())
@@ -112,20 +130,26 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
 def test_a_plan_says_what_becomes_of_failed_cells(study: Study, tmp_path: Path) -> None:
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
-    run(study, tmp_path, settings={"trouble": str(trouble), "max_neighbours": "0,1"}, progress=False)
+    run_study(study, tmp_path, settings={"trouble": str(trouble), "max_neighbours": "0,1"}, progress=False)
     left = plan(study, tmp_path, {"trouble": str(trouble)})
     again = plan(study, tmp_path, {"trouble": str(trouble)}, retry_failed=True)
     for found, todo in ((left, 3), (again, 4)):
         assert (found["cells"], found["finished"], found["failed_before"], found["to_compute"]) == (9, 5, 1, todo)
-        assert found["failures"] == [{"max_neighbours": 1, "method": "kalman", "repeated": found is again,
-                                      "reason": "FloatingPointError: the filter diverged at step 3"}]  # fmt: skip
+        assert found["failures"] == [
+            {
+                "max_neighbours": 1,
+                "method": "kalman",
+                "repeated": found is again,
+                "reason": "FloatingPointError: the filter diverged at step 3",
+            }
+        ]
 
 
 def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, tmp_path: Path) -> None:
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
     changes = {"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"}
-    results = run(study, tmp_path, settings=changes, progress=False)
+    results = run_study(study, tmp_path, settings=changes, progress=False)
     assert results.frame.empty
     assert set(views(tmp_path / "small")["missing"]) == {"rt_le", "findings"}
 
@@ -134,29 +158,29 @@ def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study: Study, t
     trouble = tmp_path / "trouble"
     trouble.write_text("kill")
     with pytest.raises(WorkerDiedError, match="repeat the command"):
-        run(study, tmp_path, jobs=2, settings={"trouble": str(trouble)}, progress=False)
+        run_study(study, tmp_path, jobs=2, settings={"trouble": str(trouble)}, progress=False)
     trouble.unlink()
-    assert run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False).failed == 0
+    assert run_study(study, tmp_path, settings={"trouble": str(trouble)}, progress=False).failed == 0
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "of another cell"])
 def test_a_damaged_file_is_computed_again(study: Study, tmp_path: Path, damage: str) -> None:
-    whole = run(study, tmp_path, progress=False)
+    whole = run_study(study, tmp_path, progress=False)
     first, second = sorted((tmp_path / "small/cells").iterdir())[:2]
     content = first.read_bytes()
     bad = {"truncated": content[: len(content) // 2], "empty": b"", "of another cell": second.read_bytes()}[damage]
     first.write_bytes(bad)
     with pytest.warns(RuntimeWarning, match=f"{first.name} is damaged and will be computed again"):
-        again = run(study, tmp_path, progress=False)
+        again = run_study(study, tmp_path, progress=False)
     pd.testing.assert_frame_equal(numbers(again.frame), numbers(whole.frame), check_exact=True)
 
 
 def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study: Study, tmp_path: Path) -> None:
     asked: list[list[int]] = []
     study = replace(study, prepare=lambda cells, jobs: asked.append(sorted({p["max_neighbours"] for p in cells})))
-    run(study, tmp_path, settings={"max_neighbours": "0"}, progress=False)
-    run(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
-    run(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
+    run_study(study, tmp_path, settings={"max_neighbours": "0"}, progress=False)
+    run_study(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
+    run_study(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
     assert asked == [[0], [2]]
 
 
@@ -167,9 +191,9 @@ def test_plan_counts_and_writes_nothing(study: Study, tmp_path: Path) -> None:
 
 
 def test_changed_settings_compute_anew_and_keep_what_is_there(study: Study, tmp_path: Path) -> None:
-    run(study, tmp_path, settings={"max_neighbours": 0}, progress=False)
+    run_study(study, tmp_path, settings={"max_neighbours": 0}, progress=False)
     before = files(tmp_path / "small")
-    more = run(study, tmp_path, settings={"max_neighbours": 0, "runs": 5}, progress=False)
+    more = run_study(study, tmp_path, settings={"max_neighbours": 0, "runs": 5}, progress=False)
     assert sorted(set(more.frame["run"])) == [0, 1, 2, 3, 4]
     after = files(tmp_path / "small")
     assert len(after) == 6
@@ -178,21 +202,25 @@ def test_changed_settings_compute_anew_and_keep_what_is_there(study: Study, tmp_
 
 def test_bad_input_is_named_before_any_work(study: Study, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="max_neighbours = -1: must be >= 0"):
-        run(study, tmp_path, settings={"max_neighbours": -1})
+        run_study(study, tmp_path, settings={"max_neighbours": -1})
     with pytest.raises(InputError, match="jobs = 0: must be >= 1"):
-        run(study, tmp_path, jobs=0)
+        run_study(study, tmp_path, jobs=0)
     with pytest.raises(InputError, match=r"study = 'smal'.*Did you mean small\?"):
-        run("smal", tmp_path)
+        run_study("smal", tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
-        run(study, tmp_path / "file", progress=False)
+        run_study(study, tmp_path / "file", progress=False)
     assert not (tmp_path / "small").exists()
 
 
 def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path: Path) -> None:
-    study = Study("odd", "?", lambda p: {"none": [], "own": [{"x": 1}], "mixed": [{"y": 1}, {"y": "a"}]}[p["x"]],
-                  {"x": ("none", "own", "mixed")})  # fmt: skip
-    reasons = list(run(study, tmp_path, progress=False).failures["reason"])
+    study = Study(
+        "odd",
+        "?",
+        lambda p: {"none": [], "own": [{"x": 1}], "mixed": [{"y": 1}, {"y": "a"}]}[p["x"]],
+        {"x": ("none", "own", "mixed")},
+    )
+    reasons = list(run_study(study, tmp_path, progress=False).failures["reason"])
     assert "at least one row" in reasons[0]
     assert "must not repeat a parameter" in reasons[1]
     assert reasons[2].startswith("Arrow")
@@ -213,7 +241,7 @@ def test_a_cell_runs_on_one_thread(tmp_path: Path) -> None:
 
         return [{"threads": max(library["num_threads"] for library in threadpool_info())}]
 
-    results = run(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1, progress=False)
+    results = run_study(Study("threads", "?", cell, {"x": (1, 2)}), tmp_path, jobs=1, progress=False)
     assert set(results.frame["threads"]) == {1}
 
 
@@ -236,17 +264,17 @@ def test_two_runs_do_not_share_a_folder(study: Study, tmp_path: Path) -> None:
     first = start(tmp_path, 1)
     wait_for(tmp_path / "small" / "cells", 1)
     with pytest.raises(InputError, match=r"small: is in use by another run\. Wait until it ends"):
-        run(study, tmp_path, settings={"runs": 2}, progress=False)
+        run_study(study, tmp_path, settings={"runs": 2}, progress=False)
     first.communicate()
     assert first.returncode == 0
     assert Results.load(tmp_path / "small").settings["runs"] == 4
-    assert run(study, tmp_path, settings={"runs": 2}, progress=False).failed == 0
+    assert run_study(study, tmp_path, settings={"runs": 2}, progress=False).failed == 0
 
 
 def test_the_damaged_row_of_a_failure_hides_nothing(study: Study, tmp_path: Path) -> None:
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
-    run(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
+    run_study(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
     next((tmp_path / "small/failed").iterdir()).write_bytes(b"")
     with pytest.warns(RuntimeWarning, match="damaged and will be computed again"):
         found = Results.load(tmp_path / "small")
@@ -257,21 +285,21 @@ def test_the_damaged_row_of_a_failure_hides_nothing(study: Study, tmp_path: Path
 
 @pytest.mark.parametrize("name", ["manifest.json", "views.json"])
 def test_a_damaged_description_is_named_and_mended_by_the_next_run(study: Study, tmp_path: Path, name: str) -> None:
-    run(study, tmp_path, progress=False)
+    run_study(study, tmp_path, progress=False)
     before = files(tmp_path / "small")
     (tmp_path / "small" / name).write_text('{"half": ')
     with pytest.raises(InputError, match=rf"holds a damaged {name} .*Repeat coopoc run"):
         views(tmp_path / "small") if name == "views.json" else Results.load(tmp_path / "small")
-    assert run(study, tmp_path, progress=False).failed == 0
+    assert run_study(study, tmp_path, progress=False).failed == 0
     assert files(tmp_path / "small") == before
 
 
 def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study: Study, tmp_path: Path) -> None:
     more = replace(study, tables={**study.tables, "extra": study.tables["rt_le"]})
-    run(more, tmp_path, progress=False)
+    run_study(more, tmp_path, progress=False)
     (tmp_path / "small/tables/mine.md").write_text("by hand")
     assert len(list((tmp_path / "small/tables").glob("extra.*"))) == 4
-    run(study, tmp_path, progress=False)
+    run_study(study, tmp_path, progress=False)
     left = {path.name for path in (tmp_path / "small/tables").iterdir()}
     assert left == {"rt_le.md", "rt_le.csv", "rt_le.tex", "rt_le.html", "mine.md"}
 

@@ -11,10 +11,11 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.manifest import held, manifest, read
+from coopoc.study.lock import locked
+from coopoc.study.manifest import Manifest, read
 from coopoc.study.merge import merge
 from coopoc.study.results import Results
-from coopoc.study.run import plan, run
+from coopoc.study.run import plan, run_study
 from coopoc.study.shard import Shard
 from coopoc.study.study import Cell, Study
 
@@ -39,6 +40,11 @@ def cells(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / "cells").glob("*.parquet")}
 
 
+def manifest(study: Study) -> Manifest:
+    cells = {cell.name: cell.params for cell in study.cells()}
+    return Manifest(study.name, study.question, study.axes, study.settings, cells, {}).as_stored()
+
+
 def start(out: Path, *words: str) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "coopoc.cli", "run", "small", "--out", str(out), *words]
     return subprocess.Popen(command, env=ENV, cwd=out, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -57,27 +63,28 @@ def test_shards_are_disjoint_whole_and_of_equal_size(count: int) -> None:
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "1/", "a/b", "-1/3", "1/0"])
 def test_a_shard_that_is_none_is_named(study: Study, tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError, match=r"must be i/n with 1 <= i <= n\. Write for example: --shard 2/3"):
-        run(study, tmp_path / "new", shard=text, progress=False)
+        run_study(study, tmp_path / "new", shard=text, progress=False)
     assert not (tmp_path / "new").exists()
 
 
 def test_three_shards_in_one_folder_make_the_tables_of_one_run(study: Study, tmp_path: Path) -> None:
-    whole = run(study, tmp_path / "whole", progress=False)
+    whole = run_study(study, tmp_path / "whole", progress=False)
     for index in (3, 1, 2):
-        part = run(study, tmp_path, progress=False, shard=f"{index}/3")
+        part = run_study(study, tmp_path, progress=False, shard=f"{index}/3")
         assert (part.frame["cell"].nunique(), part.failed, part.pending) == (3, 0, 0)
     assert not (tmp_path / "small/tables").exists()
     before = cells(tmp_path / "small")
-    found = run(study, tmp_path, progress=False)
+    found = run_study(study, tmp_path, progress=False)
     assert cells(tmp_path / "small") == before
     timings = [c for c in found.frame if c.endswith("seconds")]
-    pd.testing.assert_frame_equal(found.frame.drop(columns=timings), whole.frame.drop(columns=timings),
-                                  check_exact=True)  # fmt: skip
+    pd.testing.assert_frame_equal(
+        found.frame.drop(columns=timings), whole.frame.drop(columns=timings), check_exact=True
+    )
     assert tables(tmp_path / "small") == tables(tmp_path / "whole/small")
 
 
 def test_shards_work_in_one_folder_at_the_same_time(study: Study, tmp_path: Path) -> None:
-    run(study, tmp_path / "whole", settings={"pause": 0.1}, progress=False)
+    run_study(study, tmp_path / "whole", settings={"pause": 0.1}, progress=False)
     shards = [start(tmp_path, "--shard", f"{i}/2", "--set", "pause=0.1") for i in (1, 2)]
     for index, shard in enumerate(shards, start=1):
         stdout, stderr = shard.communicate(timeout=60)
@@ -85,24 +92,24 @@ def test_shards_work_in_one_folder_at_the_same_time(study: Study, tmp_path: Path
         assert f"coopoc: shard {index}/2 is in {tmp_path / 'small'}. When all shards are: the same command" in stderr
     done = plan(study, tmp_path, {"pause": 0.1})
     assert (done["finished"], done["to_compute"]) == (9, 0)
-    run(study, tmp_path, settings={"pause": 0.1}, progress=False)
+    run_study(study, tmp_path, settings={"pause": 0.1}, progress=False)
     assert tables(tmp_path / "small") == tables(tmp_path / "whole/small")
 
 
 def test_who_else_may_come_in_while_a_shard_is_at_work(study: Study, tmp_path: Path) -> None:
     folder = tmp_path / "small"
-    with held(folder, manifest(study, study.cells()), "2/3"):
+    with locked(folder, manifest(study), "2/3"):
         with pytest.raises(InputError, match="is in use by another run"):
-            run(study, tmp_path, progress=False)
+            run_study(study, tmp_path, progress=False)
         with pytest.raises(InputError, match=r"in use by shards that differ in runs \(2, 4\), cells \(9 and 9, 0 of"):
-            run(study, tmp_path, settings={"runs": 2}, shard="1/3", progress=False)
+            run_study(study, tmp_path, settings={"runs": 2}, shard="1/3", progress=False)
         with pytest.raises(InputError, match="in use by another process with shard 2/3"):
-            run(study, tmp_path, shard="2/3", progress=False)
-        assert run(study, tmp_path, shard="1/3", progress=False).frame["cell"].nunique() == 3
+            run_study(study, tmp_path, shard="2/3", progress=False)
+        assert run_study(study, tmp_path, shard="1/3", progress=False).frame["cell"].nunique() == 3
         with pytest.raises(InputError, match="is in use by another run"):
             merge([folder], tmp_path)
-    with held(folder, manifest(study, study.cells())), pytest.raises(InputError, match="is in use by another run"):
-        run(study, tmp_path, shard="1/3", progress=False)
+    with locked(folder, manifest(study)), pytest.raises(InputError, match="is in use by another run"):
+        run_study(study, tmp_path, shard="1/3", progress=False)
     assert Results.load(folder).pending == 6
 
 
@@ -111,21 +118,21 @@ def test_a_shard_speaks_of_its_own_cells(study: Study, tmp_path: Path) -> None:
     trouble.write_text("raise")
     changes = {"trouble": str(trouble)}
     assert plan(study, tmp_path, changes, shard="2/3")["cells"] == 3
-    parts = [run(study, tmp_path, settings=changes, progress=False, shard=f"{i}/3") for i in (1, 2, 3)]
+    parts = [run_study(study, tmp_path, settings=changes, progress=False, shard=f"{i}/3") for i in (1, 2, 3)]
     assert [part.failed for part in parts] == [0, 1, 0]
-    assert run(study, tmp_path, settings=changes, progress=False).failed == 1
+    assert run_study(study, tmp_path, settings=changes, progress=False).failed == 1
 
 
 def test_folders_of_several_machines_merge_to_the_tables_of_one_run(study: Study, tmp_path: Path) -> None:
-    run(study, tmp_path / "whole", progress=False)
+    run_study(study, tmp_path / "whole", progress=False)
     for index in (1, 2, 3):
-        run(study, tmp_path / f"m{index}", progress=False, shard=f"{index}/3")
+        run_study(study, tmp_path / f"m{index}", progress=False, shard=f"{index}/3")
     folders = [tmp_path / f"m{index}/small" for index in (1, 2, 3)]
     before = {**cells(folders[0]), **cells(folders[1]), **cells(folders[2])}
     half = merge(folders[:2], tmp_path / "all")
     assert (half.folder, half.cells, half.finished, half.missing) == (tmp_path / "all/small", 9, 6, 3)
     assert merge([folders[2]], tmp_path / "all").finished == 9
-    run(study, tmp_path / "all", progress=False)
+    run_study(study, tmp_path / "all", progress=False)
     after = cells(tmp_path / "all/small")
     assert {name: content for name, (_, content) in after.items()} == {name: c for name, (_, c) in before.items()}
     assert tables(tmp_path / "all/small") == tables(tmp_path / "whole/small")
@@ -136,11 +143,11 @@ def test_a_failure_is_merged_unless_the_cell_is_finished_elsewhere(study: Study,
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
     changes = {"trouble": str(trouble)}
-    run(study, tmp_path / "a", settings=changes, progress=False)
+    run_study(study, tmp_path / "a", settings=changes, progress=False)
     first = merge([tmp_path / "a/small"], tmp_path / "all")
     assert (first.finished, first.failed, first.missing) == (8, 1, 0)
     trouble.unlink()
-    run(study, tmp_path / "b", settings=changes, progress=False)
+    run_study(study, tmp_path / "b", settings=changes, progress=False)
     known = next((tmp_path / "a/small/cells").iterdir()).name
     (tmp_path / "b/small/cells" / known).write_bytes(b"")
     with pytest.warns(RuntimeWarning, match="damaged"):
@@ -150,8 +157,8 @@ def test_a_failure_is_merged_unless_the_cell_is_finished_elsewhere(study: Study,
 
 
 def test_what_does_not_belong_together_is_not_merged(study: Study, tmp_path: Path) -> None:
-    run(study, tmp_path / "a", progress=False, shard="1/9")
-    run(study, tmp_path / "b", settings={"runs": 2}, progress=False, shard="1/9")
+    run_study(study, tmp_path / "a", progress=False, shard="1/9")
+    run_study(study, tmp_path / "b", settings={"runs": 2}, progress=False, shard="1/9")
     with pytest.raises(InputError, match=r"a/small and .*b/small: differ in runs \(4, 2\), cells \(9 and 9, 0 of them"):
         merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "all")
     assert not (tmp_path / "all").exists()
@@ -163,7 +170,7 @@ def test_what_does_not_belong_together_is_not_merged(study: Study, tmp_path: Pat
 
 def test_a_cell_with_two_sets_of_numbers_is_named(study: Study, tmp_path: Path) -> None:
     for name in "ab":
-        run(study, tmp_path / name, progress=False, shard="1/9")
+        run_study(study, tmp_path / name, progress=False, shard="1/9")
     cell = Shard(1, 9).of(study.cells(), study.shares)[0]
     rows = store.load(tmp_path / "b/small", cell.name).to_pylist()
     own = {*store.OWN_COLUMNS, *cell.params}
@@ -179,12 +186,12 @@ def test_a_cell_with_two_sets_of_numbers_is_named(study: Study, tmp_path: Path) 
 def test_every_environment_that_worked_on_the_same_cells_is_named(
     study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = run(study, tmp_path, progress=False, shard="1/3").environment
-    monkeypatch.setattr("coopoc.study.manifest.environment", lambda: {**here, "processor": "another one"})
-    run(study, tmp_path, progress=False, shard="2/3")
-    assert read(tmp_path / "small")["environment"]["processor"] == f"{here['processor']}; another one"
-    assert read(tmp_path / "small")["environment"]["python"] == here["python"]
-    assert run(study, tmp_path, settings={"runs": 2}, progress=False).environment["processor"] == "another one"
+    here = run_study(study, tmp_path, progress=False, shard="1/3").environment
+    monkeypatch.setattr("coopoc.study.run.environment", lambda: {**here, "processor": "another one"})
+    run_study(study, tmp_path, progress=False, shard="2/3")
+    assert read(tmp_path / "small").environment["processor"] == f"{here['processor']}; another one"
+    assert read(tmp_path / "small").environment["python"] == here["python"]
+    assert run_study(study, tmp_path, settings={"runs": 2}, progress=False).environment["processor"] == "another one"
 
 
 def test_what_shards_share_is_prepared_by_one_at_a_time(study: Study, tmp_path: Path) -> None:
@@ -194,7 +201,7 @@ def test_what_shards_share_is_prepared_by_one_at_a_time(study: Study, tmp_path: 
 import time
 from dataclasses import replace
 from pathlib import Path
-from coopoc.study.run import run
+from coopoc.study.run import run_study
 from small_study import STUDY
 def prepare(cells, jobs):
     with Path({str(began)!r}).open("a") as log:
@@ -206,10 +213,12 @@ def prepare(cells, jobs):
         log.write("out ")
 if __name__ == "__main__":
     import sys
-    run(replace(STUDY, prepare=prepare), {str(tmp_path)!r}, shard=sys.argv[1])
+    run_study(replace(STUDY, prepare=prepare), {str(tmp_path)!r}, shard=sys.argv[1])
 """
-    shards = [subprocess.Popen([sys.executable, "-c", code, f"{i}/2"], env=ENV, stderr=subprocess.PIPE, text=True)
-              for i in (1, 2)]  # fmt: skip
+    shards = [
+        subprocess.Popen([sys.executable, "-c", code, f"{i}/2"], env=ENV, stderr=subprocess.PIPE, text=True)
+        for i in (1, 2)
+    ]
     messages = [shard.communicate(timeout=60)[1] for shard in shards]
     assert began.read_text() == "in out in out "
     assert sum("waits for a shard that prepares" in message for message in messages) == 1

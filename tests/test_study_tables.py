@@ -15,8 +15,10 @@ from coopoc.study.tables import FORMATS, Table
 TABLE = Table(
     ("K", "KF & co", "50 %_x", "Cramér-Rao bound"),
     (("0", Interval(0.8047, 0.75, 0.85, 30), Interval(1.2, 1.1, 1.3, 30), 0.5), ("4", 0.912, None, 0.4)),
-    "RT-LE [m] at σ = 3.5 m, ±4°.", best="min", notes=("A note.",),
-)  # fmt: skip
+    "RT-LE [m] at σ = 3.5 m, ±4°.",
+    best="min",
+    notes=("A note.",),
+)
 
 
 def test_markdown() -> None:
@@ -25,24 +27,44 @@ def test_markdown() -> None:
         "|:----|----------------------:|------------------:|-------------------:|",
         "| 0   | **0.80** [0.75, 0.85] | 1.20 [1.10, 1.30] |               0.50 |",
         "| 4   |                  0.91 |                 – |               0.40 |",
-        "", "RT-LE [m] at σ = 3.5 m, ±4°.", "", "A note.",
-    ]  # fmt: skip
+        "",
+        "RT-LE [m] at σ = 3.5 m, ±4°.",
+        "",
+        "A note.",
+    ]
 
 
 def test_latex() -> None:
     assert TABLE.to_latex().splitlines() == [
-        r"\begin{table}", r"\centering", r"\caption{RT-LE [m] at $\sigma$ = 3.5 m, $\pm$4$^\circ$. A note.}",
-        r"\smallskip", r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-        r"\begin{tabular}{lrrr}", r"\toprule", r"K & KF \& co & 50 \%\_x & Cramér-Rao bound \\", r"\midrule",
+        r"\begin{table}",
+        r"\centering",
+        r"\caption{RT-LE [m] at $\sigma$ = 3.5 m, $\pm$4$^\circ$. A note.}",
+        r"\smallskip",
+        r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+        r"\begin{tabular}{lrrr}",
+        r"\toprule",
+        r"K & KF \& co & 50 \%\_x & Cramér-Rao bound \\",
+        r"\midrule",
         r"0 & \textbf{0.80} {\scriptsize [0.75, 0.85]} & 1.20 {\scriptsize [1.10, 1.30]} & 0.50 \\",
-        r"4 & 0.91 & -- & 0.40 \\", r"\bottomrule", r"\end{tabular}}", r"\end{table}",
-    ]  # fmt: skip
+        r"4 & 0.91 & -- & 0.40 \\",
+        r"\bottomrule",
+        r"\end{tabular}}",
+        r"\end{table}",
+    ]
 
 
 def test_csv_keeps_every_digit_and_the_interval() -> None:
     header, first, second = csv.reader(io.StringIO(TABLE.to_csv()))
-    assert header == ["K", "KF & co", "KF & co low", "KF & co high", "50 %_x", "50 %_x low", "50 %_x high",
-                      "Cramér-Rao bound"]  # fmt: skip
+    assert header == [
+        "K",
+        "KF & co",
+        "KF & co low",
+        "KF & co high",
+        "50 %_x",
+        "50 %_x low",
+        "50 %_x high",
+        "Cramér-Rao bound",
+    ]
     assert first == ["0", "0.8047", "0.75", "0.85", "1.2", "1.1", "1.3", "0.5"]
     assert second == ["4", "0.912", "", "", "", "", "", "0.4"]
 

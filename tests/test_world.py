@@ -34,7 +34,7 @@ def test_unusable_fleet_names_the_field(change: dict, field: str) -> None:
     with pytest.raises(InputError) as error:
         Fleet(**{**good, **change})
     assert error.value.field == field
-    assert error.value.mend
+    assert error.value.hint
 
 
 def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, checked
 from ..errors import InputError
 
 
@@ -109,10 +109,14 @@ def absolute_error(estimate: Floats, truth: Floats, *, aligned: bool = True, sca
 
 
 def _pair(estimate: Floats, truth: Floats) -> tuple[Floats, Floats]:
-    x, y = np.asarray(estimate, dtype=float), np.asarray(truth, dtype=float)
+    x, y = checked("estimate", estimate), checked("truth", truth)
     if x.shape != y.shape or x.ndim < 2 or x.shape[-1] not in (2, 3) or not x.shape[-2]:
-        raise InputError("estimate, truth", f"shapes {x.shape} and {y.shape}",
-                         "must be equal, (..., T, 2) or (..., T, 3)", "Take both at the same instants.")  # fmt: skip
+        raise InputError(
+            "estimate, truth",
+            f"shapes {x.shape} and {y.shape}",
+            "must be equal, (..., T, 2) or (..., T, 3)",
+            "Take both at the same instants.",
+        )
     for name, values in (("estimate", x), ("truth", y)):
         if not np.isfinite(values).all():
             where = np.argwhere(~np.isfinite(values))[0].tolist()
@@ -126,6 +130,9 @@ def _determined(size: Floats) -> None:
     """InputError if fewer than d - 1 singular values differ from zero: Umeyama's condition for a single optimum."""
     open_ = size[..., -2] <= 1e-14 * np.maximum(size[..., 0], np.finfo(float).tiny)
     if open_.any():
-        raise InputError("estimate, truth", f"singular values {size[open_][0].tolist()} m^2",
-                         f"at least {size.shape[-1] - 1} must differ from zero, or the rotation is open",
-                         "Align x and y only ([..., :2]) for a straight drive, or pass aligned=False.")  # fmt: skip
+        raise InputError(
+            "estimate, truth",
+            f"singular values {size[open_][0].tolist()} m^2",
+            f"at least {size.shape[-1] - 1} must differ from zero, or the rotation is open",
+            "Align x and y only ([..., :2]) for a straight drive, or pass aligned=False.",
+        )

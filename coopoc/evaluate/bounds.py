@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, checked
 from ..errors import InputError
 from ..methods.drift_state import drifting, require_white
 from ..world.fleet import Fleet
-from ..world.recording import Links
+from ..world.links import Links
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
 from ..world.v2x import V2X
@@ -19,9 +19,14 @@ from .recursion import covariances, drifting_covariances, stages_of
 
 
 def posterior_bound(
-    fleet: Fleet, sensors: Sensors, ego: int | str, v2x: V2X | None = None, *, smoothing: bool = False,
+    fleet: Fleet,
+    sensors: Sensors,
+    ego: int | str,
+    v2x: V2X | None = None,
+    *,
+    smoothing: bool = False,
     information: Literal["star", "fleet"] = "star",
-) -> Floats:  # fmt: skip
+) -> Floats:
     """Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
 
     Filtering: J_t = (Q_t + J_{t-1}^-1)^-1 + F_t (Tichavsky, Muravchik, Nehorai 1998), F_t the Fisher information of the
@@ -93,7 +98,7 @@ def _recursion(
 
 def bound_rt_le(cov: Floats) -> float:
     """RT-LE that belongs to a bound (T, 3, 3), sqrt(mean_t trace P_t), m."""
-    return float(np.sqrt(np.trace(cov, axis1=-2, axis2=-1).mean()))
+    return float(np.sqrt(np.trace(checked("cov", cov, "(T, 3, 3)", (-1, 3, 3)), axis1=-2, axis2=-1).mean()))
 
 
 def _checked(sensors: Sensors, v2x: V2X | None) -> V2X:

@@ -9,9 +9,10 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, checked, refuse
 from ..errors import InputError
 from ..methods.track import Track
+from ..plugins import unknown
 from ..world.recording import Recording
 from ..world.v2x import Message
 
@@ -47,7 +48,9 @@ class Ledger:
 
     def __post_init__(self) -> None:
         for name in ("seconds", "sent", "received"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            values = checked(name, getattr(self, name))
+            refuse(name, values, ~(values >= 0), "must be >= 0", "Give bytes and seconds.")
+            object.__setattr__(self, name, values)
         shape = (2, 2, *self.sent.shape[2:3], len(self.names))
         for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):
             found = getattr(self, name).shape
@@ -96,9 +99,13 @@ class Ledger:
 
 
 def of_training(
-    names: Sequence[str], sent: npt.ArrayLike, received: npt.ArrayLike, servers: Sequence[str] = (),
-    messages: npt.ArrayLike = 0.0, overhead: int = 0,
-) -> Ledger:  # fmt: skip
+    names: Sequence[str],
+    sent: npt.ArrayLike,
+    received: npt.ArrayLike,
+    servers: Sequence[str] = (),
+    messages: npt.ArrayLike = 0.0,
+    overhead: int = 0,
+) -> Ledger:
     """The ledger of a training from payload bytes (V,) sent once and received.
 
     Args:
@@ -109,8 +116,9 @@ def of_training(
     >>> ledger.per_vehicle("training"), ledger.per_vehicle("training", "on air")
     (120.0, 140.0)
     """
-    payload = np.array([np.asarray(sent, float), np.asarray(received, float)])
-    kinds = np.stack([payload, payload + overhead * np.asarray(messages, float)], axis=1)[:, :, None]
+    given = (("sent", sent), ("received", received))
+    payload = np.array([checked(name, values, "(V,)", (len(names),)) for name, values in given])
+    kinds = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]
     moved = np.stack([kinds, np.zeros_like(kinds)], axis=1)
     return Ledger(tuple(names), np.zeros(len(names)), moved[0], moved[1], tuple(servers))
 
@@ -124,19 +132,17 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     Raises:
         InputError: a message as long as the neighbourhood under an overhead: its payload has no one share of the air.
 
-    >>> from coopoc import Fleet, Gnss, Sensors, observe
+    >>> from coopoc import Fleet, GNSS, Sensors, observe
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
     >>> seen = observe(fleet, Sensors())
-    >>> of_track(Gnss()(seen, ["a"]), seen, Gnss().message).rate()
+    >>> of_track(GNSS()(seen, ["a"]), seen, GNSS().message).rate()
     0.0
     """
     names, overhead = [recording.ids[ego] for ego in track.egos], recording.v2x.overhead
     return of_drive(names, len(track.t) * recording.dt, track.sent_bytes, track.received_bytes, message, overhead)
 
 
-def break_even(
-    training: Ledger, deciding: Ledger, kind: Kind = "payload", way: Way = "per receiver"
-) -> float:  # fmt: skip
+def break_even(training: Ledger, deciding: Ledger, kind: Kind = "payload", way: Way = "per receiver") -> float:
     """Seconds of driving after which deciding has moved as many bytes per vehicle as the training did; inf for never.
 
     Args:
@@ -174,7 +180,7 @@ def payload(on_air: Floats, message: Message, overhead: int) -> Floats:
 
 def of_drive(
     names: Sequence[str], seconds: npt.ArrayLike, sent: Floats, received: Floats, message: Message, overhead: int
-) -> Ledger:  # fmt: skip
+) -> Ledger:
     """The ledger of deciding from bytes on air.
 
     Args:
@@ -193,5 +199,5 @@ def of_drive(
 def _place(allowed: object, name: str, value: str) -> int:
     known = get_args(allowed)
     if value not in known:
-        raise InputError(name, repr(value), f"must be one of {known}", "Pick one.")
+        raise unknown(name, value, known)
     return known.index(value)

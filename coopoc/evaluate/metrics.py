@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from ..arrays import Floats
+from ..arrays import Floats, number, refuse
 from ..errors import InputError
-from ..kernels.compile import use_kernels
+from ..kernels.scores import distances, normalised, root_mean_squares
 from ..methods.track import Track
 from ..world.fleet import Fleet
 from ..world.recording import Recording
@@ -15,12 +15,17 @@ from ..world.recording import Recording
 
 def errors(track: Track, fleet: Fleet) -> Floats:
     """Distance between estimate and truth, (R, T, E) m."""
+    return distance(track.x, _truth(track, fleet))
+
+
+def _truth(track: Track, fleet: Fleet) -> Floats:
+    """(T, E, 3) m of the egos; InputError if the fleet is not the one that was recorded."""
+    egos = np.array(track.egos, dtype=np.int64)
+    hint = "Score a track against the fleet that its recording was observed from."
     if len(track.t) != len(fleet.t):
-        raise InputError(
-            "track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps",
-            "Score a track against the fleet that its recording was observed from.",
-        )  # fmt: skip
-    return distance(track.x, fleet.position[:, list(track.egos)])
+        raise InputError("track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps", hint)
+    refuse("track.egos", egos, egos >= len(fleet.ids), f"must be columns of the fleet, 0..{len(fleet.ids) - 1}", hint)
+    return fleet.position[:, egos]
 
 
 def distance(x: Floats, truth: Floats) -> Floats:
@@ -29,20 +34,18 @@ def distance(x: Floats, truth: Floats) -> Floats:
     >>> distance(np.zeros((1, 1, 1, 3)), np.array([[[1.0, 2.0, 2.0]]])).item()
     3.0
     """
-    if use_kernels():
-        from ..kernels.scores import distances
-
-        return distances(np.ascontiguousarray(x), np.ascontiguousarray(truth))
-    a, b, c = np.moveaxis(x - truth, -1, 0)
-    return np.asarray(np.sqrt(a * a + b * b + c * c))
+    if x.shape[1:] != truth.shape:
+        allowed = f"must have shape (T, E, 3) = {x.shape[1:]}"
+        raise InputError("truth", f"shape {truth.shape}", allowed, "Give the truth of the same egos and steps.")
+    return distances(np.ascontiguousarray(x), np.ascontiguousarray(truth))
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
     """Root mean square localization error over time, sqrt(mean_t |x_t - truth_t|^2), (R, E) m (paper, section IV.A).
 
-    >>> from coopoc import Gnss, Sensors, observe
+    >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-    >>> rt_le(Gnss()(observe(fleet, Sensors(), runs=5)), fleet).shape
+    >>> rt_le(GNSS()(observe(fleet, Sensors(), runs=5)), fleet).shape
     (5, 1)
     """
     return np.asarray(np.sqrt(np.mean(errors(track, fleet) ** 2, axis=1)))
@@ -58,25 +61,15 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
 
     NaN where an ego has no neighbour or the method says nothing about them.
     """
-    out = np.full((len(track.x), len(track.egos)), np.nan)
+    if fleet.ids != recording.ids:
+        hint = "Give the fleet that the recording was observed from."
+        raise InputError("fleet", fleet.name or "unnamed", "must hold the vehicles that were observed", hint)
     if track.neighbours is None:
-        return out
+        return np.full((len(track.x), len(track.egos)), np.nan)
     mine = [recording.links.of(ego) for ego in track.egos]
     links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
-    if use_kernels():
-        from ..kernels.scores import root_mean_squares
-
-        return root_mean_squares(np.ascontiguousarray(track.neighbours), truth, ends)
-    for run, theirs in enumerate(track.neighbours):  # a run at a time stays in the cache
-        x, y, z = (theirs - truth).T
-        square = x * x + y * y + z * z
-        for e in range(len(mine)):
-            known = square[ends[e] : ends[e + 1]]
-            known = known[np.isfinite(known)]
-            if len(known):
-                out[run, e] = np.sqrt(known.mean())
-    return out
+    return root_mean_squares(np.ascontiguousarray(track.neighbours), truth, ends)
 
 
 def nees(track: Track, fleet: Fleet) -> Floats:
@@ -88,39 +81,11 @@ def nees(track: Track, fleet: Fleet) -> Floats:
         raise InputError(
             "covariance", None, "this method claims none", "NEES needs a method that reports a covariance."
         )
-    truth = fleet.position[:, list(track.egos)]
-    if use_kernels():
-        from ..kernels.scores import normalised
-
-        arrays = (np.ascontiguousarray(values) for values in (track.x, truth, track.covariance))
-        values, sound = normalised(*arrays)
-        if not sound:
-            raise np.linalg.LinAlgError("Singular covariance")
-        return values
-    found: Floats = np.empty(track.x.shape[:-1])
-    for run, (x, cov) in enumerate(zip(track.x, track.covariance, strict=True)):  # a run at a time stays in the cache
-        found[run] = _normalised(x - truth, cov)
-    return found
-
-
-def _normalised(error: Floats, cov: Floats) -> Floats:
-    """e^T P^-1 e (...,) of errors (..., 3) and covariances (..., 3, 3) by P = L D L^T; NaN where P is zero.
-
-    Raises:
-        LinAlgError: a P that is singular.
-    """
-    xx, xy, xz, yy, yz, zz = (cov[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
-    a, b, c = np.moveaxis(error, -1, 0)
-    certain = (cov == 0).all(axis=(-2, -1)) if (xx == 0).any() else np.zeros(xx.shape, dtype=bool)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        first, second = xy / xx, xz / xx
-        yy, yz = yy - first * xy, yz - first * xz
-        third, b = yz / yy, b - first * a
-        zz, c = zz - second * xz - third * yz, c - second * a - third * b
-        found = a * a / xx + b * b / yy + c * c / zz
-    if not (np.isfinite(found) | certain).all():
+    arrays = (np.ascontiguousarray(values) for values in (track.x, _truth(track, fleet), track.covariance))
+    found, sound = normalised(*arrays)
+    if not sound:
         raise np.linalg.LinAlgError("Singular covariance")
-    return np.asarray(np.where(certain, np.nan, found))
+    return found
 
 
 def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, float]:
@@ -131,6 +96,8 @@ def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, flo
     >>> [round(b, 2) for b in nees_band(30)]
     [1.97, 4.28]
     """
+    runs = number("runs", runs, 1, kind=int, allowed=">= 1", hint="Give the number of runs averaged.")
+    level = number("level", level, 0, 1, allowed="in [0, 1]", hint="0.99 is the default.")
     low, high = stats.chi2.ppf([(1 - level) / 2, (1 + level) / 2], size * runs) / runs
     return float(low), float(high)
 

@@ -12,7 +12,7 @@ from ..arrays import Floats, Ints
 from ..methods.drift_state import Drift
 from ..methods.star import rows
 from ..world.fleet import Fleet
-from ..world.recording import Links
+from ..world.links import Links
 from ..world.sensors import Sensors
 from ..world.spherical import spherical, vector_cov
 
@@ -27,9 +27,7 @@ class Stage:
     gained: Floats
 
 
-def stages_of(
-    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], *, fixes: bool = True
-) -> list[Stage]:  # fmt: skip
+def stages_of(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], *, fixes: bool = True) -> list[Stage]:
     """Every step of the vehicles (columns) that are members of it, with what fixes say or without."""
     start = np.searchsorted(links.step, np.arange(len(fleet.t) + 1))
     stages, before = [], np.full(len(fleet.ids), -1)

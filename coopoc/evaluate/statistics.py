@@ -8,10 +8,11 @@ from functools import lru_cache
 import numpy as np
 from scipy import stats
 
-from ..arrays import AnyArray, Floats
+from ..arrays import AnyArray, Floats, checked, number
 from ..errors import InputError
 
 _CHUNK = 4_000_000
+LEVEL = "between 0 and 1"
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,9 @@ def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
     >>> over_seeds(np.array([1.0, 1.2, 1.1])).means.tolist()
     [1.0, 1.2, 1.1]
     """
-    values = np.asarray(values, dtype=float)
-    if len(values) < 2 or not np.isfinite(values).all():
+    values = checked("values", values)
+    number("level", level, 1e-9, 1 - 1e-9, allowed=LEVEL, hint="0.95 is the default.")
+    if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
     means: Floats = values.reshape(len(values), -1).mean(axis=1)
     half = stats.t.ppf((1 + level) / 2, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
@@ -111,6 +113,8 @@ def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
 
 def _resampled(values: Floats, resamples: int, seed: int) -> Floats:
     """(resamples,) means; the same draws for any values of one shape, so pairs stay pairs."""
+    resamples = number("resamples", resamples, 1, kind=int, allowed=">= 1", hint="2000 is the default.")
+    seed = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
     flat, step = values.ravel(), max(1, _CHUNK // values.size)
     counts = _counts(*values.shape, resamples, seed)
     sums = [counts[k : k + step].astype(float) @ flat for k in range(0, resamples, step)]
@@ -133,6 +137,7 @@ def _counts(egos: int, runs: int, resamples: int, seed: int) -> AnyArray:
 
 
 def _interval(resampled: Floats, mean: float, values: Floats, level: float) -> Interval:
+    number("level", level, 1e-9, 1 - 1e-9, allowed=LEVEL, hint="0.95 is the default.")
     n = values.shape[0] if values.shape[0] > 1 else values.shape[1]
     if n < 2:
         return Interval(mean, float("nan"), float("nan"), values.size)
@@ -142,7 +147,7 @@ def _interval(resampled: Floats, mean: float, values: Floats, level: float) -> I
 
 
 def _checked(name: str, values: AnyArray) -> Floats:
-    array: Floats = np.atleast_2d(np.asarray(values, dtype=float))
+    array: Floats = np.atleast_2d(checked(name, values))
     if array.ndim != 2 or array.size == 0:
         raise InputError(name, array.shape, "must have shape (E, R) or (R,)", "Egos first, then runs.")
     if not np.isfinite(array).all():

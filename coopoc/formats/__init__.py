@@ -12,13 +12,13 @@ from .pyfg import read_pyfg, write_pyfg
 GRAPHS = {".pyfg": (read_pyfg, write_pyfg), ".g2o": (read_g2o, write_g2o)}
 
 
-def read_graph(path: str | Path) -> Graph:
+def load_graph(path: str | Path) -> Graph:
     """Graph of a file, .pyfg or .g2o.
 
     Raises:
         InputError: another suffix, or what `read_pyfg` and `read_g2o` raise.
 
-    >>> read_graph("ring.json")
+    >>> load_graph("ring.json")
     Traceback (most recent call last):
     coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o. Rename or convert the file.
     """

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import AnyArray, Bools, Floats
+from ..arrays import AnyArray, Bools, Floats, Ints
 from ..errors import InputError
 from .edges import ENDS, Edges, PointEdges, PoseEdges, RangeEdges
 from .rotations import UNIT
-
-if TYPE_CHECKING:
-    from .graph import Graph
+from .vertices import Vertices
 
 NAME = re.compile(r"[A-Za-z](0|[1-9][0-9]{0,14})")
 ROUNDING = 1e-9  # what may be left below zero, or unequal, of the largest eigenvalue or entry
@@ -45,23 +42,29 @@ def no_edges(field: str, dimension: int) -> Edges:
     return kind(**empty)
 
 
-def check(graph: Graph, place: Place) -> None:
-    """InputError at the first rule that a graph breaks: `Graph` lists them."""
-    _vertices(graph, place)
-    for field in ENDS:
-        edges = getattr(graph, field)
-        for name, shape in shapes(field, graph.dimension, len(edges)).items():
+def check(vertices: Vertices, measured: Mapping[str, Edges], fixed: Ints, place: Place) -> None:
+    """InputError at the first rule that a graph breaks: `Graph` lists them.
+
+    Args:
+        vertices: poses and points.
+        measured: kind of edge -> its edges.
+        fixed: (F,) vertices that stay where they are.
+        place: (field, row) -> where it came from.
+    """
+    _vertices(vertices, place)
+    for field, edges in measured.items():
+        for name, shape in shapes(field, vertices.dimension, len(edges)).items():
             _shape(f"{field}.{name}", getattr(edges, name), shape)
         if len(edges):
-            _ends(graph, field, place)
+            _ends(vertices, field, edges.nodes, place)
             _values(edges, field, place)
-    outside = _first((graph.fixed < 0) | (graph.fixed >= len(graph.names)))
+    outside = _first((fixed < 0) | (fixed >= len(vertices.names)))
     if outside is not None:
-        raise InputError(place("fixed", outside), graph.fixed[outside], f"must be in 0..{len(graph.names) - 1}",
-                         "Give places in names.")  # fmt: skip
+        allowed = f"must be in 0..{len(vertices.names) - 1}"
+        raise InputError(place("fixed", outside), fixed[outside], allowed, "Give places in names.")
 
 
-def _vertices(graph: Graph, place: Place) -> None:
+def _vertices(graph: Vertices, place: Place) -> None:
     n = len(graph.names)
     if graph.dimension not in (2, 3):
         raise InputError("dimension", graph.dimension, "must be 2 or 3", "Give the dimension of the positions.")
@@ -80,30 +83,49 @@ def _vertices(graph: Graph, place: Place) -> None:
             raise InputError(place("names", row), f"vertex {name}", before, "Remove or rename one of them.")
     infinite = _first(np.isinf(np.hstack([graph.position, graph.orientation])).any(axis=1))
     if infinite is not None:
-        raise InputError(place("names", infinite), f"vertex {graph.names[infinite]} at infinity",
-                         "must be finite, or NaN where unknown", "Mend the number.")  # fmt: skip
+        raise InputError(
+            place("names", infinite),
+            f"vertex {graph.names[infinite]} at infinity",
+            "must be finite, or NaN where unknown",
+            "Mend the number.",
+        )
     timed = _first(np.isfinite(graph.stamps) & ~graph.is_pose)
     if timed is not None:
-        raise InputError(place("names", timed), f"stamp {graph.stamps[timed]} of {graph.names[timed]}",
-                         "must be NaN: a point has none", "Give stamps to poses only.")  # fmt: skip
+        raise InputError(
+            place("names", timed),
+            f"stamp {graph.stamps[timed]} of {graph.names[timed]}",
+            "must be NaN: a point has none",
+            "Give stamps to poses only.",
+        )
     _unit(graph.orientation, "names", place)
 
 
-def _ends(graph: Graph, field: str, place: Place) -> None:
-    nodes = getattr(graph, field).nodes
+def _ends(graph: Vertices, field: str, nodes: Ints, place: Place) -> None:
     outside = _first(((nodes < 0) | (nodes >= len(graph.names))).any(axis=1))
     if outside is not None:
-        raise InputError(place(field, outside), f"vertices {nodes[outside].tolist()}",
-                         f"must be in 0..{len(graph.names) - 1}", "Give places in names.")  # fmt: skip
+        raise InputError(
+            place(field, outside),
+            f"vertices {nodes[outside].tolist()}",
+            f"must be in 0..{len(graph.names) - 1}",
+            "Give places in names.",
+        )
     for end, role in enumerate(ENDS[field]):
         wrong = None if role == "any" else _first(graph.is_pose[nodes[:, end]] != (role == "pose"))
         if wrong is not None:
-            raise InputError(place(field, wrong), f"vertex {graph.names[nodes[wrong, end]]}",
-                             f"must be a {role} in {field}", "Check the order of the vertices.")  # fmt: skip
+            raise InputError(
+                place(field, wrong),
+                f"vertex {graph.names[nodes[wrong, end]]}",
+                f"must be a {role} in {field}",
+                "Check the order of the vertices.",
+            )
     loop = _first((nodes[:, :1] == nodes[:, 1:]).any(axis=1))
     if loop is not None:
-        raise InputError(place(field, loop), f"{graph.names[nodes[loop, 0]]} twice", "must be two vertices",
-                         "Remove the measurement.")  # fmt: skip
+        raise InputError(
+            place(field, loop),
+            f"{graph.names[nodes[loop, 0]]} twice",
+            "must be two vertices",
+            "Remove the measurement.",
+        )
 
 
 def _values(edges: Edges, field: str, place: Place) -> None:
@@ -120,9 +142,12 @@ def _values(edges: Edges, field: str, place: Place) -> None:
     if isinstance(edges, PoseEdges | PointEdges):
         row = _first(~_semidefinite(edges.covariance))
         if row is not None:
-            raise InputError(place(field, row), f"covariance {edges.covariance[row].tolist()}",
-                             "must be symmetric and positive semi-definite",
-                             "Check the order of the upper triangle: by rows.")  # fmt: skip
+            raise InputError(
+                place(field, row),
+                f"covariance {edges.covariance[row].tolist()}",
+                "must be symmetric and positive semi-definite",
+                "Check the order of the upper triangle: by rows.",
+            )
 
 
 def _semidefinite(covariance: Floats) -> Bools:
@@ -136,9 +161,12 @@ def _unit(orientation: Floats, field: str, place: Place) -> None:
     if orientation.shape[-1] == 4:
         row = _first(np.abs(np.linalg.norm(orientation, axis=1) - 1) > UNIT)
         if row is not None:
-            raise InputError(place(field, row), f"quaternion {orientation[row].tolist()}",
-                             f"must have length 1 to within {UNIT:g}",
-                             "Order is qx qy qz qw; 0 0 0 1 is no rotation.")  # fmt: skip
+            raise InputError(
+                place(field, row),
+                f"quaternion {orientation[row].tolist()}",
+                f"must have length 1 to within {UNIT:g}",
+                "Order is qx qy qz qw; 0 0 0 1 is no rotation.",
+            )
 
 
 def _shape(field: str, array: AnyArray, shape: tuple[int, ...]) -> None:

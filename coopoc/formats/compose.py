@@ -60,14 +60,21 @@ def _refuse(
 ) -> None:
     missing = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(missing):
-        raise InputError(f"vertex {graph.names[nodes[missing[0]]]}", "NaN", f"must be known: {tag} holds it",
-                         "Give it a position and an orientation, such as an initial guess.")  # fmt: skip
+        raise InputError(
+            f"vertex {graph.names[nodes[missing[0]]]}",
+            "NaN",
+            f"must be known: {tag} holds it",
+            "Give it a position and an orientation, such as an initial guess.",
+        )
     off = np.flatnonzero(np.isfinite(stamps) != record.stamped)
     if len(off):
         needs, value = ("must be given", "t") if record.stamped else ("has no place", "np.nan")
-        raise InputError(f"stamp of {record.kind} of {graph.names[nodes[off[0]]]}", stamps[off[0]],
-                         f"{needs} in a line {tag} of {grammar.format}",
-                         f"Write graph.stamped({value}), or replace the stamps.")  # fmt: skip
+        raise InputError(
+            f"stamp of {record.kind} of {graph.names[nodes[off[0]]]}",
+            stamps[off[0]],
+            f"{needs} in a line {tag} of {grammar.format}",
+            f"Write graph.stamped({value}), or replace the stamps.",
+        )
 
 
 def _lines(tag: str, record: Record, stamps: Floats, nodes: Ints, words: Sequence[str], values: Floats) -> list[str]:

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Ints, frozen
 from .check import check, no_edges
 from .edges import ENDS, PointEdges, PoseEdges, RangeEdges
-from .rotations import to_rotation
+from .vertices import Vertices
 
 
 def _row(field: str, row: int) -> str:
@@ -20,7 +20,7 @@ def _row(field: str, row: int) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class Graph:
+class Graph(Vertices):
     """A factor graph as a file holds it: n poses and points, and what was measured between them.
 
     Orientations are kept as the file writes them (an angle or a quaternion), so that writing what was read changes no
@@ -46,12 +46,6 @@ class Graph:
     Graph(2-D: 1 poses of 1 robots, 1 points; 1 ranges)
     """
 
-    dimension: int
-    names: tuple[str, ...]
-    is_pose: Bools
-    position: Floats
-    orientation: Floats
-    stamps: Floats = ()  # type: ignore[assignment]
     relative_pose: PoseEdges = PoseEdges()
     relative_point: PointEdges = PointEdges()
     ranges: RangeEdges = RangeEdges()
@@ -71,12 +65,7 @@ class Graph:
         for field in ENDS:
             if not len(getattr(self, field)):
                 object.__setattr__(self, field, no_edges(field, self.dimension))
-        check(self, place or _row)
-
-    @cached_property
-    def rotation(self) -> Floats:
-        """(n, d, d), the identity for points."""
-        return to_rotation(self.orientation)
+        check(self, {field: getattr(self, field) for field in ENDS}, self.fixed, place or _row)
 
     @cached_property
     def robots(self) -> Mapping[str, Ints]:

@@ -49,8 +49,12 @@ def write_kitti(poses: Trajectory, path: str | Path, times: str | Path | None = 
         InputError: stamps without a file for them, or a file without stamps.
     """
     if (poses.stamps is None) != (times is None):
-        raise InputError("times", times, "must be given if and only if the trajectory has stamps",
-                         "KITTI keeps stamps in a file of their own.")  # fmt: skip
+        raise InputError(
+            "times",
+            times,
+            "must be given if and only if the trajectory has stamps",
+            "KITTI keeps stamps in a file of their own.",
+        )
     table = np.concatenate([poses.rotation, poses.position[:, :, None]], axis=2).reshape(-1, 12)
     Path(path).write_text("\n".join([*to_text(table), ""]))
     if times is not None and poses.stamps is not None:

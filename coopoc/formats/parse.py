@@ -71,10 +71,12 @@ def _vertices(file: str, rows: Mapping[str, Rows], dimension: int) -> tuple[list
 def _edges(file: str, rows: Rows, grammar: Grammar, index: Index) -> PoseEdges | PointEdges | RangeEdges:
     record, (stamps, ids, numbers) = rows.record, _split(file, rows)
     places = [f"{file}: line {line}" for line in rows.lines]
-    nodes = np.array([
-        [_find(place, word, role, index) for word, role in zip(words, record.ends, strict=True)]
-        for place, words in zip(places, ids, strict=True)
-    ])  # fmt: skip
+    nodes = np.array(
+        [
+            [_find(place, word, role, index) for word, role in zip(words, record.ends, strict=True)]
+            for place, words in zip(places, ids, strict=True)
+        ]
+    )
     count = len(record.values.split())
     values, noise = numbers[:, :count], symmetric(numbers[:, count:], record.size)
     if grammar.noise == "information":
@@ -100,8 +102,12 @@ def _split(file: str, rows: Rows) -> tuple[Floats, list[list[str]], Floats]:
 def _name(place: str, word: str, kind: str, grammar: Grammar) -> str:
     name = grammar.name(word, kind)
     if not name:
-        raise InputError(place, f"vertex {word}", f"must be called as {grammar.format} does",
-                         "PyFG: a letter and a number as A0. g2o: a number.")  # fmt: skip
+        raise InputError(
+            place,
+            f"vertex {word}",
+            f"must be called as {grammar.format} does",
+            "PyFG: a letter and a number as A0. g2o: a number.",
+        )
     return name
 
 

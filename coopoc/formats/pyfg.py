@@ -66,7 +66,11 @@ def write_pyfg(graph: Graph, path: str | Path) -> None:
             PyFG has no record.
     """
     if len(graph.fixed):
-        raise InputError("fixed", f"{len(graph.fixed)} vertices", "PyFG has no record for fixed vertices",
-                         "Write dataclasses.replace(graph, fixed=()), or a pose prior.")  # fmt: skip
+        raise InputError(
+            "fixed",
+            f"{len(graph.fixed)} vertices",
+            "PyFG has no record for fixed vertices",
+            "Write dataclasses.replace(graph, fixed=()), or a pose prior.",
+        )
     lines = to_lines(graph, GRAMMAR, lambda name: name)
     Path(path).write_text("\n".join([*lines, ""]))

@@ -112,8 +112,12 @@ def collect(file: str, lines: Iterable[tuple[int, list[str]]], grammar: Grammar)
         if record.dimension and not dimension:
             dimension, since = record.dimension, f"line {number}, {tag}"
         if record.dimension not in (0, dimension):
-            raise InputError(f"{file}: line {number}", tag, f"must be {dimension}-D as {since}",
-                             "Keep 2-D and 3-D in separate files.")  # fmt: skip
+            raise InputError(
+                f"{file}: line {number}",
+                tag,
+                f"must be {dimension}-D as {since}",
+                "Keep 2-D and 3-D in separate files.",
+            )
         if len(words) != width[tag]:
             raise wrong(file, number, words, grammar.form(tag))
         if record.kind not in rows:

@@ -68,6 +68,9 @@ def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
     off = np.abs(poses.rotation @ poses.rotation.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(poses.rotation) < 0))
     if len(bad):
-        raise InputError(place(bad[0]), f"rotation {poses.rotation[bad[0]].round(6).tolist()}",
-                         f"must be orthonormal to within {ORTHONORMAL:g}, with determinant 1",
-                         "Check the order of the numbers.")  # fmt: skip
+        raise InputError(
+            place(bad[0]),
+            f"rotation {poses.rotation[bad[0]].round(6).tolist()}",
+            f"must be orthonormal to within {ORTHONORMAL:g}, with determinant 1",
+            "Check the order of the numbers.",
+        )

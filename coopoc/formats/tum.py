@@ -34,9 +34,12 @@ def read_tum(path: str | Path) -> Trajectory:
     lines, table = read_table(path, "t x y z qx qy qz qw")
     off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > UNIT)
     if len(off):
-        raise InputError(f"{path.name}: line {lines[off[0]]}", f"quaternion {table[off[0], 4:].tolist()}",
-                         f"must have length 1 to within {UNIT:g}",
-                         "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.")  # fmt: skip
+        raise InputError(
+            f"{path.name}: line {lines[off[0]]}",
+            f"quaternion {table[off[0], 4:].tolist()}",
+            f"must have length 1 to within {UNIT:g}",
+            "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
+        )
     rotation = to_rotation(table[:, 4:])
     return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
 

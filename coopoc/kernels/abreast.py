@@ -15,9 +15,9 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 
-from .lanes import LANES, fused
+from .lanes import LANES, check_index, fused
 
-_VECTOR = ir.VectorType(ir.DoubleType(), LANES)
+VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 
 
 class Abreast(types.Type):
@@ -30,7 +30,7 @@ class Abreast(types.Type):
 @register_model(Abreast)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
-        super().__init__(manager, kind, _VECTOR)  # type: ignore[no-untyped-call]
+        super().__init__(manager, kind, VECTOR)  # type: ignore[no-untyped-call]
 
 
 abreast = Abreast()
@@ -40,10 +40,14 @@ def _wide(context: Any, build: Any, value: Any, kind: Any) -> Any:
     """A vector as it is, a number in all lanes."""
     if isinstance(kind, Abreast):
         return value
-    number = context.cast(build, value, kind, types.float64)
-    first = build.insert_element(ir.Constant(_VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
+    return wide(build, context.cast(build, value, kind, types.float64))
+
+
+def wide(build: Any, number: Any) -> Any:
+    """The vector of one number in all lanes."""
+    first = build.insert_element(ir.Constant(VECTOR, ir.Undefined), number, ir.Constant(ir.IntType(32), 0))
     everywhere = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
-    return build.shuffle_vector(first, ir.Constant(_VECTOR, ir.Undefined), everywhere)
+    return build.shuffle_vector(first, ir.Constant(VECTOR, ir.Undefined), everywhere)
 
 
 def _operator(function: Any, makes: Callable[[Any, Any, Any], Any]) -> None:
@@ -85,7 +89,7 @@ def _function(function: Any, name: str) -> None:
 
     @lower_builtin(function, Abreast)  # type: ignore[untyped-decorator]
     def lowered(context: Any, build: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(_VECTOR, [_VECTOR])
+        kind = ir.FunctionType(VECTOR, [VECTOR])
         return build.call(cgutils.get_or_insert_function(build.module, kind, f"llvm.{name}.v{LANES}f64"), args)
 
 
@@ -121,7 +125,8 @@ def _place(context: Any, build: Any, kind: Any, array: Any, at: Any) -> Any:
     """Pointer to the vector `at` of a flat array."""
     data = cgutils.create_struct_proxy(kind)(context, build, array).data
     start = build.mul(at, ir.Constant(at.type, LANES))
-    return build.bitcast(build.gep(data, [start]), _VECTOR.as_pointer())
+    check_index(context, build, kind, array, build.add(start, ir.Constant(at.type, LANES)))
+    return build.bitcast(build.gep(data, [start]), VECTOR.as_pointer())
 
 
 def _take(context: Any, array: Any, at: Any) -> Any:
@@ -147,7 +152,7 @@ def _pack(context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
     """The vector of four numbers."""
 
     def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
-        whole = ir.Constant(_VECTOR, ir.Undefined)
+        whole = ir.Constant(VECTOR, ir.Undefined)
         for k, number in enumerate(args):
             whole = build.insert_element(whole, number, ir.Constant(ir.IntType(32), k))
         return whole

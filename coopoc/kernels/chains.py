@@ -1,142 +1,194 @@
-"""A neighbour's points in a window, a chain of motion that meets the ego's points only: eliminate it onto these.
+"""The Gauss-Newton step of a window of stars: each neighbour is a chain of points that meets the ego's points only.
 
-Arrays are those of `coopoc.kernels.window`. The ego's matrix (3h, 3h) with its right-hand side, which remains, is one
-of `coopoc.kernels.blocks`. Kept of each point, in flat arrays: its arm (3, stride) to the ego's points with its pull
-beside it, and twelve numbers, minus the inverse of its own block and then its move.
+Eliminating the chains one after the other leaves the ego's information matrix of h x h blocks. With S the information
+of a point without the motion that leaves it, of information Q, the next one inherits (S^-1 + Q^-1)^-1 = Q (S + Q)^-1 S,
+which is no difference of near numbers, and its blocks beside the ego's points, and eta, times Q (S + Q)^-1.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 from numpy import uint64
 
-from ..arrays import AnyArray
-from .blocks import inverse3
-from .compile import compiled, summing
-from .lanes import LANES, minus_product, subtract
-from .roster import FIX, MOVED, PROCESS
+from ..arrays import Floats
+from .abreast import take
+from .compile import inlined, inner
+from .elimination import eliminate, substitute
+from .lanes import LANES
+from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, place_of
+from .small import (
+    add,
+    add_diagonal,
+    inverse,
+    less_applied,
+    less_transposed_applied,
+    less_transposed_product,
+    load,
+    minus_apply,
+    minus_product,
+    mirrored,
+    negate,
+    scale,
+    scale_rows,
+    store,
+    subtract,
+    times,
+    zeros,
+)
 
-LEAST_PROCESS = 1e-90
-"""m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
+FLOOR = 1e-12
+"""1/m^2 on every point of a neighbour: one of which nothing is known has a place all the same."""
 
 
-@compiled
-def fold(
-    window: Any, first: int, step: int, last: int, k: int, stride: int, arms: AnyArray, pivots: AnyArray, a: AnyArray,
-    scratch: AnyArray,
-) -> None:  # fmt: skip
-    """Eliminate the chain that begins at place k of a step onto the ego's points.
+class Memory(NamedTuple):
+    """Scratch: of each place its blocks beside the ego's points, its eta, minus its inverse pivot and its move; the
+    ego's matrix of h x h blocks, its eta, two rows of blocks; of each run the largest move m, and a mask."""
 
-    With S the information of a point without the motion that leaves it, of information Q, the next one inherits
-    (S^-1 + Q^-1)^-1 = Q (S + Q)^-1 S, no difference of near numbers, and arms and pulls times Q (S + Q)^-1.
-    """
-    said, weight, edge, point, _, _, later = window
-    length, most, begin, beside = len(point), point.shape[1], 3 * (step - first), 3 * (last - first + 1)
-    xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    slot = step % length
-    at = 3 * stride * (slot * most + k)
-    for j in range(uint64(at), uint64(at + 3 * stride)):
-        arms[j] = 0.0
+    arm: Floats
+    eta: Floats
+    pivot: Floats
+    move: Floats
+    a: Floats
+    b: Floats
+    row: Floats
+    cov: Floats
+    most: Floats
+    active: Floats
+
+
+@inner
+def new_memory(length: int, most: int) -> Memory:
+    """Scratch for the same."""
+    places = (length + 1) * most
+    return Memory(
+        np.zeros((9 * length * places, LANES)),
+        np.zeros((3 * places, LANES)),
+        np.zeros((9 * places, LANES)),
+        np.zeros((3 * places, LANES)),
+        np.zeros((9 * length * length, LANES)),
+        np.zeros((3 * length, LANES)),
+        np.zeros((9 * length, LANES)),
+        np.zeros((9, LANES)),
+        np.zeros(LANES),
+        np.zeros(LANES),
+    )
+
+
+@inlined
+def move(window: Window, span: Any, memory: Memory, share: Any) -> Any:
+    """Move all points by a share of the Gauss-Newton step; the largest step m of each run. Minus the covariance of the
+    ego's newest point is in `memory.cov`."""
+    first, last = span
+    h = last - first + 1
+    assemble_ego(window, span, memory)
+    for step in range(first, last + 1):
+        for place in range(place_of(window, step, 1), place_of(window, step, count_of(window, step))):
+            if step == first or window.previous[place] < 0:
+                fold(window, span, step, place, memory)
+    store(memory.cov, 0, eliminate(memory.a, memory.a, memory.b, h, h, memory.row, ONE, ROW))
+    substitute(memory.a, memory.b, h, h, ONE, ROW)
+    most = 0.0 * share
+    for step in range(last, first - 1, -1):
+        ego = place_of(window, step, 0)
+        own = load(memory.b, step - first, ROW)
+        most = max(most, largest_of(own))
+        store(window.point, ego, add(load(window.point, ego, ROW), scale(own, share)))
+        for place in range(ego + 1, ego + count_of(window, step)):
+            moved = unfold(window, span, step, place, memory)
+            most = max(most, largest_of(moved))
+            store(window.point, place, add(load(window.point, place, ROW), scale(moved, share)))
+    return most
+
+
+@inlined
+def assemble_ego(window: Window, span: Any, memory: Memory) -> None:
+    """Information and eta of the ego's points: fixes, odometry, and the ego's end of each edge."""
+    first, last = span
+    h = last - first + 1
+    trust = take(window.odometry, uint64(0))
+    nothing = zeros(trust, ONE)
+    for s in range(h):
+        ego = place_of(window, first + s, 0)
+        own, gap = load(window.used, ego, ROW), fix_gap(window, ego)
+        block, eta = add_diagonal(nothing, own), times(own, gap)
+        for j in range(s + 1, h):
+            store(memory.a, s * h + j, nothing)
+        if s > 0:
+            stiff, off = motion(window, place_of(window, first + s - 1, 0), ego)
+            stiff, off = scale(stiff, trust), scale(off, trust)
+            block, eta = add_diagonal(block, stiff), add(eta, off)
+            before = s - 1
+            store(memory.a, before * (h + 1), add_diagonal(load(memory.a, before * (h + 1), ONE), stiff))
+            store(memory.a, before * (h + 1) + 1, add_diagonal(nothing, negate(stiff)))
+            store(memory.b, before, subtract(load(memory.b, before, ROW), off))
+        for place in range(ego + 1, ego + count_of(window, first + s)):
+            block, eta = add(block, load(window.edge, place, ONE)), subtract(eta, load(window.eta, place, ROW))
+        store(memory.a, s * (h + 1), block)
+        store(memory.b, s, eta)
+
+
+@inlined
+def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> None:
+    """Eliminate the chain that begins at a place onto the ego's points."""
+    first, last = span
+    h, begin = last - first + 1, step - first
+    nothing = zeros(take(window.odometry, uint64(0)), ROW)
+    own, eta = (
+        add_diagonal(zeros(nothing[0], ONE), (nothing[0] + FLOOR, nothing[0] + FLOOR, nothing[0] + FLOOR)),
+        nothing,
+    )
     while True:
-        end = 3 * (step - first)
-        e, w = edge[slot, k], weight[slot, k]
-        own, row, below, lowest = at + end, at + beside, at + stride + beside, at + 2 * stride + beside
-        arms[own], arms[own + 1], arms[own + 2] = -e[0], -e[1], -e[2]
-        arms[own + stride], arms[own + stride + 1], arms[own + stride + 2] = -e[1], -e[3], -e[4]
-        own += 2 * stride
-        arms[own], arms[own + 1], arms[own + 2] = -e[2], -e[4], -e[5]
-        xx, xy, xz = xx + e[0] + w[0], xy + e[1], xz + e[2]
-        yy, yz, zz = yy + e[3] + w[1], yz + e[4], zz + e[5] + w[2]
-        arms[row] += e[6] + w[0] * (said[slot, FIX, k, 0] - point[slot, k, 0])
-        arms[below] += e[7] + w[1] * (said[slot, FIX, k, 1] - point[slot, k, 1])
-        arms[lowest] += e[8] + w[2] * (said[slot, FIX, k, 2] - point[slot, k, 2])
-        goes = later[slot, k] if step < last else -1
-        qx, qy, qz, gx, gy, gz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        then = slot + 1 if slot + 1 < length else 0
-        if goes >= 0:
-            qx, gx = motion(said, point, slot, k, then, goes, 0)
-            qy, gy = motion(said, point, slot, k, then, goes, 1)
-            qz, gz = motion(said, point, slot, k, then, goes, 2)
-            arms[row] -= gx
-            arms[below] -= gy
-            arms[lowest] -= gz
-        p = 12 * (slot * most + k)
-        ixx, ixy, ixz, iyy, iyz, izz = inverse3(xx + qx, xy, xz, yy + qy, yz, zz + qz)
-        pivots[p], pivots[p + 1], pivots[p + 2], pivots[p + 3], pivots[p + 4] = -ixx, -ixy, -ixz, -ixy, -iyy
-        pivots[p + 5], pivots[p + 6], pivots[p + 7], pivots[p + 8] = -iyz, -ixz, -iyz, -izz
-        j = begin // LANES * LANES
-        minus_product(scratch, j, pivots, p, arms, at + j, stride, (stride - j) // LANES)
-        for i in range(begin, end + 3, 3):
-            j = i // LANES * LANES
-            subtract(a, i * stride + j, arms, at + i, scratch, j, stride, (stride - j) // LANES)
-        if goes < 0:
+        end, arm = step - first, place * h
+        information, fix = load(window.edge, place, ONE), load(window.used, place, ROW)
+        store(memory.arm, arm + end, negate(information))
+        own = add_diagonal(add(own, information), fix)
+        eta = add(add(eta, load(window.eta, place, ROW)), times(fix, fix_gap(window, place)))
+        after = window.later[place] if step < last else -1
+        stiff, off = nothing, nothing
+        if after >= 0:
+            after = place_of(window, step + 1, after)
+            stiff, off = motion(window, place, after)
+        eta = subtract(eta, off)
+        pivot = negate(inverse(add_diagonal(own, stiff)))
+        solved = minus_apply(pivot, eta)
+        store(memory.eta, place, eta)
+        store(memory.pivot, place, pivot)
+        for i in range(begin, end + 1):
+            store(memory.row, i, minus_product(pivot, load(memory.arm, arm + i, ONE)))
+        for i in range(begin, end + 1):
+            left = load(memory.arm, arm + i, ONE)
+            for j in range(i, end + 1):
+                at = i * h + j
+                right = load(memory.row, j, ONE)
+                store(memory.a, at, less_transposed_product(load(memory.a, at, ONE), left, right))
+            store(memory.b, i, less_transposed_applied(load(memory.b, i, ROW), left, solved))
+        if after < 0:
             return
-        xx, xy, xz, yy, yz, zz = (
-            qx * (ixx * xx + ixy * xy + ixz * xz), qx * (ixx * xy + ixy * yy + ixz * yz),
-            qx * (ixx * xz + ixy * yz + ixz * zz), qy * (ixy * xy + iyy * yy + iyz * yz),
-            qy * (ixy * xz + iyy * yz + iyz * zz), qz * (ixz * xz + iyz * yz + izz * zz),
-        )  # fmt: skip
-        step, slot, k = step + 1, then, goes
-        at = 3 * stride * (slot * most + k)
-        hand_on(scratch, stride, begin, qx, qy, qz, arms, at)
-        arms[at + beside] += gx
-        arms[at + stride + beside] += gy
-        arms[at + 2 * stride + beside] += gz
+        own = mirrored(scale_rows(stiff, minus_product(pivot, own)))
+        eta = add(times(stiff, solved), off)
+        for i in range(begin, end + 1):
+            store(memory.arm, after * h + i, scale_rows(stiff, load(memory.row, i, ONE)))
+        step, place = step + 1, after
 
 
-@compiled
-def motion(said: AnyArray, point: AnyArray, slot: int, k: int, then: int, goes: int, c: int) -> tuple[float, float]:
-    """Information 1/m^2 of the motion to the next step along an axis, and its pull 1/m on that step's point."""
-    q = 1.0 / max(said[then, PROCESS, goes, c], LEAST_PROCESS)
-    return q, q * (said[then, MOVED, goes, c] - point[then, goes, c] + point[slot, k, c])
-
-
-@compiled
-def hand_on(v: AnyArray, stride: int, begin: int, qx: float, qy: float, qz: float, arms: AnyArray, place: int) -> None:
-    """The arm of the next point: Q times (S + Q)^-1 times this one's, zero before the chain."""
-    at, one, two = uint64(place), uint64(stride), uint64(2 * stride)
-    for j in range(uint64(stride)):
-        there = j >= uint64(begin)
-        arms[at + j] = qx * v[j] if there else 0.0
-        arms[at + one + j] = qy * v[one + j] if there else 0.0
-        arms[at + two + j] = qz * v[two + j] if there else 0.0
-
-
-@compiled
-def unfold(
-    window: Any, first: int, step: int, last: int, k: int, stride: int, arms: AnyArray, pivots: AnyArray, b: AnyArray
-) -> float:  # fmt: skip
-    """Move one point of a chain, the next one's being known, and the ego's `b` (3h,); its largest move m."""
-    said, _, _, point, _, _, later = window
-    slot, most = step % len(point), point.shape[1]
-    at, p = 3 * stride * (slot * most + k), uint64(12 * (slot * most + k))
-    x, y, z = reach(arms, at, stride, 3 * (step - first + 1), 3 * (last - first + 1), b)
-    goes = later[slot, k]
-    if goes >= 0:
-        then = slot + 1 if slot + 1 < len(point) else 0
-        other = uint64(12 * (then * most + goes) + 9)
-        x += pivots[other] / max(said[then, PROCESS, goes, 0], LEAST_PROCESS)
-        y += pivots[other + uint64(1)] / max(said[then, PROCESS, goes, 1], LEAST_PROCESS)
-        z += pivots[other + uint64(2)] / max(said[then, PROCESS, goes, 2], LEAST_PROCESS)
-    largest, to = 0.0, p + uint64(9)
-    for c in range(3):
-        moved = -(pivots[p] * x + pivots[p + uint64(1)] * y + pivots[p + uint64(2)] * z)
-        pivots[to] = moved
-        point[slot, k, c] += moved
-        largest = max(largest, abs(moved))
-        p, to = p + uint64(3), to + uint64(1)
-    return largest
-
-
-@summing
-def reach(arms: AnyArray, place: int, stride: int, count: int, beside: int, b: AnyArray) -> Any:
-    """The pull on a point less its arm (3, count) times `b`."""
-    at, row, end = uint64(place), uint64(stride), uint64(beside)
-    two = row + row
-    x, y, z = 0.0, 0.0, 0.0
-    for j in range(uint64(count)):
-        x += arms[at + j] * b[j]
-        y += arms[at + row + j] * b[j]
-        z += arms[at + two + j] * b[j]
-    return arms[at + end] - x, arms[at + row + end] - y, arms[at + two + end] - z
+@inlined
+def unfold(window: Window, span: Any, step: int, place: int, memory: Memory) -> Any:
+    """The move of a point of a chain, those of the ego and of the next one being known."""
+    first, last = span
+    h, eta = last - first + 1, load(memory.eta, place, ROW)
+    begin = step
+    here = place
+    while begin > first and window.previous[here] >= 0:
+        begin, here = begin - 1, place_of(window, begin - 1, window.previous[here])
+    for i in range(begin - first, step - first + 1):
+        eta = less_applied(eta, load(memory.arm, place * h + i, ONE), load(memory.b, i, ROW))
+    after = window.later[place] if step < last else -1
+    if after >= 0:
+        after = place_of(window, step + 1, after)
+        stiff, _ = motion(window, place, after)
+        eta = add(eta, times(stiff, load(memory.move, after, ROW)))
+    moved = minus_apply(load(memory.pivot, place, ONE), eta)
+    store(memory.move, place, moved)
+    return moved

@@ -1,46 +1,15 @@
-"""Whether kernels are compiled, and how: machine code at the first call, kept on disk, no interpreter's lock."""
+"""How kernels are compiled: machine code at the first call, kept on disk, no interpreter's lock."""
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import warnings
+import sys
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from ..errors import InputError
-
 Function = TypeVar("Function", bound=Callable[..., Any])
-SWITCH = "COOPOC_KERNELS"
-"""Environment variable: "numba" (default) compiles, "numpy" uses the readable reference."""
-
-
-def use_kernels() -> bool:
-    """True if the methods may call the compiled kernels; False, with one warning, where numba is missing.
-
-    Raises:
-        InputError: the environment variable COOPOC_KERNELS is neither "numba" nor "numpy".
-    """
-    wish = os.environ.get(SWITCH, "numba")
-    if wish not in ("numba", "numpy"):
-        raise InputError(SWITCH, repr(wish), "must be 'numba' or 'numpy'", "Unset the environment variable.")
-    return wish == "numba" and numba_is_there("the NumPy reference runs, many times slower")
-
-
-@cache
-def numba_is_there(instead: str) -> bool:
-    """Whether anything can be compiled; if not, one warning says what runs instead.
-
-    Args:
-        instead: the end of a sentence, such as "the NumPy reference runs, many times slower".
-    """
-    if importlib.util.find_spec("numba") is None:
-        text = f"numba is not installed: {instead}. Run: pip install 'coopoc[fast]'"
-        warnings.warn(text, stacklevel=2)
-        return False
-    return True
 
 
 def compiled(function: Function) -> Function:
@@ -70,13 +39,55 @@ def summing(function: Function) -> Function:
 def inside(function: Function) -> Function:
     """Compiled as `as_written` is, and copied into whoever calls it: a call would hand over every number that describes
     an array, which takes longer than to read three of its elements."""
-    return cast(Function, _made(function, set(), forceinline=True))
+    return cast(Function, _made(function, set(), forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True))
 
 
-def _made(function: Function, liberties: set[str], forceinline: bool = False) -> Any:
+def inner(function: Function) -> Function:
+    """Compiled as `as_written` is, for compiled callers only, and kept in their machine code."""
+    return cast(Function, _made(function, set(), no_cpython_wrapper=True, no_cfunc_wrapper=True))
+
+
+def inlined(function: Function) -> Function:
+    """Copied into compiled callers before they are typed: a call would hand over every number that describes the arrays
+    of a NamedTuple, which takes longer to compile than the function."""
+    return cast(Function, _made(function, set(), inline="always"))
+
+
+PATIENCE = 2.0
+"""s of compiling after which a line on stderr reports it."""
+
+
+@cache
+def _announcing() -> None:
+    """Report a kernel that compiles for more than PATIENCE seconds, while it compiles."""
+    from numba.core import event
+
+    class Announcer(event.Listener):
+        depth = 0
+        timer: threading.Timer
+
+        def on_start(self, event: Any) -> None:
+            self.depth += 1
+            if self.depth == 1:
+                name = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
+                line = f"compiling the {name} kernel, once per machine\n"
+                self.timer = threading.Timer(PATIENCE, sys.stderr.write, [line])
+                self.timer.daemon = True
+                self.timer.start()
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                self.timer.cancel()
+
+    event.register("numba:compile", Announcer())
+
+
+def _made(function: Function, liberties: set[str], **options: Any) -> Any:
     import numba
 
-    return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, forceinline=forceinline)(function)
+    _announcing()
+    return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
 
 
 def _kept(made: Any, function: Function) -> Function:

@@ -1,121 +1,156 @@
-"""One step of consensus ADMM over a fleet: the methods of `coopoc.methods.admm`, arrays of `coopoc.kernels.gossip`."""
+"""Consensus ADMM of a whole fleet over a drive, one run after the other.
+
+Each vehicle holds a copy of itself and of those in contact. Copies of pair k are number 2k, of the second held by the
+first, and 2k + 1, of the first held by the second.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import NamedTuple
 
-from ..arrays import AnyArray
-from .blocks import inverse3
+import numpy as np
+
+from ..arrays import AnyArray, Floats
+from .belief_propagation import linearise
 from .compile import compiled
+from .fleet_graph import MATRIX, VECTOR, Assumed, Measured, Pairs, advance, copy, most_pairs
+from .small import add, add_diagonal, apply, inverse, load, minus_apply, minus_product, scale, store, subtract
 
 
-@compiled
-def times(a: AnyArray, x: float, y: float, z: float) -> Any:
-    """Symmetric (3, 3) as six numbers, times a vector."""
-    return a[0] * x + a[1] * y + a[2] * z, a[1] * x + a[3] * y + a[4] * z, a[2] * x + a[4] * y + a[5] * z
-
-
-@compiled
-def consent(
-    rounds: int, rho: float, first: AnyArray, second: AnyArray, heard: AnyArray, weight: AnyArray, pull: AnyArray,
-    own: AnyArray, outer: AnyArray, z: AnyArray, inner: AnyArray, duals: AnyArray, x: AnyArray,
-) -> None:  # fmt: skip
-    """Add to x (N, 3) what the rounds of ADMM agree upon.
+class Consensus(NamedTuple):
+    """Variables of one step, flat: of N vehicles, or of up to 2 P copies.
 
     Args:
-        outer: (N, 9) scratch: the inverse that a vehicle solves with, the holders of it. z: (N, 9): mean, own dual, own
-            copy. inner: (pairs, 2, 6), (half + rho)^-1 in the first. duals: (pairs, 2, 6): duals and copies of the two.
+        z: (3 N) m, agreed positions less the beliefs.
+        own: (3 N) m, each vehicle's copy of itself.
+        own_dual: (3 N) m.
+        outer: (9 N) m^2, inverse of the vehicle's own block once the copies are eliminated.
+        holders: (N) copies of a vehicle.
+        copy: (6 P) m.
+        dual: (6 P) m.
+        inner: (9 P) m^2, (W / 2 + rho)^-1 of each pair.
     """
-    for n in range(len(x)):
-        outer[n, 0], outer[n, 3], outer[n, 5] = 1.0 / own[n, 0] + rho, 1.0 / own[n, 1] + rho, 1.0 / own[n, 2] + rho
-        outer[n, 1], outer[n, 2], outer[n, 4], outer[n, 6] = 0.0, 0.0, 0.0, 1.0
-        z[n] = 0.0
-    for k in range(len(first)):
-        duals[k] = 0.0
-        if heard[k]:
-            w, g = weight[k], inner[k, 0]
-            for c in range(6):
-                w[c] *= 0.5
-            for c in range(3):
-                pull[k, c] *= 0.5
-            g[0], g[1], g[2], g[3], g[4], g[5] = inverse3(w[0] + rho, w[1], w[2], w[3] + rho, w[4], w[5] + rho)
-            xx, xy, xz = times(g, w[0], w[1], w[2])
-            _, yy, yz = times(g, w[1], w[3], w[4])
-            _, _, zz = times(g, w[2], w[4], w[5])
-            for n in (first[k], second[k]):
-                for c, value in enumerate((xx, xy, xz, yy, yz, zz)):
-                    outer[n, c] += rho * value
-                outer[n, 6] += 1.0
-    for n in range(len(x)):
-        o = outer[n]
-        o[0], o[1], o[2], o[3], o[4], o[5] = inverse3(o[0], o[1], o[2], o[3], o[4], o[5])
-    for _ in range(rounds):
-        _solve(rho, first, second, heard, weight, pull, outer, z, inner, duals)
-        _agree(first, second, heard, outer, z, duals)
-    for n in range(len(x)):
-        for c in range(3):
-            x[n, c] += z[n, c]
+
+    z: AnyArray
+    own: AnyArray
+    own_dual: AnyArray
+    outer: AnyArray
+    holders: AnyArray
+    copy: AnyArray
+    dual: AnyArray
+    inner: AnyArray
 
 
 @compiled
-def _solve(
-    rho: float, first: AnyArray, second: AnyArray, heard: AnyArray, weight: AnyArray, pull: AnyArray, outer: AnyArray,
-    z: AnyArray, inner: AnyArray, duals: AnyArray,
-) -> None:  # fmt: skip
-    """Each vehicle's copies of itself and of those that it hears."""
-    for n in range(len(z)):
-        for c in range(3):
-            z[n, 6 + c] = z[n, c] - z[n, 3 + c]
-    for k in range(len(first)):
-        for way, sign in ((0, 1.0), (1, -1.0)):
-            if heard[k]:
-                holder, of = (first[k], second[k]) if way == 0 else (second[k], first[k])
-                p, q, r = times(weight[k], *_wish(z, of, duals[k, way]))
-                p, q, r = times(inner[k, 0], p - sign * pull[k, 0], q - sign * pull[k, 1], r - sign * pull[k, 2])
-                z[holder, 6] += p
-                z[holder, 7] += q
-                z[holder, 8] += r
-    for n in range(len(z)):
-        p, q, r = times(outer[n], z[n, 6], z[n, 7], z[n, 8])
-        z[n, 6], z[n, 7], z[n, 8] = rho * p, rho * q, rho * r
-    for k in range(len(first)):
-        for way, sign in ((0, 1.0), (1, -1.0)):
-            if heard[k]:
-                holder, of = (first[k], second[k]) if way == 0 else (second[k], first[k])
-                one = duals[k, way]
-                a, b, c = _wish(z, of, one)
-                p, q, r = times(weight[k], z[holder, 6], z[holder, 7], z[holder, 8])
-                one[3], one[4], one[5] = times(
-                    inner[k, 0], p + sign * pull[k, 0] + rho * a, q + sign * pull[k, 1] + rho * b,
-                    r + sign * pull[k, 2] + rho * c,
-                )  # fmt: skip
+def follow(measured: Measured, pairs: Pairs, assumed: Assumed, rounds: int, rho: float) -> tuple[Floats, Floats]:
+    """Positions (R, T, 3 N) m and covariances (R, T, 9 N) m^2 of each vehicle's own filter, NaN m where inactive.
+
+    Args:
+        measured: what the fleet measured.
+        pairs: those that exchange messages.
+        assumed: the noise model.
+        rounds: iterations a step.
+        rho: 1/m^2, the penalty.
+    """
+    runs, steps, n = measured.active.shape
+    x, cov = np.empty((runs, steps, 3 * n)), np.zeros((runs, steps, 9 * n))
+    most = most_pairs(pairs)
+    graph, own = (np.zeros(9 * most), np.zeros(3 * most)), np.zeros(9 * n)
+    state = Consensus(
+        np.zeros(3 * n),
+        np.zeros(3 * n),
+        np.zeros(3 * n),
+        np.zeros(9 * n),
+        np.zeros(n),
+        np.zeros(6 * most),
+        np.zeros(6 * most),
+        np.zeros(9 * most),
+    )
+    for run in range(runs):
+        for t in range(steps):
+            advance(run, t, x[run], own, measured, assumed)
+            linearise(run, t, x[run, t], own, measured.relative[run], pairs, assumed, graph)
+            prepare(run, t, own, pairs, graph, rho, state)
+            for _ in range(rounds):
+                solve(run, t, pairs, graph, rho, state)
+                agree(run, t, pairs, state)
+            copy(own, cov[run, t], 9 * n)
+            for k in range(n):
+                store(x[run, t], k, add(load(x[run, t], k, VECTOR), load(state.z, k, VECTOR)))
+    return x, cov
 
 
 @compiled
-def _wish(z: AnyArray, of: int, one: AnyArray) -> Any:
-    """The mean less a copy's dual."""
-    return z[of, 0] - one[0], z[of, 1] - one[1], z[of, 2] - one[2]
+def prepare(
+    run: int, t: int, own: AnyArray, pairs: Pairs, graph: tuple[AnyArray, AnyArray], rho: float, state: Consensus
+) -> None:
+    """Inverses of the local problems; half of what a pair measured belongs to each of its vehicles."""
+    state.z[:], state.own_dual[:], state.dual[:], state.holders[:] = 0.0, 0.0, 0.0, 1.0
+    for n in range(len(state.holders)):
+        if own[9 * n] > 0.0:
+            information = inverse(load(own, n, MATRIX))
+            store(state.outer, n, add_diagonal(information, (rho, rho, rho)))
+    for k in range(pairs.start[t], pairs.start[t + 1]):
+        if pairs.alive[run, k]:
+            place = k - pairs.start[t]
+            half = scale(load(graph[0], place, MATRIX), 0.5)
+            inner = inverse(add_diagonal(half, (rho, rho, rho)))
+            store(graph[0], place, half)
+            store(graph[1], place, scale(load(graph[1], place, VECTOR), 0.5))
+            store(state.inner, place, inner)
+            for n in (pairs.first[k], pairs.second[k]):
+                store(state.outer, n, subtract(load(state.outer, n, MATRIX), scale(minus_product(inner, half), rho)))
+                state.holders[n] += 1.0
+    for n in range(len(state.holders)):
+        store(state.outer, n, inverse(load(state.outer, n, MATRIX)))
 
 
 @compiled
-def _agree(
-    first: AnyArray, second: AnyArray, heard: AnyArray, outer: AnyArray, z: AnyArray, duals: AnyArray
-) -> None:  # fmt: skip
-    """The new means of all copies, and the duals of what is left between them."""
-    for n in range(len(z)):
-        for c in range(3):
-            z[n, c] = z[n, 6 + c] + z[n, 3 + c]
-    for k in range(len(first)):
-        if heard[k]:
-            for c in range(3):
-                z[second[k], c] += duals[k, 0, 3 + c] + duals[k, 0, c]
-                z[first[k], c] += duals[k, 1, 3 + c] + duals[k, 1, c]
-    for n in range(len(z)):
-        for c in range(3):
-            z[n, c] /= outer[n, 6]
-            z[n, 3 + c] += z[n, 6 + c] - z[n, c]
-    for k in range(len(first)):
-        if heard[k]:
-            for c in range(3):
-                duals[k, 0, c] += duals[k, 0, 3 + c] - z[second[k], c]
-                duals[k, 1, c] += duals[k, 1, 3 + c] - z[first[k], c]
+def solve(run: int, t: int, pairs: Pairs, graph: tuple[AnyArray, AnyArray], rho: float, state: Consensus) -> None:
+    """Each vehicle's copies y = argmin f_i(y) + rho / 2 sum_k |y_k - a_k|^2, with a_k = z_k - u_k."""
+    for n in range(len(state.holders)):
+        store(state.own, n, subtract(load(state.z, n, VECTOR), load(state.own_dual, n, VECTOR)))
+    for k in range(pairs.start[t], pairs.start[t + 1]):
+        if pairs.alive[run, k]:
+            place, i, j = k - pairs.start[t], pairs.first[k], pairs.second[k]
+            half, inner = load(graph[0], place, MATRIX), load(state.inner, place, MATRIX)
+            for m, holder, of, sign in ((2 * place, i, j, 1.0), (2 * place + 1, j, i, -1.0)):
+                wish = subtract(load(state.z, of, VECTOR), load(state.dual, m, VECTOR))
+                eta = scale(load(graph[1], place, VECTOR), sign)
+                more = apply(inner, subtract(apply(half, wish), eta))
+                store(state.own, holder, add(load(state.own, holder, VECTOR), more))
+    for n in range(len(state.holders)):
+        store(state.own, n, scale(apply(load(state.outer, n, MATRIX), load(state.own, n, VECTOR)), rho))
+    for k in range(pairs.start[t], pairs.start[t + 1]):
+        if pairs.alive[run, k]:
+            place, i, j = k - pairs.start[t], pairs.first[k], pairs.second[k]
+            half, inner = load(graph[0], place, MATRIX), load(state.inner, place, MATRIX)
+            for m, holder, of, sign in ((2 * place, i, j, 1.0), (2 * place + 1, j, i, -1.0)):
+                wish = subtract(load(state.z, of, VECTOR), load(state.dual, m, VECTOR))
+                eta = add(scale(load(graph[1], place, VECTOR), sign), scale(wish, rho))
+                eta = subtract(eta, minus_apply(half, load(state.own, holder, VECTOR)))
+                store(state.copy, m, apply(inner, eta))
+
+
+@compiled
+def agree(run: int, t: int, pairs: Pairs, state: Consensus) -> None:
+    """z = mean over the holders of y + u, then u += y - z."""
+    for n in range(len(state.holders)):
+        store(state.z, n, add(load(state.own, n, VECTOR), load(state.own_dual, n, VECTOR)))
+    for k in range(pairs.start[t], pairs.start[t + 1]):
+        if pairs.alive[run, k]:
+            place = k - pairs.start[t]
+            for m, of in ((2 * place, pairs.second[k]), (2 * place + 1, pairs.first[k])):
+                both = add(load(state.copy, m, VECTOR), load(state.dual, m, VECTOR))
+                store(state.z, of, add(load(state.z, of, VECTOR), both))
+    for n in range(len(state.holders)):
+        z = scale(load(state.z, n, VECTOR), 1.0 / state.holders[n])
+        store(state.z, n, z)
+        dual = subtract(add(load(state.own_dual, n, VECTOR), load(state.own, n, VECTOR)), z)
+        store(state.own_dual, n, dual)
+    for k in range(pairs.start[t], pairs.start[t + 1]):
+        if pairs.alive[run, k]:
+            place = k - pairs.start[t]
+            for m, of in ((2 * place, pairs.second[k]), (2 * place + 1, pairs.first[k])):
+                rest = subtract(load(state.copy, m, VECTOR), load(state.z, of, VECTOR))
+                store(state.dual, m, add(load(state.dual, m, VECTOR), rest))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg.blas import dsymv, dsyrk, dtrmm
@@ -18,31 +18,55 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from ..arrays import AnyArray, Floats, Ints
 from .compile import compiled
-from .fleet_graph import gather, linearise, toward
+from .fleet_graph import VECTOR, Assumed, Measured, Pairs, advance, pair
+from .small import load, store, subtract
 
 STIFF = 1e7
-"""Weight of the motion over that of a fix beyond which D - D S^-1 D is no longer the difference that it stands for."""
+"""Weight of the motion over that of a fix beyond which D - D S^-1 D loses its digits."""
+
+
+class Drive(NamedTuple):
+    """One run.
+
+    Args:
+        place: (T, N) the vehicle's number among those of its step, -1 where inactive.
+        pairs: those that count; `alive` is (1, P).
+        relative: (L, 5).
+        assumed: the noise model.
+        fix_weight: (T, N, 3) 1/m^2, 0 where there is no fix.
+        fix: (T, N, 3) m, any number where there is none.
+        motion_weight: (T, N, 3) 1/m^2 of the motion from the step before.
+        motion: (T, N, 3) m.
+    """
+
+    place: AnyArray
+    pairs: Pairs
+    relative: AnyArray
+    assumed: Assumed
+    fix_weight: AnyArray
+    fix: AnyArray
+    motion_weight: AnyArray
+    motion: AnyArray
 
 
 class Memory:
     """Room for one matrix per step, used again by every sweep and run: fresh pages cost as much as what is in them.
 
     Args:
-        sizes: (T,) rows of each step's matrix.
+        sizes: (T,) rows of the largest matrix of each step.
     """
 
     def __init__(self, sizes: Ints) -> None:
-        self.sizes, self.flat = sizes, np.empty((len(sizes), int(sizes.max(initial=0)) ** 2))
+        self.flat = np.empty((len(sizes), int(sizes.max(initial=0)) ** 2))
 
-    def matrix(self, t: int) -> Floats:
+    def matrix(self, t: int, n: int) -> Floats:
         """(n, n) of step t."""
-        n = int(self.sizes[t])
         return self.flat[t, : n * n].reshape(n, n).T
 
 
 @dataclass(frozen=True, eq=False)
-class Between:
-    """What ties a step to the next: rows of those who stay, here and there, D of their motion 1/m^2, its gap m."""
+class Motion:
+    """Factor between a step and the next: rows of the vehicles that stay, here and there, D 1/m^2, its gap m."""
 
     old: Ints
     new: Ints
@@ -51,37 +75,41 @@ class Between:
 
 
 def smooth(
-    at: Floats, graph: Any, own: Any, steps: int, settled: Callable[[float], bool], memory: Memory,
-    tick: Callable[[], object],
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """Positions (T, N, 3) m and covariances (T, N, 3, 3) m^2 of one run, NaN where a vehicle is absent.
+    at: Floats, drive: Drive, steps: int, settled: Callable[[float], bool], memory: Memory, tick: Callable[[], object]
+) -> tuple[Floats, Floats]:
+    """Positions (T, N, 3) m and covariances (T, N, 3, 3) m^2 of one run, NaN where a vehicle is inactive.
 
     Args:
-        at: (T, N, 3) m to begin at. graph, own: see `fleet_graph`. steps: Gauss-Newton steps after the converted
-            solution; more with the last factors until one is `settled`. tick: called once a step of each sweep.
+        at: (T, N, 3) m to begin at.
+        drive: its measurements.
+        steps: Gauss-Newton steps after the converted solution; more with the last factors until one is `settled`.
+        settled: whether to stop after a step that moved some position by so many metres.
+        memory: of the factors.
+        tick: called once a step of each sweep.
 
     Raises:
         numpy.linalg.LinAlgError: a number is not finite.
     """
-    stays = _stays(graph[0])
+    stays = _stays(drive.place)
+    inverses: list[Floats] = []
     for exact in range(steps + 1):
-        ties, before = _ties(at, stays, own), at
-        weight, force = linearise(at, graph, exact > 0)
-        pulls = _pulls(toward(at, graph, force, own), graph[0])
-        _eliminate(graph, weight, own[0], ties, memory, pulls, tick)
-        at = _substitute(at, graph[0], ties, memory, pulls)
+        motions, before = _motions(at, stays, drive), at
+        weight, eta = linearise(at, drive, exact == 0)
+        vectors = _vectors(sum_vectors(at, drive, eta), drive.place)
+        inverses = _eliminate(drive, weight, motions, memory, vectors, tick)
+        at = _substitute(at, drive.place, motions, inverses, vectors)
     while steps and not settled(float(np.nanmax(np.abs(at - before)))):
-        moved, before = _ties(at, stays, own), at
-        pulls = _pulls(toward(at, graph, linearise(at, graph, True)[1], own), graph[0])
-        for t, tie in enumerate(moved[:-1]):
-            pulls[t + 1][tie.new] += _handed(memory.matrix(t), pulls[t], tie)
-        at = _substitute(at, graph[0], moved, memory, pulls)
-    return at, _marginals(at, graph[0], ties, memory)
+        moved, before = _motions(at, stays, drive), at
+        vectors = _vectors(sum_vectors(at, drive, linearise(at, drive, False)[1]), drive.place)
+        for t, motion in enumerate(moved[:-1]):
+            vectors[t + 1][motion.new] += _marginalised(inverses[t], vectors[t], motion)
+        at = _substitute(at, drive.place, moved, inverses, vectors)
+    return at, _marginals(at, drive.place, motions, inverses)
 
 
-def _pulls(pull: Floats, place: Ints) -> list[Floats]:
+def _vectors(eta: Floats, place: Ints) -> list[Floats]:
     """(n,) of each step."""
-    return [row[there].ravel() for row, there in zip(pull, place >= 0, strict=True)]
+    return [row[there].ravel() for row, there in zip(eta, place >= 0, strict=True)]
 
 
 def _stays(place: Ints) -> list[tuple[Ints, Ints, Ints]]:
@@ -94,76 +122,93 @@ def _stays(place: Ints) -> list[tuple[Ints, Ints, Ints]]:
     return found
 
 
-def _ties(at: Floats, stays: list[tuple[Ints, Ints, Ints]], own: Any) -> list[Between]:
+def _motions(at: Floats, stays: list[tuple[Ints, Ints, Ints]], drive: Drive) -> list[Motion]:
     """Of each step and the next; nothing after the last."""
-    gap = own[3][1:] - np.diff(at, axis=0)
-    ties = [Between(old, new, own[2][t + 1, columns].ravel(), gap[t, columns].ravel())
-            for t, (columns, old, new) in enumerate(stays)]  # fmt: skip
+    gap = drive.motion[1:] - np.diff(at, axis=0)
+    motions = [
+        Motion(old, new, drive.motion_weight[t + 1, columns].ravel(), gap[t, columns].ravel())
+        for t, (columns, old, new) in enumerate(stays)
+    ]
     none = np.zeros(0, np.int64)
-    return [*ties, Between(none, none, np.zeros(0), np.zeros(0))]
+    return [*motions, Motion(none, none, np.zeros(0), np.zeros(0))]
 
 
 def _eliminate(
-    graph: Any, weight: Floats, fix_weight: Floats, ties: list[Between], memory: Memory, pulls: list[Floats],
+    drive: Drive,
+    weight: Floats,
+    motions: list[Motion],
+    memory: Memory,
+    vectors: list[Floats],
     tick: Callable[[], object],
-) -> None:  # fmt: skip
-    """Each step given the next one: S^-1 to `memory`, and to `pulls` (n,) what the past pulls."""
-    memory.matrix(0)[:] = 0.0
-    for t, (tie, pull) in enumerate(zip(ties, pulls, strict=True)):
-        total = memory.matrix(t)
-        gather(t, graph, weight, fix_weight, total)
-        hard = tie.weight.max(initial=0.0) > STIFF * fix_weight.min()
+) -> list[Floats]:
+    """S^-1 of each step given the next one; `vectors` (n,) take in the past."""
+    stiff = STIFF * drive.fix_weight[drive.fix_weight > 0].min()
+    ahead = memory.matrix(0, len(vectors[0]))
+    ahead[:] = 0.0
+    inverses = []
+    for t, (motion, eta) in enumerate(zip(motions, vectors, strict=True)):
+        total = ahead
+        gather(t, drive, weight, total)
+        hard = motion.weight.max(initial=0.0) > stiff
         known = _whole(total) if hard else total
-        total[tie.old, tie.old] += tie.weight
+        total[motion.old, motion.old] += motion.weight
         inverse = _inverse(total)
-        if t + 1 < len(pulls) and hard:  # D S^-1 J is the same, and where a vehicle hardly moves D hides J
-            kept, ahead = tie.weight[:, None] * (_whole(inverse)[tie.old] @ known[:, tie.old]), memory.matrix(t + 1)
+        inverses.append(inverse)
+        ahead = memory.matrix(t + 1, len(vectors[t + 1])) if t + 1 < len(vectors) else total[:0, :0]
+        if len(ahead) and hard:  # D S^-1 J is the same, and where a vehicle hardly moves D hides J
+            gain = motion.weight[:, None] * (_whole(inverse)[motion.old] @ known[:, motion.old])
             ahead[:] = 0.0
-            ahead[np.ix_(tie.new, tie.new)] = (kept + kept.T) / 2
-            pulls[t + 1][tie.new] += kept @ tie.gap + tie.weight * dsymv(1.0, inverse, pull, lower=1)[tie.old]
-        elif t + 1 < len(pulls):
-            stiffness, stays = np.zeros(len(pull)), np.full(len(pull), -1)
-            stiffness[tie.old], stays[tie.old] = tie.weight, tie.new
-            carry(inverse, stays, stiffness, memory.matrix(t + 1))
-            pulls[t + 1][tie.new] += _handed(inverse, pull, tie)
+            ahead[np.ix_(motion.new, motion.new)] = (gain + gain.T) / 2
+            rest = motion.weight * dsymv(1.0, inverse, eta, lower=1)[motion.old]
+            vectors[t + 1][motion.new] += gain @ motion.gap + rest
+        elif len(ahead):
+            diagonal, rows = np.zeros(len(eta)), np.full(len(eta), -1)
+            diagonal[motion.old], rows[motion.old] = motion.weight, motion.new
+            marginalise(inverse, rows, diagonal, ahead)
+            vectors[t + 1][motion.new] += _marginalised(inverse, eta, motion)
         tick()
+    return inverses
 
 
-def _handed(inverse: Floats, pull: Floats, tie: Between) -> Floats:
-    """D (gap + S^-1 (pull - D gap)), what the past pulls at those who stay."""
-    less = pull.copy()
-    less[tie.old] -= tie.weight * tie.gap
-    return np.asarray(tie.weight * (tie.gap + dsymv(1.0, inverse, less, lower=1)[tie.old]))
+def _marginalised(inverse: Floats, eta: Floats, motion: Motion) -> Floats:
+    """D (gap + S^-1 (eta - D gap)), the information vector of the past about the vehicles that stay."""
+    if not len(eta):
+        return np.zeros(0)
+    less = eta.copy()
+    less[motion.old] -= motion.weight * motion.gap
+    return np.asarray(motion.weight * (motion.gap + dsymv(1.0, inverse, less, lower=1)[motion.old]))
 
 
-def _substitute(at: Floats, place: Ints, ties: list[Between], memory: Memory, pulls: list[Floats]) -> Floats:
+def _substitute(at: Floats, place: Ints, motions: list[Motion], inverses: list[Floats], eta: list[Floats]) -> Floats:
     """Positions (T, N, 3) m."""
-    x, error = at.copy(), np.zeros(0)
+    x = at.copy()
+    error: Floats = np.zeros(0)
     for t in range(len(at) - 1, -1, -1):
-        tie = ties[t]
-        pulls[t][tie.old] += tie.weight * (error[tie.new] - tie.gap)
-        error = dsymv(1.0, memory.matrix(t), pulls[t], lower=1)
+        motion, one = motions[t], eta[t]
+        one[motion.old] += motion.weight * (error[motion.new] - motion.gap)
+        error = dsymv(1.0, inverses[t], one, lower=1) if len(one) else one
         x[t, place[t] >= 0] += error.reshape(-1, 3)
     return x
 
 
-def _marginals(at: Floats, place: Ints, ties: list[Between], memory: Memory) -> Floats:
-    """Covariances (T, N, 3, 3) m^2; uses up what is in `memory`.
+def _marginals(at: Floats, place: Ints, motions: list[Motion], inverses: list[Floats]) -> Floats:
+    """Covariances (T, N, 3, 3) m^2; uses up the inverses.
 
     Sigma_t = S^-1 + (S^-1 D C) (S^-1 D C)^T with C C^T = Sigma_{t+1}.
     """
     cov = np.full((*at.shape, 3), np.nan)
-    spread: Floats = np.zeros((0, 0))
+    ahead: Floats = np.zeros((0, 0))
     for t in range(len(at) - 1, -1, -1):
-        inverse, tie = memory.matrix(t), ties[t]
-        if len(tie.new):
-            kept = spread if len(tie.new) == len(spread) else np.asfortranarray(spread[np.ix_(tie.new, tie.new)])
-            mirror(inverse)
-            back = (inverse.T[tie.old] * tie.weight[:, None]).T
-            back = dtrmm(1.0, _cholesky(kept), back, side=1, lower=1, overwrite_b=1)
-            inverse = dsyrk(1.0, back, 1.0, inverse, lower=1, overwrite_c=1)
-        spread = inverse
-        own_blocks(spread, np.flatnonzero(place[t] >= 0), cov[t])
+        sigma, motion = inverses[t], motions[t]
+        if len(motion.new):
+            stay = motion.new
+            ahead = ahead if len(stay) == len(ahead) else np.asfortranarray(ahead[np.ix_(stay, stay)])
+            mirror(sigma)
+            back = (sigma.T[motion.old] * motion.weight[:, None]).T
+            back = dtrmm(1.0, _cholesky(ahead), back, side=1, lower=1, overwrite_b=1)
+            sigma = dsyrk(1.0, back, 1.0, sigma, lower=1, overwrite_c=1)
+        ahead = sigma
+        own_blocks(ahead, np.flatnonzero(place[t] >= 0), cov[t])
     return cov
 
 
@@ -182,24 +227,84 @@ def _cholesky(matrix: Floats) -> Floats:
 
 def _inverse(matrix: Floats) -> Floats:
     """Lower triangle of the inverse in the matrix's place."""
-    return np.asarray(dpotri(_cholesky(matrix), lower=1, overwrite_c=1)[0])
+    return np.asarray(dpotri(_cholesky(matrix), lower=1, overwrite_c=1)[0]) if len(matrix) else matrix
 
 
 @compiled
-def carry(inverse: AnyArray, stays: AnyArray, stiffness: AnyArray, ahead: AnyArray) -> None:
-    """Information D - D S^-1 D that a step hands to the next, zero for those who join there.
+def alone(measured: Measured, assumed: Assumed) -> Floats:
+    """Positions (R, T, 3 N) m of each vehicle's own filter, NaN where inactive."""
+    runs, steps, vehicles = measured.active.shape
+    x, own = np.empty((runs, steps, 3 * vehicles)), np.zeros(9 * vehicles)
+    for run in range(runs):
+        for t in range(steps):
+            advance(run, t, x[run], own, measured, assumed)
+    return x
+
+
+@compiled
+def linearise(at: AnyArray, drive: Drive, converted: bool) -> tuple[Floats, Floats]:
+    """Information (9 P) of each pair and its information vector (P, 3) at positions (T, N, 3) m."""
+    pairs = drive.pairs
+    weight, eta = np.zeros(9 * len(pairs.first)), np.zeros((len(pairs.first), 3))
+    for t in range(len(at)):
+        for k in range(pairs.start[t], pairs.start[t + 1]):
+            if pairs.alive[0, k]:
+                vector = subtract(load(at[t, pairs.second[k]], 0, VECTOR), load(at[t, pairs.first[k]], 0, VECTOR))
+                one = pair(vector, k, pairs, drive.relative, drive.assumed, converted)
+                store(weight, k, one[0])
+                store(eta[k], 0, one[1])
+    return weight, eta
+
+
+@compiled
+def gather(t: int, drive: Drive, weight: AnyArray, total: AnyArray) -> None:
+    """Add the information of the fixes and pairs of step t to its matrix (n, n)."""
+    for column in range(drive.place.shape[1]):
+        a = 3 * drive.place[t, column]
+        for c in range(3 if a >= 0 else 0):
+            total[a + c, a + c] += drive.fix_weight[t, column, c]
+    pairs = drive.pairs
+    for k in range(pairs.start[t], pairs.start[t + 1]):
+        a, b = 3 * drive.place[t, pairs.first[k]], 3 * drive.place[t, pairs.second[k]]
+        for c in range(3 if pairs.alive[0, k] else 0):
+            for r in range(3):
+                total[b + r, a + c] -= weight[9 * k + 3 * r + c]
+                if r >= c:
+                    total[a + r, a + c] += weight[9 * k + 3 * r + c]
+                    total[b + r, b + c] += weight[9 * k + 3 * r + c]
+
+
+@compiled
+def sum_vectors(at: AnyArray, drive: Drive, eta: AnyArray) -> Floats:
+    """(T, N, 3) 1/m, information vectors of fixes and pairs at every position."""
+    pairs = drive.pairs
+    total: Floats = drive.fix_weight * (drive.fix - at)
+    for t in range(len(at)):
+        for k in range(pairs.start[t], pairs.start[t + 1]):
+            for c in range(3 if pairs.alive[0, k] else 0):
+                total[t, pairs.first[k], c] -= eta[k, c]
+                total[t, pairs.second[k], c] += eta[k, c]
+    return total
+
+
+@compiled
+def marginalise(inverse: AnyArray, rows: AnyArray, diagonal: AnyArray, ahead: AnyArray) -> None:
+    """Information D - D S^-1 D about the next step, zero for vehicles that join there.
 
     Args:
-        stays: (n,) the row there of each row here, -1 for who leaves. stiffness: (n,) D, zero for those.
+        inverse: (n, n) S^-1.
+        rows: (n,) the row there of each row here, -1 for a vehicle that leaves.
+        diagonal: (n,) D, zero for those.
+        ahead: filled.
     """
     ahead[:] = 0.0
-    for c in range(len(stays)):
-        column = stays[c]
+    for c in range(len(rows)):
+        column = rows[c]
         if column >= 0:
-            for r in range(c, len(stays)):
-                if stays[r] >= 0:
-                    ahead[stays[r], column] = -stiffness[r] * stiffness[c] * inverse[r, c]
-            ahead[column, column] += stiffness[c]
+            for r in range(c, len(rows)):
+                if rows[r] >= 0:
+                    ahead[rows[r], column] = -diagonal[r] * diagonal[c] * inverse[r, c]
+            ahead[column, column] += diagonal[c]
 
 
 @compiled

@@ -6,9 +6,11 @@ here it is told so. Matrices are flat arrays whose rows are `stride` numbers apa
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from llvmlite import ir
+from numba import config
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
@@ -26,14 +28,21 @@ def fused(build: Any, a: Any, b: Any, total: Any) -> Any:
     return build.call(function, [a, b, total])
 
 
+def check_index(context: Any, build: Any, kind: Any, array: Any, past: Any) -> None:
+    """IndexError unless a flat array holds `past` numbers; compiled under NUMBA_BOUNDSCHECK=1 only, as numba's own."""
+    if config.BOUNDSCHECK:  # type: ignore[attr-defined]
+        beyond = build.icmp_unsigned(">", past, cgutils.create_struct_proxy(kind)(context, build, array).nitems)
+        with build.if_then(beyond, likely=False):
+            context.call_conv.return_user_exc(build, IndexError, ("vector beyond the end of its array",))
+
+
 class _Code:
     """Places, vectors and sums in the function that is being built."""
 
     def __init__(self, context: Any, build: Any, signature: Any, args: Any, arrays: tuple[int, ...]) -> None:
         self.build = build
-        self.arrays = [
-            cgutils.create_struct_proxy(signature.args[k])(context, build, args[k]).data for k in arrays
-        ]
+        self.check = {k: partial(check_index, context, build, signature.args[a], args[a]) for k, a in enumerate(arrays)}
+        self.arrays = [cgutils.create_struct_proxy(signature.args[k])(context, build, args[k]).data for k in arrays]
 
     def index(self, at: Any, *steps: tuple[Any, int]) -> Any:
         """at + sum of count x size."""
@@ -43,10 +52,12 @@ class _Code:
 
     def vector(self, array: int, at: Any) -> Any:
         """Pointer to LANES numbers."""
+        self.check[array](self.build.add(at, ir.Constant(at.type, LANES)))
         return self.build.bitcast(self.build.gep(self.arrays[array], [at]), _VECTOR.as_pointer())
 
     def minus(self, array: int, at: Any) -> Any:
         """Minus one number, in all lanes."""
+        self.check[array](self.build.add(at, ir.Constant(at.type, 1)))
         number = self.build.fneg(self.build.load(self.build.gep(self.arrays[array], [at])))
         none, first = ir.Constant(_VECTOR, ir.Undefined), ir.Constant(ir.IntType(32), 0)
         everywhere = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
@@ -67,8 +78,10 @@ def _three_rows(begins: bool) -> Any:
         factors = [[code.minus(1, code.index(left_at, (across, c), (one, a))) for c in range(3)] for a in range(3)]
         with cgutils.for_range(build, tiles) as loop:
             shift = build.mul(loop.index, ir.Constant(stride.type, LANES))
-            rows = [build.load(code.vector(2, code.index(build.add(right_at, shift), (stride, c))), align=8)
-                    for c in range(3)]  # fmt: skip
+            rows = [
+                build.load(code.vector(2, code.index(build.add(right_at, shift), (stride, c))), align=8)
+                for c in range(3)
+            ]
             for a in range(3):
                 target = code.vector(0, code.index(build.add(out_at, shift), (stride, a)))
                 total = ir.Constant(_VECTOR, [0.0] * LANES) if begins else build.load(target, align=8)
@@ -87,7 +100,7 @@ def _flat(out: Any, left: Any, right: Any) -> Any:
 
 def _subtract(
     context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
-) -> Any:  # fmt: skip
+) -> Any:
     """out[out_at + a stride + j] -= sum_c left[left_at + c stride + a] right[right_at + c stride + j], a, c < 3 and
     j < LANES tiles: three rows less the transposed (3, 3) of `left` times three rows of `right`."""
     return _flat(out, left, right), _three_rows(False)
@@ -95,7 +108,7 @@ def _subtract(
 
 def _minus_product(
     context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
-) -> Any:  # fmt: skip
+) -> Any:
     """out[out_at + a stride + j] = -sum_c left[left_at + 3 c + a] right[right_at + c stride + j]: three rows are minus
     the transposed (3, 3) of `left`, its numbers in sequence, times three rows of `right`."""
     return _flat(out, left, right), _three_rows(True)

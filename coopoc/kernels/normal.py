@@ -1,5 +1,4 @@
-"""Normal equations J^T J dx = -J^T r in square blocks: the compiled twin of `coopoc.optimize.normal`.
-"""
+"""Normal equations J^T J dx = -J^T r in square blocks: the compiled twin of `coopoc.optimize.normal`."""
 
 from __future__ import annotations
 
@@ -13,9 +12,16 @@ from .compile import compiled
 
 @compiled
 def add_squares(
-    nodes: AnyArray, place: AnyArray, which: int, opposed: bool, residual: AnyArray, slope: AnyArray,
-    blocks: AnyArray, gradient: AnyArray, sizes: Any,
-) -> None:  # fmt: skip
+    nodes: AnyArray,
+    place: AnyArray,
+    which: int,
+    opposed: bool,
+    residual: AnyArray,
+    slope: AnyArray,
+    blocks: AnyArray,
+    gradient: AnyArray,
+    sizes: Any,
+) -> None:
     """Add S^T S to blocks (B, P, d, d) and S^T r to the gradient (B, n, d), S the derivative by one of the nodes.
 
     Args:
@@ -58,7 +64,7 @@ def add(out: AnyArray, sign: float, square: AnyArray, size: Any) -> None:
 @compiled
 def add_products(
     nodes: AnyArray, place: AnyArray, first: AnyArray, second: AnyArray, blocks: AnyArray, sizes: Any
-) -> None:  # fmt: skip
+) -> None:
     """Add S_i^T S_j, i the smaller of a pair's nodes (M, 2), to the blocks `place[:, 2]` of (B, P, d, d).
 
     Args:

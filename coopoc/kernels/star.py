@@ -13,9 +13,18 @@ from .compile import compiled
 
 @compiled
 def star_marginals(
-    hub: int, others: AnyArray, corner: int, head: AnyArray, arm: AnyArray, turned: AnyArray, blocks: AnyArray,
-    gradient: AnyArray, cov: AnyArray, dx: AnyArray, size: Any,
-) -> Bools:  # fmt: skip
+    hub: int,
+    others: AnyArray,
+    corner: int,
+    head: AnyArray,
+    arm: AnyArray,
+    turned: AnyArray,
+    blocks: AnyArray,
+    gradient: AnyArray,
+    cov: AnyArray,
+    dx: AnyArray,
+    size: Any,
+) -> Bools:
     """Diagonal blocks of (J^T J)^-1 into cov (B, n, d, d), and -(J^T J)^-1 gradient into dx (B, n, d).
 
     With a node's own block H and its arm A to the hub: T = H^-1 A, S = corner - sum A^T T; the hub's covariance is
@@ -43,7 +52,7 @@ def star_marginals(
             if arm[g] < 0:
                 continue
             A = blocks[b, arm[g]].T if turned[g] else blocks[b, arm[g]]
-            pull = gradient[b, others[g]]
+            eta = gradient[b, others[g]]
             for i in range(len(size)):
                 for j in range(len(size)):
                     total = 0.0
@@ -52,7 +61,7 @@ def star_marginals(
                     taken[g, i, j] = total
             for i in range(len(size)):
                 for k in range(len(size)):
-                    step[i] += taken[g, k, i] * pull[k]
+                    step[i] += taken[g, k, i] * eta[k]
                     for j in range(len(size)):
                         schur[i, j] -= A[k, i] * taken[g, k, j]
         sound[b] &= invert(schur, inverse, size)
@@ -62,21 +71,39 @@ def star_marginals(
                 for k in range(len(size)):
                     dx[b, hub, i] += inverse[i, k] * step[k]
             for g in range(len(others)):
-                spread(gradient[b, others[g]], inner[g], taken[g], inverse, step, wide, cov[b, others[g]],
-                       dx[b, others[g]], arm[g] >= 0, size)  # fmt: skip
+                spread(
+                    gradient[b, others[g]],
+                    inner[g],
+                    taken[g],
+                    inverse,
+                    step,
+                    wide,
+                    cov[b, others[g]],
+                    dx[b, others[g]],
+                    arm[g] >= 0,
+                    size,
+                )
     return sound
 
 
 @compiled
 def spread(
-    pull: AnyArray, inner: AnyArray, taken: AnyArray, hub: AnyArray, step: AnyArray, wide: AnyArray, cov: AnyArray,
-    dx: AnyArray, linked: bool, size: Any,
-) -> None:  # fmt: skip
+    eta: AnyArray,
+    inner: AnyArray,
+    taken: AnyArray,
+    hub: AnyArray,
+    step: AnyArray,
+    wide: AnyArray,
+    cov: AnyArray,
+    dx: AnyArray,
+    linked: bool,
+    size: Any,
+) -> None:
     """Covariance and step of one node from those of the hub."""
     for i in range(len(size)):
         total = 0.0
         for k in range(len(size)):
-            total += inner[i, k] * pull[k]
+            total += inner[i, k] * eta[k]
             cov[i, k] = inner[i, k]
         if linked:
             for j in range(len(size)):

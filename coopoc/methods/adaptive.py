@@ -2,88 +2,36 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.solo import FixNoise
 from ..world.recording import Recording
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
-from .knowledge import Knowledge
-from .stream import Stream, Variance, assumed_motion, scan, solo_track
+from .kalman import axis_track, filtered
+from .noise_model import NoiseModel
+from .stream import FilterStream, motion_noise
 from .track import Track
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
-LEAST = 1e-4
-"""m^2, least variance of a fix: 1 cm."""
-
-
-class Belief(NamedTuple):
-    """What an adaptive filter carries; its variance per axis is share * noise + motion. All (..., 3).
-
-    A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in
-    the fixes' variance and a part from motion. So when the estimate of that variance is revised, the past is reread
-    with it: a start at a fix that was believed too good, or too bad, does no lasting harm.
-
-    Args:
-        x: m. share: without unit. motion: m^2. noise: m^2, the estimated variance of a fix. weight: fixes behind it.
-    """
-
-    x: Floats
-    share: Floats
-    motion: Floats
-    noise: Floats
-    weight: Floats
-
-
-Revise = Callable[[Belief, Floats, Floats], tuple[Floats, Floats]]
-"""Predicted belief, innovation m and what a delayed fix has more m^2 -> estimated variance m^2 and its weight."""
-
-
-@dataclass(frozen=True, eq=False)
-class AdaptiveSolo:
-    """A noise-adaptive filter as a `Solo`: what it assumes at first, and how it revises that at every fix."""
-
-    process: Variance
-    noise: Floats
-    weight: float
-    revise: Revise
-
-    def begin(self, x: Floats, late: Floats | None) -> Belief:
-        """Exact, or as uncertain as a fix is assumed to be."""
-        one = np.ones_like(x)
-        share, motion = (0 * one, 0 * one) if late is None else (one, late * one)
-        return Belief(x, share, motion, self.noise * one, self.weight * one)
-
-    def advance(self, state: Belief, moved: Floats, process: Floats, fix: Floats, late: Floats) -> Belief:
-        """Predict; where there is a fix, revise its variance and correct."""
-        prior = state._replace(x=state.x + moved, motion=state.motion + process)
-        missing = np.isnan(fix)
-        surprise = np.where(missing, 0.0, fix - prior.x)
-        noise, weight = self.revise(prior, surprise, late)
-        spread = prior.share * noise + prior.motion
-        gain = spread / (spread + noise + late)
-        found = Belief(
-            prior.x + gain * surprise, (1 - gain) ** 2 * prior.share + gain**2,
-            (1 - gain) ** 2 * prior.motion + gain**2 * late, noise, weight,
-        )  # fmt: skip
-        return Belief(*(np.where(missing, a, b) for a, b in zip(prior, found, strict=True)))
-
-    def read(self, state: Belief) -> tuple[Floats, Floats]:
-        """Position and diagonal covariance."""
-        return state.x, (state.share * state.noise + state.motion)[..., None] * np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseAdaptive(ABC):
-    """What the noise-adaptive filters share; they differ in how they revise the variance of the fixes.
+    """What the noise-adaptive filters share; they differ in how they revise the variance r of the fixes.
+
+    A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in r
+    and a part from motion. When r is revised, the past is reread with it: a start at a fix that was believed too good,
+    or too bad, does no lasting harm.
 
     Args:
         assumed: velocity noise (ratio, reading per axis or speed, floor), and the GNSS std to start from.
@@ -101,26 +49,31 @@ class NoiseAdaptive(ABC):
     def __post_init__(self) -> None:
         positive("prior_weight", self.prior_weight)
 
+    @property
     @abstractmethod
-    def revise(self, prior: Belief, surprise: Floats, late: Floats) -> tuple[Floats, Floats]:
-        """Estimated variance of the fixes and its weight after an innovation, as in `Revise`."""
+    def fixes(self) -> FixNoise:
+        """Noise of the fixes: where it starts, and how it is revised."""
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        return solo_track(self._solo(recording.dt), recording, egos, self.x0, (velocity_note(self.assumed),))
+        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
+        x, p, _ = self._filtered(recording, columns)
+        return axis_track(recording, columns, x, p, began, (velocity_note(self.assumed),))
 
-    def start(self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> Stream[Belief]:
-        """The filter that is fed step by step: arguments as in `Kalman.start`; `state.noise` is what it estimates."""
-        return Stream(self._solo(interval), x0, history)
+    def start(self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
+        """Start the filter for one step at a time, as `Kalman.start`; `state.noise` is the estimated variance."""
+        return FilterStream(motion_noise(NoiseModel.nominal(self.assumed), interval), self.fixes, x0, history)
 
     def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
-        states = scan(self._solo(recording.dt), recording, recording.columns(egos, missing=True), self.x0)
-        return np.sqrt(np.stack([state.noise for state in states], axis=1))
+        noise = self._filtered(recording, recording.columns(egos, missing=True))[2]
+        known = np.broadcast_to(self.fixes.variance, (recording.runs, len(recording.t), len(egos), 3))
+        return np.sqrt(noise if noise.size else known)
 
-    def _solo(self, interval: float) -> AdaptiveSolo:
-        known = Knowledge.nominal(self.assumed)
-        return AdaptiveSolo(assumed_motion(known, interval), known.gnss_variance, self.prior_weight, self.revise)
+    def _filtered(self, recording: Recording, columns: Sequence[int]) -> tuple[Floats, Floats, Floats]:
+        gnss, velocity = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
+        variance = NoiseModel.nominal(self.assumed).process_variance(recording, columns)
+        return filtered(gnss, velocity, variance, self.fixes, recording.dt, self.x0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +82,14 @@ class AdaptiveKalman(NoiseAdaptive):
 
     With innovation v of variance p + r, p that of the prediction: r <- r + (v^2 - p - r) / n, n <- min(n + 1, window).
     So r is the mean of v^2 - p over all fixes and `prior_weight` fixes of the assumed variance, and once there are
-    `window` it forgets exponentially. The process noise follows the measured velocity as in Knowledge.nominal. A bias
+    `window` it forgets exponentially. The process noise follows the measured velocity as in NoiseModel.nominal. A bias
     that is there from the first fix on does not show in innovations.
 
     Args:
         window: fixes; inf never forgets. The others as in `NoiseAdaptive`.
 
-    Source: Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
+    References:
+        Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
     `town10-validation` (docs/methods.md).
 
     >>> from coopoc import Fleet, observe
@@ -152,11 +106,11 @@ class AdaptiveKalman(NoiseAdaptive):
         super().__post_init__()
         positive("window", self.window)
 
-    def revise(self, prior: Belief, surprise: Floats, late: Floats) -> tuple[Floats, Floats]:
-        """r <- r + (v^2 - p - r) / n; a late fix and the prediction share the motion since, so v does not hold it."""
-        weight = np.minimum(prior.weight + 1, self.window)
-        sample = surprise**2 - prior.share * prior.noise - prior.motion
-        return np.maximum(prior.noise + (sample - prior.noise) / weight, LEAST), weight
+    @property
+    def fixes(self) -> FixNoise:
+        """Running mean of v^2 - p."""
+        variance = NoiseModel.nominal(self.assumed).gnss_variance
+        return FixNoise(variance, float(self.prior_weight), float(self.window))
 
 
 def velocity_note(assumed: Sensors) -> str:

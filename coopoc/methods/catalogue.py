@@ -16,48 +16,50 @@ from .diffusion import Diffusion
 from .drift_filter import DriftFilter
 from .fixed_lag import FixedLagSmoother
 from .gbp import GaussianBeliefPropagation
-from .gnss import Gnss
+from .gnss import GNSS
 from .joint_filter import JointFilter
 from .kalman import Kalman
-from .knowledge import Knowledge
-from .lkf_sa import LaplacianKalman
-from .mds import Mds
+from .lkf_sa import LKFSA
+from .mds import MDS
 from .moving_horizon import MovingHorizon
-from .msmv import Msmv
-from .qcqp_sdr import QcqpSdr
+from .msmv import MSMV
+from .noise_model import NoiseModel
+from .qcqp_relaxation import QCQPRelaxation
 from .track import Method
 from .variational import VariationalKalman
 
-Factory = Callable[[Knowledge | str], Method]
+Factory = Callable[[NoiseModel | str], Method]
 """What a method assumes about noise -> the method. A third party's entry point in `coopoc.methods` is one, too."""
 
 METHODS: Mapping[str, Factory] = {
-    "gnss": lambda knowledge: Gnss(),
-    "kalman": lambda knowledge: Kalman(knowledge),
-    "kalman-adaptive": lambda knowledge: AdaptiveKalman(),
-    "kalman-variational": lambda knowledge: VariationalKalman(),
-    "lkf-sa": lambda knowledge: LaplacianKalman(knowledge),
-    "lkf-sa-edge": lambda knowledge: JointFilter(knowledge, exact=False, name="lkf-sa-edge"),
-    "msmv-r": lambda knowledge: Msmv(knowledge),
-    "drift": lambda knowledge: DriftFilter(knowledge),
-    "joint": lambda knowledge: JointFilter(knowledge),
-    "cooperative-map": lambda knowledge: CooperativeMAP(knowledge=knowledge),
-    "cooperative-map-5": lambda knowledge: CooperativeMAP(knowledge=knowledge, window=5, name="cooperative-map-5"),
-    "cooperative-map-gnc": lambda knowledge: CooperativeMAP(
-        knowledge=knowledge, window=5, robust="truncated", name="cooperative-map-gnc"
+    "gnss": lambda noise_model: GNSS(),
+    "kalman": lambda noise_model: Kalman(noise_model),
+    "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
+    "kalman-variational": lambda noise_model: VariationalKalman(),
+    "lkf-sa": lambda noise_model: LKFSA(noise_model),
+    "lkf-sa-edge": lambda noise_model: JointFilter(noise_model, exact=False, name="lkf-sa-edge"),
+    "msmv-r": lambda noise_model: MSMV(noise_model),
+    "drift": lambda noise_model: DriftFilter(noise_model),
+    "joint": lambda noise_model: JointFilter(noise_model),
+    "cooperative-map": lambda noise_model: CooperativeMAP(noise_model=noise_model),
+    "cooperative-map-5": lambda noise_model: CooperativeMAP(
+        noise_model=noise_model, window=5, name="cooperative-map-5"
     ),
-    "ci": lambda knowledge: CovarianceIntersection(knowledge),
-    "split-ci": lambda knowledge: CovarianceIntersection(knowledge, split=True, name="split-ci"),
-    "mds": lambda knowledge: Mds(knowledge),
-    "qcqp-sdr": lambda knowledge: QcqpSdr(knowledge),
-    "gbp": lambda knowledge: GaussianBeliefPropagation(knowledge),
-    "admm": lambda knowledge: ConsensusADMM(knowledge),
-    "diffusion": lambda knowledge: Diffusion(knowledge),
-    "diffusion-anchored": lambda knowledge: Diffusion(knowledge, anchored=True, name="diffusion-anchored"),
-    "central-filter": lambda knowledge: CentralFilter(knowledge),
-    "batch-smoother": lambda knowledge: BatchSmoother(knowledge),
-    "fixed-lag": lambda knowledge: FixedLagSmoother(knowledge=knowledge),
-    "mhe": lambda knowledge: MovingHorizon(knowledge=knowledge),
+    "cooperative-map-gnc": lambda noise_model: CooperativeMAP(
+        noise_model=noise_model, window=5, robust="truncated", name="cooperative-map-gnc"
+    ),
+    "ci": lambda noise_model: CovarianceIntersection(noise_model),
+    "split-ci": lambda noise_model: CovarianceIntersection(noise_model, split=True, name="split-ci"),
+    "mds": lambda noise_model: MDS(noise_model),
+    "qcqp-relaxation": lambda noise_model: QCQPRelaxation(noise_model),
+    "gbp": lambda noise_model: GaussianBeliefPropagation(noise_model),
+    "admm": lambda noise_model: ConsensusADMM(noise_model),
+    "diffusion": lambda noise_model: Diffusion(noise_model),
+    "diffusion-anchored": lambda noise_model: Diffusion(noise_model, anchored=True, name="diffusion-anchored"),
+    "central-filter": lambda noise_model: CentralFilter(noise_model),
+    "batch-smoother": lambda noise_model: BatchSmoother(noise_model),
+    "fixed-lag": lambda noise_model: FixedLagSmoother(noise_model=noise_model),
+    "mhe": lambda noise_model: MovingHorizon(noise_model=noise_model),
 }
 
 WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"})

@@ -2,67 +2,80 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from ..kernels.compile import use_kernels
+from ..optimize.backend import require_backend
 from ..optimize.batch import solve_batch
-from ..optimize.gnc import EASY, RATE, ROUNDS, SETTLED, graduate, graduate_batch, surrogate_of
+from ..optimize.gnc import EASY, RATE, ROUNDS, SETTLED, solve_gnc, surrogate_of
 from ..optimize.initial import converted
+from ..optimize.outliers import Candidates, mark, reweigh
 from ..optimize.problem import Problem
 from ..optimize.solution import Status
-from ..optimize.solve import solve, usable
-from ..optimize.suspects import mark, reweigh
+from ..optimize.solve import solve
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
-from .knowledge import Knowledge, resolve
-from .star import assumed_arrays, measured_arrays
-from .star_windows import Window, alike, stack, suspected, vehicles, windows_of
+from .noise_model import NoiseModel, resolve
+from .star import assumptions, measurements
 from .track import Track
+from .window import Positions, dead_reckoned, last_met, steps_of, vehicles_of
 
 TOLERANCE = 1e-4
 """m, the last Gauss-Newton step of a batch, whose error is then an order smaller; other backends keep their own."""
 LEAST_GROUND = 0.25
 """m, two vehicles whose centres are closer on the ground than this stand in one place."""
+CONVERTED = "problems where vehicles met were solved converted"
+REJECTED = "problems whose GNC weights rejected every fix were solved with all of them"
+DAMPED = "problems that did not settle were solved one by one, damped"
 
 
 @dataclass(frozen=True, eq=False)
 class CooperativeMAP:
-    """argmin of 1/2 sum |W (h(x) - z)|^2 over the ego and its neighbours at the last `window` steps (methods.md 6.0).
+    """argmin of 1/2 sum |W (h(x) - z)|^2 over the ego and its neighbours at the last `window` steps.
 
     Window 1 is the snapshot maximum likelihood; a longer one adds odometry, dt u with the assumed process noise, from
     step to step: a smoother whose newest point is the estimate, without a prior from before the window. Relative
-    measurements are exact factors in range and angles, or with identity knowledge unit-weight vectors. Neighbours are
-    used as far as their messages have arrived: a late one is brought forward with its last velocity, one never heard
-    is left out. Where the minimum puts two vehicles in one place, which a short noisy range can do and where angles
-    have no derivative, the converted (linear) problem answers instead, and the notes count it.
+    measurements are exact factors in range and angles, or with the identity noise model unit-weight vectors; a missing
+    component is no factor. Neighbours are used as far as their messages have arrived: a late one is brought forward
+    with its last velocity, and a neighbour whose messages never arrive adds no information. A missing fix is no factor
+    either; where a window meets a vehicle without one, its last fix counts, moved by its own odometry since. Where the
+    minimum puts two vehicles in one place, which a short noisy range can do and where angles have no derivative, the
+    converted (linear) problem answers instead, and the notes count it.
 
-    Robust against neighbours that report false fixes: graduated non-convexity (`coopoc.optimize.graduate`) gives the
-    fixes of each neighbour in the window one weight. What the ego measures itself, its own fixes, its odometry and its
-    relative measurements, is believed, and so are the velocities it is sent.
+    Robust against neighbours that report false fixes: graduated non-convexity gives the fixes of each neighbour in the
+    window one weight. The ego's own fixes, odometry and relative measurements are inliers, and so are the velocities
+    that it receives.
 
     Args:
-        backend: of `coopoc.optimize.backends()`. Only gauss-newton batches over the runs; the others loop, and their
-            tracks say so.
-        window: steps. knowledge: "identity", "nominal" or a Knowledge.
-        robust: "truncated" or "geman-mcclure"; None believes everyone.
+        backend: of `coopoc.optimize.backends()`. Only gauss-newton batches over the runs; the others loop, which their
+            tracks note.
+        window: steps.
+        noise_model: "identity", "nominal" or a NoiseModel.
+        robust: "truncated" or "geman-mcclure"; None for no robust loss.
         threshold: probability that the fixes of an honest neighbour in a window pass (of a robust loss).
-        suspect_ego: doubt the ego's own fixes and its odometry, too, each as one group. Where all fixes are doubted
-            nothing says where the window is: it is then solved as if all were honest, and the notes count it. There
-            is no compiled kernel for these doubts.
+        suspect_ego: the ego's own fixes and its odometry may be outliers, too, each as one group. Where every fix is
+            rejected nothing says where the window is: it is solved with all of them, and the notes count it.
+
+    References:
+        Yang, Antonante, Tzoumas, Carlone, Graduated non-convexity for robust spatial perception, RA-L 2020.
+
+    >>> from coopoc import Fleet, Sensors, V2X, observe
+    >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
+    >>> CooperativeMAP()(observe(fleet, Sensors(), V2X(), runs=4)).x.shape
+    (4, 2, 1, 3)
     """
 
     backend: str = "gauss-newton"
     window: int = 1
-    knowledge: Knowledge | str = "nominal"
+    noise_model: NoiseModel | str = "nominal"
     robust: str | None = None
     threshold: float = 0.99
     suspect_ego: bool = False
@@ -73,127 +86,151 @@ class CooperativeMAP:
     def __post_init__(self) -> None:
         if self.window != int(self.window) or self.window < 1:
             raise InputError("window", self.window, "must be a whole number >= 1", "Use 1 for a snapshot.")
-        usable(self.backend)
+        require_backend(self.backend)
         if self.robust is not None:
             surrogate_of(self.robust, self.threshold)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        known = resolve(self.knowledge, recording)
-        replaced: list[tuple[int, int]] = []
-
-        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
-            for windows in alike(windows_of(recording, ego, box, known, self.window)):
-                points, spread, counts = self._solve(windows, known)
-                replaced.append(counts)
-                for k, window in enumerate(windows):
-                    star, held = window[-1].star, window[-1].held
-                    rank = np.argsort(np.argsort(vehicles(window)[-1]))
-                    theirs = np.where(held[:, 1:, None], points[k][:, rank[1:]], np.nan)
-                    yield Estimate(star.step, points[k, :, 0], spread[k], star.links, theirs)
+        known = resolve(self.noise_model, recording)
+        positions, counts = dead_reckoned(recording, known), Counter[str]()
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            whole, lost, met = self._compiled(recording, ego, box, assumed)
-            replaced.append((met, 0))
-            if lost.any():
-                replaced.extend(self._mend(recording, ego, box, known, lost, whole))
-            yield whole
+            windows = Windows(recording, ego, box, known, positions, self.window)
+            found = windows.solve(self.gnc) if self._runs_compiled else windows.nothing()
+            counts.update(windows.count(found.ended))
+            for run, step, problem, vehicle in windows.problems(found.ended):
+                x, cov = self._solve(problem, vehicle, counts)
+                windows.put(found, run, step, x, cov)
+            yield Estimate(slice(None), found.x, found.covariance, box.link, found.neighbours)
 
-        able = self.robust is None or not self.suspect_ego
-        kernels = able and self.backend == "gauss-newton" and use_kernels()
-        assumed = assumed_arrays(recording, known) if kernels else ()
-        track = follow_egos(self, recording, egos, drive if kernels else follow)
-        return replace(track, notes=self._notes(*np.sum(replaced, axis=0)))
+        track = follow_egos(self, recording, egos, drive, missing=True)
+        loop = () if self._runs_compiled else (f"{self.backend} loops over the runs",)
+        return replace(track, notes=(*loop, *(f"{count} {note}" for note, count in counts.items() if count)))
 
-    def _compiled(
-        self, recording: Recording, ego: int, box: Inbox, assumed: tuple[Any, ...]
-    ) -> tuple[Estimate, Bools, int]:
-        """All windows of a drive by compiled code, (R, T) True where one did not settle, and how many of the others
-        were solved converted."""
-        from ..kernels.snapshot import LOST, MET, snapshots
-        from ..kernels.window import windows
+    @property
+    def _runs_compiled(self) -> bool:
+        return require_backend(self.backend).capabilities.compiled
 
-        measured, fresh = measured_arrays(recording, ego, replace(box, fresh=box.newest >= 0)), box.fresh
-        if self.window == 1 and self.robust is None:
-            x, cov, neighbours, ended = snapshots(measured, assumed, TOLERANCE, LEAST_GROUND)
+    @property
+    def gnc(self) -> Any:
+        """The robust loss as the kernels take it."""
+        from scipy.special import gammaincinv
+
+        from ..kernels.gnc import GNC
+
+        freedom = 3.0 * np.maximum(np.arange(self.window + 1), 1)
+        bound = 2.0 * gammaincinv(0.5 * freedom, self.threshold)
+        rounds = ROUNDS if self.robust else 0
+        return GNC(bound, self.robust == "truncated", self.suspect_ego, RATE, EASY, SETTLED, rounds)
+
+    def _solve(self, problem: Problem, vehicle: Ints, counts: Counter[str]) -> tuple[Floats, Floats]:
+        """Newest points (n, 3) and the ego's covariance of a window, by the backend."""
+        problem = self._weighted(problem, vehicle, counts)
+        ego = problem.separator[-1]
+        if self._runs_compiled:
+            counts[DAMPED] += 1
+            batch = solve_batch(problem, tolerance=TOLERANCE)
+            x, cov, sound = batch.x, batch.covariance, bool(batch.converged[0])
         else:
-            doubt = self.robust and doubt_of(self.robust, self.threshold, self.window)
-            x, cov, neighbours, ended = windows(measured, assumed, np.ascontiguousarray(fresh), self.window, TOLERANCE,
-                                                LEAST_GROUND, doubt)  # fmt: skip
-        return Estimate(slice(None), x, cov, box.link, neighbours), ended == LOST, int((ended == MET).sum())
+            solution = solve(problem, self.backend, throw=False)
+            x, cov, sound = solution.x[None], solution.covariance[None], solution.status is Status.SOLVED
+        if not sound or _meeting(problem, x)[0]:
+            linear = solve_batch(converted(problem))
+            x, cov = linear.x, linear.covariance
+            counts[CONVERTED] += 1
+        return x[0, ego:], cov[0, ego]
 
-    def _mend(
-        self, recording: Recording, ego: int, box: Inbox, known: Knowledge, lost: Bools, whole: Estimate
-    ) -> Iterator[tuple[int, int]]:
-        """Put the answers of `_solve` where runs and steps (R, T) were lost, and count as that does."""
-        for step in np.flatnonzero(lost.any(axis=0)):
-            runs = np.flatnonzero(lost[:, step])
-            mine = replace(box, newest=box.newest[runs], fresh=box.fresh[runs])
-            few = recording.of_runs(runs)
-            window = deque(windows_of(few, ego, mine, known, self.window, int(step)), maxlen=1).pop()
-            points, spread, counts = self._solve([window], known)
-            rank = np.argsort(np.argsort(vehicles(window)[-1]))
-            whole.x[runs, step], whole.covariance[runs, step] = points[0, :, 0], spread[0]
-            theirs = np.where(window[-1].held[:, 1:, None], points[0][:, rank[1:]], np.nan)
-            whole.neighbours[runs, box.start[step] : box.start[step + 1]] = theirs
-            yield counts
-
-    def _solve(self, windows: Sequence[Window], known: Knowledge) -> tuple[Floats, Floats, tuple[int, int]]:
-        """Newest points (S, R, n, 3) of S windows, the ego's covariance (S, R, 3, 3), and how many were solved
-        converted and how many in spite of doubts."""
-        problem, blind = self._doubted(stack(windows, known), windows[0])
-        ego, last = problem.hub[-1], len(windows[0][-1].members)
-        if self.backend == "gauss-newton":
-            answer = solve_batch(problem, tolerance=TOLERANCE)
-            x, spread, sound = answer.x, answer.covariance[:, ego], answer.converged
-        else:
-            each = [solve(problem.pick(b), self.backend, throw=False) for b in range(problem.batch or 1)]
-            x, spread = np.stack([s.x for s in each]), np.stack([s.covariance[ego] for s in each])
-            sound = np.array([s.status is Status.SOLVED for s in each])
-        met = np.flatnonzero(~sound | _meeting(problem, x))
-        if len(met):
-            linear = solve_batch(converted(problem.pick(met)))
-            x[met], spread[met] = linear.x, linear.covariance[:, ego]
-        shape = (len(windows), len(x) // len(windows))
-        return x[:, -last:].reshape(*shape, last, 3), spread.reshape(*shape, 3, 3), (len(met), blind)
-
-    def _doubted(self, problem: Problem, window: Window) -> tuple[Problem, int]:
-        """The problem with the weights of `robust`, and in how many realisations all fixes were doubted."""
-        suspects, groups = suspected(window, self.suspect_ego)
+    def _weighted(self, problem: Problem, vehicle: Ints, counts: Counter[str]) -> Problem:
+        """The problem with the GNC weights of its candidates: the fixes of each vehicle, and the ego's odometry."""
+        fixes = np.flatnonzero(vehicle != vehicle[0]) if not self.suspect_ego else np.arange(len(vehicle))
+        candidates: Candidates = [(0, fixes.tolist())]
+        groups = vehicle[fixes]
+        if self.suspect_ego and len(problem.separator) > 1:
+            own = np.flatnonzero(np.isin(problem.factors[1].nodes[:, 0], problem.separator))
+            candidates = [*candidates, (1, own.tolist())]
+            groups = np.concatenate([groups, np.full(len(own), -1)])
         if self.robust is None or not len(groups):
-            return problem, 0
-        if self.backend == "gauss-newton":
-            batch = graduate_batch(problem, suspects, self.robust, self.threshold, groups, tolerance=TOLERANCE)
-            x, weights, spread = batch.x, batch.weights, batch.covariance
-        else:
-            each = [graduate(problem.pick(b), suspects, self.robust, self.threshold, groups, self.backend, throw=False)
-                    for b in range(problem.batch or 1)]  # fmt: skip
-            x, spread = np.stack([s.x for s in each]), np.stack([s.covariance for s in each])
-            weights = np.stack([s.extras["weights"] for s in each])
-        blind = np.isnan(spread).any(axis=(1, 2, 3))
-        weights[blind] = 1.0
-        return reweigh(problem, mark(problem, suspects), weights, x), int(blind.sum())
+            return problem
+        found = solve_gnc(problem, candidates, self.robust, self.threshold, groups, self.backend, throw=False)
+        weights = found.extras["weights"]
+        if np.isnan(found.covariance).any():
+            counts[REJECTED] += 1
+            weights = np.ones_like(weights)
+        return reweigh(problem, mark(problem, candidates), weights[None], found.x[None]).pick(0)
 
-    def _notes(self, replaced: int, blind: int) -> tuple[str, ...]:
-        loop = () if self.backend == "gauss-newton" else (f"{self.backend} loops over the runs",)
-        counted = {f"{replaced} problems where vehicles met were solved converted": replaced,
-                   f"{blind} problems where all fixes were doubted were solved as if honest": blind}  # fmt: skip
-        return (*loop, *(note for note, count in counted.items() if count))
+
+class Windows:
+    """All windows of one ego: solved by the kernels, or problem by problem.
+
+    Args:
+        length: steps of a window. The others as in `CooperativeMAP.__call__`.
+    """
+
+    def __init__(
+        self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, positions: Positions, length: int
+    ) -> None:
+        from ..kernels.window import Fresh
+
+        self.recording, self.ego, self.box, self.known, self.length = recording, ego, box, known, length
+        seen = measurements(recording, ego, replace(box, fresh=box.newest >= 0), positions.x)
+        self.seen = seen._replace(gnss=positions.x)
+        self.assumed = assumptions(recording, known)._replace(fixes=positions.variance, broadcast=positions.variance)
+        runs = np.arange(recording.runs)[:, None]
+        sent = positions.new[runs, box.newest, self.seen.neighbour]
+        met = last_met(self.seen.neighbour, self.seen.start)
+        self.fresh = Fresh(np.ascontiguousarray(positions.new[:, :, ego]), box.fresh & sent, met)
+
+    def solve(self, gnc: Any) -> Any:
+        """By compiled Gauss-Newton, batched over the runs."""
+        from ..kernels.window import Settings, windows
+
+        return windows(self.seen, self.assumed, self.fresh, Settings(self.length, TOLERANCE, LEAST_GROUND), gnc)
+
+    def nothing(self) -> Any:
+        """Every problem still to be solved."""
+        from ..kernels.window import LOST, Found
+
+        shape = (self.recording.runs, len(self.recording.t))
+        neighbours = np.full((shape[0], len(self.box.link), 3), np.nan)
+        return Found(np.empty((*shape, 3)), np.empty((*shape, 3, 3)), neighbours, np.full(shape, LOST))
+
+    def count(self, ended: Ints) -> dict[str, int]:
+        """Of the kernels' fallbacks."""
+        from ..kernels.window import BLIND, MET
+
+        return {CONVERTED: int((ended == MET).sum()), REJECTED: int((ended == BLIND).sum())}
+
+    def problems(self, ended: Ints) -> Iterator[tuple[int, int, Problem, Ints]]:
+        """Run, step, problem and the vehicle of each point, of all windows that are not solved."""
+        from ..kernels.lanes import LANES
+        from ..kernels.window import LOST, gather_window, new_windows
+
+        for first in range(0, len(ended), LANES):
+            lost = np.argwhere(ended[first : first + LANES].T == LOST)
+            if not len(lost):
+                continue
+            window, star = new_windows(self.seen.start, self.length)
+            for t in range(int(lost[-1, 0]) + 1):
+                span = (max(0, t - self.length + 1), t)
+                last = min(first + LANES, len(ended)) - 1
+                gather_window(window, star, self.seen, self.assumed, self.fresh, (first, last), span)
+                for lane in lost[lost[:, 0] == t, 1].tolist():
+                    steps = steps_of(window, self.recording, self.box, first + lane, span)
+                    yield first + lane, t, Problem.from_steps(steps, self.known.sensors), vehicles_of(window, span)
+
+    def put(self, found: Any, run: int, step: int, x: Floats, cov: Floats) -> None:
+        """Fill in what a problem's solution says of its newest step."""
+        links = slice(self.box.start[step], self.box.start[step + 1])
+        found.x[run, step], found.covariance[run, step] = x[0], cov
+        found.neighbours[run, links] = np.where(self.box.newest[run, links, None] >= 0, x[1:], np.nan)
 
 
 def _meeting(problem: Problem, x: Floats) -> Bools:
-    """(B,) True where a solution (B, n, 3) puts an observer and the vehicle that it sees in one place on the ground."""
+    """(B,) True where a solution (B, n, 3) puts the ego and a vehicle that it measures in one place on the ground."""
     met = np.zeros(len(x), dtype=bool)
     for factor in problem.factors:
         if factor.kind == "spherical":
             gap = x[:, factor.nodes[:, 1], :2] - x[:, factor.nodes[:, 0], :2]
             met |= (np.linalg.norm(gap, axis=-1) < LEAST_GROUND).any(axis=1)
     return met
-
-
-def doubt_of(loss: str, threshold: float, length: int) -> tuple[Any, ...]:
-    """A robust loss as `coopoc.kernels.doubts` takes it, about fixes of at most `length` steps."""
-    from scipy.special import gammaincinv
-
-    freedom = 3.0 * np.maximum(np.arange(length + 1), 1)
-    return 2.0 * gammaincinv(0.5 * freedom, threshold), loss == "truncated", RATE, EASY, SETTLED, ROUNDS

@@ -104,5 +104,5 @@ def require_white(sensors: Sensors, what: str) -> None:
     """InputError where fixes err for a while and `what` takes their errors as white."""
     if drifting(sensors):
         found = (sensors.gnss_drift_std, sensors.gnss_common_std)
-        mend = "Set them to 0, or take the filtering one."
-        raise InputError("gnss_drift_std, gnss_common_std", found, f"must be 0 for {what}", mend)
+        hint = "Set them to 0, or take the filtering one."
+        raise InputError("gnss_drift_std, gnss_common_std", found, f"must be 0 for {what}", hint)

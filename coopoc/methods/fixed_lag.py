@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Ints
 from ..errors import InputError
-from ..kernels.compile import use_kernels
+from ..optimize.backend import require_backend
 from ..optimize.factor import Factor
 from ..optimize.incremental import FixedLag
 from ..optimize.problem import Problem
-from ..optimize.sights import relative_std
-from ..optimize.solve import usable
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
-from .knowledge import Knowledge, resolve
-from .slice import Slice, entering, estimate
-from .star import FORGOTTEN, assumed_arrays, measured_arrays, star_steps
+from .noise_model import NoiseModel, resolve
+from .star import FORGOTTEN, assumptions, measurements
 from .track import Track
-from .window import Window, advance, sweep
+from .window import places, steps_of, vehicles_of
+from .window_problem import window_problem
 
 BACKENDS = ("gauss-newton", "gtsam")
 
@@ -33,7 +30,7 @@ BACKENDS = ("gauss-newton", "gtsam")
 class FixedLagSmoother:
     """The joint filter's star over the steps t-lag..t, given what the steps before left when they were eliminated.
 
-    At every step one Gauss-Newton step of the window: sightings are made linear anew at the smoothed points, the oldest
+    At every step one Gauss-Newton step of the window: heldings are made linear anew at the smoothed points, the oldest
     step is eliminated into the prior of the next, D - D (J + D)^-1 D with D the stiffness of the motion, and the newest
     point is the estimate: causal, and in a linear model the filter's own for every lag (performance.md section 1.2). A
     lag of 0 is JointFilter, but for measured ranges below `min_range`, whose angles are widened here (`relative_std`).
@@ -41,9 +38,9 @@ class FixedLagSmoother:
 
     Args:
         lag: steps. backend: "gauss-newton", batched over the runs, or "gtsam", its incremental fixed-lag smoother,
-            which loops over the runs and makes each sighting linear once, when it comes.
+            which loops over the runs and makes each helding linear once, when it comes.
         smoothed: answer each step when it leaves the window, `lag` steps late; the last ones at the end of the drive.
-        knowledge: "identity", "nominal" or a Knowledge. exact: False keeps sightings as converted vectors.
+        noise_model: "identity", "nominal" or a NoiseModel. exact: False keeps heldings as converted vectors.
 
     Raises:
         InputError: a lag < 0, another backend. MissingLibraryError: no gtsam.
@@ -57,7 +54,7 @@ class FixedLagSmoother:
     lag: int = 5
     backend: str = "gauss-newton"
     smoothed: bool = False
-    knowledge: Knowledge | str = "nominal"
+    noise_model: NoiseModel | str = "nominal"
     exact: bool = True
     name: str = "fixed-lag"
     cooperative: bool = True
@@ -68,88 +65,76 @@ class FixedLagSmoother:
             raise InputError("lag", self.lag, "must be a whole number >= 0", "Use 0 for the filter.")
         if self.backend not in BACKENDS:
             raise InputError("backend", repr(self.backend), f"must be one of {BACKENDS}", "Leave it out.")
-        usable(self.backend)
+        require_backend(self.backend)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        known = resolve(self.knowledge, recording)
+        known = resolve(self.noise_model, recording)
         notes = (f"not causal: every estimate knows the next {self.lag} steps",) if self.smoothed else ()
         looped = (f"{self.backend} loops over the runs",) if self.backend != "gauss-newton" else ()
-        plain = self._follow if self.smoothed or not use_kernels() else self._compiled
-        follow = self._by_gtsam if looped else plain
-        return follow_egos(self, recording, egos, lambda ego, box: follow(recording, ego, box, known), notes + looped)
+        follow = self._by_gtsam if looped else self._follow
 
-    def _compiled(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
-        """What `_follow` yields, as one estimate of all steps from compiled code."""
+        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
+            seen, assumed = measurements(recording, ego, box), assumptions(recording, known)
+            found = follow(recording, box, known, seen, assumed)
+            yield Estimate(slice(None), found.x, found.covariance, box.link, found.neighbours)
+
+        return follow_egos(self, recording, egos, drive, notes + looped, missing=True)
+
+    def _settings(self, known: NoiseModel, lag: int) -> Any:
+        from ..kernels.horizon import Settings
+
+        return Settings(lag + 1, self.exact and known.exact_relative, 0, 0.0, -1.0, self.smoothed)
+
+    def _follow(self, recording: Recording, box: Inbox, known: NoiseModel, seen: Any, assumed: Any) -> Any:
         from ..kernels.horizon import horizons
 
-        measured, assumed = measured_arrays(recording, ego, box), assumed_arrays(recording, known)
-        exact = self.exact and known.exact_relative
-        x, cov, neighbours, _ = horizons(measured, assumed, None, self.lag + 1, exact, 0, 0.0, 0.0)
-        yield Estimate(slice(None), x, cov, box.link, neighbours)
+        return horizons(seen, assumed, box.arrival, self._settings(known, self.lag))
 
-    def _follow(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
-        window: Window | None = None
-        exact, length = self.exact and known.exact_relative, self.lag + 1
-        for star in star_steps(recording, ego, box, known):
-            stars = [*(part.star for part in window.slices), star] if window else [star]
-            window = sweep(advance(window, stars, length, known), known, exact, smooth=self.smoothed)
-            if not self.smoothed:
-                yield estimate(window.slices[-1], window.spreads[-1])
-            elif len(window.slices) == length:
-                yield estimate(window.slices[0], window.spreads[0])
-        if self.smoothed and window:
-            full = len(window.slices) == length
-            for part, spread in zip(window.slices[full:], window.spreads[full:], strict=True):
-                yield estimate(part, spread)
+    def _by_gtsam(self, recording: Recording, box: Inbox, known: NoiseModel, seen: Any, assumed: Any) -> Any:
+        """The same steps, gathered by the kernels, in gtsam's incremental smoother."""
+        from ..kernels.horizon import advance, each_group, empty
 
-    def _by_gtsam(self, recording: Recording, ego: int, box: Inbox, known: Knowledge) -> Iterator[Estimate]:
-        smoothers = [FixedLag((self.lag + 0.5) * recording.dt) for _ in range(recording.runs)]
-        exact, length = self.exact and known.exact_relative, self.lag + 1
-        point, names = np.empty((recording.runs, 0, 3)), [""]
-        window: deque[tuple[Slice, list[str]]] = deque(maxlen=length)
-        for star in star_steps(recording, ego, box, known):
-            part, before = entering(point, star, known), names
-            names = [f"{m}@{star.step}" for m in (ego, *recording.links.neighbour[star.links])]
-            piece = _piece(part, before, names, known, exact)
-            stamps = dict.fromkeys(names, star.step * recording.dt)
-            found = [smoother.update(piece.pick(run), stamps, names) for run, smoother in enumerate(smoothers)]
-            point = np.stack([each.x for each in found])
-            window.append((part, names))
-            if not self.smoothed:
-                yield estimate(replace(part, point=point), np.stack([each.covariance[0] for each in found]))
-            elif len(window) == length:
-                yield _read(*window[0], smoothers)
-        for part, late in list(window)[len(window) == length :] if self.smoothed else ():
-            yield _read(part, late, smoothers)
+        found, settings = empty(seen), self._settings(known, self.lag)._replace(smoothed=False)
+        for runs, horizon in each_group(seen, settings.length):
+            smoothers = [FixedLag((self.lag + 0.5) * recording.dt) for _ in range(runs[0], runs[1] + 1)]
+            names: list[list[str]] = []
+            for t in range(len(recording.t)):
+                advance(horizon, seen, assumed, box.arrival, settings, runs, (t, t + 1), found)
+                names.append([f"{m}@{t}" for m in vehicles_of(horizon.window, (t, t))])
+                stamps = dict.fromkeys(names[-1], t * recording.dt)
+                for run, smoother in zip(range(runs[0], runs[1] + 1), smoothers, strict=True):
+                    before = names[-2] if t else []
+                    piece = _piece(horizon, recording, box, known, (run, t, settings.exact), (before, names[-1]))
+                    read(found, box, run, t, smoother.update(piece, stamps, names[-1]))
+                    if self.smoothed and t >= self.lag:
+                        read(found, box, run, t - self.lag, smoother.estimate(names[t - self.lag]))
+            for t in range(max(0, len(names) - self.lag), len(names) if self.smoothed else 0):
+                for run, smoother in zip(range(runs[0], runs[1] + 1), smoothers, strict=True):
+                    read(found, box, run, t, smoother.estimate(names[t]))
+        return found
 
 
-def _read(part: Slice, names: list[str], smoothers: Sequence[FixedLag]) -> Estimate:
-    """What gtsam's smoothers now say of an older step."""
-    found = [smoother.estimate(names) for smoother in smoothers]
-    return estimate(replace(part, point=np.stack([f.x for f in found])), np.stack([f.covariance[0] for f in found]))
+def read(found: Any, box: Inbox, run: int, t: int, estimate: Any) -> None:
+    """Put what gtsam's smoother says of a step into the arrays of the kernels."""
+    found.x[run, t], found.covariance[run, t] = estimate.x[0], estimate.covariance[0]
+    found.neighbours[run, box.start[t] : box.start[t + 1]] = estimate.x[1:]
 
 
-def _piece(part: Slice, before: list[str], names: list[str], known: Knowledge, exact: bool) -> Problem:
-    """What a step adds in R realisations: its members' fixes, motions from the step before, and sightings."""
-    star, top = part.star, int((part.star.kept >= 0).sum())
-    stays, joins, here = np.flatnonzero(star.kept >= 0), np.flatnonzero(star.kept < 0), top + np.arange(len(names))
-    std = np.where(star.heard[..., None], np.sqrt(star.fix_variance), np.inf)
-    factors = [Factor("position", here[:, None], star.fix, std)]
-    if len(stays):
-        pairs = np.stack([np.arange(top), here[stays]], axis=1)
-        factors.append(Factor("displacement", pairs, star.moved[:, stays], np.sqrt(star.process[:, stays])))
+def _piece(
+    horizon: Any, recording: Recording, box: Inbox, known: NoiseModel, which: tuple[int, int, bool], names: Any
+) -> Problem:
+    """What a step adds in a run: its members' fixes, motions from the step before, and relative measurements."""
+    (run, t, exact), (before, here) = which, names
+    held = steps_of(horizon.window, recording, box, run, (t, t))[0]
+    problem = window_problem(horizon, [held], known, exact, run, (t, t))
+    stays, joins = np.flatnonzero(held.previous >= 0), np.flatnonzero(held.previous < 0)
+    top = len(stays)
+    factors = [replace(factor, nodes=factor.nodes + top) for factor in problem.factors]
+    if top:
+        pairs = np.stack([np.arange(top), top + stays], axis=1)
+        factors.append(Factor("displacement", pairs, held.moved[stays], held.moved_std[stays]))
     if len(joins):
-        factors.append(Factor("position", here[joins, None], part.start[:, joins], np.array(np.sqrt(FORGOTTEN))))
-    if len(star.links):
-        factors.append(_sightings(part, here, known, exact))
-    return Problem((*(before[k] for k in star.kept[stays]), *names), tuple(factors))
-
-
-def _sightings(part: Slice, here: Ints, known: Knowledge, exact: bool) -> Factor:
-    pairs = np.stack([np.full(len(here) - 1, here[0]), here[1:]], axis=1)
-    if exact:
-        assert known.sensors is not None
-        return Factor("spherical", pairs, part.star.relative, relative_std(part.star.relative, known.sensors))
-    root = np.swapaxes(np.linalg.cholesky(part.weight), -1, -2)
-    return Factor("displacement", pairs, part.star.vector, sqrt_information=root)
+        start = horizon.past.at[:, run % horizon.mask.size].reshape(-1, 3)[places(horizon.window, t)]
+        factors.append(Factor("position", top + joins[:, None], start[joins], np.array(np.sqrt(FORGOTTEN))))
+    return Problem((*(before[k] for k in held.previous[stays]), *here), tuple(factors))

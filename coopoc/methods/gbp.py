@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-from ..arrays import Floats
 from ..errors import InputError
-from ..kernels.compile import use_kernels
-from ..world.exchange import Exchange, exchange
+from ..world.exchange import exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
-from .knowledge import Knowledge, resolve
-from .network import Network, apply, collect
+from .noise_model import NoiseModel
 from .track import Track
-from .whole_fleet import brought_forward, fleet_track, follow_compiled, follow_fleet
+from .whole_fleet import Answer, fleet_track
+
+if TYPE_CHECKING:
+    from ..kernels.fleet_graph import Assumed, Measured, Pairs
 
 LOOPS = "GBP's covariance of a step leaves out the loops of the network, which makes it over-confident"
 
@@ -26,29 +24,33 @@ LOOPS = "GBP's covariance of a step leaves out the loops of the network, which m
 class GaussianBeliefPropagation:
     """Per step a prediction and the own fix, then `rounds` of messages between the vehicles in contact.
 
-    With W the information of the pair's sightings, w its pull, and (eta, Lambda) the sender's belief without what the
-    receiver told it, the message about the receiver is
+    With (w, W) the information vector and matrix of the pair's measurements, and (eta, Lambda) the sender's belief less
+    the receiver's last message, the message about the receiver is
 
         Lambda_m = W (W + Lambda)^-1 Lambda,   eta_m = W (W + Lambda)^-1 eta + Lambda (W + Lambda)^-1 w,
 
-    and a belief is the prior and the sum of the messages (methods.md section 6.8; Murai et al., T-RO 40, 2024). A
-    pair's two sightings are one factor, so that a tree of vehicles stays a tree: there a step's beliefs are exact after
-    as many rounds as the tree is wide. On loops the means are exact once converged, and the covariances too small.
+    and a belief is the prior and the sum of the messages. A pair's two measurements are one factor, so that a tree of
+    vehicles stays a tree: there a step's beliefs are exact after as many rounds as the tree is wide. On loops the means
+    are exact once converged, and the covariances too small.
 
-    Sent per pair, way and round: (eta, Lambda) of the sender, 9 numbers, 36 B; the first round also brings its sighting
-    of the receiver (3), id and time (2). The receiver computes Lambda_m, because it knows both sightings. A pair takes
-    part in a step if messages get through both ways: moving one end alone is worse than not moving (town10, K = 10,
-    10 % loss: 0.55 m against 0.49 m).
+    Sent per pair, way and round: (eta, Lambda) of the sender, 9 numbers, 36 B; the first round also brings its
+    measurement of the receiver (3), id and time (2). The receiver computes Lambda_m, because it has both measurements.
+    A pair takes part in a step if messages get through both ways: moving one end alone is worse than not moving
+    (town10, K = 10, 10 % loss: 0.55 m against 0.49 m).
 
     Args:
-        knowledge: "identity", "nominal" or a Knowledge. rounds: of messages a step.
+        noise_model: "identity", "nominal" or a NoiseModel.
+        rounds: of messages a step.
         damping: share of the old message that stays in the new one, in [0, 1); the fixed point is the same.
         carry: covariance that goes on to the next step: "own" is that of the vehicle's own filter, without neighbours.
-            "belief" takes what neighbours say at every step as independent news; it is not, and soon the fixes weigh
-            nothing: 1.17 m on the first 300 steps of town10 at K = 10, against 0.46 m, and 0.95 m without neighbours.
+            "belief" takes the messages of every step as independent; they are not, and soon the fixes weigh nothing:
+            1.17 m on the first 300 steps of town10 at K = 10, against 0.46 m, and 0.95 m without neighbours.
+
+    References:
+        Murai et al., "A Robot Web for Distributed Many-Device Localization", IEEE T-RO 40, 2024.
     """
 
-    knowledge: Knowledge | str = "nominal"
+    noise_model: NoiseModel | str = "nominal"
     rounds: int = 3
     damping: float = 0.0
     carry: Literal["own", "belief"] = "own"
@@ -65,38 +67,16 @@ class GaussianBeliefPropagation:
 
     @property
     def message(self) -> Message:
-        """The sender's belief, to each vehicle in contact and in every round; its sighting, id and time once."""
+        """The sender's belief, to each vehicle in contact and in every round; its measurement, id and time once."""
         return Message("belief", 9, rounds=self.rounds, opening=5, unicast=True)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
-        known = resolve(self.knowledge, recording)
 
-        def solve(contacts: Exchange) -> tuple[Floats, Floats]:
-            if self.carry == "own" and use_kernels():
-                x, cov = follow_compiled(recording, contacts, known, self.rounds, damping=self.damping)
-            else:
-                x, cov = follow_fleet(self, recording, contacts, known, self.cooperate, carry_own=self.carry == "own")
-            return brought_forward(x, cov, recording, known, contacts.delay)
+        def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
+            from ..kernels.belief_propagation import follow
 
-        return fleet_track(self, recording, egos, lambda: exchange(recording, self.message), solve, (LOOPS,))
+            settings = int(self.rounds), float(self.damping), self.carry == "belief"
+            return Answer(*follow(measured, pairs, assumed, *settings), self.rounds, (LOOPS,))
 
-    def cooperate(self, graph: Network) -> tuple[Floats, Floats]:
-        """Positions (R, n, 3) and covariances (R, n, 3, 3) after the rounds of one step."""
-        prior, n, pairs = np.linalg.inv(graph.cov), len(graph.here), len(graph.first)
-        to, sender = np.concatenate([[graph.first, graph.second], [graph.second, graph.first]], axis=1)
-        answer = (np.arange(2 * pairs) + pairs) % (2 * pairs)
-        heard = np.tile(graph.to_first & graph.to_second, 2)[..., None]
-        weight = np.tile(graph.weight, (1, 2, 1, 1))
-        pull = np.concatenate([-graph.pull, graph.pull], axis=1)
-        eta, told = np.zeros_like(pull), np.zeros_like(weight)
-        for _ in range(self.rounds):
-            cavity = (prior + collect(told, to, n))[:, sender] - told[:, answer]
-            cavity_eta = collect(eta, to, n)[:, sender] - eta[:, answer]
-            gain = weight @ np.linalg.inv(weight + cavity)
-            new = gain @ cavity * heard[..., None]
-            new_eta = (apply(gain, cavity_eta - pull) + pull) * heard
-            told = self.damping * told + (1 - self.damping) * (new + np.swapaxes(new, -1, -2)) / 2
-            eta = self.damping * eta + (1 - self.damping) * new_eta
-        cov = np.linalg.inv(prior + collect(told, to, n))
-        return graph.x + apply(cov, collect(eta, to, n)), cov
+        return fleet_track(self, self.noise_model, recording, egos, lambda: exchange(recording, self.message), solve)

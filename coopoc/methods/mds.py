@@ -1,4 +1,4 @@
-"""Mds: multidimensional scaling of the ranges among the ego and its neighbours, laid over their fixes, step by step."""
+"""MDS: multidimensional scaling of the ranges among the ego and its neighbours, laid over their fixes, step by step."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ from ..errors import InputError
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
+from .bridge import bridge
 from .egos import Estimate, follow_egos
-from .knowledge import Knowledge, resolve
+from .noise_model import NoiseModel, resolve
 from .scaling import complete, fit, majorise, shape
 from .star import StarStep, star_steps
 from .track import Track
 
 
 @dataclass(frozen=True, eq=False)
-class Mds:
-    """Per step: ranges, missing ones completed, classical scaling, Procrustes to the fixes (methods.md section 5.2).
+class MDS:
+    """Per step: ranges, missing ones completed, classical scaling, Procrustes to the fixes (Borg and Groenen, "Modern
+    Multidimensional Scaling", 2005, chapters 12 and 20).
 
     No step knows of another. The ego measures its own ranges; those among its neighbours come in their messages, where
     the recording has their links (`observe` with all vehicles as observers): the notes say how many did. Shortest paths
@@ -33,15 +35,16 @@ class Mds:
 
     Fails where geometry does: in a platoon on one lane the shape has rank one, and across the lane all are put on one
     line through the fixes; vehicles on a plane leave z to the noise of the ranges; a reflection is decided by the fixes
-    alone. It claims no covariance.
+    alone. It claims no covariance. Where no range connects two vehicles, their fixes give the distance.
 
     Args:
-        knowledge: "identity", "nominal" or a Knowledge. iterations: of majorisation, 0 for none.
+        noise_model: "identity", "nominal" or a NoiseModel.
+        iterations: of majorisation, 0 for none.
         ranges: how many of its ranges, nearest first, a neighbour's message lists; 0 leaves the ego's star.
         missing: "paths" or "angles".
     """
 
-    knowledge: Knowledge | str = "nominal"
+    noise_model: NoiseModel | str = "nominal"
     iterations: int = 0
     ranges: int = 10
     missing: Literal["paths", "angles"] = "paths"
@@ -66,7 +69,7 @@ class Mds:
 
         Messages are no longer than the budget's `max_neighbours` makes them, and without ranges in a star.
         """
-        known = resolve(self.knowledge, recording)
+        recording, known, notes = bridge(recording, resolve(self.noise_model, recording))
         links = recording.links
         columns = recording.columns(egos)
         heard = np.unique(links.neighbour[np.isin(links.observer, columns)])
@@ -77,12 +80,12 @@ class Mds:
         def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
             return method._follow(recording, ego, box, known, find, count)
 
-        track = follow_egos(method, recording, egos, follow)
+        track = follow_egos(method, recording, egos, follow, missing=True)
         between = f"{100 * count[0] / max(count[1], 1):.0f} % of the distances between neighbours were measured"
-        return replace(track, covariance=None, notes=(between,))
+        return replace(track, covariance=None, notes=(between, *notes))
 
     def _follow(
-        self, recording: Recording, ego: int, box: Inbox, known: Knowledge, find: Finder, count: Ints
+        self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, find: Finder, count: Ints
     ) -> Iterator[Estimate]:
         unclaimed = np.full((recording.runs, 3, 3), np.nan)
         for star in star_steps(recording, ego, box, known):
@@ -97,12 +100,15 @@ class Mds:
             theirs = np.where(sent[:, 1:, None] >= 0, points[:, 1:], np.nan)
             yield Estimate(star.step, points[:, 0], unclaimed, star.links, theirs)
 
-    def _locate(self, measured: Floats, star: StarStep, held: Bools, known: Knowledge) -> Floats:
+    def _locate(self, measured: Floats, star: StarStep, held: Bools, known: NoiseModel) -> Floats:
         """Positions (R, n, 3) of the star from its ranges (R, n, n), and the fixes of those who are held (R, n)."""
         pull = np.where(held[..., None], 1.0 / star.fix_variance, 0.0)
         seen = np.concatenate([np.zeros((len(held), 1, 3)), star.vector], axis=1)
         apart = np.linalg.norm(seen[:, :, None] - seen[:, None], axis=-1) if self.missing == "angles" else None
+        guess = np.linalg.norm(star.fix[:, :, None] - star.fix[:, None], axis=-1)
+        apart = None if apart is None else np.where(np.isfinite(apart), apart, guess)
         distance = complete(measured, apart)
+        distance = np.where(np.isfinite(distance), distance, guess)
         points = fit(shape(distance), star.fix, pull.mean(axis=2))
         if not self.iterations:
             return points

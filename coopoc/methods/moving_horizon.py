@@ -5,25 +5,24 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Ints
 from ..errors import InputError
-from ..kernels.compile import use_kernels
-from ..optimize.solve import backends, usable
+from ..optimize.backend import require_backend
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
-from .knowledge import Knowledge, resolve
-from .slice import STRAYED, estimate
-from .star import assumed_arrays, measured_arrays
+from .noise_model import NoiseModel, resolve
+from .star import assumptions, measurements
 from .track import Track
-from .true_time import Seen, known_by, seen_steps
-from .window import Window, advance, settle, sweep
-from .window_problem import Road, heights, limited, solution_of, violated, window_problem
+from .window import points_of, steps_of
+from .window_problem import Road, arrival_of, heights, limited, solution_of, violated, window_problem
 
+STRAYED = 0.03
+"""m, move of a vector v beyond which its measurement is made linear anew: off by at most 0.03^2 / 2 |v| then."""
 SWEEPS = 10
 """Gauss-Newton steps of a window after the first; one is common."""
 DROPPED = "fixes came later than the horizon and were dropped"
@@ -50,7 +49,7 @@ class MovingHorizon:
             others of `coopoc.optimize.backends()` loop over the runs: osqp can hold heights, casadi all.
         road: the height m of all vehicles, (lowest, highest), or a surface z = f(x, y, m) with m a namespace that has
             sqrt, atan2 and where. top_speed: m/s from step to step.
-        knowledge: "identity", "nominal" or a Knowledge. exact: False keeps sightings as converted vectors.
+        noise_model: "identity", "nominal" or a NoiseModel. exact: False keeps sightings as converted vectors.
 
     Raises:
         InputError: a horizon < 1, a road or top speed that the backend cannot hold or no vehicle can keep.
@@ -65,7 +64,7 @@ class MovingHorizon:
     backend: str = "gauss-newton"
     road: Road | None = None
     top_speed: float | None = None
-    knowledge: Knowledge | str = "nominal"
+    noise_model: NoiseModel | str = "nominal"
     exact: bool = True
     name: str = "mhe"
     cooperative: bool = True
@@ -74,75 +73,84 @@ class MovingHorizon:
     def __post_init__(self) -> None:
         if self.horizon != int(self.horizon) or self.horizon < 1:
             raise InputError("horizon", self.horizon, "must be a whole number >= 1", "Use 10 to 20 at 10 Hz.")
-        usable(self.backend)
+        require_backend(self.backend)
         self._check_constraints()
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        known = resolve(self.knowledge, recording)
+        known = resolve(self.noise_model, recording)
         counts: Counter[str] = Counter()
-        follow = self._compiled if self.backend == "gauss-newton" and use_kernels() else self._follow
-        track = follow_egos(self, recording, egos, lambda ego, box: follow(recording, ego, box, known, counts))
-        loop = () if self.backend == "gauss-newton" else (f"{self.backend} loops over the runs",)
+
+        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
+            counts[DROPPED] += self._dropped(recording, box)
+            found = self._follow(recording, ego, box, known, counts)
+            counts[MOVING] += int(found.moving.sum())
+            yield Estimate(slice(None), found.x, found.covariance, box.link, found.neighbours)
+
+        track = follow_egos(self, recording, egos, drive, missing=True)
+        loop = () if self._runs_compiled else (f"{self.backend} loops over the runs",)
         return replace(track, notes=(*loop, *(f"{count} {what}" for what, count in counts.items() if count)))
 
-    def _compiled(
-        self, recording: Recording, ego: int, box: Inbox, known: Knowledge, counts: Counter[str]
-    ) -> Iterator[Estimate]:
-        """What `_follow` yields, as one estimate of all steps from compiled code."""
-        from ..kernels.horizon import horizons
+    def _follow(self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, counts: Counter[str]) -> Any:
+        """The elimination's estimates; where the backend has to solve a window, those of the backend."""
+        from ..kernels.horizon import Settings, horizons
 
-        counts[DROPPED] += self._dropped(recording, box, box.arrival)
-        exact, limits = self.exact and known.exact_relative, recording.v2x.max_age / recording.dt + 1e-9
-        variance, _, *others = assumed_arrays(recording, known)
-        assumed = (variance, known.gnss_variance[None, None, None], *others)
-        x, cov, neighbours, moving = horizons(
-            measured_arrays(recording, ego, box), assumed, np.ascontiguousarray(box.arrival), self.horizon + 1, exact,
-            SWEEPS if exact else 0, limits, STRAYED,
-        )  # fmt: skip
-        counts[MOVING] += int(moving.sum())
-        yield Estimate(slice(None), x, cov, box.link, neighbours)
+        exact = self.exact and known.exact_relative
+        age = recording.v2x.max_age / recording.dt + 1e-9
+        settings = Settings(self.horizon + 1, exact, SWEEPS if exact else 0, STRAYED, age, False)
+        seen, assumed = measurements(recording, ego, box), assumptions(recording, known)
+        seen = seen._replace(newest=seen.newest.copy(), fresh=np.zeros_like(box.fresh))
+        arrival = np.ascontiguousarray(box.arrival)
+        if self._runs_compiled:
+            return horizons(seen, assumed, arrival, settings)
+        return self._by_backend(recording, box, known, (seen, assumed, arrival, settings), counts)
 
-    def _follow(
-        self, recording: Recording, ego: int, box: Inbox, known: Knowledge, counts: Counter[str]
-    ) -> Iterator[Estimate]:
-        exact, length = self.exact and known.exact_relative, self.horizon + 1
-        arrival, variance = box.arrival, known.process_variance(recording)
-        counts[DROPPED] += self._dropped(recording, box, arrival)
-        recent: list[Seen] = []
-        window: Window | None = None
-        for new in seen_steps(recording, ego, box, arrival, known):
-            recent.append(new)
-            for k in range(len(recent) > length, len(recent)):
-                before = recent[k - 1] if k else None
-                recent[k] = known_by(new.star.step, recent[k], before, recording, known, variance)
-            window = advance(window, [part.star for part in recent], length, known)
-            recent = recent[-length:]
-            window, moving = settle(window, known, SWEEPS) if exact else (sweep(window, known, exact), 0)
-            counts[MOVING] += moving
-            yield self._answer(window, known, exact, recording.dt, counts)
+    def _by_backend(self, recording: Recording, box: Inbox, known: NoiseModel, given: Any, counts: Counter[str]) -> Any:
+        from ..kernels.horizon import advance, each_group, empty
 
-    def _answer(self, window: Window, known: Knowledge, exact: bool, dt: float, counts: Counter[str]) -> Estimate:
-        """The newest slice as the elimination has it, or where the backend has to solve the window, as that does."""
-        newest, spread = window.slices[-1], window.spreads[-1]
-        if self.backend == "gauss-newton":
-            return estimate(newest, spread)
-        problem = limited(window_problem(window.slices, known, exact), dt, self.road, self.top_speed)
-        x = np.concatenate([part.point for part in window.slices], axis=1)
-        point, cov, n = newest.point.copy(), spread[:, :3, :3].copy(), newest.point.shape[1]
-        bounded = self.road is not None or self.top_speed is not None
-        for run in np.flatnonzero(violated(problem, x)).tolist() if bounded else range(len(x)):
-            solution = solution_of(problem, window.arrival, run, x[run], self.backend)
-            if solution is None:
-                counts[f"windows that {self.backend} did not solve: the unconstrained answer stands"] += 1
-                continue
-            point[run] = solution.x[-n:]
-            if bounded:
-                cov[run] = solution.covariance[problem.hub[-1]]
-        return estimate(replace(newest, point=point), cov)
+        seen, assumed, arrival, settings = given
+        found = empty(seen)
+        for runs, horizon in each_group(seen, settings.length):
+            for t in range(len(recording.t)):
+                advance(horizon, seen, assumed, arrival, settings, runs, (t, t + 1), found)
+                span = (max(0, t - self.horizon), t)
+                for run in range(runs[0], runs[1] + 1):
+                    self._replace(found, horizon, recording, box, known, (run, span, settings.exact), counts)
+        return found
 
-    def _dropped(self, recording: Recording, box: Inbox, arrival: Ints) -> int:
-        return int((arrival - recording.links.step[box.link] > self.horizon).sum())
+    def _replace(
+        self,
+        found: Any,
+        horizon: Any,
+        recording: Recording,
+        box: Inbox,
+        known: NoiseModel,
+        which: Any,
+        counts: Counter[str],
+    ) -> None:
+        """Put the backend's newest points in the place of the elimination's, where a constraint asks for them."""
+        run, span, exact = which
+        problem = window_problem(horizon, steps_of(horizon.window, recording, box, run, span), known, exact, run, span)
+        problem = limited(problem, recording.dt, self.road, self.top_speed)
+        x, bounded = points_of(horizon.window, run, span), self.road is not None or self.top_speed is not None
+        if bounded and not violated(problem, x[None])[0]:
+            return
+        solution = solution_of(problem, arrival_of(horizon, run, span[0]), x, self.backend)
+        if solution is None:
+            counts[f"windows that {self.backend} did not solve: the unconstrained answer stands"] += 1
+            return
+        t, ego = span[1], problem.separator[-1]
+        found.x[run, t] = solution.x[ego]
+        found.neighbours[run, box.start[t] : box.start[t + 1]] = solution.x[ego + 1 :]
+        if bounded:
+            found.covariance[run, t] = solution.covariance[ego]
+
+    @property
+    def _runs_compiled(self) -> bool:
+        return require_backend(self.backend).capabilities.compiled
+
+    def _dropped(self, recording: Recording, box: Inbox) -> int:
+        return int((box.arrival - recording.links.step[box.link] > self.horizon).sum())
 
     def _check_constraints(self) -> None:
         if self.top_speed is not None and not self.top_speed > 0:
@@ -150,9 +158,10 @@ class MovingHorizon:
         low, high = heights(self.road)
         if not low <= high:
             raise InputError("road", self.road, "must be a height or (lowest, highest) m", "Swap them.")
-        able = backends()[self.backend].constraints
+        able = require_backend(self.backend).capabilities.constraints
         curved = callable(self.road) or self.top_speed is not None
         if able != "all" and (curved or (able == "none" and self.road is not None)):
             given = {"road": self.road, "top_speed": self.top_speed}
-            raise InputError("backend", repr(self.backend), f"cannot hold {given}",
-                             'Use backend="casadi", or "osqp" for a height.')  # fmt: skip
+            raise InputError(
+                "backend", repr(self.backend), f"cannot hold {given}", 'Use backend="casadi", or "osqp" for a height.'
+            )

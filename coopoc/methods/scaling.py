@@ -73,7 +73,7 @@ def majorise(points: Floats, distance: Floats, weight: Floats, anchor: Floats, p
     """SMACOF with anchors: each step lowers sum_{i<j} w_ij (d_ij - |x_i - x_j|)^2 + sum_i a_i |x_i - z_i|^2.
 
     X <- (V + diag a)^-1 (B(X) X + diag(a) Z), V the Laplacian of w and B(X) that of w d / |x_i - x_j| (de Leeuw's
-    majorisation, methods.md section 5.2): no step length, and slow where the anchors are weak.
+    majorisation): no step length, and slow where the anchors are weak.
 
     Args:
         points: (B, n, 3) m, the start. distance: (B, n, n) m. weight: (B, n, n) 1/m^2, symmetric, 0 if not measured.

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..kernels.messages import Assumptions, Measurements
+from ..kernels.relative import components
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import to_vector
-from .knowledge import Knowledge
+from .kalman import solo_filter
+from .noise_model import NoiseModel
 
 FORGOTTEN = 1e6
 """m^2, prior variance of a vehicle that has just joined: nothing is known of it."""
 ACCELERATION_STD = 1.0
 """m/s^2, how fast a velocity may have changed since the message that carried it."""
+
+
+POSITION = (0.0,) * 3
+"""A state that is a position: its size, for compiled code."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +52,7 @@ class StarStep:
 
 
 def star_steps(
-    recording: Recording, ego: int, box: Inbox, knowledge: Knowledge, steps: range | None = None
+    recording: Recording, ego: int, box: Inbox, noise_model: NoiseModel, steps: range | None = None
 ) -> Iterator[StarStep]:
     """The ego's star at every step, or as if only `steps` in a row had been, with what the newest message of each
     member says.
@@ -55,7 +61,7 @@ def star_steps(
     n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this
     step adds (2n - 1) times the variance of one. Nothing is assumed of who is seen but not heard.
     """
-    variance, fixes = knowledge.process_variance(recording), knowledge.fix_variance(recording)
+    variance, fixes = noise_model.process_variance(recording), noise_model.fix_variance(recording)
     before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)
     uses = np.ones((recording.runs, 0), dtype=np.int64)
     for t in range(len(recording.t)) if steps is None else steps:
@@ -74,32 +80,73 @@ def star_steps(
         heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1) & there
         fix = np.where(there[..., None], fix, 0.0)
         yield StarStep(
-            t, kept, links, relative, to_vector(relative), moved, process, fix,
-            _when_sent(fixes, members, sent, t) + fix_variance, heard,
-        )  # fmt: skip
+            t,
+            kept,
+            links,
+            relative,
+            to_vector(relative),
+            moved,
+            process,
+            fix,
+            _when_sent(fixes, members, sent, t) + fix_variance,
+            heard,
+        )
         before, before_sent = members, sent
 
 
-def measured_arrays(recording: Recording, ego: int, box: Inbox) -> tuple[Any, ...]:
-    """What `star_steps` gathers from, as the tuple `measured` of `coopoc.kernels.star_messages`."""
-    from ..kernels.sighting import unfolded
+def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
+    """What one ego has measured and received, as `coopoc.kernels.messages.Measurements`.
 
+    Args:
+        broadcast: (R, T, N, 3) m, position in a message; None for the fix.
+    """
     neighbour, start, newest = (
         np.ascontiguousarray(numbers, dtype=np.int64)
         for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
     )
-    seen, fresh = unfolded(recording.relative, box.link), np.ascontiguousarray(box.fresh)
-    return recording.gnss, recording.velocity, seen, neighbour, start, newest, fresh, int(ego), recording.dt
+    gnss = recording.gnss
+    return Measurements(
+        gnss,
+        recording.velocity,
+        gnss if broadcast is None else broadcast,
+        components(recording.relative, box.link),
+        neighbour,
+        start,
+        newest,
+        np.ascontiguousarray(box.fresh),
+        int(ego),
+        recording.dt,
+    )
 
 
-def assumed_arrays(recording: Recording, known: Knowledge) -> tuple[Any, ...]:
-    """What is assumed of it, as the tuple `assumed` of `coopoc.kernels.star_messages`."""
-    pace, fixes = known.pace, np.ascontiguousarray(known.fix_variance(recording))
-    variance = np.zeros((1, 1, 1, 3)) if len(pace) else np.ascontiguousarray(known.process_variance(recording))
-    return variance, fixes, *sighting_noise(known), FORGOTTEN, ACCELERATION_STD, pace
+def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
+    """What a filter assumes of them, as `coopoc.kernels.messages.Assumptions`: a message holds a fix and a velocity,
+    whose error the fix of `age` steps ago has made age times."""
+    velocity_noise, fixes = known.pace, np.ascontiguousarray(known.fix_variance(recording))
+    process = np.zeros((1, 1, 1, 3)) if len(velocity_noise) else np.ascontiguousarray(known.process_variance(recording))
+    noise = sighting_noise(known)
+    return Assumptions(process, fixes, fixes, (1.0, 0.0), *noise, FORGOTTEN, ACCELERATION_STD, velocity_noise)
 
 
-def sighting_noise(known: Knowledge) -> tuple[Floats, float]:
+def estimates(
+    recording: Recording, known: NoiseModel, egos: Sequence[int], growth: tuple[float, float], acceleration: float
+) -> tuple[Assumptions, Floats]:
+    """Assumptions of a filter whose messages hold estimates, and these: the solo filters (R, T, N, 3) m of all vehicles
+    in the stars of some egos.
+
+    Args:
+        growth: as in `Assumptions`. acceleration: m/s^2.
+    """
+    links, x, p = recording.links, np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)
+    who = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+    process = known.process_variance(recording, who.tolist())
+    gnss, velocity = recording.gnss[:, :, who], recording.velocity[:, :, who]
+    x[:, :, who], p[:, :, who] = solo_filter(gnss, velocity, process, known.gnss_variance, recording.dt)
+    grown = assumptions(recording, known)._replace(broadcast=p, growth=growth, acceleration=acceleration)
+    return grown, x
+
+
+def sighting_noise(known: NoiseModel) -> tuple[Floats, float]:
     """(3,) m, rad, rad and the least range m of sightings, or nothing for unit matrices."""
     return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
 

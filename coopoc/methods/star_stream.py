@@ -1,36 +1,37 @@
-"""Streaming with neighbours: the star around one vehicle, fed step by step with what it sees and hears."""
+"""Streaming with neighbours: the star around one vehicle, fed step by step with what it measures and receives."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from ..errors import InputError
-from ..world.spherical import to_vector
-from .knowledge import Knowledge
-from .star import ACCELERATION_STD, FORGOTTEN, StarStep
-from .stream import ROUNDING, Moved, Past, assumed_motion, fix_or_none, motion, seconds, three
-
-EGO = ""
-"""Key of the ego in the star."""
-Advance = Callable[[Floats, Floats, StarStep], tuple[Floats, Floats]]
-"""State (1, m, 3) m and covariance (1, 3m, 3m) m^2 of the last star, and the new one -> those of the new star."""
+from ..kernels.messages import Assumptions
+from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
+from ..kernels.star_stream import FIX, MESSAGE, MESSAGE_AGE, RELATIVE, VELOCITY, Noise, packed, resized, stream_step
+from .motion_history import MotionHistory, check_step, fix_or_none, seconds, three
+from .noise_model import NoiseModel
+from .star import ACCELERATION_STD, FORGOTTEN, sighting_noise
+from .stream import motion_noise
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class RelativeMeasurement:
     """A neighbour as the ego measures it now, with the message that has newly come from it, if any.
 
     Args:
-        id: who it is. relative: (3,) range m, world azimuth rad, inclination rad.
-        velocity: (3,) m/s of the message, None: no message. gnss: (3,) m its fix, None or NaN: it has none.
+        id: name of the neighbour.
+        relative: (3,) range m, world azimuth rad, inclination rad; NaN for a component that is missing.
+        gnss: (3,) m, the fix in the message; None or NaN for none.
+        velocity: (3,) m/s of the message; None for no message.
         age: s since fix and velocity of the message were measured.
 
-    >>> Sighting("b", [9.0, 0.1, 1.57]).velocity is None
+    >>> RelativeMeasurement("b", [9.0, 0.1, 1.57]).velocity is None
     True
     """
 
@@ -39,122 +40,136 @@ class Sighting:
     gnss: npt.ArrayLike | None = None
     velocity: npt.ArrayLike | None = None
     age: float = 0.0
+    row: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        relative = three("relative", self.relative)
-        if relative[0] < 0 or self.id == EGO:
-            raise InputError("sighting", (self.id, self.relative), "must have a name and a range >= 0", "Check it.")
-        fix = fix_or_none(self.gnss, "neighbour's gnss")
-        if self.velocity is None and np.isfinite(fix).all():
-            raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
+        row = np.full(11, np.nan)
+        relative = np.asarray(self.relative, dtype=float)
+        if relative.shape != (3,) or not self.id or not (0.0 <= relative[0] < math.inf or math.isnan(relative[0])):
+            text = "must have a name and three numbers, the range first and >= 0"
+            raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
+        row[RELATIVE], row[MESSAGE] = relative, float(self.velocity is not None)
+        row[FIX], row[MESSAGE_AGE] = fix_or_none(self.gnss, "neighbour's gnss"), seconds("age", self.age)
         if self.velocity is not None:
-            three("neighbour's velocity", self.velocity)
-        seconds("age", self.age)
-
-
-@dataclass(frozen=True, eq=False)
-class Held:
-    """The newest message of a neighbour: its velocity m/s and the variance of that (3,) m^2/s^2, its age s, and for how
-    long its velocity has moved the neighbour without a break, s."""
-
-    velocity: Floats
-    variance: Floats
-    age: float
-    used: float = 0.0
+            row[VELOCITY] = three("neighbour's velocity", self.velocity)
+        elif math.isfinite(row[FIX][0]):
+            raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
+        object.__setattr__(self, "row", row)
 
 
 class StarStream:
-    """A cooperative filter that runs: like `Stream`, with the neighbours that are seen at each step.
+    """The joint filter, fed step by step: like `Stream`, with the neighbours that are measured at each step.
 
-    Who is seen is in the star, who is no longer seen is forgotten. Between messages a neighbour moves with the velocity
-    of its newest one until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its
-    own. Of one that is seen and was never heard, nothing is assumed.
+    The neighbours measured now are in the star. Between messages a neighbour moves with the velocity of its newest one
+    until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
+    that is measured but whose messages never arrive, nothing is assumed.
 
     Args:
-        advance: one step of the filter. known: what it assumes. x0, interval, history: as in `Kalman.start`.
+        known: what the filter assumes.
+        refine: one Gauss-Newton step on range and angles.
+        x0: (3,) m, a position known before the first step; None starts at the first fix.
+        interval: s, dt of the recordings that the assumed process noise belongs to.
+        history: s, how old a delayed fix may be.
+        max_age: s, older messages are not used.
     """
 
     def __init__(
-        self, advance: Advance, known: Knowledge, x0: npt.ArrayLike | None, interval: float, history: float,
-        max_age: float,
-    ) -> None:  # fmt: skip
-        self.advance, self.known, self.max_age = advance, known, seconds("max_age", max_age)
-        self.variance, self.interval, self.past = assumed_motion(known, interval), interval, Past(history)
-        self.members: tuple[str, ...] = () if x0 is None else (EGO,)
-        self.held: Mapping[str, Held] = {}
-        self.x: Floats = np.empty((1, 0, 3)) if x0 is None else three("x0", x0)[None, None]
-        self.cov: Floats = np.zeros((1, 3 * len(self.members), 3 * len(self.members)))
+        self, known: NoiseModel, refine: bool, x0: npt.ArrayLike | None, interval: float, history: float, max_age: float
+    ) -> None:
+        motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
+        assumed = Assumptions(
+            fixes, fixes, fixes, (1.0, 0.0), *sighting_noise(known), FORGOTTEN, ACCELERATION_STD, np.empty(0)
+        )
+        self.max_age = seconds("max_age", max_age)
+        self._noise = packed(Noise(motion, assumed, float(max_age), refine))
+        self.history = MotionHistory(history)
+        self.slots: dict[str, int] = {}
+        self.members: list[str] = []
+        self._given, self._answer, self._free = np.zeros(12), np.zeros(12), list[int]()
+        if x0 is not None:
+            self._given[8:11], self._given[11] = three("x0", x0), 1.0
+        self._numbers: Floats = np.zeros(0)
+        self._index, self._last = np.zeros(2, np.int64), np.zeros((0, 5))
+        self._reserve(8)
+
+    def _reserve(self, most: int) -> None:
+        """Room for `most` members of the star."""
+        size, place = self._index[:2].copy(), self._place
+        self._numbers = resized(self._numbers, size, most)
+        self._index = np.concatenate([[size[0], most], np.zeros(3 * most, np.int64), place])
+        self._inbox = np.zeros((most, 12))
+
+    @property
+    def _place(self) -> Ints:
+        return self._index[2 + 3 * self._index[1] :]
+
+    def _slot(self, name: str, names: Sequence[str]) -> int:
+        """A row for a vehicle that is not known, or no longer."""
+        if not self._free:
+            last, place = self._last, self._place
+            old = [n for n, k in self.slots.items() if last[k, 3] > self.max_age and place[k] < 0 and n not in names]
+            self._free = [self.slots.pop(n) for n in old]
+        if not self._free:
+            more = max(16, len(last))
+            self._free = list(range(len(last), len(last) + more))
+            self._last, self._index = np.pad(last, ((0, more), (0, 0))), np.append(self._index, np.full(more, -1))
+        slot = self.slots[name] = self._free.pop()
+        self._last[slot] = (0.0, 0.0, 0.0, np.inf, 0.0)
+        return slot
 
     @property
     def neighbours(self) -> dict[str, Floats]:
-        """Positions (3,) m of who is in the star."""
-        return dict(zip(self.members[1:], self.x[0, 1:], strict=True))
+        """Positions (3,) m of the neighbours in the star."""
+        return dict(zip(self.members, self._answer[12:].reshape(-1, 3).copy(), strict=True))
 
     def step(
-        self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0,
-        neighbours: Sequence[Sighting] = (),
-    ) -> tuple[Floats, Floats | None]:  # fmt: skip
+        self,
+        gnss: npt.ArrayLike | None,
+        velocity: npt.ArrayLike,
+        dt: float,
+        fix_age: float = 0.0,
+        neighbours: Sequence[RelativeMeasurement] = (),
+    ) -> tuple[Floats, Floats | None]:
         """Position (3,) m and covariance (3, 3) m^2 of the ego; NaN and None before its first fix.
 
         Args:
-            gnss, velocity, dt, fix_age: of the ego, as in `Stream.step`. neighbours: who is seen now, once each.
+            gnss: (3,) m of the ego; None or NaN for no fix.
+            velocity: (3,) m/s of the ego, the mean over the step.
+            dt: s since the last step.
+            fix_age: s, of the fix.
+            neighbours: what is measured now, once each.
 
         Raises:
-            InputError: as `Stream.step`; a neighbour that is seen twice. The filter is then as it was before.
+            InputError: as `Stream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
-        names = (EGO, *(s.id for s in neighbours))
+        names, given = [s.id for s in neighbours], self._given
         if len(set(names)) < len(names):
-            raise InputError("neighbours", list(names[1:]), "must be seen once each", "Merge sightings of one vehicle.")
-        moved = motion(velocity, dt)
-        process = self.variance(np.asarray(velocity, dtype=float), dt)
-        past = self.past.then(Moved(dt, moved, process))
-        fix, late = past.forward(gnss, fix_age)
-        held = self._listen(neighbours, dt)
-        self.past, self.held = past, {name: replace(h, used=h.used + dt) for name, h in held.items()}
-        if not self.members and np.isnan(fix).any():
+            raise InputError("neighbours", names, "must be given once each", "Merge the measurements of one vehicle.")
+        if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+            check_step(gnss, velocity, dt, fix_age, self.history)
+        given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        k = len(names)
+        if k >= self._index[1]:
+            self._reserve(2 * (k + 1))
+        for i, one in enumerate(neighbours):
+            self._inbox[i, :11] = one.row
+        slots = [self.slots.get(name, -1) for name in names]
+        if -1 in slots:
+            slots = [self._slot(name, names) if slot < 0 else slot for name, slot in zip(names, slots, strict=True)]
+        self._inbox[:k, 11] = slots
+        answer = np.empty(12 + 3 * k)
+        found = self._run(answer, k)
+        while found == HISTORY_FULL:
+            self.history.grow()
+            found = self._run(answer, k)
+        if found == NO_FIX_YET:
             return np.full(3, np.nan), None
-        star = self._star(names, neighbours, held, dt)
-        star.moved[0, 0], star.process[0, 0], star.fix[0, 0] = moved, process, fix
-        star.fix_variance[0, 0], star.heard[0, 0] = self.known.gnss_variance + late, np.isfinite(fix).all()
-        star.fix[~star.heard] = 0.0
-        self.x, self.cov = self.advance(self.x, self.cov, star)
-        self.members = names
-        return self.x[0, 0], self.cov[0, :3, :3]
+        if found != ESTIMATE:
+            check_step(gnss, velocity, dt, fix_age, self.history)
+        self.members, self._answer = names, answer
+        return answer[:3], answer[3:12].reshape(3, 3)
 
-    def _listen(self, neighbours: Sequence[Sighting], dt: float) -> dict[str, Held]:
-        """The newest message of everyone, none older than `max_age`; who was not seen has not been moved."""
-        here = {s.id for s in neighbours}
-        held = {
-            name: replace(h, age=h.age + dt, used=h.used if name in here and name in self.members else 0.0)
-            for name, h in self.held.items()
-        }
-        for s in neighbours:
-            if s.velocity is not None:
-                u = np.asarray(s.velocity, dtype=float)
-                held[s.id] = Held(u, self.variance(u, self.interval) / self.interval**2, s.age)
-        return {name: h for name, h in held.items() if h.age <= self.max_age + ROUNDING}
-
-    def _star(
-        self, names: Sequence[str], neighbours: Sequence[Sighting], held: Mapping[str, Held], dt: float
-    ) -> StarStep:
-        """The star, its first row, the ego, to be filled."""
-        n = len(names)
-        kept = np.array([self.members.index(name) if name in self.members else -1 for name in names])
-        moved, fix, fix_variance = np.zeros((3, 1, n, 3))
-        process = np.full((1, n, 3), FORGOTTEN)
-        heard = np.zeros((1, n), dtype=bool)
-        for k, s in enumerate(neighbours, start=1):
-            if s.id not in held:
-                continue
-            h = held[s.id]
-            now = h.variance + (h.age * ACCELERATION_STD) ** 2
-            moved[0, k] = dt * h.velocity
-            process[0, k] = ((h.used + dt) ** 2 - h.used**2) * now
-            if s.velocity is not None:
-                fix[0, k] = fix_or_none(s.gnss) + h.age * h.velocity
-                heard[0, k] = np.isfinite(fix[0, k]).all()
-                fix_variance[0, k] = self.known.gnss_variance + h.age**2 * now
-        fix_variance[~heard] = 1.0
-        relative = np.array([s.relative for s in neighbours], dtype=float).reshape(1, -1, 3)
-        return StarStep(0, kept, np.arange(n - 1), relative, to_vector(relative), moved, process, fix, fix_variance,
-                        heard)  # fmt: skip
+    def _run(self, answer: Floats, k: int) -> int:
+        rows, inbox = self.history.rows, self._inbox[:k]
+        numbers, index, last = self._numbers, self._index, self._last
+        return int(stream_step(self._given, inbox, numbers, index, last, rows, self._noise, answer))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -12,15 +11,14 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.motion import MotionNoise
+from ..kernels.solo import ESTIMATE, GNSS, HISTORY_FULL, NO_FIX_YET, VELOCITY, FixNoise, packed, stream_step
 from ..world.recording import Recording
-from .knowledge import Knowledge, resolve
+from .motion_history import MotionHistory, check_step, three
+from .noise_model import NoiseModel, resolve
 from .track import Track
 
 State = TypeVar("State")
-Variance = Callable[[Floats, float], Floats]
-"""Velocity (..., 3) m/s and dt s -> variance (..., 3) m^2 of the motion dt u."""
-ROUNDING = 1e-9
-"""s, by how much sums of time steps may miss a time."""
 
 
 class Solo(Protocol[State]):
@@ -39,93 +37,28 @@ class Solo(Protocol[State]):
         """Position (..., 3) m and covariance (..., 3, 3) m^2, or None if it claims none."""
 
 
-class Moved(NamedTuple):
-    """One step of dead reckoning: dt s, motion (3,) m, its variance (3,) m^2."""
-
-    dt: float
-    moved: Floats
-    process: Floats
-
-
-@dataclass(frozen=True, eq=False)
-class Past:
-    """How a vehicle moved lately: the newest steps, `seen` seconds in all, which is `span` or what there has been."""
-
-    span: float
-    steps: tuple[Moved, ...] = ()
-    seen: float = 0.0
-
-    def __post_init__(self) -> None:
-        seconds("history", self.span)
-
-    def then(self, step: Moved) -> Past:
-        """The past one step later."""
-        steps, seen = (*self.steps, step), self.seen + step.dt
-        while len(steps) > 1 and seen - steps[0].dt >= self.span:
-            seen -= steps[0].dt
-            steps = steps[1:]
-        return Past(self.span, steps, seen)
-
-    def since(self, age: float) -> tuple[Floats, Floats]:
-        """Motion (3,) m in the last `age` seconds and its variance (3,) m^2; of a step that is cut, its part.
-
-        Raises:
-            InputError: negative, or before what is kept.
-        """
-        if not -ROUNDING <= age <= self.seen + ROUNDING:
-            raise InputError("fix_age", f"{age} s", f"must be in 0..{self.seen:g} s, the motion that is kept",
-                             "Leave such a fix out (None), or keep more: start(..., history=).")  # fmt: skip
-        moved, process, left = np.zeros(3), np.zeros(3), age
-        for step in reversed(self.steps):
-            if left <= 0:
-                break
-            part = min(left / step.dt, 1.0)
-            moved, process, left = moved + part * step.moved, process + part * step.process, left - step.dt
-        return moved, process
-
-    def forward(self, gnss: npt.ArrayLike | None, age: float) -> tuple[Floats, Floats]:
-        """A fix of `age` seconds ago moved to now, (3,) m, NaN for none, and the variance of that motion, (3,) m^2."""
-        fix = fix_or_none(gnss)
-        if np.isnan(fix).all():
-            return fix, np.zeros(3)
-        moved, process = self.since(age)
-        return fix + moved, process
-
-
 class Stream(Generic[State]):
-    """A solo filter that runs: `step` takes what came since the last one and answers with what is known now.
+    """A solo filter of one's own, fed step by step: `step` takes what is new and returns the estimate.
 
     Args:
-        solo: the filter. x0: (3,) m, a known position before the first step; None: the first fix starts it.
+        solo: the filter.
+        x0: (3,) m, a position known before the first step; None starts at the first fix.
         history: s, how old a delayed fix may be.
     """
 
     def __init__(self, solo: Solo[State], x0: npt.ArrayLike | None = None, history: float = 10.0) -> None:
-        self.solo, self.past = solo, Past(history)
+        self.solo, self.history = solo, MotionHistory(history)
         self.state: State | None = None if x0 is None else solo.begin(three("x0", x0), None)
 
     def step(
         self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
     ) -> tuple[Floats, Floats | None]:
-        """Position (3,) m and covariance (3, 3) m^2 now; NaN and None before the first fix, None if it claims none.
-
-        A fix that was true `fix_age` seconds ago is moved by the dead-reckoned motion since, and its covariance grows
-        by the noise of that motion. The filter's own prediction has made the same error of motion, and so have other
-        delayed fixes: that correlation is ignored (docs/streaming.md says what it costs).
-
-        Args:
-            gnss: (3,) m, or None or NaN: no fix. velocity: (3,) m/s, the mean over the step. dt: s since the last step.
-            fix_age: s, of the fix; it means nothing without one.
-
-        Raises:
-            InputError: another shape, dt <= 0, a number that is not finite, a fix older than the history; the filter is
-                then as it was before.
-        """
-        moved = motion(velocity, dt)
-        process = self.solo.process(np.asarray(velocity, dtype=float), dt)
-        past = self.past.then(Moved(dt, moved, process))
-        fix, late = past.forward(gnss, fix_age)
-        self.past = past
+        """Position (3,) m and covariance (3, 3) m^2, as `FilterStream.step`; None if the filter claims none."""
+        check_step(gnss, velocity, dt, fix_age, self.history)
+        speed = np.asarray(velocity, dtype=float)
+        moved, process = dt * speed, self.solo.process(speed, dt)
+        self.history.push(dt, moved, process)
+        fix, late = self.history.forward(gnss, fix_age)
         if self.state is not None:
             self.state = self.solo.advance(self.state, moved, process, fix, late)
         elif np.isfinite(fix).all():
@@ -135,71 +68,103 @@ class Stream(Generic[State]):
         return self.solo.read(self.state)
 
 
-def three(field: str, value: npt.ArrayLike) -> Floats:
-    """(3,) finite numbers; InputError naming the field if they are not.
+class AxisStates(NamedTuple):
+    """State of a compiled solo filter, (3,) each: position m, its variance share * noise + motion m^2, the variance of
+    a fix m^2, and the fixes behind that."""
 
-    >>> three("velocity", [1, 2])
-    Traceback (most recent call last):
-    ...
-    coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers. Give east, north, up.
+    x: Floats
+    share: Floats
+    motion: Floats
+    noise: Floats
+    weight: Floats
+
+
+class FilterStream:
+    """A compiled solo filter, fed step by step: `step` takes what is new and returns the estimate.
+
+    Args:
+        motion: noise of the motion. fixes: noise of the fixes.
+        x0: (3,) m, a position known before the first step; None starts at the first fix.
+        history: s, how old a delayed fix may be.
     """
-    array = np.asarray(value, dtype=float)
-    if array.shape != (3,) or not np.isfinite(array).all():
-        raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
-    return array
+
+    def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: npt.ArrayLike | None, history: float) -> None:
+        self.history = MotionHistory(history)
+        self._state, self._given, self._noise = np.full((3, 5), np.nan), np.zeros(8), packed(motion, fixes)
+        if x0 is not None:
+            zero = np.zeros(3)
+            weight = np.full(3, fixes.weight)
+            self._state[:] = np.stack([three("x0", x0), zero, zero, fixes.variance, weight], axis=1)
+
+    @property
+    def state(self) -> AxisStates | None:
+        """What the filter carries; None before the first fix."""
+        return None if np.isnan(self._state[0, 0]) else AxisStates(*self._state.T.copy())
+
+    def step(
+        self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
+    ) -> tuple[Floats, Floats | None]:
+        """Position (3,) m and covariance (3, 3) m^2 now; NaN and None before the first fix.
+
+        A fix that was true `fix_age` seconds ago is moved by the dead-reckoned motion since, and its covariance grows
+        by the noise of that motion. The filter's own prediction has made the same error of motion, and so have other
+        delayed fixes: that correlation is ignored (docs/streaming.md says what it costs).
+
+        Args:
+            gnss: (3,) m; None or NaN for no fix.
+            velocity: (3,) m/s, the mean over the step.
+            dt: s since the last step.
+            fix_age: s, of the fix; without a fix it means nothing.
+
+        Raises:
+            InputError: another shape, dt <= 0, a number that is not finite, a fix older than the history; the filter is
+                then as it was before.
+        """
+        given, answer = self._given, np.empty(12)
+        if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+            check_step(gnss, velocity, dt, fix_age, self.history)
+        given[GNSS], given[VELOCITY], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        found = stream_step(given, self._state, self.history.rows, self._noise, answer)
+        while found == HISTORY_FULL:
+            self.history.grow()
+            found = stream_step(given, self._state, self.history.rows, self._noise, answer)
+        if found == NO_FIX_YET:
+            return np.full(3, np.nan), None
+        if found != ESTIMATE:
+            check_step(gnss, velocity, dt, fix_age, self.history)
+        return answer[:3], answer[3:].reshape(3, 3)
 
 
-def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
-    """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
-    if gnss is None or (np.shape(gnss) == (3,) and np.isnan(np.asarray(gnss, dtype=float)).all()):
-        return np.full(3, np.nan)
-    return three(field, gnss)
+def alone(noise_model: NoiseModel | str) -> NoiseModel:
+    """What a filter without a recording assumes: "identity" or a NoiseModel of constant noise, which needs none."""
+    name = noise_model.name if isinstance(noise_model, NoiseModel) else noise_model
+    bound = isinstance(noise_model, NoiseModel) and (
+        type(noise_model) is not NoiseModel or noise_model.velocity is not None
+    )
+    if bound or noise_model == "nominal":
+        raise InputError(
+            "noise_model",
+            repr(name),
+            "needs a recording, and a stream has none",
+            "Pass NoiseModel.nominal(Sensors(...)), a fitted NoiseModel or 'identity'.",
+        )
+    return noise_model if isinstance(noise_model, NoiseModel) else resolve(noise_model, None)  # type: ignore[arg-type]
 
 
-def motion(velocity: npt.ArrayLike, dt: float) -> Floats:
-    """dt u, (3,) m; InputError for a velocity that is not finite or dt <= 0."""
-    if not (np.isfinite(dt) and dt > 0):
-        raise InputError("dt", f"{dt} s", "must be finite and > 0", "Give the seconds since the last step.")
-    return dt * three("velocity", velocity)
+def motion_noise(known: NoiseModel, interval: float) -> MotionNoise:
+    """White motion noise as `known` assumes it of a recording with dt = `interval` s."""
+    check_interval(interval)
+    if known.process_std is not None:
+        return MotionNoise(np.array(known.process_std, dtype=float), np.zeros(3), 0.0, 0.0, float(interval))
+    assert known.sensors is not None
+    ratio, of_speed = np.full(3, known.sensors.velocity_std_ratio), known.sensors.velocity_reading == "speed"
+    return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), float(interval))
 
 
-def seconds(field: str, value: float) -> float:
-    """A time that is finite and >= 0; InputError naming the field if it is not."""
-    if not (np.isfinite(value) and value >= 0):
-        raise InputError(field, f"{value} s", "must be finite and >= 0", "Give seconds.")
-    return value
-
-
-def alone(knowledge: Knowledge | str) -> Knowledge:
-    """What a filter without a recording assumes: "identity" or a Knowledge of constant noise, which needs none."""
-    name = knowledge.name if isinstance(knowledge, Knowledge) else knowledge
-    bound = isinstance(knowledge, Knowledge) and (type(knowledge) is not Knowledge or knowledge.velocity is not None)
-    if bound or knowledge == "nominal":
-        raise InputError("knowledge", repr(name), "needs a recording, and a stream has none",
-                         "Pass Knowledge.nominal(Sensors(...)), a fitted Knowledge or 'identity'.")  # fmt: skip
-    return knowledge if isinstance(knowledge, Knowledge) else resolve(knowledge, None)  # type: ignore[arg-type]
-
-
-def white(step: Callable[[Floats], Floats], interval: float) -> Variance:
-    """Variance of motion as white noise: of a step of `interval` s at a velocity, `step(u)`, times dt / interval.
-
-    So a step of 0.2 s is as uncertain as two of 0.1 s, and one of `interval` as in a recording of that dt.
-    """
+def check_interval(interval: float) -> None:
+    """InputError unless an interval is finite and > 0."""
     if not (np.isfinite(interval) and interval > 0):
         raise InputError("interval", f"{interval} s", "must be finite and > 0", "The dt that the noise belongs to.")
-    return lambda velocity, dt: dt / interval * step(velocity)
-
-
-def assumed_motion(known: Knowledge, interval: float) -> Variance:
-    """White motion noise as `known` assumes it of a recording with dt = `interval` s."""
-
-    def step(velocity: Floats) -> Floats:
-        if known.process_std is not None:
-            return np.square(known.process_std)
-        assert known.sensors is not None
-        return np.asarray((interval * known.sensors.assumed_velocity_std(velocity)) ** 2)
-
-    return white(step, interval)
 
 
 def scan(solo: Solo[State], recording: Recording, columns: Sequence[int], x0: Floats | None) -> Iterator[State]:
@@ -225,5 +190,13 @@ def solo_track(
     x = np.stack([position for position, _ in found], axis=1)
     claims = [covariance for _, covariance in found if covariance is not None]
     free = np.zeros((recording.runs, len(columns)))
-    return Track(recording.t, tuple(columns), x, np.stack(claims, axis=1) if claims else None, free, free,
-                 time.perf_counter() - began, notes=notes)  # fmt: skip
+    return Track(
+        recording.t,
+        tuple(columns),
+        x,
+        np.stack(claims, axis=1) if claims else None,
+        free,
+        free,
+        time.perf_counter() - began,
+        notes=notes,
+    )

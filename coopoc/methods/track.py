@@ -46,9 +46,11 @@ class Track:
         if not np.isfinite(self.x).all():
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
             raise InputError(
-                "x", f"not finite in run {run} at step {step} of ego {self.egos[ego]}", "an estimate must be finite",
+                "x",
+                f"not finite in run {run} at step {step} of ego {self.egos[ego]}",
+                "an estimate must be finite",
                 "The method diverged: lower its gain, or check the assumed standard deviations.",
-            )  # fmt: skip
+            )
 
 
 @runtime_checkable

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
 from ..errors import InputError
-from .adaptive import LEAST, Belief, NoiseAdaptive
+from ..kernels.solo import FixNoise
+from .adaptive import NoiseAdaptive
+from .noise_model import NoiseModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +45,8 @@ class VariationalKalman(NoiseAdaptive):
         if self.iterations != int(self.iterations) or self.iterations < 1:
             raise InputError("iterations", self.iterations, "must be a whole number >= 1", "Two or three are enough.")
 
-    def revise(self, prior: Belief, surprise: Floats, late: Floats) -> tuple[Floats, Floats]:
-        """beta / alpha and 2 alpha of the fixed point."""
-        weight, noise = self.rho * prior.weight + 1, prior.noise
-        spread = prior.share * prior.noise + prior.motion
-        for _ in range(self.iterations):
-            rest = 1 - spread / (spread + noise + late)
-            sample = (rest * surprise) ** 2 + rest * spread
-            noise = np.maximum(prior.noise + (sample - prior.noise) / weight, LEAST)
-        return noise, weight
+    @property
+    def fixes(self) -> FixNoise:
+        """Inverse-gamma belief: beta / alpha and 2 alpha of the fixed point."""
+        variance = NoiseModel.nominal(self.assumed).gnss_variance
+        return FixNoise(variance, float(self.prior_weight), np.inf, float(self.rho), int(self.iterations))

@@ -1,135 +1,130 @@
-"""What the whole-fleet methods share: each vehicle's own filter between exchanges, late answers, bytes, the Track."""
+"""What the whole-fleet methods share: arrays by name for the kernels, answers that come late, bytes, the Track."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, Ints
 from ..world.exchange import Exchange
 from ..world.recording import Recording
-from .kalman import solo_filter
-from .knowledge import Knowledge
-from .network import Network, network
-from .star import sighting_noise
+from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
-Solve = Callable[[Exchange], tuple[Floats, Floats | None]]
-"""Contacts -> positions (R, T, N, 3) m of all vehicles and covariances (R, T, N, 3, 3) m^2 or None."""
-Cooperate = Callable[[Network], tuple[Floats, Floats]]
-"""A step's network -> positions (R, n, 3) m and covariances (R, n, 3, 3) m^2 after the exchange."""
+if TYPE_CHECKING:
+    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+
+
+class Answer(NamedTuple):
+    """What the fleet finds out at each step.
+
+    Args:
+        x: (R, T, N, 3) m of all vehicles, of any shape.
+        covariance: (R, T, N, 3, 3) m^2, of any shape, or None.
+        rounds: of messages a step, None if an answer needs all vehicles that pairs connect, 0 if it is never late.
+        notes: of the Track.
+    """
+
+    x: Floats
+    covariance: Floats | None
+    rounds: int | None
+    notes: tuple[str, ...] = ()
+
+
+Solve = Callable[["Measured", "Pairs", "Assumed"], Answer]
 
 
 def fleet_track(
-    method: Method, recording: Recording, egos: Sequence[int | str], contacts: Callable[[], Exchange], solve: Solve,
-    notes: tuple[str, ...] = (),
-) -> Track:  # fmt: skip
-    """Track of the egos, their bytes counted.
+    method: Method,
+    noise_model: NoiseModel | str,
+    recording: Recording,
+    egos: Sequence[int | str],
+    contacts: Callable[[], Exchange],
+    solve: Solve,
+    *,
+    both_ways: bool = True,
+) -> Track:
+    """Track of the egos from what the whole fleet finds out.
+
+    Args:
+        method: whose Track it is.
+        noise_model: as the method was given it.
+        recording: observed by all vehicles.
+        egos: columns or ids.
+        contacts: makes the pairs in contact.
+        solve: the method's kernel.
+        both_ways: whether a pair takes part only if the messages of both ways arrive, or if either does.
 
     Raises:
-        InputError: an ego that is unknown or absent at times; a recording that not all vehicles observed.
+        InputError: an ego that is unknown, absent at times or without a fix at first; a recording that not all vehicles
+            observed.
     """
+    from ..kernels.answers import bring_forward, dead_reckon, newest
+
     began = time.perf_counter()
-    columns = recording.columns(egos)
-    recording.require_complete()
-    met = contacts()
-    x, cov = solve(met)
-    return Track(
-        recording.t, tuple(columns), x[:, :, columns], None if cov is None else cov[:, :, columns],
-        met.received_bytes[:, columns], met.sent_bytes[:, columns], time.perf_counter() - began, notes=notes,
-    )  # fmt: skip
+    columns = recording.columns(egos, missing=True)
+    met, known = contacts(), resolve(noise_model, recording)
+    arrival = met.both if both_ways else met.either
+    measured, pairs, assumed = kernel_arguments(recording, met, known, arrival)
+    found = solve(measured, pairs, assumed)
+    shape = (recording.runs, len(recording.t), len(columns))
+    x = found.x.reshape(recording.gnss.shape).take(columns, axis=2)
+    cov = None if found.covariance is None else found.covariance.reshape(*recording.gnss.shape[:3], 9).take(columns, 2)
+    if found.rounds != 0 and (arrival > met.step).any():
+        rounds = len(recording.ids) if found.rounds is None else found.rounds
+        ready = np.where(pairs.alive, arrival, -1)
+        held = newest(pairs.first, pairs.second, pairs.start, ready, len(recording.ids), rounds).take(columns, axis=2)
+        own = measured._replace(gnss=measured.gnss.take(columns, 2), velocity=measured.velocity.take(columns, 2))
+        if cov is None:
+            x = dead_reckon(held, x, own)
+        else:
+            process, fix = (_columns(values, columns) for values in (assumed.process, assumed.fix))
+            x, cov = (values.reshape(*shape[:2], -1) for values in (x, cov))
+            x, cov = bring_forward(held, x, cov, own, assumed._replace(process=process, fix=fix))
+    x, cov = x.reshape(*shape, 3), None if cov is None else cov.reshape(*shape, 3, 3)
+    received, sent, seconds = met.received_bytes[:, columns], met.sent_bytes[:, columns], time.perf_counter() - began
+    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, notes=found.notes)
 
 
-def follow_fleet(
-    method: Method, recording: Recording, contacts: Exchange, known: Knowledge, cooperate: Cooperate,
-    carry_own: bool = True,
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """Positions (R, T, N, 3) and covariances (R, T, N, 3, 3) of vehicles that each keep a belief of themselves only.
+def kernel_arguments(
+    recording: Recording, met: Exchange, known: NoiseModel, arrival: Ints
+) -> tuple[Measured, Pairs, Assumed]:
+    """Arguments of the kernels by name; a pair takes part if its messages arrive and both vehicles are active."""
+    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.relative import components
 
-    Each predicts with its velocity and takes its own fix; then those in contact cooperate. The mean that comes out goes
-    on to the next step, with the covariance that the vehicle's own filter has without any neighbour: what neighbours
-    say step after step is correlated, and a vehicle that keeps no cross-covariances may not count it again as new.
+    active = located(recording)
+    both = active[:, met.step, met.first] & active[:, met.step, met.second]
+    alive = np.ascontiguousarray(both & (arrival >= 0))
+    columns = (met.first, met.second, met.link, met.link_back, met.start)
+    first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
+    pairs = Pairs(first, second, link, link_back, start, alive)
+    relative = components(recording.relative, np.arange(len(recording.links)))
+    variances = known.process_variance(recording), known.fix_variance(recording)
+    process, fix = (np.ascontiguousarray(each, dtype=float) for each in variances)
+    sensors = known.sensors
+    std, min_range = (sensors.relative_std, sensors.min_range) if sensors else (np.zeros(0), 0.0)
+    assumed = Assumed(process, fix, std, min_range)
+    return Measured(recording.gnss, recording.velocity, relative, active, recording.dt), pairs, assumed
 
-    Args:
-        cooperate: its covariances are claimed for the step. carry_own: False carries them on, too, as if independent.
+
+def located(recording: Recording) -> Bools:
+    """(R, T, N) True from a vehicle's first fix on, for as long as it is present.
+
+    A vehicle that has no fix yet has no position to linearise at: until then it takes no part.
     """
-    shape = (recording.runs, len(recording.t), len(recording.ids), 3)
-    x, cov = np.full(shape, np.nan), np.full((*shape, 3), np.nan)
-    process = np.broadcast_to(known.process_variance(recording), shape)
-    carried = cov[:, 0].copy()
-    for t in tqdm(range(shape[1]), desc=method.name, unit="step", delay=2.0):
-        if t:
-            x[:, t], carried = own_step(x[:, t - 1], carried, recording, t, process[:, t], known)
-        joins = np.isnan(x[0, t, :, 0])
-        x[:, t, joins], carried[:, joins] = recording.gnss[:, t, joins], np.diag(known.gnss_variance)
-        graph = network(recording, contacts, t, x[:, t], carried, known)
-        cov[:, t] = carried
-        if len(graph.first):
-            x[:, t, graph.here], cov[:, t, graph.here] = cooperate(graph)
-        carried = carried if carry_own else cov[:, t].copy()
-    return x, cov
+    present = np.isfinite(recording.velocity[0, :, :, 0])
+    if recording.complete:
+        return np.tile(present, (recording.runs, 1, 1))
+    step = np.arange(len(present))[:, None]
+    before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
+    joined = np.maximum.accumulate(np.where(present & ~before, step, -1))
+    fix = np.maximum.accumulate(np.where(np.isfinite(recording.gnss).all(axis=-1), step, -1), axis=1)
+    return np.asarray(present & (fix >= joined))
 
 
-def follow_compiled(
-    recording: Recording, contacts: Exchange, known: Knowledge, rounds: int, damping: float = 0.0, rho: float = 0.0
-) -> tuple[Floats, Floats]:
-    """What `follow_fleet` finds of belief propagation, or with rho > 0 of ADMM, from compiled code."""
-    from ..kernels.gossip import follow
-
-    through = contacts.to_first & contacts.to_second
-    x, cov = follow(*contact_arrays(recording, contacts, known, through), int(rounds), float(damping), float(rho))
-    return x, cov
-
-
-def contact_arrays(recording: Recording, contacts: Exchange, known: Knowledge, alive: Bools) -> tuple[Any, Any, Any]:
-    """The tuples `measured`, `contacts` and `assumed` of `coopoc.kernels.gossip`; `alive` (R, P) are pairs to count."""
-    from ..kernels.sighting import unfolded
-
-    numbers = (contacts.first, contacts.second, contacts.sight, contacts.sight_back, contacts.start)
-    pairs = (*(np.ascontiguousarray(n, dtype=np.int64) for n in numbers), alive)
-    seen = unfolded(recording.relative, np.arange(len(recording.links)))
-    variance = np.ascontiguousarray(known.process_variance(recording))
-    assumed = (variance, known.gnss_variance, *sighting_noise(known))
-    return (recording.gnss, recording.velocity, seen, recording.dt), pairs, assumed
-
-
-def own_step(
-    x: Floats, cov: Floats, recording: Recording, t: int | slice, process: Floats, known: Knowledge
-) -> tuple[Floats, Floats]:
-    """One Kalman step of each vehicle alone: x += dt u, P += q; K = P (P + R)^-1; x += K (z - x), Joseph's P.
-
-    Args:
-        x: (R, ..., N, 3) m. cov: (R, ..., N, 3, 3) m^2. t: step, or the steps of a leading time axis.
-        process: (R, ..., N, 3) m^2.
-    """
-    x = x + recording.dt * recording.velocity[:, t]
-    cov = cov + process[..., None] * np.eye(3)
-    gain = cov @ np.linalg.inv(cov + np.diag(known.gnss_variance))
-    keep = np.eye(3) - gain
-    cov = keep @ cov @ np.swapaxes(keep, -1, -2) + (gain * known.gnss_variance) @ np.swapaxes(gain, -1, -2)
-    return x + (gain @ (recording.gnss[:, t] - x)[..., None])[..., 0], cov
-
-
-def brought_forward(
-    x: Floats, cov: Floats, recording: Recording, known: Knowledge, delay: int
-) -> tuple[Floats, Floats]:
-    """What each vehicle believes now if the fleet's answer of each step comes `delay` steps late.
-
-    The answer of step t - delay takes the vehicle's own steps since then: what it measured itself is never late. Before
-    the first answer, and where a vehicle was absent at the time of the answer, it goes on alone.
-    """
-    if not delay:
-        return x, cov
-    steps = x.shape[1]
-    process = np.broadcast_to(known.process_variance(recording), x.shape)
-    now, variance = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
-    now_cov = variance[..., None] * np.eye(3)
-    for k in range(1, min(delay, steps) + 1):
-        x, cov = own_step(x[:, : steps - k], cov[:, : steps - k], recording, slice(k, steps), process[:, k:], known)
-    met = np.isfinite(x).all(axis=-1)
-    now[:, delay:][met], now_cov[:, delay:][met] = x[met], cov[met]
-    return now, now_cov
+def _columns(values: Floats, columns: Sequence[int]) -> Floats:
+    return values.take(columns, axis=2) if values.shape[2] > 1 else values

@@ -1,170 +1,87 @@
-"""The window of stars: the last steps of one ego's star as a Gaussian chain, eliminated from its oldest step on."""
+"""Windows of a star as problems, one run each: for backends that solve them in place of the compiled kernels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from .knowledge import Knowledge
-from .slice import Arrival, Slice, apply, entering, exactly, system
-from .star import StarStep, rows
+from ..optimize.window import WindowStep
+from ..world.inbox import Inbox
+from ..world.recording import Recording
+from .noise_model import NoiseModel
+
+Span = tuple[int, int]
+"""First and last step of a window."""
 
 
 @dataclass(frozen=True, eq=False)
-class Eliminated:
-    """A step given the next one: d = inverse (pull + D (d_next - gap)), D the stiffness of the motion of who stays.
+class Positions:
+    """The positions that vehicles may use and send (R, T, N, 3) m, their variance m^2, and (R, T, N) where one is new.
 
-    Args:
-        inverse: (R, 3n, 3n) m^2. pull: (R, 3n) 1/m. old, new: (3s,) rows of who stays, here and in the next step.
-        stiffness: (R or 1, 3s) 1/m^2. gap: (R, 3s) m, motion that the points leave unexplained.
+    A fix that is missing is replaced by the last one, moved by the vehicle's own odometry since.
     """
 
-    inverse: Floats
-    pull: Floats
-    old: Ints
-    new: Ints
-    stiffness: Floats
-    gap: Floats
+    x: Floats
+    variance: Floats
+    new: Bools
 
 
-@dataclass(frozen=True, eq=False)
-class Window:
-    """Slices oldest first, the arrival cost of the first, and covariances (R, 3n, 3n) m^2: all, or the last one's."""
-
-    arrival: Arrival
-    slices: tuple[Slice, ...]
-    spreads: tuple[Floats, ...]
-
-
-def advance(window: Window | None, stars: Sequence[StarStep], length: int, known: Knowledge) -> Window:
-    """The window with a new slice, yet to be solved; of more than `length` slices the oldest becomes arrival cost.
-
-    Args:
-        window: the solved one of the step before. stars: of its slices, as known now, and of the new step.
-    """
-    *old, new = stars
-    slices = [replace(s, star=star) for s, star in zip(window.slices, old, strict=True)] if window else []
-    slices.append(entering(slices[-1].point if slices else new.fix[:, :0], new, known))
-    arrival = window.arrival if window else _nothing(slices[0].start)
-    if len(slices) > length:
-        arrival = eliminate(slices[0], slices[1], arrival)[1]
-    return Window(arrival, tuple(slices[-length:]), ())
+def dead_reckoned(recording: Recording, known: NoiseModel) -> Positions:
+    """All fixes, and where one is missing the last one moved by odometry, its variance grown by the process noise."""
+    new: Bools = np.asarray(np.isfinite(recording.gnss).all(axis=-1))
+    variance = np.ascontiguousarray(known.fix_variance(recording))
+    if recording.complete:
+        return Positions(recording.gnss, variance, new)
+    x, process = recording.gnss.copy(), known.process_variance(recording)
+    variance = np.broadcast_to(variance, x.shape).copy()
+    process = np.broadcast_to(process, x.shape)
+    for t in range(1, len(recording.t)):
+        run, vehicle = np.nonzero(~new[:, t])
+        x[run, t, vehicle] = x[run, t - 1, vehicle] + recording.dt * recording.velocity[run, t, vehicle]
+        variance[run, t, vehicle] = variance[run, t - 1, vehicle] + process[run, t, vehicle]
+    x.flags.writeable = False  # as the fixes are, for the same compiled code
+    return Positions(x, variance, new)
 
 
-def sweep(window: Window, known: Knowledge, exact: bool, entered: bool = True, smooth: bool = False) -> Window:
-    """One Gauss-Newton step: eliminate up to the newest slice, solve that, substitute back.
-
-    On a chain this is a Kalman filter and a smoother's sweep back (Bell, SIAM J. Optimization 4, 1994).
-
-    Args:
-        exact: sightings in range and angles, linear around the points; False leaves them converted, as they came.
-        entered: the newest slice has just come: it is solved converted, and made exact where that leads.
-        smooth: covariances of all slices.
-    """
-    slices, newest = list(window.slices), window.slices[-1]
-    if exact:
-        slices = [part if entered and part is newest else exactly(part, part.point, known) for part in slices]
-    stages, prior = [], window.arrival
-    for here, later in pairwise(slices):
-        stage, prior = eliminate(here, later, prior)
-        stages.append(stage)
-    move, spread = _solve(slices[-1], prior)
-    if exact and entered:
-        slices[-1] = exactly(newest, newest.point + move, known)
-        move, spread = _solve(slices[-1], prior)
-    slices[-1] = replace(slices[-1], point=slices[-1].point + move)
-    ahead: Floats = (slices[-1].point - newest.point).reshape(len(move), -1)
-    spreads = [spread]
-    for k in range(len(stages) - 1, -1, -1):
-        ahead = _back(stages[k], ahead)
-        slices[k] = replace(slices[k], point=slices[k].point + ahead.reshape(slices[k].point.shape))
-        if smooth:
-            spreads.append(_spread_back(stages[k], spreads[-1]))
-    return Window(window.arrival, tuple(slices), tuple(reversed(spreads)))
+def last_met(neighbour: Ints, start: Ints) -> Ints:
+    """(M,) step at which the neighbour of each link was linked before, -1 for never."""
+    step = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    order = np.lexsort((step, neighbour))
+    met = np.full(len(neighbour), -1, np.int64)
+    again = np.flatnonzero(np.diff(neighbour[order]) == 0)
+    met[order[again + 1]] = step[order[again]]
+    return met
 
 
-def settle(window: Window, known: Knowledge, most: int) -> tuple[Window, int]:
-    """The window at its minimum, by at most `most` sweeps after the first, and in how many runs it still moves then.
-
-    A run whose sightings are linear where it stands is left alone, so that no run depends on another.
-    """
-    window = sweep(window, known, exact=True)
-    for _ in range(most):
-        moving = _moving(window)
-        if not moving.any():
-            break
-        window = _where(moving, sweep(window, known, exact=True, entered=False), window)
-    return window, int(_moving(window).sum())
-
-
-def eliminate(here: Slice, ahead: Slice, prior: Arrival) -> tuple[Eliminated, Arrival]:
-    """A slice given the next one, and what it leaves as the arrival cost of that: D S^-1 J, S = J + D.
-
-    D - D S^-1 D is the same, but a difference of near numbers where the motion is known well.
-    """
-    alone, pull = system(here, prior)
-    total = alone.copy()
-    star = ahead.star
-    stays = np.flatnonzero(star.kept >= 0)
-    old, new = rows(star.kept[stays]), rows(stays)
-    stiffness = (1.0 / star.process[:, stays]).reshape(len(star.process), -1)
-    moved = ahead.point[:, stays] - here.point[:, star.kept[stays]]
-    gap = (star.moved[:, stays] - moved).reshape(len(pull), -1)
-    total[:, old, old] += stiffness
-    inverse = np.linalg.inv(total)
-    left = stiffness[:, :, None] * (inverse[:, old] @ alone[:, :, old])
-    size = ahead.point[0].size
-    information, carried = np.zeros((len(pull), size, size)), np.zeros((len(pull), size))
-    information[:, new[:, None], new] = left
-    carried[:, new] = apply(left, gap) + stiffness * apply(inverse[:, old], pull)
-    return Eliminated(inverse, pull, old, new, stiffness, gap), Arrival(ahead.point, information, carried)
+def steps_of(window: Any, recording: Recording, box: Inbox, run: int, span: Span) -> list[WindowStep]:
+    """The steps of a compiled window in one run, oldest first."""
+    lane, steps = run % window.motion.shape[1], []
+    motion, used = window.motion[:, lane].reshape(-1, 4, 3), window.used[:, lane].reshape(-1, 3)
+    for step in range(span[0], span[1] + 1):
+        here = places(window, step)
+        moved, process, fix, _ = np.moveaxis(motion[here], 1, 0)
+        with np.errstate(divide="ignore"):
+            std = 1.0 / np.sqrt(used[here])
+        relative = recording.relative[run, box.link[box.start[step] : box.start[step + 1]]]
+        steps.append(WindowStep(window.previous[here].copy(), fix, std, moved, np.sqrt(process), relative))
+    return steps
 
 
-def _solve(part: Slice, prior: Arrival) -> tuple[Floats, Floats]:
-    """Move (R, n, 3) m and covariance (R, 3n, 3n) m^2 of the newest slice."""
-    total, pull = system(part, prior)
-    spread = np.linalg.inv(total)
-    return apply(spread, pull).reshape(part.point.shape), spread
+def places(window: Any, step: int) -> slice:
+    """Of the members of a step in the arrays of a compiled window."""
+    slot = step % len(window.sizes)
+    return slice(slot * window.stride, slot * window.stride + int(window.sizes[slot]))
 
 
-def _back(stage: Eliminated, ahead: Floats) -> Floats:
-    pull = stage.pull.copy()
-    pull[:, stage.old] += stage.stiffness * (ahead[:, stage.new] - stage.gap)
-    return apply(stage.inverse, pull)
+def vehicles_of(window: Any, span: Span) -> Ints:
+    """(n,) column of the vehicle of each point of a compiled window."""
+    return np.concatenate([window.member[places(window, step)] for step in range(span[0], span[1] + 1)])
 
 
-def _spread_back(stage: Eliminated, ahead: Floats) -> Floats:
-    """S^-1 + S^-1 D Sigma_next D S^-1."""
-    gain = stage.inverse[:, :, stage.old] * stage.stiffness[:, None]
-    grown: Floats = stage.inverse + gain @ ahead[:, stage.new[:, None], stage.new] @ np.swapaxes(gain, -1, -2)
-    return grown
-
-
-def _nothing(at: Floats) -> Arrival:
-    size = at[0].size
-    return Arrival(at, np.zeros((len(at), size, size)), np.zeros((len(at), size)))
-
-
-def _moving(window: Window) -> Bools:
-    return np.asarray(np.any([part.strayed for part in window.slices], axis=0))
-
-
-def _where(runs: Bools, new: Window, old: Window) -> Window:
-    """`new` in some runs (R,) and `old` in the others."""
-
-    def mixed(a: Floats, b: Floats) -> Floats:
-        return np.where(runs.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
-
-    slices = [
-        replace(
-            a, point=mixed(a.point, b.point), base=mixed(a.base, b.base), weight=mixed(a.weight, b.weight),
-            seen=mixed(a.seen, b.seen),
-        )
-        for a, b in zip(new.slices, old.slices, strict=True)
-    ]  # fmt: skip
-    spreads = [mixed(a, b) for a, b in zip(new.spreads, old.spreads, strict=True)]
-    return Window(new.arrival, tuple(slices), tuple(spreads))
+def points_of(window: Any, run: int, span: Span) -> Floats:
+    """(n, 3) m, the estimate at all steps of a window."""
+    point = window.point[:, run % window.point.shape[1]].reshape(-1, 3)
+    return np.concatenate([point[places(window, step)] for step in range(span[0], span[1] + 1)])

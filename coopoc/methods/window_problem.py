@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -14,12 +14,12 @@ from ..optimize.constraint import Constraint
 from ..optimize.factor import Factor
 from ..optimize.measurements import measurement
 from ..optimize.problem import Problem
-from ..optimize.sights import Sight, chain
 from ..optimize.solution import Solution, Status
 from ..optimize.solve import solve
-from .knowledge import Knowledge
-from .slice import Arrival, Slice
-from .star import FORGOTTEN, StarStep
+from ..optimize.window import WindowStep
+from .noise_model import NoiseModel
+from .star import FORGOTTEN
+from .window import Span, places
 
 Surface = Callable[[Any, Any, Any], Any]
 """Height m of the road, from x and y in m and a namespace with sqrt, atan2 and where: lambda x, y, m: 0.02 * x."""
@@ -33,24 +33,62 @@ LEAST = 1e-3
 """1/m^2, least information of a fix of `around`; it decides how fast its iterations converge, not where to."""
 
 
-def window_problem(slices: Sequence[Slice], known: Knowledge, exact: bool) -> Problem:
-    """The slices in R realisations, without their arrival cost: a point per member and step, the ego's being the hub.
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """The cost 1/2 d^T information d - eta^T d of the past, d = x - at.
 
     Args:
-        exact: sightings in range and angles; False: the vectors and weights of the slices.
+        at: (n, 3) m. information: (3n, 3n) 1/m^2. eta: (3n,) 1/m.
     """
-    problem = chain([_sight(part.star) for part in slices], known.sensors if exact else None)
-    factors, tops = list(problem.factors), np.cumsum([0, *(len(part.star.kept) for part in slices)])
-    if not exact and any(len(part.star.links) for part in slices):
-        root = np.swapaxes(np.linalg.cholesky(np.concatenate([part.weight for part in slices], axis=1)), -1, -2)
-        vector = np.concatenate([part.star.vector for part in slices], axis=1)
-        factors[-1] = Factor("displacement", factors[-1].nodes, vector, sqrt_information=root)
-    joins = [np.flatnonzero(part.star.kept < 0) for part in slices]
+
+    at: Floats
+    information: Floats
+    eta: Floats
+
+
+def arrival_of(horizon: Any, run: int, step: int) -> Arrival:
+    """What the steps before the first one of a compiled horizon say of it, in one run."""
+    window, past = horizon.window, horizon.past
+    lane, here = run % window.motion.shape[1], places(window, step)
+    n = here.stop - here.start
+    order = np.append(n - 1, np.arange(n - 1))  # the ego's block is the last
+    blocks = past.information[:, lane].reshape(-1, 3, 3)[: window.stride**2]
+    blocks = blocks.reshape(window.stride, window.stride, 3, 3)[:n, :n]
+    upper = np.triu(np.moveaxis(blocks, 2, 1).reshape(3 * n, 3 * n))
+    full = (upper + np.triu(upper, 1).T).reshape(n, 3, n, 3)[order][:, :, order].reshape(3 * n, 3 * n)
+    eta = past.eta[:, lane].reshape(-1, 3)[:n][order]
+    return Arrival(past.at[:, lane].reshape(-1, 3)[here].copy(), full, eta.ravel())
+
+
+def window_problem(
+    horizon: Any, steps: Sequence[WindowStep], known: NoiseModel, exact: bool, run: int, span: Span
+) -> Problem:
+    """The steps of a compiled horizon in one run, without their arrival cost: a point per member and step.
+
+    Args:
+        exact: measurements in range and angles; False: the vectors and weights of the kernels.
+    """
+    window, past = horizon.window, horizon.past
+    lane, problem = run % window.motion.shape[1], Problem.from_steps(steps, known.sensors)
+    factors, here = list(problem.factors), [places(window, step) for step in range(span[0], span[1] + 1)]
+    if not exact and any(len(s.relative) for s in steps):
+        factors[-1] = _vectors(window, lane, here, factors[-1])
+    start = past.at[:, lane].reshape(-1, 3)
+    tops = np.cumsum([0, *(part.stop - part.start for part in here)])
+    joins = [np.flatnonzero((window.previous[part] < 0) & (k > 0)) for k, part in enumerate(here)]
     nodes = np.concatenate([top + who for top, who in zip(tops, joins, strict=False)])
     if len(nodes):
-        start = np.concatenate([part.start[:, who] for part, who in zip(slices, joins, strict=True)], axis=1)
-        factors.append(Factor("position", nodes[:, None], start, np.array(np.sqrt(FORGOTTEN))))
+        at = np.concatenate([start[part][who] for part, who in zip(here, joins, strict=True)])
+        factors.append(Factor("position", nodes[:, None], at, np.array(np.sqrt(FORGOTTEN))))
     return replace(problem, factors=tuple(factors))
+
+
+def _vectors(window: Any, lane: int, here: Sequence[slice], edges: Factor) -> Factor:
+    """The edges of a compiled window as measured vectors."""
+    weight = np.concatenate([window.edge[:, lane].reshape(-1, 3, 3)[part][1:] for part in here])
+    eta = np.concatenate([window.eta[:, lane].reshape(-1, 3)[part][1:] for part in here])
+    root = np.swapaxes(np.linalg.cholesky(weight), -1, -2)
+    return Factor("displacement", edges.nodes, np.linalg.solve(weight, eta[..., None])[..., 0], sqrt_information=root)
 
 
 def limited(problem: Problem, dt: float, road: Road | None, top_speed: float | None) -> Problem:
@@ -61,7 +99,7 @@ def limited(problem: Problem, dt: float, road: Road | None, top_speed: float | N
     elif road is not None:
         low, high = heights(road)
         limits.append(Constraint("position", everywhere, _height(low, -np.inf), _height(high, np.inf)))
-    if top_speed is not None and len(problem.hub) > 1:
+    if top_speed is not None and len(problem.separator) > 1:
         motion = problem.factors[1].nodes
         most = np.array([top_speed**2])
         limits.append(Constraint(_square_of_speed(), motion, np.array([-np.inf]), most, np.array([dt])))
@@ -91,55 +129,44 @@ def violated(problem: Problem, x: Floats, tolerance: float = 1e-6) -> Bools:
     return found
 
 
-def around(problem: Problem, prior: Arrival, run: int, x: Floats) -> Problem:
-    """The single problem of a run with its arrival cost expanded around x (n, 3), from where it is to be solved.
+def around(problem: Problem, prior: Arrival, x: Floats) -> Problem:
+    """The problem with its arrival cost expanded around x (n, 3), from where it is to be solved.
 
-    The cost couples all members of the first slice. Fixes and displacements can say that, but for the part of its
+    The cost couples all members of the first step. Fixes and displacements can express that, but for the part of its
     blocks Lambda_ij which is not symmetric or not negative: at most 1.6 % of them on `town10` (K <= 6). Its gradient at
     x is exact, so that a solution that stays at x is that of the window itself; an iteration then multiplies the
     distance to it by less than 0.15.
     """
-    single = replace(problem.pick(run), x0=x)
-    n = prior.at.shape[1]
-    informed = np.flatnonzero(prior.information[run].reshape(n, 3, 3 * n).any(axis=(1, 2)))
-    if not len(informed):
-        return single
-    pull = prior.pull[run] - prior.information[run] @ (x[:n] - prior.at[run]).ravel()
-    blocks = np.moveaxis(prior.information[run].reshape(n, 3, n, 3), 2, 1)[np.ix_(informed, informed)]
-    i, j = np.triu_indices(len(informed), 1)
+    n = len(prior.at)
+    eta = prior.eta - prior.information @ (x[:n] - prior.at).ravel()
+    blocks = np.moveaxis(prior.information.reshape(n, 3, n, 3), 2, 1)
+    i, j = np.triu_indices(n, 1)
     tie = _root(-0.5 * (blocks[i, j] + np.swapaxes(blocks[i, j], -1, -2)), 0.0)
     own = np.einsum("iijk->ijk", blocks).copy()
     for end in (i, j):
         np.subtract.at(own, end, tie @ tie)
     fix = _root(own, LEAST)
-    at = x[informed] + np.linalg.solve(fix @ fix, pull.reshape(n, 3, 1)[informed])[..., 0]
-    arrival = [Factor("position", informed[:, None], at, sqrt_information=fix)]
+    at = x[:n] + np.linalg.solve(fix @ fix, eta.reshape(n, 3, 1))[..., 0]
+    arrival = [Factor("position", np.arange(n)[:, None], at, sqrt_information=fix)]
     if len(i):
-        first, second = informed[i], informed[j]
-        arrival.append(Factor("displacement", np.stack([first, second], axis=1), x[second] - x[first],
-                              sqrt_information=tie))  # fmt: skip
-    return replace(single, factors=(*single.factors, *arrival))
+        pairs = np.stack([i, j], axis=1)
+        arrival.append(Factor("displacement", pairs, x[j] - x[i], sqrt_information=tie))
+    return replace(problem, x0=x, factors=(*problem.factors, *arrival))
 
 
-def solution_of(problem: Problem, prior: Arrival, run: int, x: Floats, backend: str) -> Solution | None:
-    """The window of a run solved by a backend from points x (n, 3), expanded around its solution until that stays.
+def solution_of(problem: Problem, prior: Arrival, x: Floats, backend: str) -> Solution | None:
+    """The window solved by a backend from points x (n, 3), expanded around its solution until that stays.
 
     None where the backend finds none, or the solution does not stay.
     """
     for _ in range(ROUNDS):
-        solution = solve(around(problem, prior, run, x), backend, throw=False)
+        solution = solve(around(problem, prior, x), backend, throw=False)
         if solution.status is not Status.SOLVED:
             return None
         if np.abs(solution.x - x).max() <= SETTLED:
             return solution
         x = solution.x
     return None
-
-
-def _sight(star: StarStep) -> Sight:
-    std = np.where(star.heard[..., None], np.sqrt(star.fix_variance), np.inf)
-    moved_std = np.broadcast_to(np.sqrt(star.process), star.moved.shape)
-    return Sight(star.kept, star.fix, std, star.moved, moved_std, star.relative)
 
 
 def _height(z: float, open_side: float) -> Floats:

@@ -1,19 +1,42 @@
 """The optimisation problem and its solvers: nodes, factors between them, and backends by name."""
 
+from . import backends as _package  # noqa: F401  (first: the function `backends` takes its name)
 from . import kinds as _kinds  # noqa: F401  (registers the kinds that we know)
+from .backend import Backend, Capabilities, SolverResult, backends
 from .batch import Batch, solve_batch
 from .constraint import Constraint
 from .factor import Factor
-from .gnc import Graduated, graduate, graduate_batch
+from .gnc import GNCBatch, solve_gnc, solve_gnc_batch
+from .local_problem import LocalProblem
 from .losses import Loss
 from .measurements import MEASUREMENTS, Measurement, measurement
 from .problem import Problem
 from .solution import Solution, SolveError, Status
-from .solve import Backend, backends, solve
+from .solve import solve
 from .space import Space, pose
 
 __all__ = [
-    "MEASUREMENTS", "Backend", "Batch", "Constraint", "Factor", "Graduated", "Loss", "Measurement", "Problem",
-    "Solution", "SolveError", "Space", "Status", "backends", "graduate", "graduate_batch", "measurement", "pose",
-    "solve", "solve_batch",
-]  # fmt: skip
+    "MEASUREMENTS",
+    "Backend",
+    "Batch",
+    "Capabilities",
+    "Constraint",
+    "Factor",
+    "GNCBatch",
+    "LocalProblem",
+    "Loss",
+    "Measurement",
+    "Problem",
+    "Solution",
+    "SolveError",
+    "SolverResult",
+    "Space",
+    "Status",
+    "backends",
+    "measurement",
+    "pose",
+    "solve",
+    "solve_batch",
+    "solve_gnc",
+    "solve_gnc_batch",
+]

@@ -1,4 +1,4 @@
-"""Which constraints hold a point, how hard, which ways remain, and by how much any is violated."""
+"""Active constraints at a point: their multipliers, the directions that remain, and the largest violation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ class Rows:
     """All numbers of a problem that are bounded, at x.
 
     Args:
-        value, lower, upper: (rows,). matrix: (rows, n dof) sparse derivative of the values by the steps.
+        value: (rows,).
+        lower: as `value`.
+        upper: as `value`.
+        matrix: (rows, n dof) sparse derivative of the values by the steps.
         place: (rows, 3) constraint, row of its nodes and component.
     """
 
@@ -42,18 +45,21 @@ class Rows:
 
 @dataclass(frozen=True, eq=False)
 class Active:
-    """The constraints that hold at x: equalities, and the inequalities that push.
+    """The constraints that hold at x: equalities, and the inequalities with a multiplier.
 
     Args:
         multipliers: (rows,) of `Rows`, the gradient of the cost plus matrix^T multipliers vanishes at a minimum; at a
             lower bound they are <= 0, at an upper one >= 0.
-        pull: (n dof,) matrix^T multipliers. onto: (n dof,) the least step onto what holds.
+        constraint_gradient: (n dof,) matrix^T multipliers.
+        onto: (n dof,) the least step onto what holds.
         along: (n dof, k) sparse, orthonormal directions in which all that holds stays as it is.
-        exact: the same for the equalities alone. violation: the largest of any constraint. violated: which, in words.
+        exact: the same for the equalities alone.
+        violation: the largest of any constraint.
+        violated: which, in words.
     """
 
     multipliers: Floats
-    pull: Floats
+    constraint_gradient: Floats
     onto: Floats
     along: Any
     exact: Any
@@ -73,7 +79,7 @@ def bounded(constraint: Constraint) -> Bools:
 
 def steerable(problem: Problem, constraint: Constraint) -> Bools:
     """(M, size) True where a side is finite and a node can move: the rows that a solver gets."""
-    free = problem.free
+    free = problem.movable
     if free is None:
         return bounded(constraint)
     moves = np.asarray(free[constraint.nodes].any(axis=(1, 2)))
@@ -81,7 +87,7 @@ def steerable(problem: Problem, constraint: Constraint) -> Bools:
 
 
 def constraint_rows(problem: Problem, x: Floats) -> Rows:
-    """The constraints of a single problem at x (n, width)."""
+    """The constraints of a single problem at x (n, ambient)."""
     from scipy.sparse import vstack
 
     parts = [_rows_of(problem, x, k) for k in range(len(problem.constraints))]
@@ -95,14 +101,16 @@ def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats,
     item, space = problem.constraints[k], problem.space
     known, which = item.measurement, bounded(item)
     seen = local(space, known, x[None], item.nodes)
-    value, slope = values(known, item, *seen)
-    slopes = chain(space, known, x[None], item.nodes, seen, np.broadcast_to(slope, (*value.shape, slope.shape[-1])))
-    if len(slopes) < known.arity:
-        slopes = (-slopes[0], slopes[0])
+    value, jacobian = values(known, item, *seen)
+    jacobians = chain(
+        space, known, x[None], item.nodes, seen, np.broadcast_to(jacobian, (*value.shape, jacobian.shape[-1]))
+    )
+    if len(jacobians) < known.arity:
+        jacobians = (-jacobians[0], jacobians[0])
     row, component = np.nonzero(which)
-    data = np.stack([s[0, row, component] for s in slopes], axis=1)
-    if problem.free is not None:
-        data = data * problem.free[item.nodes[row]]
+    data = np.stack([s[0, row, component] for s in jacobians], axis=1)
+    if problem.movable is not None:
+        data = data * problem.movable[item.nodes[row]]
     columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
     starts = np.arange(0, data.size + 1, known.arity * space.dof)
     matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
@@ -111,7 +119,7 @@ def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats,
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
-    """The constraints that hold at x (n, width), where the gradient of the cost is (n, dof).
+    """The constraints that hold at x (n, ambient), where the gradient of the cost is (n, dof).
 
     Multipliers are the least-squares ones with the signs that a minimum needs; an inequality that does not push does
     not hold. Constraints that share no direction are looked at apart from each other.
@@ -134,10 +142,10 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
         onto[columns], ways = _split(unit[pushes], gap[pushes])
         along.append((columns, ways))
         exact.append((columns, _split(unit[equal[own]], gap[equal[own]])[1]))
-    pull, worst = rows.matrix.T @ multipliers, int(rows.outside.argmax())
+    constraint_gradient, worst = rows.matrix.T @ multipliers, int(rows.outside.argmax())
     violation, violated = float(rows.outside[worst]), _words(problem, rows, worst)
-    ways, held = (_directions(gradient.size, blocks) for blocks in (along, exact))
-    return Active(multipliers, pull, onto, ways, held, violation, violated)
+    ways, fixed = (_directions(gradient.size, blocks) for blocks in (along, exact))
+    return Active(multipliers, constraint_gradient, onto, ways, fixed, violation, violated)
 
 
 def _apart(matrix: Any) -> Iterator[tuple[Ints, Ints, Floats]]:

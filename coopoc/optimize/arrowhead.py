@@ -1,7 +1,7 @@
-"""Arrowhead elimination: groups of points that only meet at a hub, by its Schur complement, B problems at once.
+"""Arrowhead elimination: groups of points that only meet at a separator, by its Schur complement, B problems at once.
 
-A snapshot is a hub of one (the ego) with groups of one (its neighbours); a window is a hub of the ego's points with one
-group per neighbour's chain. One Schur complement serves both, batched in LAPACK.
+A snapshot has a separator of one point (the ego) and groups of one (its neighbours); a window has the ego's points as
+separator and one group per neighbour's chain. One Schur complement serves both, batched in LAPACK.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..kernels.compile import use_kernels
 from .linear import opposite
 from .normal import Pattern, pattern
 from .problem import Problem
@@ -22,9 +21,9 @@ Part: TypeAlias = tuple[tuple[Ints, ...], tuple[Ints, ...]]
 
 
 class Star(NamedTuple):
-    """A hub of one point and groups of one: what `coopoc.kernels.star` takes."""
+    """A separator of one point and groups of one: what `coopoc.kernels.star` takes."""
 
-    hub: int
+    separator: int
     others: Ints
     corner: int
     head: Ints
@@ -34,15 +33,18 @@ class Star(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A hub of h points and G groups of up to s points that only meet at the hub: J^T J is an arrowhead.
+    """A separator of h points and G groups of up to s points that only meet at the separator: J^T J is an arrowhead.
 
     Args:
-        hub: (h,) points. group: (G, s) points, -1 where a group is smaller.
-        corner, arm, head: source block and destination (group, row, column) of the three parts, first of the blocks
-            (i, j) that are taken as they are, then of those (j, i) that are turned over.
+        separator: (h,) points.
+        group: (G, s) points, -1 where a group is smaller.
+        corner: source block and destination (group, row, column) of the three parts, first of the blocks (i, j) that
+            are taken as they are, then of those (j, i) that are turned over.
+        arm: as `corner`.
+        head: as `corner`.
     """
 
-    hub: Ints
+    separator: Ints
     group: Ints
     corner: Part
     arm: Part
@@ -52,42 +54,42 @@ class Arrow:
     def star(self) -> Star | None:
         """The same in short, if it is one whose nodes are all measured."""
         own = len(self.corner[0][0]), len(self.head[0][0])
-        if len(self.hub) != 1 or self.group.shape[1] != 1 or own != (1, len(self.group)):
+        if len(self.separator) != 1 or self.group.shape[1] != 1 or own != (1, len(self.group)):
             return None
         head, arm = np.empty(len(self.group), np.int64), np.full(len(self.group), -1)
         turned = np.zeros(len(self.group), bool)
         head[self.head[0][1]] = self.head[0][0]
         for over, (source, group, *_) in enumerate(self.arm):
             arm[group], turned[group] = source, bool(over)
-        return Star(int(self.hub[0]), self.group[:, 0].copy(), int(self.corner[0][0][0]), head, arm, turned)
+        return Star(int(self.separator[0]), self.group[:, 0].copy(), int(self.corner[0][0][0]), head, arm, turned)
 
 
 def structure(problem: Problem) -> tuple[Pattern, Arrow]:
     """Pattern and arrowhead of a problem, kept for the next problems of the same structure: a drive has few."""
-    factors = tuple((f.nodes.shape[1], f.nodes.tobytes(), opposite(f, problem.free)) for f in problem.factors)
-    still = b"" if problem.free is None else (~problem.free).tobytes()
-    return _structure(len(problem.names), problem.space.dof, problem.hub, factors, still)
+    factors = tuple((f.nodes.shape[1], f.nodes.tobytes(), opposite(f, problem.movable)) for f in problem.factors)
+    still = b"" if problem.movable is None else (~problem.movable).tobytes()
+    return _structure(len(problem.names), problem.space.dof, problem.separator, factors, still)
 
 
 @lru_cache(maxsize=512)
 def _structure(
-    n: int, dof: int, hub: tuple[int, ...], factors: tuple[tuple[int, bytes, bool], ...], still: bytes
+    n: int, dof: int, separator: tuple[int, ...], factors: tuple[tuple[int, bytes, bool], ...], still: bytes
 ) -> tuple[Pattern, Arrow]:
     nodes = [(np.frombuffer(raw, np.int64).reshape(-1, arity), signs) for arity, raw, signs in factors]
     scheme = pattern(n, nodes, np.frombuffer(still, bool).reshape(n, dof) if still else None)
-    return scheme, _arrow(np.array(hub or range(n), dtype=np.int64), scheme)
+    return scheme, _arrow(np.array(separator or range(n), dtype=np.int64), scheme)
 
 
-def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
-    """Groups are what is left connected when the hub is taken out (no hub: all is hub)."""
+def _arrow(separator: Ints, scheme: Pattern) -> Arrow:
+    """Groups are what is left connected when the separator is taken out (no separator: all is separator)."""
     n = scheme.nodes
-    label = _groups(n, hub, scheme.pairs)
+    label = _groups(n, separator, scheme.pairs)
     count = int(label.max(initial=-1)) + 1
     members = [np.flatnonzero(label == g) for g in range(count)]
     size = max((len(m) for m in members), default=0)
     group = np.full((count, size), -1, dtype=np.int64)
     place = np.empty(n, dtype=np.int64)
-    place[hub] = np.arange(len(hub))
+    place[separator] = np.arange(len(separator))
     for g, m in enumerate(members):
         group[g, : len(m)] = m
         place[m] = np.arange(len(m))
@@ -101,17 +103,22 @@ def _arrow(hub: Ints, scheme: Pattern) -> Arrow:
         straight, over = ((source[k], np.maximum(label[row[k]], 0), place[row[k]], place[col[k]]) for k in kept)
         return straight, over
 
-    return Arrow(hub, group, part(in_hub[row] & in_hub[col]),
-                 part(~in_hub[row] & in_hub[col]), part(~in_hub[row] & ~in_hub[col]))  # fmt: skip
+    return Arrow(
+        separator,
+        group,
+        part(in_hub[row] & in_hub[col]),
+        part(~in_hub[row] & in_hub[col]),
+        part(~in_hub[row] & ~in_hub[col]),
+    )
 
 
-def _groups(n: int, hub: Ints, pairs: Ints) -> Ints:
-    """(n,) group of each point, -1 for the hub."""
+def _groups(n: int, separator: Ints, pairs: Ints) -> Ints:
+    """(n,) group of each point, -1 for the separator."""
     from scipy.sparse import csr_array
     from scipy.sparse.csgraph import connected_components
 
     rest = np.ones(n, dtype=bool)
-    rest[hub] = False
+    rest[separator] = False
     edges = pairs[rest[pairs].all(axis=1)]
     graph = csr_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
     label = connected_components(graph, directed=False)[1]
@@ -122,7 +129,7 @@ def _groups(n: int, hub: Ints, pairs: Ints) -> Ints:
 
 def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Floats, Floats]:
     """Corner (B, dh, dh), arms (B, G, ds, dh) and heads (B, G, ds, ds), damping added to the diagonal; d is dof."""
-    batch, d, h, (count, size) = len(blocks), blocks.shape[-1], len(frame.hub), frame.group.shape
+    batch, d, h, (count, size) = len(blocks), blocks.shape[-1], len(frame.separator), frame.group.shape
 
     def fill(part: Part, groups: int, rows: int, cols: int) -> Floats:
         out = np.zeros((batch, groups, rows, d, cols, d))
@@ -135,7 +142,7 @@ def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Float
 
     corner = fill(frame.corner, 1, h, h)[:, 0]
     at = np.arange(d * h)
-    corner[:, at, at] += damping[:, frame.hub].reshape(batch, -1)
+    corner[:, at, at] += damping[:, frame.separator].reshape(batch, -1)
     arm, head = fill(frame.arm, count, size, h), fill(frame.head, count, size, size)
     extra = np.where((frame.group >= 0)[None, :, :, None], damping[:, frame.group], 1.0)
     at = np.arange(d * size)
@@ -144,26 +151,26 @@ def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Float
 
 
 def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -> Floats:
-    """dx (B, n, dof) of (J^T J + diag(damping)) dx = -gradient by the Schur complement on the hub.
+    """dx (B, n, dof) of (J^T J + diag(damping)) dx = -gradient by the Schur complement on the separator.
 
     Raises:
         numpy.linalg.LinAlgError: a singular block.
     """
     corner, arm, head = _parts(frame, blocks, damping)
     batch, d = len(blocks), blocks.shape[-1]
-    pull = gradient[:, frame.hub].reshape(batch, -1, 1)
+    eta = gradient[:, frame.separator].reshape(batch, -1, 1)
     dx = np.empty_like(gradient)
     if not frame.group.size:
-        dx[:, frame.hub] = -np.linalg.solve(corner, pull).reshape(batch, -1, d)
+        dx[:, frame.separator] = -np.linalg.solve(corner, eta).reshape(batch, -1, d)
         return dx
     there = frame.group >= 0
     side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
     reduced = np.linalg.solve(head, np.concatenate([arm, side], axis=-1))
     taken = arm.swapaxes(-1, -2) @ reduced
     schur = corner - taken[..., :-1].sum(axis=1)
-    hub = np.linalg.solve(schur, taken[..., -1:].sum(axis=1) - pull)
-    rest = -(reduced[..., -1:] + reduced[..., :-1] @ hub[:, None])
-    dx[:, frame.hub] = hub.reshape(batch, -1, d)
+    separator = np.linalg.solve(schur, taken[..., -1:].sum(axis=1) - eta)
+    rest = -(reduced[..., -1:] + reduced[..., :-1] @ separator[:, None])
+    dx[:, frame.separator] = separator.reshape(batch, -1, d)
     dx[:, frame.group[there]] = rest.reshape(batch, *frame.group.shape, d)[:, there]
     return dx
 
@@ -177,27 +184,27 @@ def marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool = False
     Raises:
         numpy.linalg.LinAlgError: a singular block.
     """
-    batch, d, n = len(blocks), blocks.shape[-1], len(frame.hub) + int((frame.group >= 0).sum())
-    if many and frame.star is not None and use_kernels():
+    batch, d, n = len(blocks), blocks.shape[-1], len(frame.separator) + int((frame.group >= 0).sum())
+    if many and frame.star is not None:
         return _compiled(frame.star, blocks, gradient)
     corner, arm, head = _parts(frame, blocks, np.zeros((batch, n, d)))
     cov = np.empty((batch, n, d, d))
-    dx, pull = np.empty_like(gradient), gradient[:, frame.hub].reshape(batch, -1, 1)
+    dx, eta = np.empty_like(gradient), gradient[:, frame.separator].reshape(batch, -1, 1)
     if not frame.group.size:
-        hub = _inverse(corner, many)
-        cov[:, frame.hub], dx[:, frame.hub] = _own(hub, d), -(hub @ pull).reshape(batch, -1, d)
+        separator = _inverse(corner, many)
+        cov[:, frame.separator], dx[:, frame.separator] = _own(separator, d), -(separator @ eta).reshape(batch, -1, d)
         return cov, dx
     there = frame.group >= 0
     side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
     inverse = _inverse(head, many)
     reduced = inverse @ arm
-    hub = _inverse(corner - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1), many)
+    separator = _inverse(corner - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1), many)
     turned = reduced.swapaxes(-1, -2)
-    step = hub @ ((turned @ side).sum(axis=1) - pull)
-    cov[:, frame.hub], dx[:, frame.hub] = _own(hub, d), step.reshape(batch, -1, d)
+    step = separator @ ((turned @ side).sum(axis=1) - eta)
+    cov[:, frame.separator], dx[:, frame.separator] = _own(separator, d), step.reshape(batch, -1, d)
     rest = inverse @ side + reduced @ step[:, None]
     dx[:, frame.group[there]] = -rest.reshape(batch, *frame.group.shape, d)[:, there]
-    rest = _own(inverse + reduced @ hub[:, None] @ turned, d)
+    rest = _own(inverse + reduced @ separator[:, None] @ turned, d)
     cov[:, frame.group[there]] = rest[:, there]
     return cov, dx
 

@@ -1,4 +1,4 @@
-"""What is true at a point, whoever found it: cost, gradient, covariance, the step still to go, what is left free."""
+"""Cost, gradient, covariance, remaining step and unobservable nodes at a point, independently of the solver."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .problem import Problem
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
 SMALL = 200
-"""Nodes up to which a problem without a hub is assessed densely."""
+"""Nodes up to which a problem without a separator is assessed densely."""
 LARGE = 1000
 """Nodes beyond which GTSAM's Bayes tree finds the marginals: 10,000 poses take 0.3 s there, and 75 s by columns."""
 
@@ -31,24 +31,28 @@ class Assessment:
     """Of a single problem at x.
 
     Args:
-        cost: 1/2 sum of rho. gradient: |J^T r|, or with constraints |J^T r + C^T multipliers|.
-        covariance: (n, dof, dof) m^2, rad^2. remaining: m or rad, largest move of a Gauss-Newton step.
-        free: names of nodes that the measurements leave free. violation: largest of a constraint, m, rad or m/s.
-        violated: which constraint that is, in words. active: what holds x, None without constraints.
+        cost: 1/2 sum of rho.
+        gradient_norm: |J^T r|, or with constraints |J^T r + C^T multipliers|.
+        covariance: (n, dof, dof) m^2, rad^2.
+        remaining: m or rad, largest move of a Gauss-Newton step.
+        unobservable: names of nodes that can move without changing the cost.
+        violation: largest of a constraint, m, rad or m/s.
+        violated: which constraint that is, in words.
+        active: what holds x, None without constraints.
     """
 
     cost: float
-    gradient: float
+    gradient_norm: float
     covariance: Floats
     remaining: float
-    free: tuple[str, ...] = ()
+    unobservable: tuple[str, ...] = ()
     violation: float = 0.0
     violated: str = ""
     active: Active | None = None
 
 
 def assess(problem: Problem, x: Floats) -> Assessment:
-    """Assessment of a single problem at x (n, width)."""
+    """Assessment of a single problem at x (n, ambient)."""
     linear = problem.linearise(x[None])
     cost = float(linear.cost[0])
     gradient, unconstrained = (_as_matrix if is_small(problem) else _as_blocks)(problem, linear)
@@ -56,8 +60,8 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     active = active_at(problem, x, gradient) if problem.constraints else None
     violation, violated = (0.0, "") if active is None else (active.violation, active.violated)
     if active is not None:
-        size = float(np.linalg.norm(gradient.ravel() + active.pull))
-    still = None if problem.free is None else ~problem.free
+        size = float(np.linalg.norm(gradient.ravel() + active.constraint_gradient))
+    still = None if problem.movable is None else ~problem.movable
     try:
         if active is not None and active.holds:
             cov, dx, sound = _restricted(problem.jacobian(linear), gradient, still, active)
@@ -71,8 +75,8 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     except np.linalg.LinAlgError:
         pass
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
-    free = _free(problem, problem.jacobian(linear), active)
-    return Assessment(cost, size, unknown, np.nan, free, violation, violated, active)
+    unobservable = _unobservable(problem, problem.jacobian(linear), active)
+    return Assessment(cost, size, unknown, np.nan, unobservable, violation, violated, active)
 
 
 Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]
@@ -81,13 +85,13 @@ Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]
 
 def _as_matrix(problem: Problem, linear: Linear) -> tuple[Floats, Marginals]:
     """Gradient (n, dof) and what follows from one matrix."""
-    matrix, pull = normal_matrix(problem, linear)
-    gradient = pull.reshape(len(problem.names), -1)
+    matrix, eta = normal_matrix(problem, linear)
+    gradient = eta.reshape(len(problem.names), -1)
 
     def unconstrained() -> tuple[Floats, Floats, bool]:
         cov, inverse = diagonal_blocks(matrix, len(gradient))
         inflation = matrix.diagonal() * inverse.diagonal()
-        return cov, -(inverse @ pull).reshape(gradient.shape), bool(((inflation > 0) & (inflation < INFLATION)).all())
+        return cov, -(inverse @ eta).reshape(gradient.shape), bool(((inflation > 0) & (inflation < INFLATION)).all())
 
     return gradient, unconstrained
 
@@ -98,7 +102,7 @@ def _as_blocks(problem: Problem, linear: Linear) -> tuple[Floats, Marginals]:
     blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
 
     def unconstrained() -> tuple[Floats, Floats, bool]:
-        if problem.hub or len(gradient[0]) <= SMALL:
+        if problem.separator or len(gradient[0]) <= SMALL:
             cov, dx = (each[0] for each in marginals(frame, blocks, gradient))
         else:
             cov, dx = _sparse(problem.jacobian(linear), gradient[0], scheme.still)
@@ -179,13 +183,13 @@ def _diagonal_blocks(solve: Callable[[Floats], Floats], n: int, dof: int) -> Flo
     return cov
 
 
-def _free(problem: Problem, J: Any, active: Active | None) -> tuple[str, ...]:
+def _unobservable(problem: Problem, J: Any, active: Active | None) -> tuple[str, ...]:
     """Nodes that take part in a direction which no measurement sees: the null space of J with unit columns."""
     ways = None if active is None else active.exact
     null = _null_rows(J if ways is None else J @ ways)
     null = null if ways is None else null @ ways.T
-    if problem.free is not None:
-        null = null * problem.free.ravel()
+    if problem.movable is not None:
+        null = null * problem.movable.ravel()
     moves = np.square(null).sum(axis=0).reshape(len(problem.names), -1).sum(axis=1)
     return tuple(name for name, m in zip(problem.names, moves, strict=True) if m > 1e-6)
 

@@ -1,8 +1,7 @@
-"""solve_batch: B noise realisations of one problem at once, by gauss-newton or by one solver of a library."""
+"""solve_batch: B noise realisations of one problem at once, by one solver of their structure."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -12,11 +11,11 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from .arrowhead import Arrow, marginals, structure
 from .assess import bounded
-from .descend import Descent, Step, descend, one_step
+from .backend import Backend, Options, require_backend
 from .initial import initial_guess, somewhere
 from .normal import normal_equations
 from .problem import Problem
-from .solve import POSITION_TOLERANCE, backend_module, second_way
+from .solve import POSITION_TOLERANCE
 
 CHUNK = 40_000
 """Blocks of 3x3 numbers that one chunk may hold, so that a batch stays in the cache."""
@@ -24,11 +23,12 @@ CHUNK = 40_000
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Solutions of B realisations: x (B, n, width), covariance (B, n, dof, dof), the others (B,).
+    """Solutions of B realisations: x (B, n, ambient), covariance (B, n, dof, dof), the others (B,).
 
-    again: the backend's first way did not converge, and its second was taken (see `solve`).
-    Not converged: the last step was still long, or a point is free; then the covariance is NaN. Unlike `solve` it does
-    not look whether the stationary point is a saddle.
+    converged: a Gauss-Newton step from x would move no node by more than the tolerance of the options (at least
+    1e-6 m); where a node is unobservable it is False and the covariance NaN. Unlike `solve` it does not check whether
+    the stationary point is a saddle.
+    again: the first try did not converge, and the backend's fallback options were tried (see `solve`).
     """
 
     x: Floats
@@ -39,84 +39,61 @@ class Batch:
     again: Bools
 
 
-def solve_batch(problem: Problem, backend: str = "gauss-newton", **options: Any) -> Batch:
+def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **options: Any) -> Batch:
     """Minima of all realisations, each as `solve` finds it.
 
-    What they share is made once: a backend's solver of their structure, and the check of its answers.
+    The solver of their structure and the pattern of the checks are made once. A backend that is not batched is called
+    once per realisation.
 
     Args:
         problem: with a batch axis B (a single problem is a batch of one).
-        backend, options: as in `solve`.
+        backend: as in `solve`.
+        options: of the backend.
 
     Raises:
-        InputError: no measurements, constraints, an unknown backend or option. MissingLibraryError: no such library.
+        InputError: no measurements, constraints, an unknown backend or option, a problem beyond its capabilities.
+        MissingLibraryError: the backend's library is not installed.
 
     >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
     >>> solve_batch(problem).x.shape
     (2, 1, 3)
     """
+    known = require_backend(backend)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if problem.constraints:
-        mend = 'Use solve(problem.pick(run), "casadi").'
-        raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", mend)
-    run = _runner(problem, backend, options)
+        hint = "Solve one realisation after the other: solve(problem.pick(run), ...)."
+        raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", hint)
+    solver = known.solver(problem, options)
     scheme, frame = structure(problem)
-    count = problem.batch or 1
-    per = max(1, CHUNK // (len(scheme.rows) + frame.group.size * max(len(frame.hub), 1)))
+    count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
+    per = max(1, CHUNK // (len(scheme.rows) + frame.group.size * max(len(frame.separator), 1)))
     parts = []
     for first in range(0, count, per):
         part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
-        end = run(part)
+        end = solver(part, (somewhere if part.linear else initial_guess)(part))
         linear = part.linearise(end.x)
         blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in part.factors])
         cov, left = _marginals(frame, blocks, gradient, linear.many)
         sound = bounded(scheme, blocks, cov)
+        if part.movable is not None:
+            cov *= part.movable[:, :, None] & part.movable[:, None, :]
         cov[~sound] = np.nan
-        there = end.converged | (np.abs(left).max(axis=(1, 2)) <= POSITION_TOLERANCE)
-        parts.append((end.x, cov, linear.cost, end.iterations, there & sound, np.zeros(len(sound), dtype=bool)))
+        there = sound & (np.abs(left).max(axis=(1, 2)) <= reach)
+        parts.append((end.x, cov, linear.cost, end.iterations, there, np.zeros(len(sound), dtype=bool)))
     found = Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    other = None if found.converged.all() else second_way(backend_module(backend, options), problem, options)
-    return found if other is None else _repeated(found, problem, backend, other)
+    other = None if found.converged.all() else known.fallback(problem, options)
+    return found if other is None else _repeated(found, problem, known, other)
 
 
-def _repeated(found: Batch, problem: Problem, backend: str, options: dict[str, Any]) -> Batch:
-    """The batch with what did not converge solved with other options."""
+def _repeated(found: Batch, problem: Problem, backend: Backend, options: Options) -> Batch:
+    """The batch with the realisations that did not converge solved with the fallback options."""
     which = np.flatnonzero(~found.converged)
     better = solve_batch(problem.pick(which) if problem.batch else problem, backend, **options)
     for field in fields(Batch):
         getattr(found, field.name)[which] = getattr(better, field.name)
     found.again[which] = True
     return found
-
-
-def _runner(problem: Problem, backend: str, options: dict[str, Any]) -> Callable[[Problem], Descent]:
-    """From some realisations to where they end."""
-    module = backend_module(backend, options)
-    if not hasattr(module, "linear_step") or "optimizer" in options:
-        return lambda part: _claimed(module, part, options)
-    limits = {name: options[name] for name in ("max_iterations", "tolerance") if name in options}
-    step = module.linear_step(problem, **{name: v for name, v in options.items() if name not in limits})
-    if problem.linear and backend != "gauss-newton":
-        return lambda part: _one_step(part, step)
-    return lambda part: descend(part, step, initial_guess(part), **limits)
-
-
-def _one_step(part: Problem, step: Step) -> Descent:
-    """One step, whose answer is not said to have converged."""
-    x = one_step(part, step, somewhere(part))
-    return Descent(x, np.ones(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool))
-
-
-def _claimed(module: Any, part: Problem, options: dict[str, Any]) -> Descent:
-    """Where a backend ends, all realisations together if it can; whether it has converged it is not asked."""
-    start = initial_guess(part)
-    if hasattr(module, "each"):
-        ended = module.each(part, start, **options)
-    else:
-        ended = [module.build(part.pick(b) if part.batch else part, **options)(x) for b, x in enumerate(start)]
-    found = np.stack([each.x for each in ended])
-    return Descent(found, np.array([each.iterations for each in ended]), np.zeros(len(found), dtype=bool))
 
 
 def _marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool) -> tuple[Floats, Floats]:

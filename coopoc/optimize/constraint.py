@@ -1,4 +1,4 @@
-"""Constraint: what must hold exactly, said with the same formulas as what is measured."""
+"""Constraint: bounds on the same formulas as are measured."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ class Constraint:
     a formula of one's own).
 
     Args:
-        kind: a registered measurement that is no comparison of poses. nodes: (M, arity).
-        lower, upper: (M, size), (size,) or a number: m, rad, m/s; -inf, inf leave a side open.
+        kind: a registered measurement that is no comparison of poses.
+        nodes: (M, arity).
+        lower: (M, size), (size,) or a number: m, rad, m/s; -inf, inf leave a side open.
+        upper: as `lower`.
         constants: as in Factor.
 
     Raises:
@@ -42,6 +44,7 @@ class Constraint:
         known = self.measurement
         if known.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
+        object.__setattr__(self, "kind", known.name)
         object.__setattr__(self, "nodes", check_nodes(known, self.nodes))
         object.__setattr__(self, "constants", check_constants(known, self.constants, len(self.nodes)))
         lower, upper = np.broadcast_arrays(numbers("lower", self.lower), numbers("upper", self.upper))

@@ -16,13 +16,13 @@ from .problem import Problem
 STEP = 1e-4
 """Of the vector's length: the second derivative is a central difference of the exact first."""
 SMALL = 60
-"""Nodes up to which a dense factorisation tells faster."""
+"""Nodes up to which a dense factorisation is faster."""
 SLACK = 1e-6
 """Share of the diagonal by which the curvature may be negative: a flat minimum is one, whatever the rounding."""
 
 
 def is_minimum(problem: Problem, x: Floats) -> bool:
-    """True unless the cost of a single problem curves downwards at x (n, width), where its gradient vanishes.
+    """True unless the cost of a single problem curves downwards at x (n, ambient), where its gradient vanishes.
 
     The Hessian is J^T J + sum_k r_k d2 r_k / dx2. J^T J alone is positive definite at a saddle too, such as an ego on
     the line between two others whose ranges are longer than the line. Where there are constraints see lagrangian.py.
@@ -72,26 +72,28 @@ def true_blocks(problem: Problem, linear: Linear) -> Floats:
 
 def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats]:
     """Second derivatives of what each measurement of a factor costs, as `squares` orders them: (1, M, dof, dof)."""
-    factor, slopes = problem.factors[k], linear.slope[k]
+    factor, jacobians = problem.factors[k], linear.jacobian[k]
     if factor.measurement.linear and factor.loss is None:
-        return squares(Linear(linear.x, (linear.residual[k],), (slopes,), linear.cost), [factor.nodes])
-    pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.free)
+        return squares(Linear(linear.x, (linear.residual[k],), (jacobians,), linear.cost), [factor.nodes])
+    pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.movable)
     count, dof = len(factor.nodes), problem.space.dof
     local, bare = x[factor.nodes], unchecked(factor, loss=None)
     reach = STEP * np.maximum(np.linalg.norm(problem.space.position(local[:, -1] - local[:, 0] * pair), axis=-1), 1e-3)
     size = np.where(np.arange(dof)[:, None] < problem.dimension, reach, STEP)
     arity, columns = factor.nodes.shape[1], []
-    for moved in range(arity - len(slopes), arity):
+    for moved in range(arity - len(jacobians), arity):
         step = np.zeros((2, dof, count, arity, dof))
         for c in range(dof):
             step[:, c, :, moved, c] = size[c], -size[c]
-        up, down = _pulls(problem, bare, local, step.reshape(2 * dof, count, arity, dof)).reshape(2, dof, count, -1)
+        up, down = _gradients(problem, bare, local, step.reshape(2 * dof, count, arity, dof)).reshape(2, dof, count, -1)
         by = (up - down) / (2.0 * size[:, :, None])
-        columns.append(by if problem.free is None else by * problem.free[factor.nodes[:, moved]].T[:, :, None])
+        columns.append(by if problem.movable is None else by * problem.movable[factor.nodes[:, moved]].T[:, :, None])
     whole: Floats = np.concatenate(columns).transpose(1, 2, 0)
     whole = 0.5 * (whole + np.swapaxes(whole, 1, 2))
     if factor.loss is not None:
-        whole = _bent(problem, factor, whole, x, _pulls(problem, bare, local, np.zeros((1, count, arity, dof)))[0])
+        whole = _with_loss(
+            problem, factor, whole, x, _gradients(problem, bare, local, np.zeros((1, count, arity, dof)))[0]
+        )
     if not pair or opposed:
         return [whole[None]]
     first, second, between = whole[:, :dof, :dof], whole[:, dof:, dof:], whole[:, :dof, dof:]
@@ -99,34 +101,37 @@ def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats
     return [first[None], second[None], np.where(swapped, np.swapaxes(between, 1, 2), between)[None]]
 
 
-def _bent(problem: Problem, factor: Factor, whole: Floats, x: Floats, pull: Floats) -> Floats:
-    """rho' H + 2 rho'' g g^T of H `whole` and g `pull` of the measurements without their loss.
+def _with_loss(problem: Problem, factor: Factor, whole: Floats, x: Floats, gradient: Floats) -> Floats:
+    """rho' H + 2 rho'' g g^T of H `whole` and g of the measurements without their loss.
 
     A difference of the robust gradient itself would need steps far below a standard deviation.
     """
     assert factor.loss is not None
-    bare = linearise(problem.space, [unchecked(factor, loss=None)], problem.free, x[None])
+    bare = linearise(problem.space, [unchecked(factor, loss=None)], problem.movable, x[None])
     square = np.square(bare.residual[0][0]).sum(axis=-1)
-    outer = pull[:, :, None] * pull[:, None, :]
-    return factor.loss.weight(square)[:, None, None] * whole + 2.0 * factor.loss.bend(square)[:, None, None] * outer
+    outer = gradient[:, :, None] * gradient[:, None, :]
+    return (
+        factor.loss.weight(square)[:, None, None] * whole
+        + 2.0 * factor.loss.second_derivative(square)[:, None, None] * outer
+    )
 
 
-def _pulls(problem: Problem, factor: Factor, local: Floats, step: Floats) -> Floats:
+def _gradients(problem: Problem, factor: Factor, local: Floats, step: Floats) -> Floats:
     """(S, M, nodes * dof) gradient of each measurement's own cost after S steps (S, M, arity, dof) of its nodes.
 
     Every measurement gets nodes of its own, so that one call moves them all.
     """
     space, (count, arity) = problem.space, factor.nodes.shape
     nodes = np.arange(count * arity).reshape(count, arity)
-    free = None if problem.free is None else problem.free[factor.nodes].reshape(count * arity, -1)
+    free = None if problem.movable is None else problem.movable[factor.nodes].reshape(count * arity, -1)
     alone = unchecked(factor, nodes=nodes)
     with np.errstate(all="ignore"):
         moved = linearise(space, [alone], free, space.retract(local, step).reshape(len(step), count * arity, -1))
-    slopes, residual = moved.slope[0], moved.residual[0]
-    if len(slopes) > 1 and opposite(factor, problem.free):
-        slopes = slopes[1:]
-    pulls = [(np.swapaxes(s, -1, -2) @ residual[..., None])[..., 0] for s in slopes]
-    return np.concatenate(pulls, axis=-1)
+    jacobians, residual = moved.jacobian[0], moved.residual[0]
+    if len(jacobians) > 1 and opposite(factor, problem.movable):
+        jacobians = jacobians[1:]
+    parts = [(np.swapaxes(s, -1, -2) @ residual[..., None])[..., 0] for s in jacobians]
+    return np.concatenate(parts, axis=-1)
 
 
 def pivots(matrix: Any) -> Any:
@@ -136,8 +141,9 @@ def pivots(matrix: Any) -> Any:
     if not np.isfinite(matrix.data).all():
         return None
     try:
-        factored = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                        options={"SymmetricMode": True})  # fmt: skip
+        factored = splu(
+            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
     except RuntimeError:  # a pivot of exactly zero
         return None
     symmetric = np.array_equal(factored.perm_r, factored.perm_c)

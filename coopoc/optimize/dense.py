@@ -29,12 +29,12 @@ def normal_matrix(problem: Problem, linear: Linear) -> tuple[Floats, Floats]:
     residual = np.concatenate([r.ravel() for r in linear.residual])
     J = np.zeros((len(residual), numbers))
     entries = J.ravel()  # a view
-    for slopes, nodes in zip(linear.by_node(problem.factors), places, strict=True):
-        for slope, at in zip(slopes, nodes, strict=True):
-            entries[at] = slope[0]
+    for jacobians, nodes in zip(linear.by_node(problem.factors), places, strict=True):
+        for jacobian, at in zip(jacobians, nodes, strict=True):
+            entries[at] = jacobian[0]
     matrix = J.T @ J
-    if problem.free is not None:
-        matrix.flat[:: numbers + 1] += ~problem.free.ravel()
+    if problem.movable is not None:
+        matrix.flat[:: numbers + 1] += ~problem.movable.ravel()
     return matrix, residual @ J
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
+from .backend import SolverResult
 from .linear import Linear
 from .problem import Problem
 
@@ -31,7 +32,9 @@ class Descent:
     """Where the loop ended.
 
     Args:
-        x: (B, n, width). iterations: (B,) linear steps taken. converged: (B,) the last step was below the tolerance.
+        x: (B, n, ambient).
+        iterations: (B,) linear steps taken.
+        converged: (B,) the last step was below the tolerance.
     """
 
     x: Floats
@@ -50,8 +53,11 @@ def descend(
     leaves the batch when no point of it moves by more than `tolerance`.
 
     Args:
-        problem: one or B realisations. step: the backend's linear solver. x: (B, n, width) start.
-        max_iterations: of linear steps. tolerance: m.
+        problem: one or B realisations.
+        step: the backend's linear solver.
+        x: (B, n, ambient) start.
+        max_iterations: of linear steps.
+        tolerance: m.
 
     Raises:
         InputError: max_iterations that is no whole number >= 0, tolerance that is not > 0.
@@ -85,14 +91,23 @@ def descend(
     return Descent(best, count, done)
 
 
-def one_step(problem: Problem, step: Step, x: Floats) -> Floats:
-    """x (B, n, width) after all that a linear problem needs, one step; what is singular stays."""
+def one_step(problem: Problem, step: Step, x: Floats) -> SolverResult:
+    """The result from x (B, n, ambient) of all that a linear problem needs, one step; what is singular stays."""
+    count = np.ones(len(x), dtype=np.int64)
     try:
         dx = step(problem.linearise(x), np.zeros((*x.shape[:2], problem.space.dof)))
     except np.linalg.LinAlgError:
-        return x
+        return SolverResult(x, count)
     dx[~np.isfinite(dx).all(axis=(1, 2))] = 0.0
-    return problem.space.retract(x, dx)
+    return SolverResult(problem.space.retract(x, dx), count)
+
+
+def minimise(problem: Problem, step: Step, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
+    """The result from x (B, n, ambient) of one step where the problem is linear, else of `descend`."""
+    if problem.linear and max_iterations:
+        return one_step(problem, step, x)
+    end = descend(problem, step, x, max_iterations, tolerance)
+    return SolverResult(end.x, end.iterations)
 
 
 def check_limits(max_iterations: int, tolerance: float) -> None:
@@ -106,8 +121,8 @@ def check_limits(max_iterations: int, tolerance: float) -> None:
 def _promised(problem: Problem, linear: Linear, dx: Floats) -> Floats:
     """(B,) cost that the linear model expects after the step, 1/2 |r + J dx|^2 in place of 1/2 |r|^2."""
     expected = linear.cost.copy()
-    for factor, r, slopes in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
-        moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(slopes, factor.nodes.T, strict=True))
+    for factor, r, jacobians in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
+        moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(jacobians, factor.nodes.T, strict=True))
         expected += np.einsum("bmk,bmk->b", r + 0.5 * moved, np.broadcast_to(moved, r.shape))
     return expected
 
@@ -139,7 +154,7 @@ def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floa
 def diagonal(problem: Problem, linear: Linear) -> Floats:
     """(B, n, dof) diagonal of J^T J."""
     total = np.zeros((*linear.x.shape[:2], problem.space.dof))
-    for factor, slopes in zip(problem.factors, linear.by_node(problem.factors), strict=True):
-        for column, slope in zip(factor.nodes.T, slopes, strict=True):
-            np.add.at(total.swapaxes(0, 1), column, np.square(slope).sum(axis=-2).swapaxes(0, 1))
+    for factor, jacobians in zip(problem.factors, linear.by_node(problem.factors), strict=True):
+        for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
+            np.add.at(total.swapaxes(0, 1), column, np.square(jacobian).sum(axis=-2).swapaxes(0, 1))
     return total

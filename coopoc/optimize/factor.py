@@ -1,4 +1,4 @@
-"""Factor: M measurements of one kind between points, with how far each is trusted."""
+"""Factor: M measurements of one kind between points, with their standard deviations."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Factor:
         kind: a registered measurement.
         nodes: (M, arity); of two, the first observes the second.
         z: (M, k) or (B, M, k) for B noise realisations: m, rad; kinds that compare poses have k = d + d^2 (see `pose`).
-        std: size, (size,), (M, size) or (B, M, size) standard deviations, W = diag(1/std); infinite: no information
-            (a measurement that this realisation lacks).
+        std: size, (size,), (M, size) or (B, M, size) standard deviations, W = diag(1/std); infinite: no information (a
+            measurement that this realisation lacks).
         sqrt_information: instead of std, (size, size), (M, size, size) or (B, M, size, size), W^T W = cov^-1.
         constants: (M, c) or (c,) known numbers of the kind, such as dt s of a speed.
         loss: rho, None for least squares.
@@ -51,11 +51,15 @@ class Factor:
 
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
         known = self.measurement
+        object.__setattr__(self, "kind", known.name)
         object.__setattr__(self, "nodes", check_nodes(known, self.nodes))
         object.__setattr__(self, "z", check_values(known, self.z, len(self.nodes)))
         object.__setattr__(self, "constants", check_constants(known, self.constants, len(self.nodes)))
-        given = [name for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
-                 if v is not None]  # fmt: skip
+        given = [
+            name
+            for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
+            if v is not None
+        ]
         if len(given) != 1:
             allowed = "exactly one of std, cov and sqrt_information must be given"
             raise InputError("std", " and ".join(given) or "nothing", allowed, "Give std=.")
@@ -66,6 +70,7 @@ class Factor:
             root = whitening(known.name, cov) if cov is not None else self.sqrt_information
             assert root is not None
             object.__setattr__(self, "sqrt_information", check_root(known, root, shape))
+        _ = self.batch  # refuses numbers of realisations that differ
 
     @property
     def measurement(self) -> Measurement:
@@ -85,21 +90,24 @@ class Factor:
     @cached_property
     def batch(self) -> int | None:
         """B, or None for a single realisation."""
-        sizes = {len(a) for a, rank in ((self.z, 3), (self.std, 3), (self.sqrt_information, 4))
-                 if a is not None and a.ndim == rank}  # fmt: skip
+        sizes = {
+            len(a)
+            for a, rank in ((self.z, 3), (self.std, 3), (self.sqrt_information, 4))
+            if a is not None and a.ndim == rank
+        }
         if len(sizes - {1}) > 1:
             raise InputError("std", f"for {sorted(sizes)} realisations", "must agree with z", "Give one axis B.")
         return max(sizes) if sizes else None
 
     @property
     def informative(self) -> Bools:
-        """(M,) or (B, M) True where the measurement says anything at all."""
+        """(M,) or (B, M) True where the measurement carries information."""
         if self.std is not None:
-            says = np.isfinite(self.std).any(axis=-1)
+            informed = np.isfinite(self.std).any(axis=-1)
         else:
             assert self.sqrt_information is not None
-            says = (self.sqrt_information != 0).any(axis=(-2, -1))
-        return np.asarray(says if says.shape[-1] == len(self.nodes) else says.repeat(len(self.nodes), axis=-1))
+            informed = (self.sqrt_information != 0).any(axis=(-2, -1))
+        return np.broadcast_to(informed, (*informed.shape[:-1], len(self.nodes)))
 
     @property
     def root(self) -> Floats:
@@ -122,17 +130,19 @@ class Factor:
         assert self.sqrt_information is not None
         return np.asarray((self.sqrt_information @ residual[..., None])[..., 0])
 
-    def whiten_slope(self, slope: Floats) -> Floats:
-        """W slope (..., M, size, D)."""
+    def whiten_jacobian(self, jacobian: Floats) -> Floats:
+        """W jacobian (..., M, size, D)."""
         if self.std is not None:
-            return slope / self.std[..., None]
+            return jacobian / self.std[..., None]
         assert self.sqrt_information is not None
-        return np.asarray(self.sqrt_information @ slope)
+        return np.asarray(self.sqrt_information @ jacobian)
 
     def pick(self, which: Ints | int) -> Factor:
         """The realisations `which` of B; an int gives a single one."""
-        chosen = {name: None if (a := getattr(self, name)) is None else _pick(a, rank, which)
-                  for name, rank in (("z", 3), ("std", 3), ("sqrt_information", 4))}  # fmt: skip
+        chosen = {
+            name: None if (a := getattr(self, name)) is None else _pick(a, rank, which)
+            for name, rank in (("z", 3), ("std", 3), ("sqrt_information", 4))
+        }
         return unchecked(self, **chosen)
 
     def __repr__(self) -> str:

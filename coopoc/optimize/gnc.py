@@ -1,4 +1,4 @@
-"""Graduated non-convexity: which measurements to disbelieve, decided by least squares whose weights sharpen."""
+"""Graduated non-convexity (GNC): least squares whose weights find the outliers."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
+from ..plugins import unknown
+from .backend import Backend
 from .batch import Batch, solve_batch
-from .descend import MAX_ITERATIONS, TOLERANCE
+from .outliers import Candidates, Marked, bounds, mark, reweigh, squares
 from .problem import Problem
 from .solution import Solution, SolveError, Status
 from .solve import solve
-from .suspects import Marked, Suspects, bounds, mark, reweigh, squares
 
 RATE = 1.4
 """By which mu changes from round to round."""
@@ -25,7 +26,7 @@ ROUNDS = 300
 SETTLED = 1e-6
 """Largest change of a weight that is none."""
 EASY = 1e-6
-"""Below this mu is not inverted: all suspects are far within their thresholds."""
+"""Below this mu is not inverted: all candidates are far within their thresholds."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,9 @@ class Surrogate:
     """A robust loss made convex by mu, as weights of the ratio s = r^2 / c^2.
 
     Args:
-        first: mu from the largest ratio. weight: w(s, mu) = d rho_mu / d r^2. later: the next mu.
+        first: mu from the largest ratio.
+        weight: w(s, mu) = d rho_mu / d r^2.
+        later: the next mu.
         done: whether the weights (B, G) have settled, from the new ones, those before and mu (B,).
     """
 
@@ -61,8 +64,8 @@ SURROGATES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Graduated(Batch):
-    """A Batch whose suspects got weights: weights (B, M) of the M suspect measurements, rounds and mu (B,).
+class GNCBatch(Batch):
+    """A Batch whose candidates got weights: weights (B, M) of the M candidate measurements, rounds and mu (B,).
 
     Args:
         problem: the weighted problem that was solved last.
@@ -74,13 +77,13 @@ class Graduated(Batch):
     problem: Problem
 
 
-def graduate(
+def solve_gnc(
     problem: Problem,
-    suspects: Suspects,
+    candidates: Candidates,
     loss: str = "truncated",
     threshold: float = 0.99,
     groups: npt.ArrayLike | None = None,
-    backend: str = "gauss-newton",
+    backend: str | Backend = "gauss-newton",
     throw: bool = True,
     **options: Any,
 ) -> Solution:
@@ -93,91 +96,108 @@ def graduate(
         truncated: w = sqrt(mu (mu + 1)) c/|r| - mu within [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round
         geman-mcclure: w = (mu c^2 / (r^2 + mu c^2))^2, mu from 2 r_max^2 / c^2 down to 1
 
-    until the weights no longer change, truncated ones at 0 or 1. It needs no good start, but honest groups that agree
-    better than the others: a majority that lies in concert wins, and so does an error that all share. (Yang, Antonante,
-    Tzoumas, Carlone, RA-L 2020, equations 12 and 14, remark 5; methods.md section 6.5.)
+    until the weights no longer change, truncated ones at 0 or 1. It needs no good start, but inlier groups that agree
+    better than the others: a majority of consistent outliers wins, and so does an error that all share.
 
     Args:
-        problem: a single one; all that is not suspected is a known inlier.
-        suspects: factors by index, or (factor, rows); M measurements in all.
-        loss: "truncated" or "geman-mcclure". threshold: probability that an honest group is within c.
+        problem: a single one; measurements that are no candidates are known inliers.
+        candidates: factors by index, or (factor, rows); M measurements in all.
+        loss: "truncated" or "geman-mcclure".
+        threshold: probability that the residual of an inlier group is within c.
         groups: (M,) labels; measurements with one label share one weight, such as the fixes of one neighbour. Default:
             each on its own.
-        backend, throw, options: of `solve`, which solves every round.
+        backend: of `solve`, which solves every round.
+        throw: as in `solve`.
+        options: of the backend.
 
     Returns:
         The Solution of the last weighted problem, whose cost, gradient and covariance are those of the weighted least
         squares; iterations and times are of all rounds; extras has weights (M,), rounds and mu.
 
     Raises:
-        InputError: suspects that do not exist, appear twice or have a loss, other groups than measurements, a threshold
-            outside (0, 1), an unknown loss, and what `solve` refuses.
+        InputError: candidates that do not exist, appear twice or have a loss, other groups than measurements, a
+            threshold outside (0, 1), an unknown loss, and what `solve` refuses.
         SolveError: (if `throw`) as `solve`, or weights that did not settle.
 
+    References:
+        Yang, Antonante, Tzoumas, Carlone, RA-L 2020, equations 12 and 14, remark 5.
+
     >>> problem = Problem(("a",)).add("position", ["a"] * 3, [[0, 0, 0], [1, 0, 0], [50, 0, 0]], std=1.0)
-    >>> solution = graduate(problem, suspects=[0])
+    >>> solution = solve_gnc(problem, candidates=[0])
     >>> float(solution.x[0, 0].round(3)), solution.extras["weights"]
     (0.5, array([1., 1., 0.]))
     """
     if problem.batch is not None:
-        mend = "Pick one with problem.pick(0), or use graduate_batch."
-        raise InputError("problem", repr(problem), "must be a single realisation", mend)
+        hint = "Pick one with problem.pick(0), or use solve_gnc_batch."
+        raise InputError("problem", repr(problem), "must be a single realisation", hint)
     each: list[Solution] = []
 
     def inner(weighted: Problem) -> Floats:
         each.append(solve(weighted.pick(0), backend, throw=False, **options))
         return each[-1].x[None]
 
-    marked = mark(problem, suspects, groups)
+    marked = mark(problem, candidates, groups)
     end = _sharpen(problem, marked, loss, threshold, inner)
     weighted = reweigh(problem, marked, end.weight, end.x).pick(0)
     final = solve(weighted, backend, throw=throw and bool(end.settled[0]), **options)
     extras = {"weights": end.weight[0, marked.group], "rounds": int(end.rounds[0]), "mu": float(end.mu[0])}
     solution = replace(
-        final, extras=final.extras | extras, iterations=sum(s.iterations for s in (*each, final)),
+        final,
+        extras=final.extras | extras,
+        iterations=sum(s.iterations for s in (*each, final)),
         build_seconds=sum(s.build_seconds for s in (*each, final)),
         solve_seconds=sum(s.solve_seconds for s in (*each, final)),
         status=final.status if end.settled[0] else Status.MAX_ITERATIONS,
-    )  # fmt: skip
+    )
     if throw and not end.settled[0]:
         raise SolveError(solution)
     return solution
 
 
-def graduate_batch(
+def solve_gnc_batch(
     problem: Problem,
-    suspects: Suspects,
+    candidates: Candidates,
     loss: str = "truncated",
     threshold: float = 0.99,
     groups: npt.ArrayLike | None = None,
-    max_iterations: int = MAX_ITERATIONS,
-    tolerance: float = TOLERANCE,
-) -> Graduated:
-    """All realisations as `graduate` solves each, by gauss-newton; one leaves the batch when its weights have settled.
+    backend: str | Backend = "gauss-newton",
+    **options: Any,
+) -> GNCBatch:
+    """All realisations as `solve_gnc` solves each; one leaves the batch when its weights have settled.
 
     Args:
-        problem: with a batch axis B (a single problem is a batch of one); the others as `graduate` and `solve_batch`.
+        problem: with a batch axis B (a single problem is a batch of one).
+        candidates: as in `solve_gnc`, and so are loss, threshold and groups.
+        backend: of `solve_batch`, and so are the options.
 
     Raises:
-        InputError: as `graduate`.
+        InputError: as `solve_gnc`.
     """
 
     def inner(weighted: Problem) -> Floats:
-        return solve_batch(weighted, max_iterations=max_iterations, tolerance=tolerance).x
+        return solve_batch(weighted, backend, **options).x
 
-    marked = mark(problem, suspects, groups)
+    marked = mark(problem, candidates, groups)
     end = _sharpen(problem, marked, loss, threshold, inner)
     weighted = reweigh(problem, marked, end.weight, end.x)
-    last = solve_batch(weighted, max_iterations=max_iterations, tolerance=tolerance)
-    return Graduated(
-        last.x, last.covariance, last.cost, last.iterations, last.converged & end.settled, last.again,
-        end.weight[:, marked.group], end.rounds, end.mu, weighted,
-    )  # fmt: skip
+    last = solve_batch(weighted, backend, **options)
+    return GNCBatch(
+        last.x,
+        last.covariance,
+        last.cost,
+        last.iterations,
+        last.converged & end.settled,
+        last.again,
+        end.weight[:, marked.group],
+        end.rounds,
+        end.mu,
+        weighted,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """x (B, n, width), weight (B, G), mu, rounds and settled (B,) of the last round of each realisation."""
+    """x (B, n, ambient), weight (B, G), mu, rounds and settled (B,) of the last round of each realisation."""
 
     x: Floats
     weight: Floats
@@ -212,8 +232,8 @@ def _sharpen(problem: Problem, marked: Marked, loss: str, threshold: float, inne
 def surrogate_of(loss: str, threshold: float) -> Surrogate:
     """The surrogate of a loss; InputError if there is none, or if the threshold is no probability in (0, 1)."""
     if loss not in SURROGATES:
-        raise InputError("loss", repr(loss), f"must be one of {sorted(SURROGATES)}", "Or use a Loss in solve.")
+        raise unknown("loss", loss, SURROGATES)
     if not 0 < threshold < 1:
-        mend = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
-        raise InputError("threshold", threshold, "must be a probability in (0, 1)", mend)
+        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
+        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
     return SURROGATES[loss]

@@ -10,8 +10,9 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError
-from ..formats import read_graph
+from ..formats import load_graph
 from ..formats.graph import Graph
+from ..plugins import unknown
 from .factor import Factor
 from .problem import Problem
 from .space import Space
@@ -20,28 +21,28 @@ Objective = Literal["chordal", "geodesic"]
 Start = Literal["odometry", "apart", "file"]
 
 
-def read(path: str | Path, objective: Objective = "chordal", start: Start = "odometry") -> Problem:
+def read_graph(path: str | Path, objective: Objective = "chordal", start: Start = "odometry") -> Problem:
     """The problem of a PyFG or g2o file; see `from_graph`.
 
     Raises:
         InputError: a line that is wrong, with file and number; an unknown suffix, objective or start.
     """
-    return from_graph(read_graph(path), objective, start)
+    return from_graph(load_graph(path), objective, start)
 
 
 def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "odometry") -> Problem:
-    """The problem of a graph, with the first pose held where the graph has neither priors nor fixed vertices.
+    """The problem of a graph, with the first pose fixed where the graph has neither priors nor fixed vertices.
 
     chordal: kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2, tau = d / trace(cov_t) and kappa = 1 / var_theta
     in the plane, 3 / (2 trace(cov_R)) in space, as SE-Sync (Rosen et al., IJRR 2019) and CORA (arXiv 2302.11614) have
     it: quadratic, so that it can be certified. geodesic: |log(T_ij^-1 T_i^-1 T_j)|^2 with the full covariance.
 
     Args:
-        graph: of `coopoc.formats.read_graph`.
+        graph: of `coopoc.formats.load_graph`.
         start: "odometry" chains each robot's relative poses from its first vertex in the file; "apart" from a ring as
             wide as the mean range, all facing one way, as if nothing were known of how the robots stand to each other;
-            "file" takes the vertices as they are.
-            Landmarks are put where the first pose that measures them sees them, or by the ranges to them.
+            "file" takes the vertices as they are. Landmarks are put where the first pose that measures them sees them,
+            or by the ranges to them.
 
     >>> from coopoc.formats.edges import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
@@ -50,18 +51,18 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "o
     """
     for name, value, allowed in (("objective", objective, Objective), ("start", start, Start)):
         if value not in get_args(allowed):
-            raise InputError(name, repr(value), f"must be one of {list(get_args(allowed))}", "Pick one.")
+            raise unknown(name, value, get_args(allowed))
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
-    held = tuple(graph.fixed.tolist())
-    if not held and not len(graph.pose_prior) and not len(graph.point_prior):
-        held = poses[:1]
+    fixed = tuple(graph.fixed.tolist())
+    if not fixed and not len(graph.pose_prior) and not len(graph.point_prior):
+        fixed = poses[:1]
     x0 = _file(graph) if start == "file" else _chained(graph, start == "apart")
     x0 = x0 if poses else x0[:, : graph.dimension]
-    return Problem(graph.names, _factors(graph, objective), x0, dimension=graph.dimension, poses=poses, held=held)
+    return Problem(graph.names, _factors(graph, objective), x0, dimension=graph.dimension, poses=poses, fixed=fixed)
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
-    space, found = Space(graph.dimension, turning=True), []
+    space, found = Space(graph.dimension, has_rotation=True), []
     for kind, edges in (("relative_pose", graph.relative_pose), ("pose", graph.pose_prior)):
         if not len(edges):
             continue
@@ -101,12 +102,12 @@ def _file(graph: Graph) -> Floats:
     if unknown.any():
         name = graph.names[int(np.flatnonzero(unknown)[0])]
         raise InputError("start", "'file'", f"needs a position of {name} in the file", 'Use start="odometry".')
-    return Space(graph.dimension, turning=True).join(graph.position, graph.rotation)
+    return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
 
 
 def _chained(graph: Graph, apart: bool) -> Floats:
     """Poses along the relative poses from each robot's first vertex, landmarks from what measures them."""
-    space = Space(graph.dimension, turning=True)
+    space = Space(graph.dimension, has_rotation=True)
     position = np.zeros_like(graph.position)
     rotation = np.tile(np.eye(graph.dimension), (len(graph.names), 1, 1))
     known = np.zeros(len(graph.names), dtype=bool)

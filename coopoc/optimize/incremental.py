@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
+from .backend import require_backend
 from .backends.gauss_newton import linear_step
 from .backends.gtsam_forms import forms
 from .backends.gtsam_native import estimate, linearised, native_graph, tangent, values, which_turn
@@ -18,7 +19,6 @@ from .descend import descend
 from .factor import Factor
 from .initial import initial_guess, somewhere
 from .problem import Problem
-from .solve import usable
 from .space import Space
 
 
@@ -27,7 +27,9 @@ class Estimates:
     """Some nodes at one moment, each as a Solution has it.
 
     Args:
-        names: of n nodes. x: (n, width), see Space. covariance: (n, dof, dof) m^2, rad^2 marginals.
+        names: of n nodes.
+        x: (n, ambient), see Space.
+        covariance: (n, dof, dof) m^2, rad^2 marginals.
     """
 
     names: tuple[str, ...]
@@ -42,14 +44,15 @@ class FixedLag:
     exactly our objective (see backends/gtsam_forms.py) it linearises afresh where a node has moved by more than
     `threshold`. All else, such as range and angles in the world frame, is linearised once, robust weights included, at
     the most probable geometry given the piece and the marginals of the nodes before it: after the converted
-    measurement, which makes a poor prior harmless, one exact step (performance.md section 1.5). Nodes that fall out of
+    measurement, which makes a poor prior harmless, one exact step. Nodes that fall out of
     the lag are marginalised (Kaess et al., iSAM2, IJRR 2012; gtsam.IncrementalFixedLagSmoother); an infinite lag
     forgets nothing.
 
     Args:
         lag: s; a node whose stamp is older than the newest one minus the lag leaves. Of steps of dt take (k + 1/2) dt,
-            so that rounding does not decide. threshold: m or rad, a move that asks for a fresh linearisation; where
-            all is linear take infinity, which saves the search for them.
+            so that rounding does not decide.
+        threshold: m or rad, a move that asks for a fresh linearisation; where all is linear take infinity, which saves
+            the search for them.
         passes: Gauss-Newton steps per update; more only matter for GTSAM's own nonlinear factors.
 
     Raises:
@@ -66,7 +69,7 @@ class FixedLag:
         if not (lag >= 0 and threshold > 0 and passes >= 1):
             given = f"lag {lag}, threshold {threshold}, passes {passes}"
             raise InputError("FixedLag", given, "must be >= 0 s, > 0 m or rad, >= 1", "Such as FixedLag(lag=1.0).")
-        usable("gtsam")
+        require_backend("gtsam")
         import gtsam
 
         params = gtsam.ISAM2Params()
@@ -93,27 +96,27 @@ class FixedLag:
 
         Args:
             piece: a single problem; a name that the window has is its node, any other is a new one. Poses need an x0;
-                that of nodes of the window is not looked at. hub is not looked at.
+                that of nodes of the window is not looked at. separator is not looked at.
             stamps: s, moment of each new node. One of a node of the window moves it there: a landmark that is seen
                 again stays.
             wanted: names of the window, default those that have the newest stamp.
 
         Raises:
-            InputError: what a piece cannot have (realisations, held nodes, constraints), a new node without a stamp or
+            InputError: what a piece cannot have (realisations, fixed nodes, constraints), a new node without a stamp or
                 older than the window, a node that changes its kind, nodes that the measurements leave free.
         """
         before = self._stamps
         posed = which_turn(piece)
         fresh = self._check(piece, stamps, before, posed)
-        said = forms(piece)
-        rest = [f for f, form in enumerate(said) if isinstance(form, str)]
+        forms_ = forms(piece)
+        rest = [f for f, form in enumerate(forms_) if isinstance(form, str)]
         x = self._geometry(piece, rest)
         self._dimension = piece.dimension
         for i in fresh:
             self._keys[piece.names[i]] = next(self._count)
             self._turns[piece.names[i]] = posed[i]
         keys = [self._keys[name] for name in piece.names]
-        graph = native_graph(piece, said, keys).graph
+        graph = native_graph(piece, forms_, keys).graph
         for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
         entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
@@ -147,7 +150,7 @@ class FixedLag:
         keys, posed = [self._keys[name] for name in names], [self._turns[name] for name in names]
         x = estimate(space, posed, self._smoother.calculateEstimate(keys), keys)
         cov = [self._smoother.marginalCovariance(key) for key in keys]
-        if space.turning:
+        if space.has_rotation:
             cov = [t @ each @ t.T for t, each in zip(tangent(space, posed, x), cov, strict=True)]
         return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
 
@@ -155,31 +158,31 @@ class FixedLag:
         self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float], posed: Sequence[bool]
     ) -> list[int]:
         """Indices of the new nodes; InputError as `update`."""
-        for field, given in (("batch", piece.batch), ("held", piece.held), ("constraints", piece.constraints)):
+        for field, given in (("batch", piece.batch), ("fixed", piece.fixed), ("constraints", piece.constraints)):
             if given:
-                mend = "Pick one realisation; hold a node with a position or pose factor of small std."
-                raise InputError("piece", f"with {field} {given}", f"must have no {field}", mend)
+                hint = "Pick one realisation; hold a node with a position or pose factor of small std."
+                raise InputError("piece", f"with {field} {given}", f"must have no {field}", hint)
         if self._dimension not in (None, piece.dimension):
-            mend = "Use one smoother per dimension."
-            raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", mend)
+            hint = "Use one smoother per dimension."
+            raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", hint)
         own, newest = {*piece.names}, max([self._newest, *stamps.values()])
         for name, at in stamps.items():
             if not (name in own or name in before) or not newest - self.lag <= at < np.inf:
-                mend = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
-                raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", mend)
+                hint = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
+                raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", hint)
         fresh = []
         for i, (name, turns) in enumerate(zip(piece.names, posed, strict=True)):
             if name not in before:
                 fresh.append(i)
                 if name not in stamps:
-                    mend = "Give a new node its moment; a node that has left the window cannot be measured any more."
-                    raise InputError("stamps", f"none of {name!r}", "must have every new node", mend)
+                    hint = "Give a new node its moment; a node that has left the window cannot be measured any more."
+                    raise InputError("stamps", f"none of {name!r}", "must have every new node", hint)
             elif self._turns[name] != turns:
                 raise InputError("piece", repr(name), "must stay the point or pose that it was", "Name it in poses.")
         return fresh
 
     def _geometry(self, piece: Problem, rest: Sequence[int]) -> Floats:
-        """(n, width) where the piece is linearised: its most probable nodes given the marginals of those of the window.
+        """(n, ambient) where the piece is linearised: its most probable nodes given the marginals of the window.
 
         Of converted measurements that is their linear solution; of others, the `rest`, one Gauss-Newton step from x0.
         Where all is linear any will do.
@@ -207,12 +210,12 @@ class FixedLag:
             for _ in range(self.passes - 1):
                 self._smoother.update()
         except RuntimeError as singular:
-            mend = "Add a position factor, or more measurements. The smoother cannot be used any more."
-            raise InputError("piece", str(singular)[:60], "must leave no node free", mend) from singular
+            hint = "Add a position factor, or more measurements. The smoother cannot be used any more."
+            raise InputError("piece", str(singular)[:60], "must leave no node free", hint) from singular
 
 
 def priors(piece: Problem, old: Ints, was: Estimates) -> list[Factor]:
-    """What the window says of nodes of a piece, one by one."""
+    """Marginals of the window as prior factors on nodes of a piece, one by one."""
     space, d = piece.space, piece.dimension
     turns = np.isin(old, piece.poses)
     found = []

@@ -12,9 +12,9 @@ from .factor import Factor, unchecked
 from .problem import Problem
 
 LEAST_RANGE = 1.0
-"""m; a noisy range near zero would make the converted angles seem exact (performance.md G1 of the design notes)."""
+"""m; a noisy range near zero would make the converted angles seem exact."""
 LEAST_SINE = 0.05
-"""Of the inclination: near the vertical the azimuth says nothing."""
+"""Of the inclination: near the vertical the azimuth carries no information."""
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
 
@@ -23,22 +23,21 @@ def converted(problem: Problem) -> Problem:
     """The linear problem: spherical factors become vectors d u with the rotated covariance; other angles are left out.
 
     d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
-    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot
-    (performance.md section 1.1 of the design notes).
+    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
     """
     factors = [_vector(f) if f.kind == "spherical" else unchecked(f, loss=None) for f in problem.factors]
-    return problem.having(factors=tuple(f for f in factors if f.measurement.linear), x0=None, held=())
+    return problem.replace_unchecked(factors=tuple(f for f in factors if f.measurement.linear), x0=None, fixed=())
 
 
 def initial_guess(problem: Problem) -> Floats:
-    """(B, n, width): x0 if the problem has one, else the solution of `converted`.
+    """(B, n, ambient): x0 if the problem has one, else the solution of `converted`.
 
     Raises:
         InputError: poses without an x0.
     """
     batch = problem.batch or 1
     if problem.x0 is not None:
-        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.width)))
+        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.ambient)))
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
     linear = converted(problem)
@@ -49,7 +48,7 @@ def initial_guess(problem: Problem) -> Floats:
 
 
 def somewhere(problem: Problem) -> Floats:
-    """(B, n, width): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
+    """(B, n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
 
     Raises:
         InputError: poses without an x0.
@@ -67,16 +66,23 @@ def somewhere(problem: Problem) -> Floats:
 
 def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:
     """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
-    touched = np.unique(np.concatenate([np.empty(0, np.int64), *(f.nodes.ravel() for f in linear.factors)]))
-    lost = np.setdiff1d(np.arange(len(problem.names)), touched)
-    if len(lost):
-        ranges = [f.z[..., 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
-        turn, radius = 2.4 * np.arange(len(lost)), np.sqrt(1.0 + np.arange(len(lost)))
-        spiral = np.zeros((len(lost), problem.dimension))
-        spiral[:, 0], spiral[:, 1] = radius * np.cos(turn), radius * np.sin(turn)
-        middle = x[:, touched].mean(axis=1, keepdims=True) if len(touched) else 0.0
-        x[:, lost] = middle + (ranges[0] if ranges else 1.0) * spiral
-    return x
+    touched = np.zeros(x.shape[:2], dtype=bool)
+    for f in linear.factors:
+        informative = f.informative
+        if informative.all():
+            touched[:, f.nodes] = True
+        else:
+            for column in f.nodes.T:
+                np.logical_or.at(touched.T, column, np.atleast_2d(informative).T)
+    if touched.all():
+        return x
+    ranges = [f.z[..., 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
+    place = np.cumsum(~touched, axis=1) - 1
+    turn, radius = 2.4 * place, np.sqrt(1.0 + place) * (ranges[0] if ranges else 1.0)
+    spiral = np.zeros_like(x)
+    spiral[..., 0], spiral[..., 1] = radius * np.cos(turn), radius * np.sin(turn)
+    middle = (x * touched[..., None]).sum(axis=1) / np.maximum(touched.sum(axis=1), 1)[:, None]
+    return np.where(touched[..., None], x, middle[:, None] + spiral)
 
 
 def _vector(factor: Factor) -> Factor:

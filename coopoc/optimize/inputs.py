@@ -1,4 +1,4 @@
-"""What users give as nodes, values and trust, checked: each error names the field, the value and the mend."""
+"""Nodes, values and standard deviations as users give them, checked."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Bools, Floats, Ints, checked, frozen, refuse
 from ..errors import InputError
 from .measurements import Measurement
 from .space import Space
@@ -33,8 +33,8 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
     if not (least > 0).all():
         k = int(np.flatnonzero(~(least > 0))[0])
         why = f"smallest eigenvalue {least[k]:.3g}" if symmetric[k] else "not symmetric or not finite"
-        mend = "Give a covariance, not an information matrix, with no exact direction."
-        raise InputError(f"cov of {kind}", f"number {k}: {why}", "must be symmetric positive definite", mend)
+        hint = "Give a covariance, not an information matrix, with no exact direction."
+        raise InputError(f"cov of {kind}", f"number {k}: {why}", "must be symmetric positive definite", hint)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(array)))
 
 
@@ -44,34 +44,27 @@ def fitting(known: Measurement, given: int) -> int | None:
     fits = [d for d in (2, 3) if (d == 3 or known.plane is not None) and known.given(d) == given]
     if not fits:
         allowed = sorted({known.given(d) for d in (2, 3) if d == 3 or known.plane is not None})
-        mend = "Write poses with coopoc.optimize.pose." if known.compares_poses else "Give one per component."
+        hint = "Write poses with coopoc.optimize.pose." if known.compares_poses else "Give one per component."
         words = f"must have {' or '.join(map(str, allowed))}"
-        raise InputError(f"z of {known.name}", f"{given} numbers per row", words, mend)
+        raise InputError(f"z of {known.name}", f"{given} numbers per row", words, hint)
     return fits[0] if len(fits) == 1 else None
 
 
 def numbers(field: str, values: npt.ArrayLike) -> Floats:
     """Read-only array of what a user gave; InputError if it is no array of numbers."""
-    try:
-        return frozen(values)
-    except (TypeError, ValueError):
-        mend = "Rows must be equally long and hold numbers only."
-        raise InputError(field, repr(values)[:60], "must be an array of numbers", mend) from None
+    return checked(field, values)
 
 
 def check_nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
     """(M, arity) whole numbers, no node paired with itself."""
-    given = np.asarray(nodes)
-    if given.size and given.dtype.kind not in "iu":
-        mend = "Problem.add takes names; a Factor takes indices."
-        raise InputError("nodes", repr(nodes)[:60], "must be whole numbers", mend)
-    array = frozen(nodes, np.int64)
+    array = checked("nodes", nodes, dtype=int)
     if array.ndim != 2 or array.shape[1] != known.arity:
-        mend = "Give one row per measurement."
-        raise InputError("nodes", array.shape, f"must have shape (M, {known.arity}) for {known.name}", mend)
+        hint = "Give one row per measurement."
+        raise InputError("nodes", array.shape, f"must have shape (M, {known.arity}) for {known.name}", hint)
+    refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
     if known.arity == 2 and (same := array[:, 0] == array[:, 1]).any():
-        mend = "A vehicle does not measure itself."
-        raise InputError("nodes", array[same][0].tolist(), "must be two different points", mend)
+        hint = "A vehicle does not measure itself."
+        raise InputError("nodes", array[same][0].tolist(), "must be two different points", hint)
     return array
 
 
@@ -86,9 +79,9 @@ def check_constants(known: Measurement, constants: npt.ArrayLike | None, count: 
         and given.size in (known.constants, count * known.constants)
     )
     if not fits or not np.isfinite(given).all():
-        mend = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
+        hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
         raise InputError(
-            "constants", given.tolist(), f"must be {known.constants} finite numbers for {known.name}", mend
+            "constants", given.tolist(), f"must be {known.constants} finite numbers for {known.name}", hint
         )
     return frozen(np.broadcast_to(given, (count, known.constants)))
 
@@ -103,10 +96,10 @@ def check_values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
     dimension = fitting(known, array.shape[-1]) or 3
     if not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array))[0]
-        mend = "Drop the measurement, or give it std = inf and any finite z."
-        raise InputError(f"z of {known.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", mend)
+        hint = "Drop the measurement, or give it std = inf and any finite z."
+        raise InputError(f"z of {known.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", hint)
     if known.compares_poses:
-        _check_rotations(known, Space(dimension, turning=True).rotation(array))
+        _check_rotations(known, Space(dimension, has_rotation=True).rotation(array))
         return array
     for k, component in enumerate(known.kept(dimension)):
         _check_component(known, known.components[component], array[..., k])
@@ -115,18 +108,22 @@ def check_values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
 
 def _check_component(known: Measurement, component: str, column: Floats) -> None:
     if component == "distance" and (column <= 0).any():
-        mend = "Coincident vehicles have no direction: drop the pair."
-        raise InputError(f"z of {known.name}", column.min(), "must be a distance > 0 m", mend)
+        hint = "Coincident vehicles have no direction: drop the pair."
+        raise InputError(f"z of {known.name}", column.min(), "must be a distance > 0 m", hint)
     if component == "angle" and (np.abs(column) > 2 * np.pi).any():
-        mend = "This looks like degrees: use np.deg2rad."
-        raise InputError(f"z of {known.name}", np.abs(column).max(), "must be within 2 pi rad", mend)
+        hint = "This looks like degrees: use np.deg2rad."
+        raise InputError(f"z of {known.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
 
 
 def _check_rotations(known: Measurement, rotation: Floats) -> None:
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(rotation.shape[-1])).max(axis=(-1, -2))
     if (error > 1e-6).any() or (np.linalg.det(rotation) < 0).any():
-        raise InputError(f"z of {known.name}", f"a rotation off by {error.max():.1g}", "must hold rotation matrices",
-                         "Make it with coopoc.optimize.pose(position, angle).")  # fmt: skip
+        raise InputError(
+            f"z of {known.name}",
+            f"a rotation off by {error.max():.1g}",
+            "must hold rotation matrices",
+            "Make it with coopoc.optimize.pose(position, angle).",
+        )
 
 
 def check_std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
@@ -139,8 +136,8 @@ def check_std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) ->
         allowed = f"must have shape ({size},) or {(shape[-2], size)} or (B, M, {size})"
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
     if not (wide > 0).all():
-        mend = "Give standard deviations; infinity means no information."
-        raise InputError(f"std of {known.name}", array[~(array > 0)][0], "must be > 0", mend)
+        hint = "Give standard deviations; infinity means no information."
+        raise InputError(f"std of {known.name}", array[~(array > 0)][0], "must be > 0", hint)
     kept = known.kept(3 if size == len(known.components) else 2)
     angles = wide[..., [known.components[k] in ("angle", "turn") for k in kept]]
     if (np.isfinite(angles) & (angles > np.pi)).any():

@@ -18,7 +18,7 @@ from .space import Space
 
 
 def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
-    """True unless the Lagrangian of a single problem curves downwards at x (n, width) along what `active` leaves free.
+    """True unless the Lagrangian of a single problem curves downwards at x (n, ambient) within what `active` allows.
 
     Z^T (H + sum_c m_c d2 h_c / dx2) Z is positive definite, H the Hessian of the cost, m the multipliers and Z the
     directions that remain. The far side of a range that must be met is a stationary point too, and a maximum.
@@ -32,13 +32,13 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
         return is_minimum(replace(problem, constraints=()), x)
     J = problem.jacobian(linear := problem.linearise(x[None]))
     cost = matrix(structure(problem)[0], true_blocks(problem, linear))
-    curved = cost + _bend(problem, x, active.multipliers)
+    curved = cost + _constraint_curvature(problem, x, active.multipliers)
     curved = curved + SLACK * diags_array(np.asarray(J.multiply(J).sum(axis=0)).ravel())
     within = active.along.T @ curved @ active.along
     return not within.shape[0] or pivots(within) is not None
 
 
-def _bend(problem: Problem, x: Floats, multipliers: Floats) -> Any:
+def _constraint_curvature(problem: Problem, x: Floats, multipliers: Floats) -> Any:
     """(n dof, n dof) sparse sum of multipliers times second derivatives of the constraints."""
     from scipy.sparse import coo_array
 
@@ -52,7 +52,7 @@ def _bend(problem: Problem, x: Floats, multipliers: Floats) -> Any:
         if item.measurement.linear or not len(pushing):
             continue
         nodes = item.nodes[pushing]
-        free = np.ones((*nodes.shape, dof)) if problem.free is None else problem.free[nodes]
+        free = np.ones((*nodes.shape, dof)) if problem.movable is None else problem.movable[nodes]
         free = free.reshape(len(nodes), -1)
         whole = _second(problem.space, item, pushing, x[nodes], weight[pushing]) * free[:, :, None] * free[:, None, :]
         at = (dof * nodes[:, :, None] + np.arange(dof)).reshape(len(nodes), -1)
@@ -65,23 +65,32 @@ def _second(space: Space, item: Constraint, rows: Any, at: Floats, weight: Float
     """(M, arity dof, arity dof) second derivative of weight . h, by central differences of the exact first.
 
     Args:
-        item: a constraint, and which `rows` of it. at: (M, arity, width) nodes of each row, its own. weight: (M, size).
+        item: a constraint, and which `rows` of it.
+        at: (M, arity, ambient) nodes of each row.
+        weight: (M, size).
     """
     count, arity = at.shape[:2]
     assert item.constants is not None
-    alone = replace(item, nodes=np.arange(count * arity).reshape(count, arity), lower=item.lower[rows],
-                    upper=item.upper[rows], constants=item.constants[rows])  # fmt: skip
+    alone = replace(
+        item,
+        nodes=np.arange(count * arity).reshape(count, arity),
+        lower=item.lower[rows],
+        upper=item.upper[rows],
+        constants=item.constants[rows],
+    )
 
-    def slope(step: Floats) -> Floats:
+    def jacobian(step: Floats) -> Floats:
         moved = space.retract(at, step.reshape(count, arity, space.dof)).reshape(1, count * arity, -1)
         seen = local(space, alone.measurement, moved, alone.nodes)
         value, inner = values(alone.measurement, alone, *seen)
         inner = np.broadcast_to(inner, (*value.shape, inner.shape[-1]))
-        slopes = chain(space, alone.measurement, moved, alone.nodes, seen, inner)
-        slopes = (-slopes[0], slopes[0]) if len(slopes) < arity else slopes
-        pushing = (np.where(weight[..., None] != 0.0, s[0], 0.0) for s in slopes)  # the others may have no derivative
+        jacobians = chain(space, alone.measurement, moved, alone.nodes, seen, inner)
+        jacobians = (-jacobians[0], jacobians[0]) if len(jacobians) < arity else jacobians
+        pushing = (
+            np.where(weight[..., None] != 0.0, s[0], 0.0) for s in jacobians
+        )  # the others may have no derivative
         return np.concatenate([np.einsum("mk,mkd->md", weight, s) for s in pushing], axis=1)
 
     sides = STEP * np.eye(arity * space.dof)[:, None].repeat(count, axis=1)
-    whole = np.stack([(slope(side) - slope(-side)) / (2.0 * STEP) for side in sides], axis=2)
+    whole = np.stack([(jacobian(side) - jacobian(-side)) / (2.0 * STEP) for side in sides], axis=2)
     return 0.5 * (whole + np.swapaxes(whole, 1, 2))

@@ -22,47 +22,50 @@ class Linear:
     residual and derivatives carry the root of its weight rho'.
 
     Args:
-        x: (B, n, width). residual: per factor (B, M, size). slope: per factor and node (B or 1, M or 1, size, dof).
-        cost: (B,) 1/2 sum of rho. many: of a problem with realisations, whose normal equations kernels may compute; how
-            many take part must not decide that, since a realisation's digits shall not depend on the others.
+        x: (B, n, ambient).
+        residual: per factor (B, M, size).
+        jacobian: per factor and node (B or 1, M or 1, size, dof).
+        cost: (B,) 1/2 sum of rho.
+        many: of a problem with realisations, whose normal equations kernels may compute; how many take part must not
+            decide that, since a realisation's digits shall not depend on the others.
     """
 
     x: Floats
     residual: tuple[Floats, ...]
-    slope: tuple[tuple[Floats, ...], ...]
+    jacobian: tuple[tuple[Floats, ...], ...]
     cost: Floats
     many: bool = False
 
     def pick(self, which: Bools | Ints) -> Linear:
         """The realisations `which` of B."""
-        slope = tuple(tuple(s[which] if len(s) > 1 else s for s in nodes) for nodes in self.slope)
-        return Linear(self.x[which], tuple(r[which] for r in self.residual), slope, self.cost[which], self.many)
+        jacobian = tuple(tuple(s[which] if len(s) > 1 else s for s in nodes) for nodes in self.jacobian)
+        return Linear(self.x[which], tuple(r[which] for r in self.residual), jacobian, self.cost[which], self.many)
 
     def by_node(self, factors: Sequence[Factor]) -> list[tuple[Floats, ...]]:
         """Per factor one derivative for each of its nodes."""
-        return [(-slope[0], slope[0]) if len(slope) < factor.nodes.shape[1] else slope
-                for factor, slope in zip(factors, self.slope, strict=True)]  # fmt: skip
+        return [
+            (-jacobian[0], jacobian[0]) if len(jacobian) < factor.nodes.shape[1] else jacobian
+            for factor, jacobian in zip(factors, self.jacobian, strict=True)
+        ]
 
 
-def linearise(
-    space: Space, factors: Sequence[Factor], free: Bools | None, x: Floats, many: bool = False
-) -> Linear:  # fmt: skip
-    """Factors around x (B, n, width); what is not `free` (n, dof) has no derivative."""
-    residuals, slopes, cost = [], [], np.zeros(len(x))
+def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats, many: bool = False) -> Linear:
+    """Factors around x (B, n, ambient); what is not `movable` (n, dof) has no derivative."""
+    residuals, jacobians, cost = [], [], np.zeros(len(x))
     for factor in factors:
-        residual, slope = _factor(space, factor, x)
+        residual, jacobian = _factor(space, factor, x)
         if factor.loss is None:
             cost += 0.5 * np.einsum("bmk,bmk->b", residual, residual)
         else:
             square = np.einsum("bmk,bmk->bm", residual, residual)
             root = np.sqrt(factor.loss.weight(square))[..., None]
-            residual, slope = residual * root, tuple(s * root[..., None] for s in slope)
+            residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)
             cost += 0.5 * factor.loss.cost(square).sum(axis=1)
-        if free is not None:
-            slope = _masked(factor, slope, free)
+        if movable is not None:
+            jacobian = _masked(factor, jacobian, movable)
         residuals.append(residual)
-        slopes.append(slope)
-    return Linear(x, tuple(residuals), tuple(slopes), cost, many)
+        jacobians.append(jacobian)
+    return Linear(x, tuple(residuals), tuple(jacobians), cost, many)
 
 
 def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
@@ -70,32 +73,32 @@ def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floa
     assert factor.constants is not None
     seen = local(space, known, x, factor.nodes)
     gap: Floats
-    slope: Floats
+    jacobian: Floats
     if known.linear:
-        gap, slope = seen[0] - factor.z, factor.root
+        gap, jacobian = seen[0] - factor.z, factor.root
     else:
-        gap, slope = known.differentiate(*seen, factor.z, factor.constants)
-        slope = factor.whiten_slope(slope)
-    slope = slope.reshape(*(1,) * (4 - slope.ndim), *slope.shape)
-    return factor.whiten(gap), chain(space, known, x, factor.nodes, seen, slope)
+        gap, jacobian = known.differentiate(*seen, factor.z, factor.constants)
+        jacobian = factor.whiten_jacobian(jacobian)
+    jacobian = jacobian.reshape(*(1,) * (4 - jacobian.ndim), *jacobian.shape)
+    return factor.whiten(gap), chain(space, known, x, factor.nodes, seen, jacobian)
 
 
-def opposite(factor: Factor, free: Bools | None) -> bool:
+def opposite(factor: Factor, movable: Bools | None) -> bool:
     """Whether the two nodes of the factor's measurements have derivatives that differ in sign only."""
     pair = factor.measurement.frame == "world" and factor.nodes.shape[1] == 2
-    return pair and (free is None or bool(free[factor.nodes].all()))
+    return pair and (movable is None or bool(movable[factor.nodes].all()))
 
 
-def _masked(factor: Factor, slope: tuple[Floats, ...], free: Bools) -> tuple[Floats, ...]:
+def _masked(factor: Factor, jacobian: tuple[Floats, ...], movable: Bools) -> tuple[Floats, ...]:
     nodes = factor.nodes.T
-    if opposite(factor, free):
-        return slope
-    if len(slope) < len(nodes):
-        slope = (-slope[0], slope[0])
-    return tuple(s * free[column][:, None, :] for s, column in zip(slope, nodes, strict=True))
+    if opposite(factor, movable):
+        return jacobian
+    if len(jacobian) < len(nodes):
+        jacobian = (-jacobian[0], jacobian[0])
+    return tuple(s * movable[column][:, None, :] for s, column in zip(jacobian, nodes, strict=True))
 
 
-def jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], which: int) -> Any:
+def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], which: int) -> Any:
     """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
     from scipy.sparse import csr_array
 
@@ -109,11 +112,11 @@ def entries(linear: Linear, factors: Sequence[Factor], dof: int) -> tuple[Floats
     batch, top = len(linear.x), 0
     data: list[Floats] = [np.empty((batch, 0))]
     rows, cols = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for factor, residual, slopes in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+    for factor, residual, jacobians in zip(factors, linear.residual, linear.by_node(factors), strict=True):
         count, size = residual.shape[1:]
         row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
-        for column, slope in zip(factor.nodes.T, slopes, strict=True):
-            data.append(np.broadcast_to(slope, (*residual.shape, dof)).reshape(batch, -1))
+        for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
+            data.append(np.broadcast_to(jacobian, (*residual.shape, dof)).reshape(batch, -1))
             rows.append(row.ravel())
             cols.append((dof * column[:, None, None] + np.arange(dof) + np.zeros((size, 1), np.int64)).ravel())
         top += count * size

@@ -10,7 +10,7 @@ from .space import Space, cross
 
 
 def local(space: Space, known: Measurement, x: Floats, nodes: Ints) -> tuple[Floats, Floats | None]:
-    """Vector (B, M, d) and rotation (B, M, d, d), or None, that the formula of a kind gets at x (B, n, width)."""
+    """Vector (B, M, d) and rotation (B, M, d, d), or None, that the formula of a kind gets at x (B, n, ambient)."""
     p = space.position(x)
     here = p[:, nodes[:, -1]]
     vector = here if known.arity == 1 else here - p[:, nodes[:, 0]]
@@ -25,27 +25,28 @@ def local(space: Space, known: Measurement, x: Floats, nodes: Ints) -> tuple[Flo
 
 
 def chain(
-    space: Space, known: Measurement, x: Floats, nodes: Ints, seen: tuple[Floats, Floats | None], slope: Floats
+    space: Space, known: Measurement, x: Floats, nodes: Ints, seen: tuple[Floats, Floats | None], jacobian: Floats
 ) -> tuple[Floats, ...]:
     """Derivatives (B, M, size, dof) by the steps of the nodes, from those by what is seen.
 
     A pair in the world frame gets only its second node's: the first's is minus it.
 
     Args:
-        seen: of `local`. slope: (B, M, size, d), or (B, M, size, dof) if the frame is relative.
+        seen: of `local`.
+        jacobian: (B, M, size, d), or (B, M, size, dof) if the frame is relative.
     """
     if known.frame == "world":
-        return (_wide(space, slope),)
+        return (_wide(space, jacobian),)
     if known.arity == 1:
-        return (slope,)
+        return (jacobian,)
     vector, rotation = seen
     d = space.dimension
     back = np.swapaxes(space.rotation(x)[:, nodes[:, 0]], -1, -2)
-    moved = slope[..., :d] @ back
-    turning = slope[..., :d] @ _swing(vector)
+    moved = jacobian[..., :d] @ back
+    turning = jacobian[..., :d] @ _swing(vector)
     if rotation is None:
         return np.concatenate([-moved, turning], axis=-1), _wide(space, moved)
-    own = slope[..., d:]
+    own = jacobian[..., d:]
     turning -= own @ (np.swapaxes(rotation, -1, -2) if d == 3 else np.ones((1, 1)))
     return np.concatenate([-moved, turning], axis=-1), np.concatenate([moved, own], axis=-1)
 
@@ -57,7 +58,7 @@ def _swing(vector: Floats) -> Floats:
     return np.stack([vector[..., 1], -vector[..., 0]], axis=-1)[..., None]
 
 
-def _wide(space: Space, slope: Floats) -> Floats:
+def _wide(space: Space, jacobian: Floats) -> Floats:
     if space.angles == 0:
-        return slope
-    return np.concatenate([slope, np.zeros((*slope.shape[:-1], space.angles))], axis=-1)
+        return jacobian
+    return np.concatenate([jacobian, np.zeros((*jacobian.shape[:-1], space.angles))], axis=-1)

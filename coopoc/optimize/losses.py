@@ -1,4 +1,4 @@
-"""Robust losses: how much a measurement that disagrees may pull."""
+"""Robust losses, which bound the influence of outliers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..plugins import unknown
 
 Curve = Callable[[Floats, float], Floats]
 Shape = tuple[Curve, Curve, Curve]
@@ -43,11 +44,12 @@ class Loss:
     """rho(s) of the squared whitened residual s = |W (h(x) - z)|^2; half of it is what a measurement costs.
 
     huber: s up to c^2, then 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s/c^2). geman-mcclure: s / (1 + s/c^2).
-    truncated: min(s, c^2). All equal s near zero. A measurement then pulls with the weight rho'(s) (Barron, CVPR 2019;
+    truncated: min(s, c^2). All equal s near zero. A measurement then has the weight rho'(s) (Barron, CVPR 2019;
     Black and Rangarajan, IJCV 1996). Only huber has a single minimum where least squares has.
 
     Args:
-        name: of the four. scale: c > 0, in standard deviations.
+        name: of the four.
+        scale: c > 0, in standard deviations.
 
     >>> float(Loss("huber", 1.0).cost(np.array(9.0))), float(Loss("huber", 1.0).weight(np.array(9.0)).round(3))
     (5.0, 0.333)
@@ -58,7 +60,7 @@ class Loss:
 
     def __post_init__(self) -> None:
         if self.name not in LOSSES:
-            raise InputError("loss", repr(self.name), f"must be one of {sorted(LOSSES)}", 'Such as Loss("huber", 1.5).')
+            raise unknown("loss", self.name, LOSSES)
         if not 0 < self.scale < np.inf:
             raise InputError("scale", self.scale, "must be > 0 and finite", "It counts standard deviations: 1.5 to 3.")
 
@@ -70,6 +72,6 @@ class Loss:
         """rho'(s), in [0, 1]."""
         return LOSSES[self.name][1](square, self.scale)
 
-    def bend(self, square: Floats) -> Floats:
+    def second_derivative(self, square: Floats) -> Floats:
         """rho''(s), at most 0; 0 at the kink of a truncated loss."""
         return LOSSES[self.name][2](square, self.scale)

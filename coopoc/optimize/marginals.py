@@ -13,7 +13,8 @@ def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Float
     """(n, dof, dof) diagonal blocks of (J^T J)^-1 from the Bayes tree of J's rows.
 
     Args:
-        J: (rows, n dof) sparse, every row of at most a few nodes. still: (n, dof) what cannot move: its variance is 1.
+        J: (rows, n dof) sparse, every row of at most a few nodes.
+        still: (n, dof) what cannot move: its variance is 1.
 
     Raises:
         numpy.linalg.LinAlgError: the system is singular.

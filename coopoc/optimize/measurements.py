@@ -10,6 +10,8 @@ import numpy as np
 
 from ..arrays import Bools, Floats
 from ..errors import InputError
+from ..one_file import in_file
+from ..plugins import find, names, unknown
 from ..world import spherical as polar
 from . import dual
 from .space import Space, exp
@@ -36,7 +38,7 @@ class Measurement:
         linear: the formula is the world vector itself.
         plane: components that a problem of dimension 2 keeps (z = 0 there); None if it has none of them.
         constants: how many known numbers each measurement carries, such as the time between two positions.
-        compares_poses: z is a pose (Space.width numbers), and the formula also gets it: (x, y, z, R, pose z, m).
+        compares_poses: z is a pose (Space.ambient numbers), and the formula also gets it: (x, y, z, R, pose z, m).
     """
 
     name: str
@@ -63,7 +65,7 @@ class Measurement:
 
     def given(self, dimension: int = 3) -> int:
         """Numbers z per measurement."""
-        return Space(dimension, turning=True).width if self.compares_poses else self.size(dimension)
+        return Space(dimension, has_rotation=True).ambient if self.compares_poses else self.size(dimension)
 
     def angles(self, dimension: int = 3) -> Bools:
         """(size,) True where a component is an angle."""
@@ -79,7 +81,8 @@ class Measurement:
 
         Args:
             local: x, y[, z] of the vector, then, if the frame is relative, the d^2 components of the rotation.
-            z: `given` numbers. constants: `constants` numbers.
+            z: `given` numbers.
+            constants: `constants` numbers.
         """
         dimension = 2 if len(local) in (2, 6) else 3
         kept = self.kept(dimension)
@@ -93,20 +96,23 @@ class Measurement:
         """(..., size) residuals and (..., size, E) their derivative by the local vector and, if relative, its turning.
 
         Args:
-            local: (..., d) vector. rotation: (..., d, d) or None. z: (..., given). given: (..., constants).
+            local: (..., d) vector.
+            rotation: (..., d, d) or None.
+            z: (..., given).
+            given: (..., constants).
         """
         if self.linear:
             return local - z, np.eye(local.shape[-1])
         numbers = _seed(local, rotation)
         parts = self.residual(numbers, columns(z), columns(given), dual)
-        shape, coordinates = local.shape[:-1], len(numbers[0].slope)
+        shape, coordinates = local.shape[:-1], len(numbers[0].derivative)
         value = np.empty((*shape, len(parts)))
-        slope = np.empty((*shape, len(parts), coordinates))
-        by_part = slope.transpose(len(shape), len(shape) + 1, *range(len(shape)))
+        jacobian = np.empty((*shape, len(parts), coordinates))
+        by_part = jacobian.transpose(len(shape), len(shape) + 1, *range(len(shape)))
         for k, part in enumerate(parts):
             value[..., k] = part.value
-            by_part[k] = part.slope
-        return self.wrapped(value), slope
+            by_part[k] = part.derivative
+        return self.wrapped(value), jacobian
 
     def difference(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> Floats:
         """(..., size) residuals h(x) - z, angles in [-pi, pi); arguments as `differentiate`."""
@@ -147,15 +153,15 @@ def _seed(local: Floats, rotation: Floats | None) -> list[dual.Dual]:
     d = local.shape[-1]
     if rotation is None:
         return list(dual.seeds(local))
-    turns = Space(d, turning=True).angles
+    turns = Space(d, has_rotation=True).angles
     found = list(dual.seeds(local, d + turns))
     generators = exp(0.5 * np.pi * np.eye(turns)) - exp(-0.5 * np.pi * np.eye(turns))
-    slopes = rotation[..., None, :, :] @ (0.5 * generators)
+    jacobians = rotation[..., None, :, :] @ (0.5 * generators)
     for i in range(d):
         for j in range(d):
-            slope = np.moveaxis(slopes[..., i, j], -1, 0)
-            still = np.zeros((d, *slope.shape[1:]))
-            found.append(dual.Dual(rotation[..., i, j], np.concatenate([still, slope])))
+            jacobian = np.moveaxis(jacobians[..., i, j], -1, 0)
+            still = np.zeros((d, *jacobian.shape[1:]))
+            found.append(dual.Dual(rotation[..., i, j], np.concatenate([still, jacobian])))
     return found
 
 
@@ -185,8 +191,8 @@ def measurement(
     if arity not in (1, 2):
         raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
     if not components or not set(components) <= set(get_args(Component)):
-        mend = "Give one per number that the formula returns."
-        raise InputError("components", components, f"must be among {get_args(Component)}", mend)
+        hint = "Give one per number that the formula returns."
+        raise InputError("components", components, f"must be among {get_args(Component)}", hint)
     if frame not in get_args(Frame):
         raise InputError("frame", repr(frame), f"must be one of {get_args(Frame)}", 'Use "world".')
     if linear and (components != ("coordinate",) * 3 or frame != "world"):
@@ -195,7 +201,7 @@ def measurement(
         )
 
     def register(formula: Formula) -> Formula:
-        if name in MEASUREMENTS:
+        if name in MEASUREMENTS and not _edited(MEASUREMENTS[name].formula, formula):
             raise InputError("measurement", repr(name), "is registered already", "Choose another name.")
         MEASUREMENTS[name] = Measurement(
             name, arity, frame, components, formula, linear, plane, constants, compares_poses
@@ -206,7 +212,23 @@ def measurement(
 
 
 def lookup(kind: str) -> Measurement:
-    """The measurement of a kind; InputError that lists the kinds if there is none."""
-    if kind not in MEASUREMENTS:
-        raise InputError("kind", repr(kind), f"must be one of {sorted(MEASUREMENTS)}", "Or register it: @measurement.")
-    return MEASUREMENTS[kind]
+    """The measurement of a kind: a registered one, an entry point of "coopoc.measurements" or "folder/mine.py:NAME".
+
+    Raises:
+        InputError: no such kind (lists the kinds and the nearest one), or the object is no measurement.
+    """
+    if kind in MEASUREMENTS:
+        return MEASUREMENTS[kind]
+    if not in_file(kind) and kind not in names("coopoc.measurements"):
+        raise unknown("kind", kind, sorted({*MEASUREMENTS, *names("coopoc.measurements")}))
+    found = find("coopoc.measurements", kind)
+    for known in MEASUREMENTS.values():
+        if known.formula is found:
+            return known
+    raise InputError("kind", repr(kind), "is no measurement", "Decorate the formula: @measurement(name, arity, ...).")
+
+
+def _edited(before: Formula, after: Formula) -> bool:
+    """Whether both come from one file that was loaded again after a change ("mine.py:NAME")."""
+    same = before.__code__.co_filename == after.__code__.co_filename
+    return same and before.__module__ != after.__module__

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..kernels.compile import use_kernels
 from .linear import Linear
 
 
@@ -20,9 +19,16 @@ class Pattern:
     once and the block between them subtracts it.
 
     Args:
-        nodes: n. pairs: (P, 2). rows, starts: products of each block, one block after the other.
-        negated: (P,) blocks between nodes that only subtract. minus: rows that subtract in blocks that also add.
-        pull_rows, pull_signs, pull_starts, pull_nodes: the same for the gradient, by node.
+        nodes: n.
+        pairs: (P, 2).
+        rows: products of each block, one block after the other.
+        starts: as `rows`.
+        negated: (P,) blocks between nodes that only subtract.
+        minus: rows that subtract in blocks that also add.
+        gradient_rows: the same for the gradient, by node.
+        gradient_signs: as `gradient_rows`.
+        gradient_starts: as `gradient_rows`.
+        gradient_nodes: as `gradient_rows`.
         places: per factor (M, 1 or 3) the blocks of its node, or of the first, the second and the two.
         still: (n, dof) True where a node cannot move, or None.
     """
@@ -33,10 +39,10 @@ class Pattern:
     starts: Ints
     negated: Bools
     minus: Ints
-    pull_rows: Ints
-    pull_signs: Floats
-    pull_starts: Ints
-    pull_nodes: Ints
+    gradient_rows: Ints
+    gradient_signs: Floats
+    gradient_starts: Ints
+    gradient_nodes: Ints
     places: tuple[Ints, ...]
     still: Bools | None
 
@@ -45,40 +51,49 @@ def pattern(n: int, factors: Sequence[tuple[Ints, bool]], still: Bools | None = 
     """Pattern of n nodes from the nodes (M, arity) of each factor and whether its two derivatives are opposite."""
     keys, rows, signs = [], [], []
     ends, end_rows, end_signs = [], [], []
-    top = pull_top = 0
+    top = gradient_top = 0
     for nodes, opposite in factors:
         count = len(nodes)
-        row, pull = top + np.arange(count), pull_top + np.arange(count)
+        row, at = top + np.arange(count), gradient_top + np.arange(count)
         first, last = nodes[:, 0], nodes[:, -1]
         pair = nodes.shape[1] == 2
         apart = pair and not opposite
-        added = [(last, row + apart * count, pull + apart * count)]
+        added = [(last, row + apart * count, at + apart * count)]
         if pair:
-            added.append((first, row, pull))
+            added.append((first, row, at))
             keys.append(np.minimum(first, last) * n + np.maximum(first, last))
             rows.append(row + 2 * apart * count)
             signs.append(np.full(count, 1.0 if apart else -1.0))
-        for k, (node, at, pulls) in enumerate(added):
+        for k, (node, at, parts) in enumerate(added):
             keys.append(node * n + node)
             rows.append(at)
             signs.append(np.ones(count))
             ends.append(node)
-            end_rows.append(pulls)
+            end_rows.append(parts)
             end_signs.append(np.full(count, -1.0 if k and opposite else 1.0))
         top += count * (3 if apart else 1)
-        pull_top += count * (2 if apart else 1)
+        gradient_top += count * (2 if apart else 1)
     key, end = np.concatenate(keys), np.concatenate(ends)
-    order, pull_order = np.argsort(key, kind="stable"), np.argsort(end, kind="stable")
+    order, gradient_order = np.argsort(key, kind="stable"), np.argsort(end, kind="stable")
     blocks, starts = np.unique(key[order], return_index=True)
-    pull_nodes, pull_starts = np.unique(end[pull_order], return_index=True)
+    gradient_nodes, gradient_starts = np.unique(end[gradient_order], return_index=True)
     sign = np.concatenate(signs)[order]
     negated = np.maximum.reduceat(sign, starts) < 0
     mixed = (sign < 0) & ~np.repeat(negated, np.diff(np.append(starts, len(sign))))
     return Pattern(
-        n, np.stack([blocks // n, blocks % n], axis=1), np.concatenate(rows)[order], starts, negated,
-        np.flatnonzero(mixed), np.concatenate(end_rows)[pull_order], np.concatenate(end_signs)[pull_order][:, None],
-        pull_starts, pull_nodes, tuple(_places(n, blocks, nodes) for nodes, _ in factors), still,
-    )  # fmt: skip
+        n,
+        np.stack([blocks // n, blocks % n], axis=1),
+        np.concatenate(rows)[order],
+        starts,
+        negated,
+        np.flatnonzero(mixed),
+        np.concatenate(end_rows)[gradient_order],
+        np.concatenate(end_signs)[gradient_order][:, None],
+        gradient_starts,
+        gradient_nodes,
+        tuple(_places(n, blocks, nodes) for nodes, _ in factors),
+        still,
+    )
 
 
 def _places(n: int, blocks: Ints, nodes: Ints) -> Ints:
@@ -95,13 +110,16 @@ def normal_equations(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> 
     Args:
         nodes: (M, arity) of each factor.
     """
-    if linear.many and use_kernels():
+    if linear.many:
         return _compiled(scheme, linear, nodes)
-    pulls = [(slope.swapaxes(-1, -2) @ residual[..., None])[..., 0]
-             for residual, slopes in zip(linear.residual, linear.slope, strict=True) for slope in slopes]  # fmt: skip
-    gradient = np.zeros((len(linear.x), scheme.nodes, pulls[0].shape[-1]))
-    signed = np.concatenate(pulls, axis=1)[:, scheme.pull_rows] * scheme.pull_signs
-    gradient[:, scheme.pull_nodes] = np.add.reduceat(signed, scheme.pull_starts, axis=1)
+    parts = [
+        (jacobian.swapaxes(-1, -2) @ residual[..., None])[..., 0]
+        for residual, jacobians in zip(linear.residual, linear.jacobian, strict=True)
+        for jacobian in jacobians
+    ]
+    gradient = np.zeros((len(linear.x), scheme.nodes, parts[0].shape[-1]))
+    signed = np.concatenate(parts, axis=1)[:, scheme.gradient_rows] * scheme.gradient_signs
+    gradient[:, scheme.gradient_nodes] = np.add.reduceat(signed, scheme.gradient_starts, axis=1)
     return assemble(scheme, squares(linear, nodes)), gradient
 
 
@@ -109,15 +127,15 @@ def _compiled(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> tuple[F
     """The same by the kernels, measurement by measurement."""
     from ..kernels.normal import add_products, add_squares
 
-    d = linear.slope[0][0].shape[-1]
+    d = linear.jacobian[0][0].shape[-1]
     blocks = np.zeros((len(linear.x), len(scheme.pairs), d, d))
     gradient = np.zeros((len(linear.x), scheme.nodes, d))
-    for residual, slopes, touched, place in zip(linear.residual, linear.slope, nodes, scheme.places, strict=True):
+    for residual, jacobians, touched, place in zip(linear.residual, linear.jacobian, nodes, scheme.places, strict=True):
         sizes = (0,) * residual.shape[2], (0,) * d
-        each = [np.ascontiguousarray(slope) for slope in slopes]
+        each = [np.ascontiguousarray(jacobian) for jacobian in jacobians]
         opposed = len(each) < touched.shape[1]
-        for k, slope in enumerate(each):
-            add_squares(touched, place, k + opposed, opposed, residual, slope, blocks, gradient, sizes)
+        for k, jacobian in enumerate(each):
+            add_squares(touched, place, k + opposed, opposed, residual, jacobian, blocks, gradient, sizes)
         if len(each) == 2:
             add_products(touched, place, each[0], each[1], blocks, sizes)
     return _stilled(scheme, blocks), gradient
@@ -126,10 +144,10 @@ def _compiled(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> tuple[F
 def squares(linear: Linear, nodes: Sequence[Ints]) -> list[Floats]:
     """Per factor the products of its derivatives (B, M, dof, dof): S_i^T S_i, S_j^T S_j, S_i^T S_j (i the smaller)."""
     found: list[Floats] = []
-    for residual, slopes, touched in zip(linear.residual, linear.slope, nodes, strict=True):
-        products = [slope.swapaxes(-1, -2) @ slope for slope in slopes]
-        if len(slopes) == 2:
-            cross = slopes[0].swapaxes(-1, -2) @ slopes[1]
+    for residual, jacobians, touched in zip(linear.residual, linear.jacobian, nodes, strict=True):
+        products = [jacobian.swapaxes(-1, -2) @ jacobian for jacobian in jacobians]
+        if len(jacobians) == 2:
+            cross = jacobians[0].swapaxes(-1, -2) @ jacobians[1]
             swapped = (touched[:, 0] > touched[:, 1])[:, None, None]
             products.append(np.where(swapped, cross.swapaxes(-1, -2), cross))
         shape = residual.shape[:2]

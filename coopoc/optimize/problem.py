@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -15,14 +15,16 @@ from ..errors import InputError
 from .constraint import Constraint
 from .factor import Factor
 from .inputs import numbers
-from .linear import Linear, jacobian, linearise
+from .linear import Linear, linearise, sparse_jacobian
 from .measurements import lookup
+from .nodes import check_item, indices, no_such_node, points, rows
 from .space import Space
+from .window import Noise, WindowStep, recorded_steps, window_factors
 
 if TYPE_CHECKING:
     from ..world.recording import Recording
+    from ..world.sensors import Sensors
     from .losses import Loss
-    from .sights import Noise
 
 Nodes = str | int | Sequence[str | int] | Sequence[Sequence[str | int]]
 
@@ -37,16 +39,17 @@ class Problem:
     Args:
         names: (n,) unique names of the nodes.
         factors: the measurements.
-        x0: (n, width) or (B, n, width) where the solver starts. None: the converted measurements' linear solution;
+        x0: (n, ambient) or (B, n, ambient) where the solver starts. None: the converted measurements' linear solution;
             poses need an x0.
-        hub: nodes that the others hang on, such as the ego at each step. What remains without them must fall into
+        separator: nodes that the others hang on, such as the ego at each step. What remains without them must fall into
             small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
-        dimension: 2 or 3. poses: the nodes that have a rotation.
-        held: nodes that stay at x0, such as the first pose of a graph without fixes.
+        dimension: 2 or 3.
+        poses: the nodes that have a rotation.
+        fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
         constraints: what must hold exactly.
 
     Raises:
-        InputError: repeated names, factors or a hub on unknown nodes, kinds that need a pose, shapes that do not agree.
+        InputError: repeated names, unknown nodes, kinds that need a pose, shapes that do not agree.
 
     >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
     >>> problem = problem.add("displacement", ("a", "b"), [5, 0, 0], std=1.0)
@@ -57,10 +60,10 @@ class Problem:
     names: tuple[str, ...]
     factors: tuple[Factor, ...] = ()
     x0: Floats | None = None
-    hub: tuple[int, ...] = ()
+    separator: tuple[int, ...] = ()
     dimension: int = 3
     poses: tuple[int, ...] = ()
-    held: tuple[int, ...] = ()
+    fixed: tuple[int, ...] = ()
     constraints: tuple[Constraint, ...] = ()
 
     def __post_init__(self) -> None:
@@ -68,22 +71,29 @@ class Problem:
         if len(self._place) != len(self.names):
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
-        for field in ("hub", "poses", "held"):
+        for field in ("separator", "poses", "fixed"):
             object.__setattr__(self, field, tuple(self.index(node) for node in getattr(self, field)))
-        if len(set(self.hub)) < len(self.hub):
-            raise InputError("hub", self.hub, "must not name a point twice", "Name each point of the hub once.")
+        if len(set(self.separator)) < len(self.separator):
+            raise InputError(
+                "separator", self.separator, "must not name a point twice", "Name each point of the separator once."
+            )
         Space(self.dimension)  # refuses any other than 2 and 3
-        items: tuple[Factor | Constraint, ...] = (*self.factors, *self.constraints)
+        items: tuple[object, ...] = (*self.factors, *self.constraints)
         for item in items:
-            _check_item(self, item)
+            if not isinstance(item, Factor | Constraint):
+                hint = "Add measurements with Problem.add, constraints with Problem.constrain."
+                raise InputError("factors, constraints", repr(item)[:60], "must be Factors and Constraints", hint)
+            check_item(item, self.names, self.poses, self.dimension)
         if self.x0 is not None:
-            object.__setattr__(self, "x0", frozen(points(self, "x0", self.x0)))
-        if self.held and self.x0 is None:
-            raise InputError("held", [self.names[k] for k in self.held[:3]], "needs an x0 to be held at", "Give x0=.")
+            object.__setattr__(self, "x0", frozen(points(self.space, len(self.names), "x0", self.x0)))
+        if self.fixed and self.x0 is None:
+            raise InputError(
+                "fixed", [self.names[k] for k in self.fixed[:3]], "needs an x0 to be fixed at", "Give x0=."
+            )
         sizes = {b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None and b > 1}
         if len(sizes) > 1:
-            mend = "Use the same number of realisations throughout."
-            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", mend)
+            hint = "Use the same number of realisations throughout."
+            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
 
     @cached_property
     def space(self) -> Space:
@@ -91,16 +101,16 @@ class Problem:
         return Space(self.dimension, bool(self.poses))
 
     @cached_property
-    def free(self) -> Bools | None:
-        """(n, dof) False where a node cannot move: it is held, or a point that has no rotation. None: all are free."""
+    def movable(self) -> Bools | None:
+        """(n, dof) False where a node cannot move: it is fixed, or a point that has no rotation. None: all are free."""
         space, n = self.space, len(self.names)
-        if not self.held and len(self.poses) in (0, n):
+        if not self.fixed and len(self.poses) in (0, n):
             return None
-        free = np.ones((n, space.dof), dtype=bool)
-        if space.turning:
-            free[np.setdiff1d(np.arange(n), self.poses), space.dimension :] = False
-        free[list(self.held)] = False
-        return free
+        movable = np.ones((n, space.dof), dtype=bool)
+        if space.has_rotation:
+            movable[np.setdiff1d(np.arange(n), self.poses), space.dimension :] = False
+        movable[list(self.fixed)] = False
+        return movable
 
     @cached_property
     def _place(self) -> dict[str, int]:
@@ -127,9 +137,7 @@ class Problem:
             return self._place[node]
         if isinstance(node, int | np.integer) and 0 <= node < len(self.names):
             return int(node)
-        known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
-        raise InputError("node", repr(node), f"must be an index < {len(self.names)} or one of {known}",
-                         "Name the point when the Problem is made.")  # fmt: skip
+        raise no_such_node(node, self.names)
 
     def add(
         self,
@@ -149,8 +157,17 @@ class Problem:
             nodes: one node ("a"), a pair (("a", "b")), or a list of M nodes or pairs; names or indices.
             z: (size,), a number, or (M, size).
         """
-        factor = Factor(kind, *_rows(self, kind, nodes, z), std=std, sqrt_information=sqrt_information,  # type: ignore[arg-type]
-                        constants=constants, loss=loss, cov=cov)  # type: ignore[arg-type]  # fmt: skip
+        index = indices(self.index, kind, nodes)
+        factor = Factor(
+            kind,
+            index,
+            rows(kind, z, len(index)),
+            std=std,  # type: ignore[arg-type]
+            sqrt_information=sqrt_information,  # type: ignore[arg-type]
+            constants=constants,  # type: ignore[arg-type]
+            loss=loss,
+            cov=cov,
+        )
         return replace(self, factors=(*self.factors, factor))
 
     def constrain(
@@ -166,19 +183,21 @@ class Problem:
         >>> Problem(("a",)).constrain("position", "a", lower=[0, 0, -np.inf]).constraints
         (Constraint(-inf <= position <= inf x 1),)
         """
-        index = _indices(self, kind, nodes)
+        index = indices(self.index, kind, nodes)
         size = lookup(kind).size(self.dimension)
-        low, high = (np.broadcast_to(numbers(name, v), (len(index), size)) if np.ndim(v) == 0 else numbers(name, v)
-                     for name, v in (("lower", lower), ("upper", upper)))  # fmt: skip
+        low, high = (
+            np.broadcast_to(numbers(name, v), (len(index), size)) if np.ndim(v) == 0 else numbers(name, v)
+            for name, v in (("lower", lower), ("upper", upper))
+        )
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
 
     def pick(self, which: Ints | int) -> Problem:
         """The realisations `which` of B; an int gives a single problem."""
         x0 = self.x0 if self._start_batch is None or self.x0 is None else self.x0[which]
-        return self.having(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
+        return self.replace_unchecked(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
 
-    def having(self, **changes: Any) -> Problem:
+    def replace_unchecked(self, **changes: Any) -> Problem:
         """The problem with changes that come from checked parts and need not be checked again."""
         changed = object.__new__(Problem)
         for field in fields(Problem):
@@ -186,24 +205,28 @@ class Problem:
         return changed
 
     def linearise(self, x: Floats) -> Linear:
-        """Whitened residuals and derivatives at x (B, n, width)."""
-        return linearise(self.space, self.factors, self.free, x, self.batch is not None)
+        """Whitened residuals and derivatives at x (B, n, ambient)."""
+        return linearise(self.space, self.factors, self.movable, x, self.batch is not None)
 
     def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
-        """Residual r (rows,) and sparse Jacobian J (rows, n dof) of a single problem at x (n, width): cost = 1/2 r.r.
+        """Residual r (rows,) and sparse Jacobian J (rows, n dof) of a single problem at x (n, ambient): cost = 1/2 r.r.
 
         A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
         """
-        linear = self.linearise(points(self, "x", x, (2,))[None])
+        linear = self.linearise(self._at(x))
         return np.concatenate([r.ravel() for r in linear.residual]), self.jacobian(linear)
 
     def jacobian(self, linear: Linear, which: int = 0) -> Any:
         """Sparse Jacobian (rows, n dof) of one of the realisations of `linearise`, CSR."""
-        return jacobian(linear, self.factors, (len(self.names), self.space.dof), which)
+        return sparse_jacobian(linear, self.factors, (len(self.names), self.space.dof), which)
 
     def cost(self, x: npt.ArrayLike) -> float:
-        """1/2 sum of rho of a single problem at x (n, width)."""
-        return float(self.linearise(points(self, "x", x, (2,))[None]).cost[0])
+        """1/2 sum of rho of a single problem at x (n, ambient)."""
+        return float(self.linearise(self._at(x)).cost[0])
+
+    def _at(self, x: npt.ArrayLike) -> Floats:
+        """x (1, n, ambient) of a single problem."""
+        return points(self.space, len(self.names), "x", x, (2,))[None]
 
     @classmethod
     def from_snapshot(
@@ -211,31 +234,53 @@ class Problem:
     ) -> Problem:
         """The star of one step: fixes of the ego and its linked neighbours, spherical factors between them.
 
-        All messages of the step are taken as received; `CooperativeMAP` obeys the channel instead.
+        All messages of the step are taken as received; `CooperativeMAP` obeys the channel instead. Missing
+        measurements are treated as in `from_window`.
 
         Args:
-            recording: what was measured. step: t. ego: column or id. run: realisation, None for all R at once.
+            recording: what was measured.
+            step: t.
+            ego: column or id.
+            run: realisation, None for all R at once.
             noise: what is assumed of it, default the recording's sensors.
 
         Raises:
             InputError: unknown ego, step or run.
         """
-        from .sights import window_problem
-
-        return window_problem(recording, step, ego, 1, run, noise)
+        return cls.from_window(recording, step, ego, 1, run, noise)
 
     @classmethod
     def from_window(
-        cls, recording: Recording, step: int, ego: int | str, length: int, run: int | None = 0,
+        cls,
+        recording: Recording,
+        step: int,
+        ego: int | str,
+        length: int,
+        run: int | None = 0,
         noise: Noise | None = None,
-    ) -> Problem:  # fmt: skip
+    ) -> Problem:
         """The stars of the last `length` steps, one point per vehicle and step, joined by odometry dt u.
 
-        Arguments and errors as `from_snapshot`; the first step of the window must exist.
+        A missing fix makes no factor; of a relative measurement its parts make one each where some are missing. In a
+        problem of all R realisations what one of them lacks has an infinite std. Arguments and errors as
+        `from_snapshot`; the first step of the window must exist.
         """
-        from .sights import window_problem
+        steps, names = recorded_steps(recording, step, ego, length, run, noise)
+        return cls.from_steps(steps, recording.sensors if noise is None else noise.sensors, names)
 
-        return window_problem(recording, step, ego, length, run, noise)
+    @classmethod
+    def from_steps(
+        cls, steps: Sequence[WindowStep], sensors: Sensors | None, names: Sequence[str] | None = None
+    ) -> Problem:
+        """The problem of consecutive steps, oldest first; the ego's points are the separator (see `window_factors`).
+
+        Args:
+            steps: what was measured.
+            sensors: relative noise; None: unit covariance of the converted vectors.
+            names: of the points, step by step; default their numbers.
+        """
+        count, factors, ego = window_factors(steps, sensors)
+        return cls(tuple(names or map(str, range(count))), factors, separator=ego)
 
     def __repr__(self) -> str:
         kinds = ", ".join(f"{len(f.nodes)} {f.kind}" for f in self.factors)
@@ -244,54 +289,3 @@ class Problem:
         plane = " in the plane" if self.dimension == 2 else ""
         bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
         return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
-
-
-def _indices(problem: Problem, kind: str, nodes: Any) -> Ints:
-    """Nodes (M, arity) as indices, from what a user writes."""
-    known = lookup(kind)
-    flat = [nodes] if isinstance(nodes, str) or not isinstance(nodes, Iterable) else list(nodes)
-    flat = [p for row in flat for p in (row if isinstance(row, list | tuple | np.ndarray) else [row])]
-    if len(flat) % known.arity or not flat:
-        raise InputError("nodes", nodes, f"must name {known.arity} points per {kind}", "Give points by name or index.")
-    return np.array([problem.index(p) for p in flat]).reshape(-1, known.arity)
-
-
-def _rows(problem: Problem, kind: str, nodes: Any, z: npt.ArrayLike) -> tuple[Ints, Floats]:
-    index = _indices(problem, kind, nodes)
-    values = numbers(f"z of {kind}", z)
-    return index, values.reshape(len(index), -1) if values.ndim < 2 and values.size % len(index) == 0 else values
-
-
-def _check_item(problem: Problem, item: Factor | Constraint) -> None:
-    """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
-    known, nodes = item.measurement, item.nodes
-    bad = (nodes < 0) | (nodes >= len(problem.names))
-    if bad.any():
-        problem.index(int(nodes[bad][0]))
-    if item.dimension not in (None, problem.dimension):
-        mend = f"Make it with Problem(names, dimension={item.dimension})." if known.plane else "Leave it out."
-        raise InputError(
-            f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {problem.dimension}", mend
-        )
-    observers = {"world": nodes[:, :0], "body": nodes[:, :1], "relative": nodes}[known.frame]
-    lacking = np.setdiff1d(observers, problem.poses)
-    if len(lacking):
-        raise InputError(f"nodes of {item.kind}", problem.names[lacking[0]], "must be a pose: it is seen from its body",
-                         "Name it in Problem(names, poses=[...]).")  # fmt: skip
-
-
-def points(problem: Problem, field: str, x: npt.ArrayLike, ranks: tuple[int, ...] = (2, 3)) -> Floats:
-    """x as an array (n, width) or (B, n, width); InputError if it is not one, or holds rotations that are none."""
-    array = numbers(field, x)
-    space, n = problem.space, len(problem.names)
-    if array.ndim not in ranks or array.shape[-2:] != (n, space.width) or not np.isfinite(array).all():
-        shape = f"must be finite with shape ({n}, {space.width})" + (
-            f", or (B, n, {space.width})" if 3 in ranks else ""
-        )
-        given = f"shape {array.shape}" if np.isfinite(array).all() else "not finite"
-        mend = "Make it with coopoc.optimize.pose." if space.turning else "Give one row of metres per point."
-        raise InputError(field, given, shape, mend)
-    turned = space.rotation(array)
-    if space.turning and np.abs(turned @ np.swapaxes(turned, -1, -2) - np.eye(space.dimension)).max(initial=0.0) > 1e-6:
-        raise InputError(field, "a matrix that is no rotation", "must hold rotations", "Use coopoc.optimize.pose.")
-    return array

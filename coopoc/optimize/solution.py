@@ -1,4 +1,4 @@
-"""Solution: the estimate, how sure it is, and what became of the solve."""
+"""Solution: the estimate, its covariance and the status of the solve."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Status(Enum):
     MAX_ITERATIONS = "Stopped at the limit of iterations before a minimum: raise max_iterations or give a better x0."
     SADDLE = "At a stationary point that is no minimum: give an x0 to the side of it, where the cost falls."
     RANK_DEFICIENT = "Some points can move without changing the cost: measure them, or add a position factor."
-    INFEASIBLE = "No point was found that satisfies the constraints: loosen the bounds that extras['violated'] names."
+    INFEASIBLE = "No point was found that satisfies the constraints: relax the bounds that extras['violated'] names."
     FAILED = "The backend stopped before a minimum: give a better x0, or try another backend."
 
 
@@ -33,21 +33,28 @@ class Solution:
     """The answer of one backend, with all that can be checked recomputed by `solve`.
 
     Args:
-        x: (n, width), see Space. covariance: (n, dof, dof) m^2, rad^2 marginals of (J^T J)^-1 at x, position in the
-            world's directions, then rotation in the body's; equalities taken as exact, inequalities as absent; NaN if
-            rank deficient.
-        cost: 1/2 sum of rho of the squared whitened residuals. gradient: |J^T r| at x, with constraints that of the
-            Lagrangian.
-        status: how it ended. iterations: of the backend. build_seconds, solve_seconds: to prepare and to run it.
-        backend: its name. names: of the nodes. shown: the node that `print` shows. space: of the problem.
-        free: names of the nodes that the measurements leave free. violation: largest of a constraint, in its unit.
+        x: (n, ambient), see Space.
+        covariance: (n, dof, dof) m^2, rad^2 marginals of (J^T J)^-1 at x, position in the world's directions, then
+            rotation in the body's; equalities taken as exact, inequalities as absent; NaN if rank deficient.
+        cost: 1/2 sum of rho of the squared whitened residuals.
+        gradient_norm: |J^T r| at x, with constraints that of the Lagrangian.
+        status: how it ended.
+        iterations: of the backend.
+        build_seconds: to prepare the solver and the start.
+        solve_seconds: to run it.
+        backend: its name.
+        names: of the nodes.
+        shown: the node that `print` shows.
+        space: of the problem.
+        unobservable: names of the nodes that can move without changing the cost.
+        violation: largest of a constraint, in its unit.
         extras: the backend's own numbers.
     """
 
     x: Floats
     covariance: Floats
     cost: float
-    gradient: float
+    gradient_norm: float
     status: Status
     iterations: int
     build_seconds: float
@@ -55,7 +62,7 @@ class Solution:
     backend: str
     names: tuple[str, ...]
     shown: int = 0
-    free: tuple[str, ...] = ()
+    unobservable: tuple[str, ...] = ()
     space: Space = field(default_factory=Space)
     violation: float = 0.0
     extras: dict[str, Any] = field(default_factory=dict)
@@ -71,7 +78,7 @@ class Solution:
         return self.space.rotation(self.x)
 
     def __getitem__(self, point: str) -> Floats:
-        """(width,) estimate of a node by name; InputError that lists the names if there is none."""
+        """(ambient,) estimate of a node by name; InputError that lists the names if there is none."""
         if point not in self.names:
             known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
             raise InputError("point", repr(point), f"must be one of {known}", "See solution.names.")
@@ -84,7 +91,7 @@ class Solution:
         spread = ", ".join(f"{v:.2f}" for v in np.sqrt(variance))
         return (
             f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; "
-            f"cost {self.cost:.4g}, gradient {self.gradient:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"
+            f"cost {self.cost:.4g}, gradient {self.gradient_norm:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"
         )
 
 

@@ -12,35 +12,36 @@ from ..errors import InputError
 
 @dataclass(frozen=True)
 class Space:
-    """Points of dimension d, or poses too: a node is `width` numbers, and moves in `dof` directions.
+    """Points of dimension d, or poses too: a node is `ambient` numbers, and moves in `dof` directions.
 
-    A point is its position (d,) m. Where there are poses (`turning`) every node is its position and then its rotation
-    matrix row by row, d + d^2 numbers, the identity for points. A step (dp, w) moves it to (p + dp, R Exp(w)): dp in
-    world coordinates, m, and w in the body's, rad.
+    A point is its position (d,) m. Where there are poses (`has_rotation`) every node is its position and then its
+    rotation matrix row by row, d + d^2 numbers, the identity for points. A step (dp, w) moves it to
+    (p + dp, R Exp(w)): dp in world coordinates, m, and w in the body's, rad.
 
     Args:
-        dimension: 2 or 3. turning: some nodes have a rotation.
+        dimension: 2 or 3.
+        has_rotation: some nodes have a rotation.
 
-    >>> Space(3, turning=True).width, Space(3, turning=True).dof
+    >>> Space(3, has_rotation=True).ambient, Space(3, has_rotation=True).dof
     (12, 6)
     """
 
     dimension: int = 3
-    turning: bool = False
+    has_rotation: bool = False
 
     def __post_init__(self) -> None:
         if self.dimension not in (2, 3):
             raise InputError("dimension", self.dimension, "must be 2 or 3", "Roads are flat (2) or not (3).")
 
     @property
-    def width(self) -> int:
+    def ambient(self) -> int:
         """Numbers per node."""
-        return self.dimension + self.turning * self.dimension**2
+        return self.dimension + self.has_rotation * self.dimension**2
 
     @property
     def angles(self) -> int:
         """Directions in which a pose turns."""
-        return self.turning * (1 if self.dimension == 2 else 3)
+        return self.has_rotation * (1 if self.dimension == 2 else 3)
 
     @property
     def dof(self) -> int:
@@ -48,29 +49,29 @@ class Space:
         return self.dimension + self.angles
 
     def position(self, x: Floats) -> Floats:
-        """(..., d) m of nodes (..., width)."""
+        """(..., d) m of nodes (..., ambient)."""
         at: Floats = x[..., : self.dimension]
         return at
 
     def rotation(self, x: Floats) -> Floats:
-        """(..., d, d) of nodes (..., width)."""
+        """(..., d, d) of nodes (..., ambient)."""
         d = self.dimension
-        if not self.turning:
+        if not self.has_rotation:
             return np.broadcast_to(np.eye(d), (*x.shape[:-1], d, d))
         turned: Floats = x[..., d:].reshape(*x.shape[:-1], d, d)
         return turned
 
     def join(self, position: Floats, rotation: Floats | None = None) -> Floats:
-        """Nodes (..., width) from positions (..., d) and rotations (..., d, d), default the identity."""
-        if not self.turning:
+        """Nodes (..., ambient) from positions (..., d) and rotations (..., d, d), default the identity."""
+        if not self.has_rotation:
             return np.asarray(position, dtype=np.float64)
         turned = np.eye(self.dimension) if rotation is None else np.asarray(rotation, dtype=np.float64)
         flat = turned.reshape(*turned.shape[:-2], -1)
         return np.concatenate([position, np.broadcast_to(flat, (*np.shape(position)[:-1], flat.shape[-1]))], axis=-1)
 
     def retract(self, x: Floats, step: Floats) -> Floats:
-        """Nodes (..., width) after a step (..., dof): p + dp, R Exp(w)."""
-        if not self.turning:
+        """Nodes (..., ambient) after a step (..., dof): p + dp, R Exp(w)."""
+        if not self.has_rotation:
             return np.asarray(x + step)
         d = self.dimension
         return self.join(x[..., :d] + step[..., :d], self.rotation(x) @ exp(step[..., d:]))
@@ -122,7 +123,7 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     array([ 1.,  2.,  0., -1.,  1.,  0.])
     """
     at = np.asarray(position, dtype=np.float64)
-    space = Space(at.shape[-1], turning=True)
+    space = Space(at.shape[-1], has_rotation=True)
     w = np.asarray(turn, dtype=np.float64)
     w = np.broadcast_to(w[..., None], (*at.shape[:-1], 1)) if space.dimension == 2 else w
     return space.join(at, exp(np.broadcast_to(w, (*at.shape[:-1], space.angles))))

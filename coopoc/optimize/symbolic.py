@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..errors import InputError
 from .active import steerable
 from .losses import Loss
 from .measurements import Measurement
@@ -26,8 +25,11 @@ class Term:
     """What the structure knows of a factor or a constraint.
 
     Args:
-        measurement: of the kind. raw: nodes (M, arity) int64 as bytes.
-        full: the weight is a matrix. loss: of a factor. steered: (M, size) as bytes, see `steerable`.
+        measurement: of the kind.
+        raw: nodes (M, arity) int64 as bytes.
+        full: the weight is a matrix.
+        loss: of a factor.
+        steered: (M, size) as bytes, see `steerable`.
     """
 
     measurement: Measurement
@@ -47,8 +49,11 @@ class Structure:
     """All of a problem that is no number: problems that share it share one solver.
 
     Args:
-        nodes: n. space: where they live. fixed: (n, dof) as bytes, True where a node cannot move; empty: all move.
-        factors, constraints: in the problem's order.
+        nodes: n.
+        space: where they live.
+        fixed: (n, dof) as bytes, True where a node cannot move; empty: all move.
+        factors: in the problem's order.
+        constraints: as `factors`.
     """
 
     nodes: int
@@ -58,31 +63,24 @@ class Structure:
     constraints: tuple[Term, ...]
 
     @cached_property
-    def free(self) -> Bools:
+    def movable(self) -> Bools:
         """(n, dof) True where a node can move."""
         shape = (self.nodes, self.space.dof)
         return ~np.frombuffer(self.fixed, bool).reshape(shape) if self.fixed else np.ones(shape, dtype=bool)
 
 
 def structure_of(problem: Problem) -> Structure:
-    """The structure of a single problem.
-
-    Raises:
-        InputError: a truncated loss: where it is flat its second derivative says nothing.
-    """
-    flat = [f.loss.name for f in problem.factors if f.loss is not None and f.loss.name not in _LOSSES]
-    if flat:
-        raise InputError("loss", repr(flat[0]), f"must be one of {sorted(_LOSSES)} here: it has no second derivative",
-                         "Use backend='gauss-newton', or geman-mcclure, which also lets go.")  # fmt: skip
+    """The structure of a problem."""
     factors = (Term(f.measurement, f.nodes.tobytes(), f.std is None, f.loss) for f in problem.factors)
-    constraints = (Term(c.measurement, c.nodes.tobytes(), steered=steerable(problem, c).tobytes())
-                   for c in problem.constraints)  # fmt: skip
-    fixed = b"" if problem.free is None else (~problem.free).tobytes()
+    constraints = (
+        Term(c.measurement, c.nodes.tobytes(), steered=steerable(problem, c).tobytes()) for c in problem.constraints
+    )
+    fixed = b"" if problem.movable is None else (~problem.movable).tobytes()
     return Structure(len(problem.names), problem.space, fixed, tuple(factors), tuple(constraints))
 
 
 def numbers_of(problem: Problem, x: Floats) -> Floats:
-    """(B, .) parameters of `expressions`: the centres x (B, n, width), then z, constants, weights, column by column."""
+    """(B, .) parameters of `expressions`: the centres x (B, n, ambient), then z, constants, weights by columns."""
     parts: list[Floats] = []
     for f in problem.factors:
         weight = 1.0 / f.std if f.std is not None else f.sqrt_information
@@ -97,31 +95,33 @@ def numbers_of(problem: Problem, x: Floats) -> Floats:
 
 
 def expressions(structure: Structure) -> dict[str, Any]:
-    """CasADi's x (the free steps), p (see `numbers_of`), f (cost), g (what the constraints bound) and flat (J^T J).
+    """CasADi's x (the free steps), p (see `numbers_of`), f (cost) and g (what the constraints bound).
 
     A step (dp, w) moves a node from the centre to (p + dp, R C(w)), C the Cayley map in space, which like Exp starts
-    as I + [w]x but is rational, and the angle itself in the plane. J^T J has the losses' weights in it.
+    as I + [w]x but is rational, and the angle itself in the plane.
     """
     import casadi as ca
 
     space, n = structure.space, structure.nodes
-    centre = ca.SX.sym("centre", n, space.width)
-    steps = ca.SX.sym("dx", int(structure.free.sum()))
+    centre = ca.SX.sym("centre", n, space.ambient)
+    steps = ca.SX.sym("dx", int(structure.movable.sum()))
     step = ca.SX.zeros(n, space.dof)
-    for k, (i, j) in enumerate(np.argwhere(structure.free).tolist()):
+    for k, (i, j) in enumerate(np.argwhere(structure.movable).tolist()):
         step[i, j] = steps[k]
     place = _moved(space, ca.horzsplit(centre), ca.horzsplit(step))
     factors = [_factor(term, space, *place) for term in structure.factors]
     bounds = [_constraint(term, space, *place) for term in structure.constraints]
-    slope = ca.jacobian(ca.vertcat(*(white for part in factors for white in part[2])), steps)
-    weight = ca.vertcat(*(part[3] for part in factors for _ in part[2]))
     numbers = [*(number for part in factors for number in part[0]), *(number for number, _ in bounds)]
-    return {"x": steps, "p": ca.veccat(centre, *numbers), "f": sum(part[1] for part in factors),
-            "g": ca.vertcat(*(value for _, value in bounds)), "flat": slope.T @ (ca.diag(weight) @ slope)}  # fmt: skip
+    return {
+        "x": steps,
+        "p": ca.veccat(centre, *numbers),
+        "f": sum(part[1] for part in factors),
+        "g": ca.vertcat(*(value for _, value in bounds)),
+    }
 
 
-def _factor(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tuple[Columns, Any, Columns, Any]:
-    """z, constants and weights (M, .), the cost, the whitened residuals and the weights rho' of the measurements."""
+def _factor(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tuple[Columns, Any]:
+    """z, constants and weights (M, .), and the cost."""
     import casadi as ca
 
     known, m = term.measurement, _namespace()
@@ -130,8 +130,8 @@ def _factor(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tup
     z, constants, weight = (ca.horzsplit(number) if number.size2() else [] for number in numbers)
     gap = _residual(known, _seen(known, at, turned, term.nodes), z, constants, m)
     white = _whitened(gap, weight, term.full)
-    rho, pull = _robust(term.loss, sum(w * w for w in white), m)
-    return numbers, 0.5 * ca.sum1(rho), white, pull
+    square = sum(w * w for w in white)
+    return numbers, 0.5 * ca.sum1(square if term.loss is None else LOSSES[term.loss.name](square, term.loss.scale, m))
 
 
 def _constraint(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tuple[Any, Any]:
@@ -150,34 +150,30 @@ def _namespace() -> Any:
     """CasADi as the namespace of a formula."""
     import casadi as ca
 
-    return SimpleNamespace(sqrt=ca.sqrt, sin=ca.sin, cos=ca.cos, atan2=ca.atan2, log1p=ca.log1p, fmax=ca.fmax,
-                           where=ca.if_else, remainder=ca.remainder)  # fmt: skip
+    return SimpleNamespace(
+        sqrt=ca.sqrt,
+        sin=ca.sin,
+        cos=ca.cos,
+        atan2=ca.atan2,
+        log1p=ca.log1p,
+        fmax=ca.fmax,
+        where=ca.if_else,
+        remainder=ca.remainder,
+    )
 
 
-_LOSSES: dict[str, Any] = {
+LOSSES: dict[str, Any] = {
     "huber": lambda s, c, m: m.where(s > c * c, 2.0 * c * m.sqrt(m.fmax(s, c * c)) - c * c, s),
     "cauchy": lambda s, c, m: c * c * m.log1p(s / (c * c)),
     "geman-mcclure": lambda s, c, m: s / (1.0 + s / (c * c)),
 }
 
 
-def _robust(loss: Loss | None, square: Any, m: Any) -> tuple[Any, Any]:
-    """rho and its derivative, columns (M, 1), of the squared whitened residuals."""
-    import casadi as ca
-
-    if loss is None:
-        return square, ca.SX.ones(square.shape[0])
-    s = ca.SX.sym("s", square.shape[0])
-    rho = _LOSSES[loss.name](s, loss.scale, m)
-    slope = ca.gradient(ca.sum1(rho), s)
-    return ca.substitute(rho, s, square), ca.substitute(slope, s, square)
-
-
 def _moved(space: Space, centre: Columns, step: Columns) -> tuple[Columns, list[Columns]]:
     """Columns of the positions and of the rotations (d rows of d) after the steps."""
     d = space.dimension
     at = [centre[k] + step[k] for k in range(d)]
-    if not space.turning:
+    if not space.has_rotation:
         return at, []
     turn = _chart(step[d:])
     start = [centre[d + d * i : 2 * d + d * i] for i in range(d)]
@@ -223,8 +219,10 @@ def _residual(known: Measurement, local: Columns, z: Columns, constants: Columns
     """h - z, angles in [-pi, pi]: the derivative of the remainder is 1."""
     dimension = 2 if len(local) in (2, 6) else 3
     parts = known.residual(local, z, constants, m)
-    return [m.remainder(part, 2.0 * np.pi) if angle else part
-            for part, angle in zip(parts, known.angles(dimension), strict=True)]  # fmt: skip
+    return [
+        m.remainder(part, 2.0 * np.pi) if angle else part
+        for part, angle in zip(parts, known.angles(dimension), strict=True)
+    ]
 
 
 def _whitened(gap: Columns, weight: Columns, full: bool) -> Columns:

@@ -1,4 +1,4 @@
-"""cluster: outcomes of cells from the workers of a Dask cluster, for who has outgrown one machine.
+"""cluster: outcomes of cells from the workers of a Dask cluster.
 
 joblib's Dask backend waits for ever when a cell kills its workers (joblib 1.6: an error never reaches the caller), so
 cells go to Dask's own client.
@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 from ..errors import InputError, MissingLibraryError
+from .cell import Cell
 from .compute import Function, Outcome, WorkerDiedError, attempt
 from .environment import environment
-from .study import Cell
 
 PATIENCE = 30.0
 """Seconds without any worker until a run gives up: one that is restarted is back by then."""
@@ -26,7 +26,7 @@ PATIENCE = 30.0
 
 @dataclass(frozen=True)
 class Cluster:
-    """A Dask scheduler with workers that can load what they are to compute; their environments by address."""
+    """A Dask scheduler with workers that can load the study; their environments by address."""
 
     client: Any
     address: str
@@ -45,8 +45,10 @@ class Cluster:
         """
         done: SimpleQueue[Any] = SimpleQueue()
         run = uuid4().hex  # results of other runs are not ours, even if they have the same name
-        futures = [self.client.submit(attempt, function, cell, key=f"{cell.name}-{run}", priority=-place, pure=False)
-                   for place, cell in enumerate(cells)]  # fmt: skip
+        futures = [
+            self.client.submit(attempt, function, cell, key=f"{cell.name}-{run}", priority=-place, pure=False)
+            for place, cell in enumerate(cells)
+        ]
         for future in futures:
             future.add_done_callback(done.put)
         for _ in cells:
@@ -55,7 +57,7 @@ class Cluster:
             future.release()
 
     def _patiently(self, step: Callable[[float], Any]) -> Any:
-        """What a step that may time out returns; a result can be lost with its worker after it was announced."""
+        """Repeat a step that may time out: a result can be lost with its worker after it was announced."""
         while True:
             try:
                 return step(PATIENCE)
@@ -72,8 +74,8 @@ def connected(address: str, function: Function) -> Iterator[Cluster]:
 
     Raises:
         MissingLibraryError: Dask is not installed.
-        InputError: nobody answers there, there is no worker, one computes on several threads, or one cannot load the
-            study or has another version of coopoc.
+        InputError: no scheduler at the address, no worker, or a worker that computes on several threads, that cannot
+            load the study or that has another version of coopoc.
     """
     try:
         from distributed import Client
@@ -84,8 +86,8 @@ def connected(address: str, function: Function) -> Iterator[Cluster]:
         socket.create_connection((place.hostname, place.port), PATIENCE / 3).close()  # a Client that fails lingers on
         client = Client(address, timeout=PATIENCE / 3, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
-        mend = "Start one with: dask scheduler. It prints its address, such as tcp://10.0.0.1:8786."
-        raise InputError("cluster", address, f"has no Dask scheduler ({error})", mend) from None
+        hint = "Start one with: dask scheduler. It prints its address, such as tcp://10.0.0.1:8786."
+        raise InputError("cluster", address, f"has no Dask scheduler ({error})", hint) from None
     with client:
         yield Cluster(client, address, _checked(client, address, function))
 
@@ -94,20 +96,20 @@ def _checked(client: Any, address: str, function: Function) -> dict[str, Mapping
     try:
         client.wait_for_workers(1, timeout=PATIENCE)
     except TimeoutError:
-        mend = f"Start one on each machine: dask worker {address} --nthreads 1."
-        raise InputError("cluster", address, "has no worker", mend) from None
+        hint = f"Start one on each machine: dask worker {address} --nthreads 1."
+        raise InputError("cluster", address, "has no worker", hint) from None
     if several := [worker for worker, threads in client.nthreads().items() if threads > 1]:
-        allowed = f"has a worker of several threads, {several[0]}; what computes is not made to share a process"
+        allowed = f"has a worker of several threads, {several[0]}, but cells do not share a process"
         raise InputError("cluster", address, allowed, "Start workers with --nthreads 1, and --nworkers for more.")
     found = client.run(_environment, function, on_error="return")
     mine = environment()["coopoc"]
     for worker, answer in found.items():
-        mend = "Install the same coopoc, and what the study comes in, where the workers run."
+        hint = "Install the same coopoc, and the package of the study, where the workers run."
         if isinstance(answer, BaseException):
-            raise InputError("cluster", address, f"has a worker, {worker}, that cannot load the study ({answer})", mend)
+            raise InputError("cluster", address, f"has a worker, {worker}, that cannot load the study ({answer})", hint)
         if answer["coopoc"] != mine:
             allowed = f"has a worker, {worker}, with coopoc {answer['coopoc']} instead of {mine}"
-            raise InputError("cluster", address, allowed, mend)
+            raise InputError("cluster", address, allowed, hint)
     return dict(found)
 
 
@@ -118,5 +120,5 @@ def _environment(function: Function) -> dict[str, str]:
 
 def _died(address: str, reason: str) -> WorkerDiedError:
     return WorkerDiedError(
-        f"The cluster {address} does not go on ({reason}). Finished cells are kept: repeat the command to resume."
+        f"The cluster {address} stopped ({reason}). Finished cells are kept: repeat the command to resume."
     )

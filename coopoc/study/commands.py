@@ -1,4 +1,4 @@
-"""coopoc reference: a study's results against the numbers that were committed with it."""
+"""coopoc reference: a study's results against its committed reference values."""
 
 from __future__ import annotations
 
@@ -9,41 +9,50 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
+from ..plugins import names
 
 
 def reference(
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")],
     /,
+    study: Annotated[str, arg(metavar="NAME")] = "",
     file: Annotated[Path | None, arg(metavar="FILE")] = None,
     write: bool = False,
     all: bool = False,
 ) -> int:
-    """Hold the results of a study against the numbers that were committed with it; the status is 1 if one is worse.
+    """Check the results of a study against its committed reference values; the status is 1 if one is worse.
 
     Example: coopoc reference runs/budget
 
+    Example: coopoc reference runs/mine --study mine.py:STUDY
+
     Args:
         folder: of the study.
-        file: with the reference numbers, instead of the study's own.
+        study: the study that was run, if it is one of your own files: FILE.py:NAME.
+        file: with the reference values, instead of the study's own.
         write: write them from these results instead.
-        all: show the numbers that hold, too.
+        all: show the values that hold, too.
     """
-    from ..plugins import find
     from . import reference as known
     from .results import Results
-    from .study import Study
+    from .run import find_study
 
     results = Results.load(folder)
-    study: Study = find("coopoc.studies", results.study)
-    file = file or (Path(study.reference) if study.reference else None)
-    if file is None or not study.metrics:
-        raise InputError("study", results.study, "has no reference numbers", "Name its metrics, and give --file.")
+    if not study and results.study not in names("coopoc.studies"):
+        hint = f"If it is a file of your own, name it: coopoc reference {folder} --study FILE.py:NAME."
+        raise InputError("study", repr(results.study), "is not installed", hint)
+    of = find_study(study or results.study)
+    if of.name != results.study:
+        raise InputError("study", repr(of.name), f"must be {results.study}, as in the folder", "Name that study.")
+    file = file or (Path(of.reference) if of.reference else None)
+    if file is None or not of.metrics:
+        raise InputError("study", of.name, "has no reference numbers", "Name its metrics, and give --file.")
     if write:
-        made = known.measure(results, study.metrics)
+        made = known.measure(results, of.metrics)
         made.save(file)
         print(f"coopoc: {len(made.numbers)} numbers are in {file}", file=sys.stderr)
         return 0
-    found = known.hold(results, known.Reference.load(file))
+    found = known.check(results, known.Reference.load(file))
     shown = known.table(found, everything=all)
     print(shown.to_markdown() if shown else known.summary(found))
-    return int(any(held.verdict == "worse" for held in found))
+    return int(any(change.verdict == "worse" for change in found))

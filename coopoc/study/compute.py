@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from ..errors import InputError
 from ..workers import leave_with
 from . import store
-from .study import Cell, Params, Row
+from .cell import Cell, Params, Row
 
 Function: TypeAlias = Callable[[Params], list[Row]]
 OF_WORKERS = {
@@ -28,7 +28,7 @@ OF_WORKERS = {
     "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1:glibc.malloc.mmap_threshold=268435456:"
     "glibc.malloc.trim_threshold=536870912",  # keep freed memory, in large pages: else a fifth of a cell is page faults
 }
-"""Environment of worker processes, where it says nothing else."""
+"""Defaults of the environment of worker processes."""
 
 
 class WorkerDiedError(ChildProcessError):
@@ -37,7 +37,7 @@ class WorkerDiedError(ChildProcessError):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a worker returns: rows, or the reason why there are none."""
+    """Rows of a cell, or the reason why there are none."""
 
     cell: Cell
     rows: pa.Table | None
@@ -67,7 +67,7 @@ def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Ce
 
 
 def attempt(function: Function, cell: Cell) -> Outcome:
-    """Compute one cell on one thread; whatever it raises becomes its reason."""
+    """Compute one cell on one thread; an exception becomes its reason."""
     start = time.perf_counter()
     try:
         with threadpool_limits(limits=1):

@@ -1,4 +1,4 @@
-"""The environment that produced a result, and revisions of source code for the names of cells."""
+"""The environment of a result, and revisions of source code for the names of cells."""
 
 from __future__ import annotations
 
@@ -14,14 +14,29 @@ from pathlib import Path
 from ..errors import InputError
 
 _LIBRARIES = (
-    "numpy", "scipy", "torch", "gtsam", "casadi", "cvxpy", "osqp", "pandas", "pyarrow", "joblib", "matplotlib"
-)  # fmt: skip
+    "numpy",
+    "scipy",
+    "torch",
+    "gtsam",
+    "casadi",
+    "cvxpy",
+    "osqp",
+    "pandas",
+    "pyarrow",
+    "joblib",
+    "matplotlib",
+)
 
 
 def environment() -> dict[str, str]:
     """Versions of Python, coopoc and the libraries that compute, the processor, and the git revision if any."""
-    found = {"coopoc": metadata.version("coopoc"), "git revision": git_revision(), "python": platform.python_version(),
-             "system": f"{platform.system()} {platform.machine()}", "processor": _processor()}  # fmt: skip
+    found = {
+        "coopoc": metadata.version("coopoc"),
+        "git revision": git_revision(),
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+    }
     for library in _LIBRARIES:
         try:
             found[library] = metadata.version(library)

@@ -1,4 +1,4 @@
-"""Figures that every study shares, in one look; the Pareto front and the scenes come from beside this file."""
+"""Figures for every study, in one style; the Pareto front and the scenes are in files of their own."""
 
 from __future__ import annotations
 
@@ -26,11 +26,17 @@ Where = Mapping[str, Any] | None
 def sweep(
     results: Results, x: str, y: str = "rt_le_m", where: Where = None, caption: str = "", log: bool = False
 ) -> Plot:
-    """A metric against an axis: one line per method and knowledge with its 95 % band; "bound" is dashed. Without a
-    column `method`, one line per combination of the other axes.
+    """Plot a metric against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
+
+    Without a column `method` there is one line per combination of the other axes.
 
     Args:
-        x: column of the horizontal axis. y: metric. where: column -> value or values. log: vertical axis.
+        results: of the study.
+        x: column of the horizontal axis.
+        y: metric.
+        where: column -> value or values.
+        caption: under the figure; default the metric and the axis.
+        log: logarithmic vertical axis.
 
     Raises:
         InputError: as `Results.summary`.
@@ -60,11 +66,14 @@ def sweep(
 def cdf(
     results: Results, value: str = "error_quantiles_m", where: Where = None, caption: str = "", log: bool = False
 ) -> Plot:
-    """Share of errors below each value, with a marker at the mean of the per-run maxima.
+    """Plot the share of errors below each value, with a marker at the mean of the per-run maxima.
 
     Args:
+        results: of the study.
         value: column of lists: equally likely quantiles of the errors of one run and ego, the last its maximum.
-        log: horizontal axis.
+        where: column -> value or values.
+        caption: under the figure.
+        log: logarithmic horizontal axis.
 
     Raises:
         InputError: an unknown column or value.
@@ -100,10 +109,15 @@ def convergence(
     levels: Mapping[str, float] | None = None,
     caption: str = "",
 ) -> Plot:
-    """A metric after every round: mean over training seeds, band from the lowest to the highest seed.
+    """Plot a metric after every round: mean over training seeds, band from the lowest to the highest seed.
 
     Args:
-        x: column of rounds. y: metric. levels: label -> value of what does not change, such as individual nets.
+        results: of the study.
+        x: column of rounds.
+        y: metric.
+        where: column -> value or values.
+        levels: label -> constant value, such as the error of an individual net.
+        caption: under the figure.
 
     Raises:
         InputError: as `Results.summary`; no column "train_seed".
@@ -116,8 +130,9 @@ def convergence(
             table = group.pivot(index=x, columns=SEED, values="mean").sort_index()
             options = strokes(names)
             axes.plot(table.index, table.mean(axis=1), **options, markevery=max(1, len(table) // 10))
-            axes.fill_between(table.index, table.min(axis=1), table.max(axis=1), color=options["color"], alpha=0.18,
-                              linewidth=0)  # fmt: skip
+            axes.fill_between(
+                table.index, table.min(axis=1), table.max(axis=1), color=options["color"], alpha=0.18, linewidth=0
+            )
             drawn.append(names)
         axes.set(xlabel=words(x), ylabel=words(y))
         axes.set_xlim(left=0)
@@ -139,5 +154,13 @@ def _levels(axes: Axes, levels: Mapping[str, float]) -> None:
     heights = apart(levels, 0.045 * (max(high, *levels.values()) - low) if levels else 0.0)
     for label, level in levels.items():
         axes.axhline(level, color=color, linewidth=0.9, linestyle=(0, (6, 2)))
-        axes.annotate(label, (1.0, level), (1.015, heights[label]), ("axes fraction", "data"), fontsize=7, va="center",
-                      textcoords=("axes fraction", "data"), color=color)  # fmt: skip
+        axes.annotate(
+            label,
+            (1.0, level),
+            (1.015, heights[label]),
+            ("axes fraction", "data"),
+            fontsize=7,
+            va="center",
+            textcoords=("axes fraction", "data"),
+            color=color,
+        )

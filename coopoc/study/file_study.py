@@ -1,4 +1,4 @@
-"""A study in one file of somebody's own: the file's contents name its cells, and workers load it by its path."""
+"""A study in a file of one's own: the file's contents name its cells, and workers load it by its path."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any
 
 from ..errors import InputError
 from ..one_file import file_digest, from_file
-from .study import Params, Row, Study
+from .cell import Params, Row
+from .study import Study
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,16 @@ def file_study(name: str) -> Study:
     """The study that a file holds, as "folder/mine.py:STUDY".
 
     Raises:
-        InputError: no such file or name, or what it names is no Study.
+        InputError: no such file or name, or an object that is no Study.
     """
     study = from_file(name, "study")
     if not isinstance(study, Study):
-        mend = "Give STUDY = coopoc.Study(...) in the file."
-        raise InputError("study", repr(name), f"is a {type(study).__name__}, no Study", mend)
-    path, _, held = name.rpartition(":")
+        hint = "Give STUDY = coopoc.Study(...) in the file."
+        raise InputError("study", repr(name), f"is a {type(study).__name__}, no Study", hint)
+    path, _, attribute = name.rpartition(":")
     contents, own = file_digest(name, "study"), study.key
 
     def key(params: Params) -> Mapping[str, Any]:
         return {**own(params), "study file": contents}
 
-    return replace(study, cell=_FileCell(f"{Path(path).resolve()}:{held}", contents), key=key)
+    return replace(study, cell=_FileCell(f"{Path(path).resolve()}:{attribute}", contents), key=key)

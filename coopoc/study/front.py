@@ -1,4 +1,4 @@
-"""The Pareto front: what accuracy costs in bytes while deciding, and beside it what training cost."""
+"""The Pareto front of accuracy and received bytes, and beside it the bytes of the training."""
 
 from __future__ import annotations
 
@@ -23,12 +23,16 @@ def pareto(
     training: Mapping[str, float] | None = None,
     caption: str = "",
 ) -> Plot:
-    """Accuracy against received bytes per second (log); what receives nothing stands in a strip at the left.
+    """Plot a metric against received bytes per second (log); methods that receive nothing are in a strip at the left.
 
     Args:
-        x: bytes per second while deciding. y: metric.
+        results: of the study.
+        x: bytes per second of online cooperation.
+        y: metric.
         along: axes that vary; a line joins the points of along[0], one line per value of the others.
+        where: column -> value or values.
         training: method -> bytes that one vehicle sends and receives in training, as bars beside the front.
+        caption: under the figure.
 
     Raises:
         InputError: as `Results.summary`.
@@ -53,12 +57,12 @@ def pareto(
 
 def _front(axes: Sequence[Axes], names: Mapping[str, Any], group: pd.DataFrame) -> None:
     options = strokes(names, thin=True)
-    spread = np.array([group["mean"] - group["low"], group["high"] - group["mean"]])
+    ends = np.array([group["mean"] - group["low"], group["high"] - group["mean"]])
     silent = (group["bytes"] == 0).to_numpy()
     for panel, chosen in ((axes[0], silent), (axes[1], ~silent)):
         part = group[chosen]
         at = np.zeros(len(part)) if panel is axes[0] else part["bytes"]
-        panel.errorbar(at, part["mean"], yerr=spread[:, chosen], elinewidth=0.7, **options)
+        panel.errorbar(at, part["mean"], yerr=ends[:, chosen], elinewidth=0.7, **options)
 
 
 def _share_height(left: Axes, right: Axes, label: str, low: float) -> None:

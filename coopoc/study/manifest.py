@@ -1,93 +1,89 @@
-"""The manifest of a folder, and who may work there: one run, or shards of one manifest at the same time."""
+"""Manifest: the study, the settings, the cells and the environments that a folder of results stands on."""
 
 from __future__ import annotations
 
-import fcntl
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from ..errors import InputError
-from .environment import environment
-from .store import content, write
-from .study import Cell, Study
+from ..file_names import file_name
+from . import store
 
-Manifest = dict[str, Any]
 NAME = "manifest.json"
+_FIELDS = {"study": str, "question": str, "axes": list, "settings": dict, "cells": dict, "environment": dict}
 
 
-def manifest(study: Study, cells: Sequence[Cell], workers: Iterable[Mapping[str, str]] = ()) -> Manifest:
-    """What the folder of a study is, as it reads when it comes back from its file; `workers` are environments, too."""
-    found: Manifest = {
-        "study": study.name, "question": study.question, "axes": list(study.axes), "settings": dict(study.settings),
-        "cells": [{"name": cell.name, "params": dict(cell.params)} for cell in cells],
-        "environment": environments([environment(), *workers]),
-    }  # fmt: skip
-    return dict(json.loads(json.dumps(found, default=str)))
+@dataclass(frozen=True)
+class Manifest:
+    """A folder of results.
+
+    Args:
+        study: name of the study.
+        question: of the study.
+        axes: names of the parameters that vary.
+        settings: name -> value, the same in all cells.
+        cells: name -> parameters of the cell.
+        environment: version of each library, the processor and the revision, see `environments`.
+    """
+
+    study: str
+    question: str
+    axes: Sequence[str]
+    settings: Mapping[str, Any]
+    cells: Mapping[str, Mapping[str, Any]]
+    environment: Mapping[str, str]
+
+    def as_stored(self) -> Manifest:
+        """The manifest as it comes back from its file, where a tuple has become a list."""
+        return Manifest(**json.loads(json.dumps(asdict(self), default=str)))
+
+    def save(self, folder: Path) -> None:
+        """Write the manifest. If the cells are the same as before, each environment that computed them is named."""
+        try:
+            before = read(folder)
+            known = [self.environment] if different(self, before) else [before.environment, self.environment]
+        except InputError:
+            known = [self.environment]
+        found = replace(self, environment=environments(known))
+        store.write(folder / NAME, json.dumps(asdict(found), indent=1, default=str) + "\n")
 
 
 def read(folder: Path) -> Manifest:
-    """The manifest in a folder; InputError if there is none, or if it is damaged."""
-    return content(folder / NAME, f"holds no {NAME}", "Give a folder that coopoc run has made.")
-
-
-@contextmanager
-def held(folder: Path, mine: Manifest, shard: str = "") -> Iterator[None]:
-    """Make the folder, write its manifest, and keep both for this process, or for shards of the same manifest.
-
-    A second run would swap the manifest under the first. Who comes first writes it; whoever comes in while others are
-    at work must bring the same. The locks go with the process, however that ends.
+    """The manifest in a folder.
 
     Raises:
-        InputError: another run or the same shard holds it, shards with another manifest do, or it cannot be written.
+        InputError: none, a damaged one, or one whose names are no file names: they would lead out of the folder.
     """
-    with ExitStack() as stack:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            door, place = (stack.enter_context((folder / name).open("a+")) for name in (".door", ".lock"))
-            fcntl.flock(door, fcntl.LOCK_EX)  # nobody else comes in meanwhile; this takes milliseconds
-            _enter(folder, mine, place, shard)
-            if shard:
-                own = stack.enter_context((folder / f".shard-{shard.replace('/', '-of-')}").open("a+"))
-                if not _locked(own, fcntl.LOCK_EX):
-                    raise _in_use(folder, f"another process with shard {shard}")
-            fcntl.flock(door, fcntl.LOCK_UN)
-        except OSError as error:
-            allowed = f"cannot be written ({error.strerror})"
-            raise InputError("out", str(folder), allowed, "Choose another --out.") from None
-        yield
-
-
-@contextmanager
-def alone(folder: Path, waits: Callable[[], object]) -> Iterator[None]:
-    """One process at a time: what shards share is made by the first and found by the others, who call `waits`."""
-    with (folder / ".prepare").open("a+") as lock:
-        if not _locked(lock, fcntl.LOCK_EX):
-            waits()
-            fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+    path = folder / NAME
+    given = store.content(path, _FIELDS, f"holds no {NAME}", "Give a folder that coopoc run has made.")
+    found = Manifest(**{name: given[name] for name in _FIELDS})
+    texts = [*found.axes, *found.environment.values()]
+    if not all(isinstance(text, str) for text in texts) or not all(isinstance(p, dict) for p in found.cells.values()):
+        raise store.damaged(path, "axes, cells or environment")
+    file_name("study", found.study, f"Run the study again: {path} was not written by coopoc run.")
+    if wrong := next((name for name in found.cells if not re.fullmatch("[0-9a-f]{20}", name)), None):
+        raise store.damaged(path, f"{wrong[:60]!r} is no name of a cell")
+    return found
 
 
 def different(one: Manifest, other: Manifest) -> list[str]:
-    """In what two manifests differ, their environments apart.
+    """Differences between two manifests, their environments apart.
 
-    >>> different({"settings": {"runs": 4}}, {"settings": {"runs": 2}})
+    >>> one = Manifest("demo", "?", [], {"runs": 4}, {}, {})
+    >>> different(one, replace(one, settings={"runs": 2}))
     ['runs (4, 2)']
     """
-    found = []
-    for field in dict.fromkeys((*one, *other)):
-        a: Any = one.get(field)
-        b: Any = other.get(field)
-        if field == "settings":
-            found += [f"{name} ({a.get(name)}, {b.get(name)})" for name in {**a, **b} if a.get(name) != b.get(name)]
-        elif field == "cells" and a != b:
-            same = len({cell["name"] for cell in a} & {cell["name"] for cell in b})
-            found.append(f"cells ({len(a)} and {len(b)}, {same} of them the same)")
-        elif field != "environment" and a != b:
-            found.append(f"{field} ({a}, {b})")
-    return found
+    a, b = one.settings, other.settings
+    found = [f"{name} ({a.get(name)}, {b.get(name)})" for name in {**a, **b} if a.get(name) != b.get(name)]
+    if one.cells != other.cells:
+        same = len(one.cells.keys() & other.cells.keys())
+        found.append(f"cells ({len(one.cells)} and {len(other.cells)}, {same} of them the same)")
+    pairs = [(field, getattr(one, field), getattr(other, field)) for field in ("study", "question", "axes")]
+    return found + [f"{field} ({x}, {y})" for field, x, y in pairs if x != y]
 
 
 def environments(found: Sequence[Mapping[str, str]]) -> dict[str, str]:
@@ -99,39 +95,3 @@ def environments(found: Sequence[Mapping[str, str]]) -> dict[str, str]:
     fields = dict.fromkeys(name for each in found for name in each)
     values = {name: [v for each in found if name in each for v in each[name].split("; ")] for name in fields}
     return {name: "; ".join(dict.fromkeys(listed)) for name, listed in values.items()}
-
-
-def _enter(folder: Path, mine: Manifest, place: IO[str], shard: str) -> None:
-    if _locked(place, fcntl.LOCK_EX):
-        for left in (*folder.glob(".*.part"), *folder.glob("*/.*.part")):  # by who was killed while writing
-            left.unlink()
-    else:
-        if not (shard and _locked(place, fcntl.LOCK_SH)):
-            raise _in_use(folder, "another run")
-        if fields := different(mine, read(folder)):
-            raise _in_use(folder, f"shards that differ in {', '.join(fields)}")
-    _describe(folder, mine)
-    if shard:
-        fcntl.flock(place, fcntl.LOCK_SH)
-
-
-def _describe(folder: Path, mine: Manifest) -> None:
-    """Write the manifest. If the cells are the same as before, they may come from any environment that is named."""
-    try:
-        before = json.loads((folder / NAME).read_text())
-    except (FileNotFoundError, ValueError):
-        before = mine
-    known = [mine["environment"]] if different(mine, before) else [before["environment"], mine["environment"]]
-    write(folder / NAME, json.dumps({**mine, "environment": environments(known)}, indent=1) + "\n")
-
-
-def _locked(file: IO[str], kind: int) -> bool:
-    try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
-def _in_use(folder: Path, by: str) -> InputError:
-    return InputError("out", str(folder), f"is in use by {by}", "Wait until it ends, or choose another --out.")

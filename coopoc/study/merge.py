@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pyarrow as pa
 
 from ..errors import InputError
+from ..file_names import inside
 from . import store
-from .manifest import NAME, different, environments, held, read
+from .lock import locked
+from .manifest import NAME, different, environments, read
 
 
 @dataclass(frozen=True)
@@ -40,16 +42,18 @@ def merge(folders: Sequence[str | Path], out: str | Path) -> Merged:
     if not folders:
         raise InputError("folders", "none", "must be at least one", "Example: coopoc merge a/small b/small --out all.")
     sources = [Path(folder) for folder in folders]
-    target = Path(out) / read(sources[0])["study"]
+    target = Path(out) / read(sources[0]).study
+    for path in (target, *(target / kind for kind in ("cells", "failed"))):
+        inside(Path(out), path)
     if (target / NAME).is_file():
         sources = [target, *(folder for folder in sources if folder != target)]
     first, *others = manifests = [read(folder) for folder in sources]
     for folder, other in zip(sources[1:], others, strict=True):
         if fields := different(first, other):
-            mend = "Merge folders of one study that ran with the same --set."
-            raise InputError("folders", f"{sources[0]} and {folder}", f"differ in {', '.join(fields)}", mend)
-    with held(target, {**first, "environment": environments([each["environment"] for each in manifests])}):
-        states = [_bring(sources, target, cell["name"]) for cell in first["cells"]]
+            hint = "Merge folders of one study that ran with the same --set."
+            raise InputError("folders", f"{sources[0]} and {folder}", f"differ in {', '.join(fields)}", hint)
+    with locked(target, replace(first, environment=environments([each.environment for each in manifests]))):
+        states = [_bring(sources, target, name) for name in first.cells]
     return Merged(target, len(states), states.count("finished"), states.count("failed"), states.count("missing"))
 
 

@@ -12,7 +12,7 @@ from .plot import Plot, canvas
 from .style import NEUTRAL, look
 
 NEAR, FAR = (0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 2.0), (0.5, 1.0, 2.0, 5.0, 10.0)
-"""Ticks where nothing is beyond 2, and where something is."""
+"""Ticks of an axis up to 2, and of a longer one."""
 
 
 def multiples(
@@ -20,10 +20,12 @@ def multiples(
     caption: str,
     target: Mapping[str, float] | None = None,
 ) -> Plot:
-    """Dots at value / reference of each method in each case; a line marks 1, a band reaches up to the case's target.
+    """Plot value / reference of each method in each case as dots; a line marks 1, a band ends at the case's target.
 
     Args:
-        found: (method, knowledge) -> case -> multiples, one per training seed. target: case -> upper end of the band.
+        found: (method, noise model) -> case -> multiples, one per training seed.
+        caption: under the figure.
+        target: case -> upper end of the band.
 
     Raises:
         InputError: nothing to draw.
@@ -33,24 +35,33 @@ def multiples(
         raise InputError("found", "no multiples", "must hold at least one", "Run the study, or a case of it.")
     width, height = 1.9 + 1.75 * len(cases), 0.9 + 0.21 * len(found)
     with canvas(1, len(cases), width=width, height=height, sharex=True, sharey=True, squeeze=False) as (
-        figure, axes,
-    ):  # fmt: skip
+        figure,
+        axes,
+    ):
         for panel, case in zip(axes[0], cases, strict=True):
             panel.axvspan(1.0, (target or {}).get(case, 1.0), color=NEUTRAL, alpha=0.35, linewidth=0)
             panel.axvline(1.0, color="black", linewidth=0.9)
             for row, ((method, _), each) in enumerate(found.items()):
                 values = np.array(each.get(case, ()), dtype=float)
                 shown = look(method)
-                panel.plot(values, np.full(len(values), row), linestyle="none", marker=shown.marker, color=shown.color,
-                           markersize=4, alpha=0.8, markeredgewidth=0.6)  # fmt: skip
+                panel.plot(
+                    values,
+                    np.full(len(values), row),
+                    linestyle="none",
+                    marker=shown.marker,
+                    color=shown.color,
+                    markersize=4,
+                    alpha=0.8,
+                    markeredgewidth=0.6,
+                )
             panel.set(title=case, xscale="log", xlabel="× reference")
             panel.xaxis.set_major_locator(FixedLocator(NEAR if panel.get_xlim()[1] < 2.1 else FAR))
             panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             panel.xaxis.set_minor_formatter(NullFormatter())
-        labels = [f"{look(method).label}{_of(knowledge)}" for method, knowledge in found]
+        labels = [f"{look(method).label}{_of(noise_model)}" for method, noise_model in found]
         axes[0, 0].set(yticks=range(len(found)), yticklabels=labels, ylim=(len(found) - 0.4, -0.6))
     return Plot(figure, caption)
 
 
-def _of(knowledge: str) -> str:
-    return "" if knowledge in ("trained", "none") else f", {knowledge}"
+def _of(noise_model: str) -> str:
+    return "" if noise_model in ("trained", "none") else f", {noise_model}"

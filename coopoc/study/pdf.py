@@ -14,9 +14,13 @@ from ..errors import InputError, MissingLibraryError
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 """Names of the program in Linux distributions, in the order in which they are tried."""
 FLAGS = (
-    "--headless", "--disable-gpu", "--no-pdf-header-footer", "--no-first-run", "--disable-extensions",
+    "--headless",
+    "--disable-gpu",
+    "--no-pdf-header-footer",
+    "--no-first-run",
+    "--disable-extensions",
     "--no-sandbox",  # without it Chromium refuses to start as root, as in a container; the page is our own
-)  # fmt: skip
+)
 _SECONDS = 180
 
 
@@ -35,20 +39,26 @@ def printed(page: str) -> bytes:
         MissingLibraryError: no Chromium. InputError: it could not print the page, with its last words.
     """
     program = browser()
-    with tempfile.TemporaryDirectory(prefix="coopoc-", ignore_cleanup_errors=True) as name, tqdm(
-        total=1, desc="PDF", unit="page", leave=False
-    ):  # fmt: skip
+    with (
+        tempfile.TemporaryDirectory(prefix="coopoc-", ignore_cleanup_errors=True) as name,
+        tqdm(total=1, desc="PDF", unit="page", leave=False),
+    ):
         folder = Path(name)
         (folder / "page.html").write_text(page)
         out = folder / "page.pdf"
         # a profile of its own: a browser that is already open would take the page and print nothing
-        command = [program, *FLAGS, f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={out}",
-                   (folder / "page.html").as_uri()]  # fmt: skip
+        command = [
+            program,
+            *FLAGS,
+            f"--user-data-dir={folder / 'profile'}",
+            f"--print-to-pdf={out}",
+            (folder / "page.html").as_uri(),
+        ]
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS)
-            said = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+            ended = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
         except subprocess.TimeoutExpired:
-            said = [f"not done after {_SECONDS} s"]
+            ended = [f"not done after {_SECONDS} s"]
         if not out.is_file():
-            raise InputError("PDF", program, f"could not print the page: {said[0]}", "Write report.html and print it.")
+            raise InputError("PDF", program, f"could not print the page: {ended[0]}", "Write report.html and print it.")
         return out.read_bytes()

@@ -27,7 +27,7 @@ FIXED: Mapping[str, Mapping[str, Any]] = {
     "svg": {"Date": None, "Creator": None},
     "png": {"Software": None},
 }
-"""Formats and the metadata that would otherwise carry a time or a version."""
+"""Formats, and metadata without a time or a version."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Plot:
         return self.caption
 
     def _repr_png_(self) -> bytes:
-        """What a notebook shows."""
+        """Image for a notebook."""
         buffer = BytesIO()
         with mpl.rc_context(RC):
             self.figure.savefig(buffer, format="png")
@@ -56,7 +56,7 @@ class Plot:
 
 
 def _settle(figure: Figure) -> None:
-    """Lay the panels out and round their places: the solver of constrained layout differs in its last digits."""
+    """Lay the panels out and round their places, of which the layout solver leaves the last digits open."""
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axes in figure.axes:
@@ -65,13 +65,13 @@ def _settle(figure: Figure) -> None:
 
 
 def line_names(results: Results, *across: str) -> list[str]:
-    """Columns that tell the lines of a figure apart: method and knowledge, or all axes but those of the figure."""
-    usual = [name for name in ("method", "knowledge") if name in results.frame]
+    """Columns that identify a line of a figure: method and noise model, or all axes but those of the figure."""
+    usual = [name for name in ("method", "noise_model") if name in results.frame]
     return usual if "method" in usual else [name for name in results.axes if name not in across]
 
 
 def _line(names: Mapping[str, Any]) -> str:
-    """The method of a line; without one, what else it is called."""
+    """The method of a line; without one, its other names."""
     return str(names["method"]) if "method" in names else ", ".join(map(str, names.values()))
 
 
@@ -84,10 +84,14 @@ def groups(frame: pd.DataFrame, by: Sequence[str]) -> list[tuple[dict[str, Any],
 
 @contextmanager
 def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 3.4, **grid: Any) -> Iterator[Any]:
-    """(figure, axes) in the house style; matplotlib's global state stays as it is.
+    """(figure, axes) in the house style; matplotlib's global state does not change.
 
     Args:
-        rows, columns: of panels. width, height: inches. grid: options of `Figure.subplots`.
+        rows: of panels.
+        columns: of panels.
+        width: inches.
+        height: inches.
+        grid: options of `Figure.subplots`.
     """
     with mpl.rc_context(RC):
         figure = Figure(figsize=(width, height))
@@ -95,9 +99,9 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
 
 
 def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
-    """Line options of a method (colour, marker) under a knowledge (line style); the bound is dashed."""
+    """Line options of a method (colour, marker) and of a noise model (line style); the bound is dashed."""
     shown = look(_line(names))
-    dashes = "--" if _line(names) == "bound" else line(names.get("knowledge"))
+    dashes = "--" if _line(names) == "bound" else line(names.get("noise_model"))
     width = {"linewidth": 0.8} if thin else {}
     return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8, **width}
 
@@ -105,10 +109,12 @@ def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
 def legend(
     axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None, inside: bool = False
 ) -> None:
-    """Legend: one entry per method, and one per line style where knowledge differs.
+    """Draw the legend: one entry per method, and one per line style where noise models differ.
 
     Args:
-        lines: the names (method, knowledge) of what was drawn. words: method -> text after its label.
+        axes: panel.
+        lines: names (method, noise_model) of the lines in it.
+        words: method -> text after its label.
         inside: in the panel; else at its right.
     """
     handles = []
@@ -117,8 +123,8 @@ def legend(
         text = look(method).label + (words or {}).get(method, "")
         handles.append(Line2D([], [], **options, label=text))
     styles: dict[Any, list[str]] = {}
-    told = [n for n in lines if "knowledge" in n and "method" in n and n["method"] != "bound"]
-    for known in dict.fromkeys(str(n["knowledge"]) for n in told):
+    modelled = [n for n in lines if "noise_model" in n and "method" in n and n["method"] != "bound"]
+    for known in dict.fromkeys(str(n["noise_model"]) for n in modelled):
         if known == "none":
             continue
         styles.setdefault(line(known), []).append(known)
@@ -131,8 +137,8 @@ def legend(
 
 
 def plain_log(axis: Axis) -> None:
-    """Logarithmic axis with plain numbers at 1, 2 and 5 of each decade; at more where it spans less than one, at the
-    decades alone where it spans many."""
+    """Make an axis logarithmic with plain numbers at 1, 2 and 5 of each decade: at more if it spans less than one, at
+    the decades alone if it spans many."""
     if axis is axis.axes.xaxis:
         axis.axes.set_xscale("log")
     else:
@@ -156,7 +162,11 @@ def plain_log(axis: Axis) -> None:
 
 
 def apart(heights: Mapping[str, float], gap: float) -> dict[str, float]:
-    """Heights of labels moved up just enough to stand `gap` apart, in their order.
+    """Heights of labels, moved up until they are `gap` apart, in their order.
+
+    Args:
+        heights: label -> height.
+        gap: least distance of two labels.
 
     >>> apart({"a": 1.0, "b": 1.1, "c": 3.0}, 0.5)
     {'a': 1.0, 'b': 1.5, 'c': 3.0}

@@ -1,5 +1,5 @@
 "use strict";
-// What the page does beyond being read: sort a table, switch the knowledge, mark the place in the contents.
+// What the page does beyond being read: sort a table, switch the noise model, mark the place in the contents.
 // Without it every row and every panel is there.
 (() => {
   const SECONDS = { s: 1, min: 60, h: 3600 };
@@ -48,24 +48,24 @@
     });
   }
 
-  // Tabs over the panels of a block; all blocks that have a panel of the chosen knowledge follow.
+  // Tabs over the panels of a block; all blocks that have a panel of the chosen noise model follow.
   function tabs(block) {
     const panels = [...block.children];
     const list = document.createElement("div");
     list.className = "tabs";
     list.setAttribute("role", "tablist");
-    list.setAttribute("aria-label", "Knowledge");
+    list.setAttribute("aria-label", "Noise model");
     const buttons = panels.map((panel) => {
       const button = document.createElement("button");
-      Object.assign(button, { type: "button", id: `${panel.id}-tab`, textContent: panel.dataset.knowledge });
+      Object.assign(button, { type: "button", id: `${panel.id}-tab`, textContent: panel.dataset.noise_model });
       button.setAttribute("role", "tab");
       button.setAttribute("aria-controls", panel.id);
       panel.setAttribute("role", "tabpanel");
       panel.setAttribute("aria-labelledby", button.id);
       return button;
     });
-    const show = (knowledge) => {
-      const at = panels.findIndex((panel) => panel.dataset.knowledge === knowledge);
+    const show = (model) => {
+      const at = panels.findIndex((panel) => panel.dataset.noise_model === model);
       if (at < 0) return;
       panels.forEach((panel, i) => panel.classList.toggle("other", i !== at));
       buttons.forEach((button, i) => {
@@ -90,7 +90,7 @@
     });
     list.append(...buttons);
     block.prepend(list);
-    show(panels[0].dataset.knowledge);
+    show(panels[0].dataset.noise_model);
     return show;
   }
 

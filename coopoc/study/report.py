@@ -11,16 +11,25 @@ import jinja2
 import markupsafe
 
 from ..errors import InputError
+from ..file_names import inside
 from . import store
 from .pdf import printed
 from .publish import views
 from .results import Results
 from .style import look, title, words
+from .tables import FORMATS, Table
 
-_MIME = {"csv": "text/csv", "tex": "text/x-tex", "md": "text/markdown", "pdf": "application/pdf", "png": "image/png",
-         "svg": "image/svg+xml"}  # fmt: skip
+_MIME = {
+    "csv": "text/csv",
+    "tex": "text/x-tex",
+    "md": "text/markdown",
+    "pdf": "application/pdf",
+    "png": "image/png",
+    "svg": "image/svg+xml",
+}
+_FORMS = {word: FORMATS[word] for word in ("csv", "latex", "markdown")}
 _LARGEST_SVG = 1_000_000
-KNOWLEDGE = ("identity", "fitted", "nominal", "oracle")
+NOISE_MODELS = ("identity", "fitted", "nominal", "oracle")
 """Ends of the names of views that differ in nothing else: the page shows one of them at a time."""
 
 
@@ -35,10 +44,12 @@ def report(
     """Write one page that shows several studies, and return its path.
 
     Args:
-        folders: of finished studies, in the order of the page. out: the file; a name in .pdf is printed by Chromium.
-        title: of the page. lead: sentences under it, before the first study.
-        answers: question -> answer, shown after those.
-        cards: name -> field -> value of the data that the studies stand on.
+        folders: of finished studies, in the order of the page.
+        out: the file; a name in .pdf is printed by Chromium.
+        title: of the page.
+        lead: sentences under the title, before the first study.
+        answers: question -> answer, shown after the lead.
+        cards: name of a data set -> field -> value.
 
     Raises:
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
@@ -51,11 +62,15 @@ def report(
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
     page = _template().render(
-        title=title or f"coopoc: {', '.join(section['title'] for section in sections)}", lead=lead,
-        answers=answers or {}, sections=sections, cards=cards or {}, environment=_environment(sections),
+        title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
+        lead=lead,
+        answers=answers or {},
+        sections=sections,
+        cards=cards or {},
+        environment=_environment(sections),
         css=markupsafe.Markup(_own("report.css")),
         script=markupsafe.Markup(_own("report.js")),
-    )  # fmt: skip
+    )
     store.write(Path(out), printed(page) if Path(out).suffix.lower() == ".pdf" else page)
     return Path(out)
 
@@ -63,41 +78,54 @@ def report(
 def _section(folder: Path) -> dict[str, Any]:
     results, shown = Results.load(folder), views(folder)
     return {
-        **shown, "name": results.study, "title": words(results.study), "question": results.question,
-        "settings": results.settings, "environment": results.environment, "pending": results.pending,
+        **shown,
+        "name": results.study,
+        "title": words(results.study),
+        "question": results.question,
+        "settings": results.settings,
+        "environment": results.environment,
+        "pending": results.pending,
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
-        "tables": _blocks([_table(folder, view, results.study) for view in shown["tables"]]),
+        "tables": _blocks([_table(view, results.study) for view in shown["tables"]]),
         "figures": _blocks([_figure(folder, view, results.study) for view in shown["figures"]]),
         "failures": _failures(results),
-    }  # fmt: skip
+    }
 
 
 def _blocks(shown: Sequence[Mapping[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Views in their order, those that differ in knowledge alone together, each with its knowledge."""
+    """Views in their order, those that differ in the noise model alone together, each with its noise model."""
     found: dict[tuple[str, bool], list[dict[str, Any]]] = {}
     for view in shown:
         stem, _, known = view["name"].rpartition("_")
-        key = (stem, True) if known in KNOWLEDGE else (view["name"], False)
-        found.setdefault(key, []).append({**view, "knowledge": known})
+        key = (stem, True) if known in NOISE_MODELS else (view["name"], False)
+        found.setdefault(key, []).append({**view, "noise_model": known})
     return list(found.values())
 
 
-def _table(folder: Path, view: Mapping[str, str], study: str) -> dict[str, Any]:
-    path = folder / "tables" / view["name"]
-    html = markupsafe.Markup(Path(f"{path}.html").read_text())
-    return {**view, "html": html, "files": [_file(path, form, study) for form in ("csv", "tex", "md")]}
+def _table(view: Mapping[str, Any], study: str) -> dict[str, Any]:
+    """A table, made anew from its numbers: HTML on the disk is never embedded."""
+    table = Table.from_data(view.get("table"))
+    files = [_file(f"{study}-{view['name']}", form, table.render(word).encode()) for word, form in _FORMS.items()]
+    return {**view, "html": markupsafe.Markup(table.to_html()), "files": files}
 
 
-def _figure(folder: Path, view: Mapping[str, str], study: str) -> dict[str, Any]:
-    path = folder / "figures" / view["name"]
-    form = "svg" if Path(f"{path}.svg").stat().st_size <= _LARGEST_SVG else "png"
-    shown = _file(path, form, study)["uri"]
-    return {**view, "uri": shown, "files": [_file(path, form, study) for form in ("pdf", "png")]}
+def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]:
+    content = {form: _bytes(folder, f"figures/{view['name']}.{form}") for form in ("pdf", "png", "svg")}
+    name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= _LARGEST_SVG else "png"
+    files = [_file(name, form, content[form]) for form in ("pdf", "png")]
+    return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
 
 
-def _file(path: Path, form: str, study: str) -> dict[str, str]:
-    content = base64.b64encode(Path(f"{path}.{form}").read_bytes()).decode()
-    return {"form": form.upper(), "name": f"{study}-{path.name}.{form}", "uri": f"data:{_MIME[form]};base64,{content}"}
+def _bytes(folder: Path, name: str) -> bytes:
+    path = inside(folder, folder / name)
+    if not path.is_file():
+        raise InputError("folder", str(folder), f"lacks {name}", "Repeat coopoc run: it writes the views again.")
+    return path.read_bytes()
+
+
+def _file(name: str, form: str, content: bytes) -> dict[str, str]:
+    uri = f"data:{_MIME[form]};base64,{base64.b64encode(content).decode()}"
+    return {"form": form.upper(), "name": f"{name}.{form}", "uri": uri}
 
 
 def _failures(results: Results) -> list[dict[str, str]]:
@@ -122,8 +150,9 @@ def _environment(sections: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 
 def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    jinja = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
-                               lstrip_blocks=True)  # fmt: skip
+    jinja = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
     jinja.filters["named"] = _named
     jinja.filters["shown"] = _shown
     return jinja.get_template("report.html.j2")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -16,11 +16,9 @@ from ..errors import InputError
 from ..evaluate.statistics import Interval, mean_interval
 from ..plugins import unknown
 from . import store
+from .escapes import spreadsheet
 from .manifest import read
 from .parse import assignments, parse
-
-if TYPE_CHECKING:
-    from .tables import Table
 
 SEED = "train_seed"
 """Column of the training seed: means are taken over it, and intervals are not."""
@@ -29,12 +27,16 @@ NOTHING = Interval(float("nan"), float("nan"), float("nan"), 0)
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """Rows of a study and what they stand on.
+    """Rows of a study with its settings and environment.
 
     Args:
-        study, question: of the study. axes: names of the parameters that vary. settings: what all cells share.
+        study: name of the study.
+        question: of the study.
+        axes: names of the parameters that vary.
+        settings: name -> value, the same in all cells.
         frame: rows of finished cells: parameters, `run`, `ego`, metrics, status "ok".
-        failures: rows of failed cells: parameters, `reason`, `traceback`. pending: cells that nobody has tried yet.
+        failures: rows of failed cells: parameters, `reason`, `traceback`.
+        pending: number of cells that were not computed yet.
         environment: versions, processor, revision.
     """
 
@@ -49,22 +51,26 @@ class Results:
 
     @classmethod
     def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:
-        """Results in the folder of a study, finished or not, or of the cells that are named; InputError if none."""
+        """Read the results in the folder of a study, finished or not.
+
+        Args:
+            folder: of the study.
+            names: of cells; default all.
+
+        Raises:
+            InputError: as `coopoc.study.manifest.read`.
+        """
         folder = Path(folder)
         manifest = read(folder)
         done, failed, pending = [], [], 0
-        for cell in manifest["cells"]:
-            if names is not None and cell["name"] not in names:
-                continue
-            table = store.load(folder, cell["name"])
-            failure = None if table is not None else store.load_failure(folder, cell["name"])
+        for name in manifest.cells if names is None else [name for name in manifest.cells if name in names]:
+            table = store.load(folder, name)
+            failure = None if table is not None else store.load_failure(folder, name)
             done += [table] if table is not None else []
             failed += [failure] if failure is not None else []
             pending += table is None and failure is None
-        return cls(
-            manifest["study"], manifest["question"], tuple(manifest["axes"]), manifest["settings"],
-            _joined(done), _joined(failed), pending, manifest["environment"],
-        )  # fmt: skip
+        given = manifest.study, manifest.question, tuple(manifest.axes), manifest.settings
+        return cls(*given, _joined(done), _joined(failed), pending, manifest.environment)
 
     @property
     def failed(self) -> int:
@@ -90,7 +96,7 @@ class Results:
         return frame
 
     def values(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Floats:
-        """(E, R) of one metric, sorted by ego and run: what paired comparisons take. Averaged over training seeds."""
+        """(E, R) of one metric for paired comparisons, sorted by ego and run, averaged over training seeds."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
         found = ego_by_run(frame, value)[0]
@@ -132,38 +138,49 @@ class Results:
 
     def parsed(self, texts: Sequence[str]) -> dict[str, Any]:
         """["method=okf,kalman"] as a selection: each value read as the type of its column."""
-        where: dict[str, Any] = {}
-        for name, text in assignments(texts).items():
-            if name not in self.frame:
-                raise unknown("column", name, self.frame.columns)
-            example = self.frame[name].dropna().iloc[:1].tolist()
-            where[name] = list(parse(name, text, tuple(example)))
-        return where
-
-    def table(self, rows: str | Sequence[str], columns: str | Sequence[str], value: str, **options: Any) -> Table:
-        """Table of one metric, see `coopoc.study.tables.tabulated` for the options."""
-        from .tables import tabulated
-
-        return tabulated(self, rows, columns, value, **options)
+        return {name: list(values) for name, values in parsed([self.frame], texts).items()}
 
     def to_parquet(self, path: str | Path) -> None:
         """Write all rows as Parquet."""
         store.write(Path(path), lambda file: self.frame.to_parquet(file, index=False))
 
     def to_csv(self, path: str | Path) -> None:
-        """Write all rows as CSV with full precision; columns that hold lists are left to Parquet."""
+        """Write all rows as CSV with full precision; columns of lists are left to Parquet, no text is a formula."""
         flat = [c for c in self.frame if not self.frame[c].map(lambda v: isinstance(v, list | np.ndarray)).any()]
-        store.write(Path(path), self.frame[flat].to_csv(index=False))
+        texts = [str(c) for c in flat if not pd.api.types.is_numeric_dtype(self.frame[c])]
+        safe = self.frame[flat].copy()
+        safe[texts] = safe[texts].map(lambda v: spreadsheet(v) if isinstance(v, str) else v)
+        store.write(Path(path), safe.to_csv(index=False))
 
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
-        if value not in frame:
-            raise unknown("metric", value, frame.columns)
-        if not pd.api.types.is_numeric_dtype(given := frame[value].dropna()) and len(given):
-            raise InputError("metric", repr(value), "must be a column of numbers", "It names or lists things.")
+        check_metric(frame, value)
         for axis in self.axes:
             if axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
                 mixed = ", ".join(map(str, frame[axis].unique()))
                 raise InputError(axis, mixed, "would be averaged together", f"Name {axis} in where, rows or columns.")
+
+
+def parsed(frames: Sequence[pd.DataFrame], texts: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """["method=okf,kalman"] as column -> values, read as the type of the column in the first frame that has it.
+
+    Raises:
+        InputError: a column that no frame has, or a value of another type.
+    """
+    found = {}
+    for name, text in assignments(texts).items():
+        known = [frame[name].dropna() for frame in frames if name in frame]
+        if not known:
+            raise unknown("column", name, [column for frame in frames for column in frame.columns])
+        found[name] = parse(name, text, tuple(pd.concat(known).iloc[:1].tolist()))
+    return found
+
+
+def check_metric(frame: pd.DataFrame, value: str) -> None:
+    """InputError unless `value` is a column of numbers."""
+    if value not in frame:
+        raise unknown("metric", value, frame.columns)
+    if len(given := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(given):
+        raise InputError("metric", repr(value), "must be a column of numbers", "It holds text or lists.")
 
 
 def _is(column: pd.Series[Any], value: Any) -> pd.Series[bool]:

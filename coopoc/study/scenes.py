@@ -1,4 +1,4 @@
-"""What was driven and what was measured: paths and speeds, innovations against the assumed Gaussian."""
+"""Plots of data: paths and speeds of a fleet, innovations against the assumed Gaussian."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ from .style import NEUTRAL
 
 
 def paths(fleet: Fleet, caption: str = "") -> Plot:
-    """Path (colour: speed) and speed over time of each vehicle of a fleet, one column per vehicle.
+    """Plot the path (colour: speed) and the speed over time of each vehicle of a fleet, one column per vehicle.
+
+    Args:
+        fleet: at most six vehicles.
+        caption: under the figure.
 
     Raises:
         InputError: more than six vehicles.
@@ -28,8 +32,9 @@ def paths(fleet: Fleet, caption: str = "") -> Plot:
         raise InputError("fleet", f"{count} vehicles", "must be at most 6", "Pick some with fleet.select([...]).")
     speed = np.linalg.norm(fleet.velocity, axis=2)
     top = float(np.nanmax(speed))
-    with canvas(2, count, width=max(1.9 * count, 3.0), height=3.7, squeeze=False,
-                gridspec_kw={"height_ratios": [1.5, 1.0]}) as (figure, axes):  # fmt: skip
+    with canvas(
+        2, count, width=max(1.9 * count, 3.0), height=3.7, squeeze=False, gridspec_kw={"height_ratios": [1.5, 1.0]}
+    ) as (figure, axes):
         for n, name in enumerate(fleet.ids):
             shade = _path(axes[0, n], fleet.position[:, n, :2], speed[:, n], top)
             axes[0, n].set(title=name, xlabel="East [m]")
@@ -42,10 +47,11 @@ def paths(fleet: Fleet, caption: str = "") -> Plot:
 
 
 def innovations(samples: Mapping[str, tuple[AnyArray, float, str]], caption: str = "") -> Plot:
-    """Histogram of each measurement's innovations against the Gaussian of the standard deviation that is assumed.
+    """Plot a histogram of each measurement's innovations against the Gaussian of its assumed standard deviation.
 
     Args:
-        samples: name -> (innovations of any shape, assumed standard deviation, unit). NaN stands for no measurement.
+        samples: name -> (innovations of any shape, assumed standard deviation, unit). NaN is no measurement.
+        caption: under the figure.
     """
     with canvas(1, len(samples), width=3.3 * len(samples), height=2.9, squeeze=False) as (figure, axes):
         for panel, (name, (values, sigma, unit)) in zip(axes[0], samples.items(), strict=True):
@@ -72,14 +78,26 @@ def _histogram(axes: Axes, values: Floats, sigma: float, unit: str) -> None:
     values = values[np.isfinite(values)]
     reach = 5 * sigma
     inside = np.abs(values) <= reach
-    axes.hist(values[inside], bins=61, range=(-reach, reach), color=NEUTRAL,
-              weights=np.full(inside.sum(), 61 / (2 * reach * len(values))))  # fmt: skip
+    axes.hist(
+        values[inside],
+        bins=61,
+        range=(-reach, reach),
+        color=NEUTRAL,
+        weights=np.full(inside.sum(), 61 / (2 * reach * len(values))),
+    )
     grid = np.linspace(-reach, reach, 301)
     axes.plot(grid, stats.norm.pdf(grid, scale=sigma), color="black")
     axes.set_ylim(top=1.4 * axes.get_ylim()[1])
     middle = np.median(values)
-    spread = 1.4826 * np.median(np.abs(values - middle))
-    axes.text(0.98, 0.98, f"assumed σ {sigma:.3g} {unit}, rms {np.sqrt(np.mean(values**2)):.3g} {unit}\n"
-              f"median {middle:.2g}, MAD σ {spread:.3g} {unit}\n"
-              f"beyond 5σ {100 * (1 - inside.mean()):.1f} %, n {len(values)}",
-              transform=axes.transAxes, ha="right", va="top", fontsize=6.5)  # fmt: skip
+    robust = 1.4826 * np.median(np.abs(values - middle))
+    axes.text(
+        0.98,
+        0.98,
+        f"assumed σ {sigma:.3g} {unit}, rms {np.sqrt(np.mean(values**2)):.3g} {unit}\n"
+        f"median {middle:.2g}, MAD σ {robust:.3g} {unit}\n"
+        f"beyond 5σ {100 * (1 - inside.mean()):.1f} %, n {len(values)}",
+        transform=axes.transAxes,
+        ha="right",
+        va="top",
+        fontsize=6.5,
+    )

@@ -1,4 +1,4 @@
-"""Shard: one of n disjoint parts of a study, for batch systems; the same part whenever and wherever it is asked for."""
+"""Shard: one of n disjoint parts of a study, for batch systems; the same part on every machine and at any time."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..errors import InputError
+from .cell import Cell
 from .compute import groups
-from .study import Cell
 
 
 @dataclass(frozen=True)
 class Shard:
-    """The `index`-th of `count` parts, counted from 1.
+    """One part of a study.
+
+    Args:
+        index: of the part, counted from 1.
+        count: number of parts.
 
     >>> str(Shard.parse("2/3"))
     '2/3'
@@ -34,10 +38,14 @@ class Shard:
         return f"{self.index}/{self.count}"
 
     def of(self, cells: Sequence[Cell], shares: Sequence[str]) -> list[Cell]:
-        """Its cells: cells floor((i-1) N / n) to floor(i N / n) of the N, after those of one recording are together.
+        """Its cells: cells floor((i-1) N / n) to floor(i N / n) of the N, in an order that groups recordings.
 
-        Parts differ by one cell at most, and n - 1 recordings at most are made twice. Which cells are finished does not
-        matter: a shard that is repeated resumes its own cells.
+        Parts differ by one cell at most, and at most n - 1 recordings are made twice. Finished cells count: a shard
+        that is repeated resumes its own cells.
+
+        Args:
+            cells: of the study.
+            shares: names of the parameters that a recording depends on.
         """
         ordered = [cell for group in groups(cells, shares) for cell in group]
         size = len(ordered)

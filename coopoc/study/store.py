@@ -1,12 +1,15 @@
-"""The folder of a study: one Parquet file per cell, written whole or not at all."""
+"""The folder of a study: one Parquet file per cell, written whole or not at all, with a checksum."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
 import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +17,27 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..errors import InputError
-from .study import Cell, Row
+from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
+UNSEALED = b"sha256:" + 64 * b"0"
+"""Place of the checksum in the metadata of a Parquet file while the checksum is computed over the whole file."""
 
 
 def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
     """Write a file atomically: a temporary neighbour, flushed to disk, then renamed onto `path`.
 
-    Whoever is killed in between leaves the old file or none, and never half a file.
+    A process that is killed in between leaves the old file or none, never half a file. A symbolic link at `path` is
+    replaced, not followed.
 
     Raises:
-        OSError: of a full or read-only disk, with the path.
+        OSError: a full or read-only disk, with the path.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(path, content)
     except OSError as error:
-        text = f"{error.strerror or error}. What is finished is kept: make room and repeat"
+        text = f"{error.strerror or error}. Finished cells are kept: make room and repeat"
         raise OSError(error.errno, text, str(path)) from error
 
 
@@ -52,37 +58,58 @@ def _write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
         raise
 
 
-def content(path: Path, absent: str, mend: str) -> dict[str, Any]:
-    """What a JSON file of a folder holds; InputError with `absent` and `mend` if there is none, or if it is damaged."""
+def content(path: Path, fields: Mapping[str, Any], absent: str, hint: str) -> dict[str, Any]:
+    """Fields of a JSON file in the folder of a study.
+
+    Args:
+        path: of the file.
+        fields: name -> type that the file must have.
+        absent: "allowed" of the error if there is no such file.
+        hint: of that error.
+
+    Raises:
+        InputError: no such file, no JSON, or a field that is missing or of another type.
+    """
     if not path.is_file():
-        raise InputError("folder", str(path.parent), absent, mend)
+        raise InputError("folder", str(path.parent), absent, hint)
     try:
-        found: dict[str, Any] = json.loads(path.read_text())
-    except ValueError as error:
-        damage = f"holds a damaged {path.name} ({error})"
-        raise InputError("folder", str(path.parent), damage, "Repeat coopoc run: finished cells are kept.") from None
+        found: Any = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise damaged(path, str(error)) from None
+    if not isinstance(found, dict):
+        raise damaged(path, f"a {type(found).__name__} instead of fields")
+    for name, kind in fields.items():
+        if not isinstance(found.get(name), kind):
+            raise damaged(path, f"{name} is a {type(found[name]).__name__}" if name in found else f"{name} is missing")
     return found
 
 
+def damaged(path: Path, damage: str) -> InputError:
+    """The error for a file of a folder that cannot be used."""
+    hint = "Repeat coopoc run: finished cells are kept."
+    return InputError("folder", str(path.parent), f"holds a damaged {path.name} ({damage})", hint)
+
+
 def save(folder: Path, cell: Cell, rows: pa.Table, seconds: float) -> None:
-    """Keep the rows of a finished cell, and forget that it failed before."""
+    """Write the rows of a finished cell and remove its earlier failure."""
     own = {"cell": cell.name, "status": "ok", "reason": "", "cell_seconds": seconds}
-    before, after = ({name: pa.repeat(pa.scalar(value), rows.num_rows) for name, value in each.items()}
-                     for each in (cell.params, own))  # fmt: skip
+    before, after = (
+        {name: pa.repeat(pa.scalar(value), rows.num_rows) for name, value in each.items()}
+        for each in (cell.params, own)
+    )
     table = pa.table({**before, **dict(zip(rows.column_names, rows.columns, strict=True)), **after})
-    write(_finished(folder, cell.name), lambda file: pq.write_table(table, file))
+    _save(_finished(folder, cell.name), table)
     _failed(folder, cell.name).unlink(missing_ok=True)
 
 
 def save_failure(folder: Path, cell: Cell, reason: str, trace: str, seconds: float) -> None:
-    """Keep the reason of a failed cell where the next run does not take it for finished."""
+    """Write the reason of a failed cell, apart from the finished ones."""
     own = {"cell": cell.name, "status": "failed", "reason": reason, "cell_seconds": seconds, "traceback": trace}
-    table = to_table([{**cell.params, **own}])
-    write(_failed(folder, cell.name), lambda file: pq.write_table(table, file))
+    _save(_failed(folder, cell.name), to_table([{**cell.params, **own}]))
 
 
 def copy(source: Path, target: Path, name: str, failed: bool) -> None:
-    """Copy the file of a finished or failed cell from one folder to another as it is; a finished one failed no more."""
+    """Copy the file of a finished or failed cell to another folder; a finished cell is no longer failed there."""
     place = _failed if failed else _finished
     if source != target:
         write(place(target, name), place(source, name).read_bytes())
@@ -100,11 +127,37 @@ def load_failure(folder: Path, name: str) -> pa.Table | None:
     return _read(_failed(folder, name), name)
 
 
+def to_table(rows: Sequence[Row]) -> pa.Table:
+    """Arrow table with the union of the rows' columns, in order of first appearance; absent values are null."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
+
+
+def _save(path: Path, table: pa.Table) -> None:
+    buffer = BytesIO()
+    pq.write_table(table.replace_schema_metadata({"checksum": UNSEALED}), buffer)
+    before, seal, after = buffer.getvalue().rpartition(UNSEALED)
+    write(path, before + _seal(before + seal + after) + after)
+
+
+def _seal(content: bytes) -> bytes:
+    return b"sha256:" + hashlib.sha256(content).hexdigest().encode()
+
+
+def _checked(content: bytes) -> pa.Table:
+    """The table of a file whose checksum is right; pa.ArrowInvalid otherwise."""
+    seals = re.findall(rb"sha256:[0-9a-f]{64}", content)
+    before, seal, after = content.rpartition(seals[-1]) if seals else (b"", b"", b"")
+    if not seal or _seal(before + UNSEALED + after) != seal:
+        raise pa.ArrowInvalid("its checksum is wrong")
+    return pq.read_table(BytesIO(content))
+
+
 def _read(path: Path, name: str) -> pa.Table | None:
     if not path.exists():
         return None
     try:
-        table = pq.read_table(path, partitioning=None)
+        table = _checked(path.read_bytes())
         if set(OWN_COLUMNS) <= set(table.column_names) and set(table["cell"].to_pylist()) == {name}:
             return table
         damage = "it does not hold the rows of this cell"
@@ -112,12 +165,6 @@ def _read(path: Path, name: str) -> pa.Table | None:
         damage = str(error)
     warnings.warn(f"{path} is damaged and will be computed again: {damage}", RuntimeWarning, stacklevel=3)
     return None
-
-
-def to_table(rows: Sequence[Row]) -> pa.Table:
-    """Arrow table with the union of the rows' columns, in order of first appearance; absent values are null."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return pa.table({name: pa.array([row.get(name) for row in rows]) for name in names})
 
 
 def _finished(folder: Path, name: str) -> Path:

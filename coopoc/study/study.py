@@ -2,31 +2,47 @@
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
+from ..file_names import file_name
 from ..one_file import file_digest, in_file
 from ..plugins import unknown
+from .cell import Cell, Params, Row, Scalar, digest
 from .parse import parse
 
 if TYPE_CHECKING:
-    from .figures import Plot
+    from .plot import Plot
     from .results import Results
     from .tables import Table
 
-Scalar: TypeAlias = str | int | float | bool | None
-Params: TypeAlias = Mapping[str, Any]
-Row: TypeAlias = dict[str, Any]
+
+__all__ = ["Cell", "Finding", "Params", "Row", "Scalar", "Study"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence for the top of the report.
+
+    Args:
+        text: the sentence.
+        key: name by which a survey finds it among the findings of a study.
+
+    >>> print(Finding("The heading bias doubles the error.", key="heading_bias_deg"))
+    The heading bias doubles the error.
+    """
+
+    text: str
+    key: str = ""
+
+    def __str__(self) -> str:
+        return self.text
 
 
 def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:
@@ -48,24 +64,27 @@ class Study:
             settings and the cell's own parameters in one mapping. A value of a row is a number, a string or a list of
             numbers. Columns that end in "seconds" are timings, all others are numbers that repeat to the last digit.
         grid: axis -> values (their product), or a list of parameter mappings. Values are scalars.
-        settings: what all cells share (runs, seed, data, egos ...) with defaults, overridden by --set key=value.
-        key: parameters -> what else changes the numbers (fleet digest, hash of weights, revision of the methods).
-            Evaluated for every cell before any work, so an InputError raised here is reported at once.
+        settings: defaults that all cells share (runs, seed, data, egos ...), overridden by --set key=value.
+        key: parameters -> anything else that changes the numbers (fleet digest, hash of weights, revision of the
+            methods). Evaluated for every cell before any work, so an InputError raised here is reported at once.
         prepare: called once with the parameters of the cells that are not finished and the number of processes,
             before they are computed, in the process that started the run: trains or downloads what several cells
             share. It must resume by itself.
-        where: parameters -> False for combinations that mean nothing.
+        where: parameters -> False for combinations without a meaning.
         shares: names of parameters on which the expensive part (a Recording) depends: cells that agree on them follow
-            each other in one worker, where functools.lru_cache then serves.
-        tables, figures: name -> function of Results; None where the results do not call for the view.
-            findings: Results -> sentences for the top of the report.
-        recipe: Results -> what the report says about the training.
-        limitations: sentences. minutes: expected on one core.
-        metrics: of which reference numbers are kept -> "lower" or "higher", which is better, or the best value.
-        reference: the file that holds them, see `coopoc.study.reference`; its absence is no error.
+            each other in one worker, so that functools.lru_cache finds the recording.
+        tables: name -> function of Results; None where the results lack what the table shows.
+        figures: name -> function of Results, likewise.
+        findings: Results -> sentences for the top of the report.
+        recipe: Results -> field -> value of the training, for the report.
+        limitations: sentences.
+        minutes: expected on one core.
+        metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
+        reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
 
     Raises:
-        InputError: an empty grid, a cell twice, a parameter that is no scalar, or a name that is both axis and setting.
+        InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, or
+            a name of the study that is no file name.
 
     >>> Study("demo", "Does x matter?", cell=dict, grid={"x": (1, 2)}, settings={"runs": 3}).cells()[1].params
     {'x': 2}
@@ -82,7 +101,7 @@ class Study:
     shares: tuple[str, ...] = ()
     tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)
     figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
-    findings: Callable[[Results], Sequence[str]] | None = None
+    findings: Callable[[Results], Sequence[Finding | str]] | None = None
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
     limitations: tuple[str, ...] = ()
     minutes: float | None = None
@@ -90,6 +109,7 @@ class Study:
     reference: str | Path | None = None
 
     def __post_init__(self) -> None:
+        file_name("study", self.name, "Rename the study: its folder has this name.")
         both = sorted(set(self.axes) & set(self.settings))
         if both:
             raise InputError("settings", both, "must not name an axis of the grid", "Keep it in one of the two.")
@@ -125,31 +145,6 @@ class Study:
             else:
                 raise unknown("setting", name, [*settings, *self.axes])
         return replace(self, settings=settings, grid=grid)
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One point of the grid. `params` are its own parameters, `given` those and the settings, `name` their hash."""
-
-    params: Mapping[str, Scalar]
-    given: Params
-    name: str
-
-
-def digest(content: Any) -> str:
-    """First 20 hex digits of the SHA-256 of canonical JSON: the same content has the same name on every machine.
-
-    >>> digest({"a": 1, "b": [0.5]}) == digest({"b": (0.5,), "a": np.int64(1)})
-    True
-    """
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=_plain)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise InputError("settings", repr(value), "must be numbers, words, or lists of them", "Pass a name, not an object.")
 
 
 def _named(study: Study, params: Mapping[str, Scalar]) -> Cell:

@@ -1,4 +1,4 @@
-"""One look per method in every figure and table: colour, marker and label; line style says the knowledge."""
+"""One look per method in every figure and table: colour, marker and label; the line style is its noise model."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00", "#CC79A7"
-)  # fmt: skip
+    "#000000",
+    "#E69F00",
+    "#56B4E9",
+    "#009E73",
+    "#0072B2",
+    "#D55E00",
+    "#CC79A7",
+)
 """Okabe and Ito, Color Universal Design (2008): distinguishable under the common forms of colour blindness."""
 
 
@@ -22,7 +28,7 @@ class Look:
 
 
 NEUTRAL = "#9DB0C3"
-"""For what belongs to no method."""
+"""Colour of anything that belongs to no method."""
 
 METHODS = {
     "gnss": Look("GNSS", "#7F7F7F", "x"),
@@ -39,7 +45,7 @@ METHODS = {
     "ci": Look("Covariance intersection", "#A65628", "<"),
     "split-ci": Look("Split CI", "#C77C11", ">"),
     "mds": Look("MDS", "#8C8C8C", "1"),
-    "qcqp-sdr": Look("QCQP-SDR", "#4D4D4D", "2"),
+    "qcqp-relaxation": Look("QCQP-SDR", "#4D4D4D", "2"),
     "gbp": Look("Belief propagation", "#0096A0", "d"),
     "admm": Look("ADMM", "#3F51B5", "H"),
     "diffusion": Look("Diffusion", "#B0A8B9", "3"),
@@ -66,34 +72,68 @@ _SPARE = tuple((color, marker) for marker in "<>d8H" for color in (BLUE, VERMILL
 _LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1, 1, 1)), "fitted": "-", "trained": "-"}
 
 UNITS = {
-    "rt_le_m": ("RT-LE", "m"), "max_error_m": ("Maximum error", "m"), "bytes_per_second": ("Received", "B/s"),
-    "nees": ("NEES", ""), "max_neighbours": ("Neighbours K", ""), "round": ("Round", ""), "seconds": ("Time", "s"),
-    "error_cdf": ("Error CDF", ""), "rate_hz": ("Rate", "Hz"),
-    "cap_bytes_per_second": ("Cap", "B/s"), "nees_inside": ("NEES inside its band", ""),
-    "neighbour_rt_le_m": ("Error of neighbours", "m"), "loss": ("Message loss", ""), "latency": ("Latency", "s"),
-    "heading_std_deg": ("Heading noise", "°"), "heading_bias_deg": ("Heading bias", "°"),
-    "epsilon": ("Epsilon", ""), "auc": ("AUC of the probe", ""), "radius_m": ("Radius of V2X", "m"),
-    "correlated_gnss": ("Correlated GNSS", ""), "latency_loss": ("Latency and loss", ""),
-    "velocity_ratio": ("Velocity noise, share", ""), "velocity_reading": ("Velocity noise is per", ""),
-    "drift_time_s": ("Time of the GNSS drift", "s"), "offset_m": ("Offset of false data", "m"),
-    "train_seeds": ("Training seeds", ""), "train_seed": ("Training seed", ""),
-    "in_mult": ("Input width of the net, multiple", ""), "out_mult": ("Output width of the net, multiple", ""),
-    "backend": ("Optimisation backend", ""), "attacked_share": ("Share of attacked vehicles", ""),
-}  # fmt: skip
+    "rt_le_m": ("RT-LE", "m"),
+    "max_error_m": ("Maximum error", "m"),
+    "bytes_per_second": ("Received", "B/s"),
+    "nees": ("NEES", ""),
+    "max_neighbours": ("Neighbours K", ""),
+    "round": ("Round", ""),
+    "seconds": ("Time", "s"),
+    "error_cdf": ("Error CDF", ""),
+    "rate_hz": ("Rate", "Hz"),
+    "cap_bytes_per_second": ("Cap", "B/s"),
+    "nees_inside": ("NEES inside its band", ""),
+    "neighbour_rt_le_m": ("Error of neighbours", "m"),
+    "loss": ("Message loss", ""),
+    "latency": ("Latency", "s"),
+    "heading_std_deg": ("Heading noise", "°"),
+    "heading_bias_deg": ("Heading bias", "°"),
+    "epsilon": ("Epsilon", ""),
+    "auc": ("AUC of the probe", ""),
+    "radius_m": ("Radius of V2X", "m"),
+    "correlated_gnss": ("Correlated GNSS", ""),
+    "latency_loss": ("Latency and loss", ""),
+    "velocity_ratio": ("Velocity noise, share", ""),
+    "velocity_reading": ("Velocity noise is per", ""),
+    "drift_time_s": ("Time of the GNSS drift", "s"),
+    "offset_m": ("Offset of false data", "m"),
+    "train_seeds": ("Training seeds", ""),
+    "train_seed": ("Training seed", ""),
+    "in_mult": ("Input width of the net, multiple", ""),
+    "out_mult": ("Output width of the net, multiple", ""),
+    "backend": ("Optimisation backend", ""),
+    "spoofed_share": ("Share of spoofed vehicles", ""),
+}
 """Column -> (words, unit)."""
 
 SYMBOLS = {"max_neighbours": "K"}
 """Column -> the short form that fits over a column of numbers."""
 
 RC: Any = {
-    "figure.figsize": (5.6, 3.5), "figure.constrained_layout.use": True, "savefig.dpi": 200,
+    "figure.figsize": (5.6, 3.5),
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 200,
     "figure.dpi": 72,  # what PDF and SVG are drawn at: letters are hinted wider there, and a layout for 100 cuts them
-    "font.family": "DejaVu Sans", "font.size": 9, "axes.titlesize": 9, "axes.labelsize": 9, "legend.fontsize": 7.5,
-    "xtick.labelsize": 8, "ytick.labelsize": 8, "axes.spines.top": False, "axes.spines.right": False,
-    "axes.grid": True, "grid.color": "#E3E3E3", "grid.linewidth": 0.6, "axes.axisbelow": True, "lines.linewidth": 1.5,
-    "lines.markersize": 4.5, "legend.frameon": False, "pdf.fonttype": 42, "svg.hashsalt": "coopoc",
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "legend.fontsize": 7.5,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#E3E3E3",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "lines.linewidth": 1.5,
+    "lines.markersize": 4.5,
+    "legend.frameon": False,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "coopoc",
     "svg.fonttype": "path",
-}  # fmt: skip
+}
 
 
 def look(method: str) -> Look:
@@ -114,9 +154,9 @@ def look(method: str) -> Look:
     return Look(method.replace("_", " "), color, marker)
 
 
-def line(knowledge: object) -> Any:
-    """Line style of a knowledge: dotted identity, dashed nominal, dash-dotted oracle, solid fitted or trained."""
-    return _LINES.get(str(knowledge), "-")
+def line(noise_model: object) -> Any:
+    """Line style of a noise model: dotted identity, dashed nominal, dash-dotted oracle, solid fitted or trained."""
+    return _LINES.get(str(noise_model), "-")
 
 
 def words(name: str) -> str:
@@ -135,7 +175,7 @@ def title(column: str, value: object) -> str:
     >>> title("max_neighbours", 4), title("method", "okf")
     ('K = 4', 'OKF')
     """
-    if column in ("method", "knowledge"):
+    if column in ("method", "noise_model"):
         return label(column, value)
     return f"{SYMBOLS.get(column, words(column))} = {label(column, value)}"
 

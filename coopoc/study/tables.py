@@ -5,41 +5,38 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from tabulate import tabulate
 
 from ..errors import InputError
 from ..evaluate.statistics import Interval
-from .style import METHODS, label, title, words
-
-if TYPE_CHECKING:
-    from .results import Results
+from ..plugins import unknown
+from .escapes import markdown, spreadsheet, tex
+from .style import METHODS
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
 REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
-_LATEX = {"\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-          "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "±": r"$\pm$", "–": "--", "≤": r"$\le$",
-          "≥": r"$\ge$", "×": r"$\times$", "σ": r"$\sigma$", "°": r"$^\circ$", "²": r"$^2$",
-          "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of entries under a header; an Interval shows its mean and, where there is room, its ends.
+    """Rows of entries under a header; an Interval shows its mean and its ends.
 
     Args:
-        header: column titles, with units. rows: entries, as many per row as titles.
+        header: column titles, with units.
+        rows: entries, as many per row as titles.
         caption: with the noise settings; it goes under the table in every format.
-        best: "min" or "max": which number is set in bold. along: "row" or "column" in which it is sought.
+        best: "min" or "max": the number in bold.
+        along: "row" or "column": where the best number is sought.
         unranked: row labels and titles (or parts of a title between commas) that are never the best: bounds, oracles.
-        decimals: of numbers. intervals: show the ends. notes: sentences under the table.
+        decimals: of numbers.
+        intervals: show the ends.
+        notes: sentences under the table.
 
     Raises:
         InputError: a row of another length than the header.
@@ -67,39 +64,68 @@ class Table:
             if len(row) != len(self.header):
                 raise InputError("rows", row, f"must have {len(self.header)} entries", f"Header: {self.header}.")
 
+    @classmethod
+    def from_data(cls, given: Any) -> Table:
+        """The table whose `vars` were stored as JSON.
+
+        Raises:
+            InputError: it is no table.
+        """
+        try:
+            rows = tuple(tuple(map(_entry, row)) for row in given["rows"])
+            texts: dict[str, Any] = {name: tuple(map(str, given[name])) for name in ("header", "unranked", "notes")}
+            allowed = {"best": ("min", "max", None), "along": ("row", "column"), "decimals": range(20)}
+            if wrong := next((name for name, values in allowed.items() if given[name] not in values), ""):
+                raise ValueError(wrong)
+            shown: dict[str, Any] = {name: given[name] for name in allowed}
+            return cls(rows=rows, caption=str(given["caption"]), intervals=bool(given["intervals"]), **texts, **shown)
+        except (TypeError, KeyError, ValueError) as error:
+            raise InputError("table", type(given).__name__, f"is damaged ({error})", "Repeat coopoc run.") from None
+
     def render(self, form: str) -> str:
         """The table in one of FORMATS; InputError for another."""
         if form not in FORMATS:
-            raise InputError("format", repr(form), f"must be one of {', '.join(FORMATS)}", "Pick one.")
+            raise unknown("format", form, FORMATS)
         text: str = getattr(self, f"to_{form}")()
         return text
 
     def to_markdown(self) -> str:
         """GitHub Markdown, best in bold, caption and notes below."""
         bold = self._bold()
-        body = [[_mark(self.text(e), (i, j) in bold, "**{}**").replace("|", "\\|") for j, e in enumerate(row)]
-                for i, row in enumerate(self.rows)]  # fmt: skip
-        grid = tabulate(body, self.header, "pipe", disable_numparse=True, colalign=self._sides("left", "right"))
-        return "\n\n".join([grid, *self.below])
+        body = [
+            [_mark(markdown(self.text(e)), (i, j) in bold, "**{}**") for j, e in enumerate(row)]
+            for i, row in enumerate(self.rows)
+        ]
+        header, sides = [markdown(title) for title in self.header], self._sides("left", "right")
+        grid = tabulate(body, header, "pipe", disable_numparse=True, colalign=sides)
+        return "\n\n".join([grid, *map(markdown, self.below)])
 
     def to_csv(self) -> str:
-        """Full precision; an interval takes three columns: mean, low, high."""
+        """Full precision; an interval takes three columns: mean, low, high. No text is a formula of a spreadsheet."""
         wide = [any(isinstance(row[j], Interval) for row in self.rows) for j in range(len(self.header))]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
         ends = ("", " low", " high")
-        writer.writerow([t + end for t, w in zip(self.header, wide, strict=True) for end in (ends if w else ends[:1])])
+        titles = [(title, end) for title, w in zip(self.header, wide, strict=True) for end in (ends if w else ends[:1])]
+        writer.writerow([spreadsheet(title) + end for title, end in titles])
         for row in self.rows:
-            writer.writerow([n for e, w in zip(row, wide, strict=True) for n in _plain(e, w)])
+            writer.writerow([n for e, w in zip(row, wide, strict=True) for n in _columns(e, w)])
         return out.getvalue()
 
     def to_latex(self) -> str:
         r"""A table for \usepackage{booktabs,graphicx}, not wider than the line; best in bold, text escaped."""
         bold = self._bold()
-        lines = [r"\begin{table}", r"\centering", rf"\caption{{{_tex(' '.join(self.below))}}}", r"\smallskip",
-                 r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
-                 rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}", r"\toprule",
-                 " & ".join(map(_tex, self.header)) + r" \\", r"\midrule"]  # fmt: skip
+        lines = [
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{tex(' '.join(self.below))}}}",
+            r"\smallskip",
+            r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+            rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}",
+            r"\toprule",
+            " & ".join(map(tex, self.header)) + r" \\",
+            r"\midrule",
+        ]
         for i, row in enumerate(self.rows):
             entries = [self._latex(e, (i, j) in bold) for j, e in enumerate(row)]
             lines.append(" & ".join(entries) + r" \\")
@@ -118,14 +144,17 @@ class Table:
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
     def _repr_html_(self) -> str:
-        """What a notebook shows."""
+        """HTML for a notebook."""
         return self.to_html()
 
     def text(self, entry: Entry) -> str:
         """One entry as text."""
         if isinstance(entry, Interval):
-            ends = "" if math.isnan(entry.low) or not self.intervals else (
-                f" [{_number(entry.low, self.decimals)}, {_number(entry.high, self.decimals)}]")  # fmt: skip
+            ends = (
+                ""
+                if math.isnan(entry.low) or not self.intervals
+                else (f" [{_number(entry.low, self.decimals)}, {_number(entry.high, self.decimals)}]")
+            )
             return _number(entry.mean, self.decimals) + ends
         if isinstance(entry, float):
             return _number(entry, self.decimals)
@@ -133,16 +162,16 @@ class Table:
 
     def _latex(self, entry: Entry, bold: bool) -> str:
         if isinstance(entry, str):
-            return _tex(entry)
+            return tex(entry)
         mean, _, ends = self.text(entry).partition(" ")
-        return _mark(_tex(mean), bold, r"\textbf{{{}}}") + (rf" {{\scriptsize {ends}}}" if ends else "")
+        return _mark(tex(mean), bold, r"\textbf{{{}}}") + (rf" {{\scriptsize {ends}}}" if ends else "")
 
     def _html(self, entry: Entry, bold: bool) -> str:
         if isinstance(entry, str):
             return f"<td>{escape(entry)}</td>"
         mean, _, ends = self.text(entry).partition(" ")
         small = f" <span class=interval>{escape(ends)}</span>" if ends else ""
-        return f"<td class=number>{_mark(mean, bold, '<strong>{}</strong>')}{small}</td>"
+        return f"<td class=number>{_mark(escape(mean), bold, '<strong>{}</strong>')}{small}</td>"
 
     def _sides(self, words: str, numbers: str) -> tuple[str, ...]:
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.header)
@@ -164,57 +193,25 @@ class Table:
                 if isinstance(mean, float) and math.isfinite(mean) and not names & set(self.unranked):
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         pick = min if self.best == "min" else max
-        return {(i, j) for group in places.values() if len(group) > 1
-                for mean, i, j in group if mean == pick(group)[0]}  # fmt: skip
-
-
-def tabulated(
-    results: Results,
-    rows: str | Sequence[str],
-    columns: str | Sequence[str],
-    value: str,
-    where: Mapping[str, Any] | None = None,
-    caption: str = "",
-    best: Best = "min",
-    along: Literal["row", "column"] | None = None,
-    decimals: int = 2,
-    intervals: bool = True,
-) -> Table:
-    """Table of one metric over a study's results: mean over egos and runs, with its 95 % interval.
-
-    Args:
-        rows: column(s) of the frame that label the rows. columns: column(s) whose values become columns.
-        value: the metric. where: column -> value or values. best: "min", "max" or None.
-        along: where the best is sought; default among the methods.
-
-    Raises:
-        InputError: as `Results.summary`.
-    """
-    down, across = ([names] if isinstance(names, str) else list(names) for names in (rows, columns))
-    summary = results.summary([*down, *across], value, where)
-    summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
-    titles = list(dict.fromkeys(summary["_title"]))
-    body = []
-    for names, group in summary.groupby(down, sort=False, dropna=False):
-        found = {row["_title"]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
-                 for _, row in group.iterrows() if row["n"]}  # fmt: skip
-        body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(found.get, titles)))
-    missing = int(summary["missing"].sum())
-    return Table(
-        (*map(words, down), *titles), tuple(body), caption or f"{words(value)}: mean and 95 % interval.", best,
-        along or ("column" if "method" in down else "row"), decimals=decimals, intervals=intervals,
-        notes=(f"{missing} egos are left out because a run of theirs failed.",) if missing else (),
-    )  # fmt: skip
+        return {(i, j) for group in places.values() if len(group) > 1 for mean, i, j in group if mean == pick(group)[0]}
 
 
 def _number(value: float, decimals: int) -> str:
     return "–" if math.isnan(value) else f"{value:.{decimals}f}"
 
 
-def _plain(entry: Entry, wide: bool) -> list[object]:
+def _columns(entry: Entry, wide: bool) -> list[object]:
     if isinstance(entry, Interval):
         return [entry.mean, entry.low, entry.high]
-    return [entry, "", ""] if wide else [entry]
+    shown = spreadsheet(entry) if isinstance(entry, str) else entry
+    return [shown, "", ""] if wide else [shown]
+
+
+def _entry(stored: Any) -> Entry:
+    """An entry as JSON has it: a mapping stands for an interval."""
+    if isinstance(stored, dict):
+        return Interval(float(stored["mean"]), float(stored["low"]), float(stored["high"]), int(stored["n"]))
+    return stored if isinstance(stored, float | int | None) else str(stored)
 
 
 def _mark(text: str, bold: bool, pattern: str) -> str:
@@ -222,7 +219,3 @@ def _mark(text: str, bold: bool, pattern: str) -> str:
         return text
     mean, space, ends = text.partition(" ")
     return pattern.format(mean) + space + ends
-
-
-def _tex(text: str) -> str:
-    return "".join(_LATEX.get(letter, letter) for letter in text)

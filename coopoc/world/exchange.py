@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats, Ints
 from ..errors import InputError
 from .recording import Recording
 from .schedules import Nearest, Order, RoundRobin, within_cap
@@ -15,46 +15,62 @@ from .v2x import Message
 
 @dataclass(frozen=True, eq=False)
 class Exchange:
-    """Pairs of vehicles that are in contact, sorted by step; `first` < `second` are columns.
+    """Pairs of vehicles in contact, sorted by step.
 
-    Two vehicles are in contact at a step if either sees the other: who sees may speak, and who is spoken to may answer.
-    What a pair says at a step, all rounds of it, both ways, is one message each way and shares that message's fate:
-    it gets through as a whole, `delay` steps late, or not at all. Over a pair where only one sees the other, the answer
-    shares the fate of what it answers.
+    Two vehicles are in contact at a step if at least one measures the other. All that a pair exchanges at a step, every
+    round of it, is one message each way: it arrives as a whole, late or never. Where only one vehicle measures the
+    other, the answer has the fate of the message that it answers.
 
     Args:
-        step, first, second: (P,). start: (T+1,) start[t]:start[t+1] are the pairs of step t.
-        sight, sight_back: (P,) link in the Recording by which `first` sees `second`, and back; -1 for none.
-        to_first, to_second: (R, P) True where the other's message of that step gets through.
-        delay: steps from sending to arrival.
-        received_bytes, sent_bytes: (R, N) over the drive.
+        step: (P,) of the pair.
+        first: (P,) column, less than `second`.
+        second: (P,) column.
+        start: (T+1,) start[t]:start[t+1] are the pairs of step t.
+        link: (P,) link of the Recording by which `first` measures `second`, -1 for none.
+        link_back: (P,) link by which `second` measures `first`, -1 for none.
+        at_first: (R, P) step at which the message of `second` arrives at `first`, -1 for never.
+        at_second: (R, P) step at which the message of `first` arrives at `second`, -1 for never.
+        received_bytes: (R, N) over the drive.
+        sent_bytes: (R, N) over the drive.
     """
 
     step: Ints
     first: Ints
     second: Ints
     start: Ints
-    sight: Ints
-    sight_back: Ints
-    to_first: Bools
-    to_second: Bools
-    delay: int
+    link: Ints
+    link_back: Ints
+    at_first: Ints
+    at_second: Ints
     received_bytes: Floats
     sent_bytes: Floats
 
+    @property
+    def both(self) -> Ints:
+        """(R, P) step by which the messages of both ways have arrived, -1 for never."""
+        lost = np.minimum(self.at_first, self.at_second) < 0
+        return np.where(lost, -1, np.maximum(self.at_first, self.at_second))
+
+    @property
+    def either(self) -> Ints:
+        """(R, P) step at which the first message of the two ways arrives, -1 for never."""
+        one, other = self.at_first, self.at_second
+        return np.where(np.minimum(one, other) < 0, np.maximum(one, other), np.minimum(one, other))
+
 
 def exchange(recording: Recording, message: Message) -> Exchange:
-    """Contacts of all vehicles when each sends `message` to those that it is in contact with.
+    """Contacts of all vehicles when each sends `message` to those in contact with it.
 
-    A cap on bytes acts on each receiver as in its inbox: nearest first, those that it does not see itself last, or in
-    turns.
+    A cap on bytes applies to each receiver as in its inbox: nearest first and vehicles that it does not measure last,
+    or in turns.
 
     Args:
-        recording: observed by all vehicles. message: its size counts against `v2x.bytes_per_second`.
+        recording: observed by all vehicles.
+        message: its size counts against `v2x.bytes_per_second`.
 
     Raises:
-        InputError: the links of some vehicles were not recorded; a cap whose schedule is "most informative": what a
-            belief is worth depends on what others say in the same round.
+        InputError: the links of some vehicles were not recorded; a cap whose schedule is "most informative", since the
+            value of a belief depends on the other messages of the same round.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> from coopoc.world.v2x import Message
@@ -64,24 +80,27 @@ def exchange(recording: Recording, message: Message) -> Exchange:
     """
     silent = sorted(set(range(len(recording.ids))) - set(recording.observers))
     if silent:
-        raise InputError("observers", f"without {[recording.ids[c] for c in silent[:4]]}", "must be all vehicles here",
-                         "Leave observe(..., observers=...) at its default.")  # fmt: skip
-    step, first, second, sight, back = _pairs(recording)
-    to_first, to_second = _arrivals(recording, step, first, second, sight, back)
+        raise InputError(
+            "observers",
+            f"without {[recording.ids[c] for c in silent[:4]]}",
+            "must be all vehicles here",
+            "Leave observe(..., observers=...) at its default.",
+        )
+    step, first, second, link, link_back = pairs = _pairs(recording)
+    arrivals = _arrivals(recording, *pairs)
     steps, vehicles = len(recording.t), len(recording.ids)
     contacts = np.zeros((steps, vehicles), dtype=np.int64)
     np.add.at(contacts, (step, first), 1)
     np.add.at(contacts, (step, second), 1)
     size = np.broadcast_to(message.size(recording.v2x.overhead, contacts), contacts.shape)
-    received = _receive(recording, (step, first, second, sight, back), (to_first, to_second), size)
+    received = _receive(recording, pairs, arrivals, size)
     sends = recording.broadcasts * (contacts if message.unicast else recording.v2x.max_neighbours > 0)
-    delay = int(np.ceil(recording.v2x.latency / recording.dt - 1e-9))
-    in_time = delay * recording.dt <= recording.v2x.max_age + 1e-9
+    oldest = recording.v2x.max_age / recording.dt + 1e-9
+    at_first, at_second = (np.where(arrival - step <= oldest, arrival, -1) for arrival in arrivals)
+    start, sent = np.searchsorted(step, np.arange(steps + 1)), (sends * size).sum(axis=0, dtype=float)
     return Exchange(
-        step, first, second, np.searchsorted(step, np.arange(steps + 1)), sight, back,
-        (to_first >= 0) & in_time, (to_second >= 0) & in_time, delay,
-        received, np.repeat((sends * size).sum(axis=0, dtype=float)[None], recording.runs, axis=0),
-    )  # fmt: skip
+        step, first, second, start, link, link_back, at_first, at_second, received, np.tile(sent, (recording.runs, 1))
+    )
 
 
 def _pairs(recording: Recording) -> tuple[Ints, Ints, Ints, Ints, Ints]:
@@ -91,15 +110,13 @@ def _pairs(recording: Recording) -> tuple[Ints, Ints, Ints, Ints, Ints]:
     first = np.where(forward, links.observer, links.neighbour)
     second = np.where(forward, links.neighbour, links.observer)
     key, pair = np.unique((links.step * vehicles + first) * vehicles + second, return_inverse=True)
-    sight, back = np.full((2, len(key)), -1, dtype=np.int64)
-    sight[pair[forward]] = np.flatnonzero(forward)
+    link, back = np.full((2, len(key)), -1, dtype=np.int64)
+    link[pair[forward]] = np.flatnonzero(forward)
     back[pair[~forward]] = np.flatnonzero(~forward)
-    return key // vehicles**2, key // vehicles % vehicles, key % vehicles, sight, back
+    return key // vehicles**2, key // vehicles % vehicles, key % vehicles, link, back
 
 
-def _arrivals(
-    recording: Recording, step: Ints, first: Ints, second: Ints, sight: Ints, back: Ints
-) -> tuple[Ints, Ints]:  # fmt: skip
+def _arrivals(recording: Recording, step: Ints, first: Ints, second: Ints, link: Ints, back: Ints) -> tuple[Ints, Ints]:
     """(R, P) steps at which the pair's messages reach `first` and `second`, -1 for never."""
 
     def reaching(own: Ints, other: Ints, sender: Ints) -> Ints:
@@ -109,17 +126,17 @@ def _arrivals(
     if not len(step):
         empty = np.empty((recording.runs, 0), dtype=np.int64)
         return empty, empty.copy()
-    return reaching(sight, back, second), reaching(back, sight, first)
+    return reaching(link, back, second), reaching(back, link, first)
 
 
 def _receive(recording: Recording, pairs: tuple[Ints, ...], arrivals: tuple[Ints, Ints], size: Ints) -> Floats:
     """Apply the cap to what each vehicle receives, in place, and count its bytes (R, N)."""
-    step, first, second, sight, back = pairs
+    step, first, second, link, back = pairs
     vehicles, count = len(recording.ids), len(step)
     arrival, receiver = np.concatenate(arrivals, axis=1), np.concatenate([first, second])
     sizes = np.concatenate([size[step, second], size[step, first]])
     if np.isfinite(recording.v2x.bytes_per_second) and sizes.any():
-        own, other = np.concatenate([sight, back]), np.concatenate([back, sight])
+        own, other = np.concatenate([link, back]), np.concatenate([back, link])
         rank = np.where(own >= 0, own, len(recording.links) + other)
         both, sender = np.tile(step, 2), np.concatenate([second, first])
         order = np.lexsort((rank, both, receiver))
@@ -135,8 +152,12 @@ def _receive(recording: Recording, pairs: tuple[Ints, ...], arrivals: tuple[Ints
 def _order(recording: Recording, sender: Ints) -> Order:
     """The schedule of one receiver of beliefs."""
     if recording.v2x.schedule == "most informative":
-        raise InputError("schedule", repr(recording.v2x.schedule), "must be 'nearest' or 'round robin' in an exchange",
-                         "Take it with a method of a star, such as the joint filter.")  # fmt: skip
+        raise InputError(
+            "schedule",
+            repr(recording.v2x.schedule),
+            "must be 'nearest' or 'round robin' in an exchange",
+            "Take it with a method of a star, such as the joint filter.",
+        )
     if recording.v2x.schedule == "nearest":
         return Nearest()
     return RoundRobin(sender, np.full((recording.runs, len(recording.ids)), -1))

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats, frozen
+from ..arrays import Bools, Floats, checked
 from ..errors import InputError
+from .axes import clock, column, columns, interval, names
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +43,17 @@ class Fleet:
     licence: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ids", tuple(str(i) for i in self.ids))
-        for field in ("t", "position", "velocity"):
-            object.__setattr__(self, field, frozen(getattr(self, field)))
-        _check(self)
+        object.__setattr__(self, "ids", names(self.ids))
+        object.__setattr__(self, "t", clock(self.t))
+        for field in ("position", "velocity"):
+            values = checked(field, getattr(self, field), "(T, N, 3)", (len(self.t), len(self.ids), 3))
+            object.__setattr__(self, field, values)
+        _check_gaps(self)
 
     @property
     def dt(self) -> float:
         """Sampling interval, s."""
-        return round(float((self.t[-1] - self.t[0]) / (len(self.t) - 1)), 9)
+        return interval(self.t)
 
     @property
     def present(self) -> Bools:
@@ -67,21 +70,11 @@ class Fleet:
 
     def index(self, vehicle: str | int) -> int:
         """Column of a vehicle given by its id or its index; InputError if there is none."""
-        if isinstance(vehicle, str) and vehicle in self.ids:
-            return self.ids.index(vehicle)
-        if not isinstance(vehicle, str) and 0 <= int(vehicle) < len(self.ids):
-            return int(vehicle)
-        known = ", ".join(self.ids[:8]) + (", ..." if len(self.ids) > 8 else "")
-        raise InputError(
-            "vehicle",
-            repr(vehicle),
-            f"must be an index in 0..{len(self.ids) - 1} or one of the ids {known}",
-            "List them with fleet.ids.",
-        )
+        return column("vehicle", vehicle, self.ids)
 
     def select(self, vehicles: Sequence[str | int]) -> Fleet:
         """The same drive with these vehicles only."""
-        cols = [self.index(v) for v in vehicles]
+        cols = columns("vehicles", vehicles, self.ids)
         return replace(
             self, ids=tuple(self.ids[c] for c in cols), position=self.position[:, cols], velocity=self.velocity[:, cols]
         )
@@ -96,36 +89,7 @@ class Fleet:
         return f"Fleet({self.name or 'unnamed'}: {len(self.ids)} vehicles x {len(self.t)} steps, dt {self.dt:g} s)"
 
 
-def _check(fleet: Fleet) -> None:
-    steps, vehicles = len(fleet.t), len(fleet.ids)
-    if steps < 2:
-        raise InputError("t", f"{steps} steps", "needs at least 2", "Check that the file holds a drive.")
-    if len(set(fleet.ids)) != vehicles:
-        twice = sorted({i for i in fleet.ids if fleet.ids.count(i) > 1})
-        raise InputError("ids", twice[:3], "must be unique", "Rename the vehicles that share an id.")
-    for field in ("position", "velocity"):
-        if getattr(fleet, field).shape != (steps, vehicles, 3):
-            raise InputError(
-                field,
-                getattr(fleet, field).shape,
-                f"must have shape (T, N, 3) = ({steps}, {vehicles}, 3)",
-                "Axis order is time, vehicle, component.",
-            )
-    gaps = np.diff(fleet.t)
-    if not np.all(gaps > 0):
-        raise InputError(
-            "dt",
-            f"{gaps.min():g} s at step {int(np.argmin(gaps)) + 1}",
-            "must be > 0",
-            "Sort the rows by time and drop repeated stamps.",
-        )
-    if np.ptp(gaps) > 1e-3 * gaps.mean() + 1e-6:
-        raise InputError(
-            "t",
-            f"steps between {gaps.min():g} and {gaps.max():g} s",
-            "must be equally spaced",
-            "Resample first: coopoc data convert --dt 0.1.",
-        )
+def _check_gaps(fleet: Fleet) -> None:
     numbers = np.concatenate([fleet.position, fleet.velocity], axis=2)
     bad = np.isinf(numbers).any(axis=2) | (np.isnan(numbers).any(axis=2) & ~np.isnan(numbers).all(axis=2))
     if bad.any():

@@ -67,9 +67,14 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     newest[too_old] = -1
     broadcasts = recording.broadcasts[:, ego].sum() if recording.v2x.max_neighbours else 0
     return Inbox(
-        link, start, arrival, newest, fresh & ~too_old,
-        received_bytes=(arrival >= 0).sum(axis=1) * float(size), sent_bytes=float(broadcasts * size),
-    )  # fmt: skip
+        link,
+        start,
+        arrival,
+        newest,
+        fresh & ~too_old,
+        received_bytes=(arrival >= 0).sum(axis=1) * float(size),
+        sent_bytes=float(broadcasts * size),
+    )
 
 
 def _held(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Ints, Bools]:

@@ -8,41 +8,13 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Bools, Floats, Ints, checked, refuse
 from ..errors import InputError
+from .axes import clock, columns, interval, names
+from .consistency import check_links, check_measurements
+from .links import Links
 from .sensors import Sensors
 from .v2x import V2X
-
-
-@dataclass(frozen=True, eq=False)
-class Links:
-    """Who measured whom, the same in all runs, sorted by (step, observer, distance).
-
-    Args:
-        step: (L,) step of the link. observer, neighbour: (L,) columns of the Recording.
-    """
-
-    step: Ints
-    observer: Ints
-    neighbour: Ints
-
-    def of(self, observer: int) -> Ints:
-        """Indices of the links of one observer, in time order and nearest first within a step."""
-        order, start = self._by_observer
-        if not 0 <= observer < len(start) - 1:
-            return np.empty(0, dtype=np.int64)
-        return order[start[observer] : start[observer + 1]]
-
-    @cached_property
-    def _by_observer(self) -> tuple[Ints, Ints]:
-        """Links in the order of their observers, and where each one's begin: a search of all links for every observer
-        would make a fleet's cost per vehicle grow with the fleet."""
-        order = np.argsort(self.observer, kind="stable")
-        last = int(self.observer.max(initial=-1))
-        return order, np.searchsorted(self.observer[order], np.arange(last + 2))
-
-    def __len__(self) -> int:
-        return len(self.step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +31,10 @@ class Recording:
         arrival: (R, L) step at which the neighbour's broadcast of the link's step arrives, -1 if lost or not sent.
         sensors, v2x: what a method may know (the bias is not among it).
         notes: labels that every table and figure carries (what is simulated, what uses truth).
+
+    Raises:
+        InputError: arrays of other shapes or kinds, links of steps or columns that are not there, more of them than
+            `v2x.max_neighbours`, links of absent vehicles, a message that arrives before it is sent, infinite numbers.
     """
 
     ids: tuple[str, ...]
@@ -75,14 +51,33 @@ class Recording:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("t", "gnss", "velocity", "relative"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
+            if not isinstance(getattr(self, name), kind):
+                given, allowed = repr(getattr(self, name))[:60], f"must be {kind.__name__}"
+                raise InputError(name, given, allowed, f"Give {kind.__name__}(...).")
+        ids, t, links = names(self.ids), clock(self.t), len(self.links)
+        gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
+        found = {
+            "ids": ids,
+            "t": t,
+            "gnss": gnss,
+            "velocity": checked("velocity", self.velocity, "(R, T, N, 3)", gnss.shape),
+            "relative": checked("relative", self.relative, "(R, L, 3)", (len(gnss), links, 3)),
+            "broadcasts": checked("broadcasts", self.broadcasts, "(T, N)", gnss.shape[1:3], bool),
+            "arrival": checked("arrival", self.arrival, "(R, L)", (len(gnss), links), int),
+            "observers": tuple(checked("observers", self.observers, "(O,)", (-1,), int).tolist()),
+            "notes": tuple(self.notes),
+        }
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
+        check_measurements(self.gnss, self.velocity, self.relative)
+        check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours)
         self.sensors.check_assumed()
 
     @property
     def dt(self) -> float:
         """Sampling interval, s."""
-        return round(float((self.t[-1] - self.t[0]) / (len(self.t) - 1)), 9)
+        return interval(self.t)
 
     @property
     def runs(self) -> int:
@@ -97,14 +92,11 @@ class Recording:
         >>> observe(fleet, Sensors(), runs=5).of_runs(slice(1, 4)).runs
         3
         """
+        if not isinstance(runs, slice):
+            runs = checked("runs", runs, "(number of runs,)", (-1,), int)
+            refuse("runs", runs, (runs < 0) | (runs >= self.runs), f"must be in 0..{self.runs - 1}", "Count from 0.")
         parts = {name: getattr(self, name)[runs] for name in ("gnss", "velocity", "relative", "arrival")}
-        found = replace(self, **parts)
-        return found.known_complete() if self.complete else found
-
-    def known_complete(self) -> Recording:
-        """Itself, told that it is `complete` by who knows without a look through all runs."""
-        vars(self)["complete"] = True
-        return self
+        return replace(self, **parts)
 
     @cached_property
     def complete(self) -> bool:
@@ -119,12 +111,27 @@ class Recording:
         """InputError, which names the vehicle and the step, if a fix is missing."""
         if not self.complete:
             _, step, column, _ = np.argwhere(np.isnan(self.gnss) & np.isfinite(self.velocity))[0]
-            raise InputError("gnss", f"none of {self.ids[column]} at step {step}", "must be there at every step here",
-                             "Take a filter, a learned gain or the joint filter, which do without.")  # fmt: skip
+            raise InputError(
+                "gnss",
+                f"none of {self.ids[column]} at step {step}",
+                "must be there at every step here",
+                "Take a filter, a learned gain or the joint filter, which do without.",
+            )
 
     def neighbours(self, ego: int) -> Ints:
         """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
         return np.bincount(self.links.step[self.links.of(ego)], minlength=len(self.t)).astype(np.int64)
+
+    def observing(self, egos: Sequence[int | str]) -> list[int]:
+        """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""
+        cols = columns("egos", egos, self.ids)
+        if not cols:
+            raise InputError("egos", egos, "must name at least one vehicle", "Give [0] for the first.")
+        for ego, col in zip(egos, cols, strict=True):
+            if col not in self._observing:
+                allowed = f"has no links here, only {list(self.observers)} have"
+                raise InputError("egos", repr(ego), allowed, "Name it in observe(..., observers=[...]).")
+        return cols
 
     def columns(self, egos: Sequence[int | str], missing: bool = False) -> list[int]:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, or absent at times.
@@ -132,16 +139,7 @@ class Recording:
         Args:
             missing: whether fixes may be missing (NaN) after the first one while the vehicle drives on.
         """
-        cols = []
-        for ego in egos:
-            col = self.ids.index(ego) if isinstance(ego, str) and ego in self.ids else ego
-            if isinstance(col, str) or not 0 <= col < len(self.ids):
-                known = f"0..{len(self.ids) - 1} or an id"
-                raise InputError("egos", repr(ego), f"must be one of {known}", "See recording.ids.")
-            if col not in self._observing:
-                raise InputError("egos", repr(ego), f"has no links here, only {list(self.observers)} have",
-                                 "Name it in observe(..., observers=[...]).")  # fmt: skip
-            cols.append(int(col))
+        cols = self.observing(egos)
         moves, seen = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss))
         if moves.all() and (seen[:, 0] if missing else seen).all():
             return cols
@@ -149,12 +147,12 @@ class Recording:
         fixes: Bools = np.asarray(seen.all(axis=(0, 3)))
         for ego, present, fix in zip(egos, there, fixes.T, strict=True):
             if not present:
-                mend = "Choose another ego or cut the drive with fleet.between(...)."
-                raise InputError("egos", repr(ego), "is absent at some steps", mend)
+                hint = "Choose another ego or cut the drive with fleet.between(...)."
+                raise InputError("egos", repr(ego), "is absent at some steps", hint)
             if not (fix[0] if missing else fix.all()):
                 step = int(np.argmin(fix))
-                mend = "Cut the drive with fleet.between(...)." if step == 0 else "Take a method that does without."
-                raise InputError("egos", repr(ego), f"has no fix at step {step}, where this method needs one", mend)
+                hint = "Cut the drive with fleet.between(...)." if step == 0 else "Take a method that does without."
+                raise InputError("egos", repr(ego), f"has no fix at step {step}, where this method needs one", hint)
         return cols
 
     def __repr__(self) -> str:

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..kernels.compile import use_kernels
+from ..kernels.bucket import nearest_first
 from .informative import MostInformative
 from .recording import Recording
 from .v2x import Message
@@ -97,9 +97,7 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, recording: Recording, hea
     if not np.isfinite(cap) or not size.any():
         return arrival
     depth = float(max(cap, int(size.max()))) if cap else 0.0
-    if isinstance(heard_by, Nearest) and use_kernels():
-        from ..kernels.bucket import nearest_first
-
+    if isinstance(heard_by, Nearest):
         there, bytes_, first = (np.ascontiguousarray(values, dtype=np.int64) for values in (arrival, size, start))
         return nearest_first(there, bytes_, first, cap * recording.dt, depth)
     kept = np.full_like(arrival, -1)

@@ -8,11 +8,13 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints
+from ..arrays import AnyArray, Bools, Floats, Ints, number
 from ..errors import InputError
+from .axes import columns
 from .fleet import Fleet
+from .links import Links
 from .noise import stream
-from .recording import Links, Recording
+from .recording import Recording
 from .sensors import Sensors
 from .spherical import spherical, wrap
 from .v2x import V2X, lost
@@ -56,25 +58,30 @@ def observe(
     >>> observe(fleet, Sensors(), V2X(max_neighbours=1), runs=3)
     Recording(3 runs x 2 steps x 2 vehicles, 4 links, K <= 1)
     """
-    if runs < 1:
-        raise InputError("runs", runs, "must be >= 1", "Use at least one noise run.")
-    if seed < 0:
-        raise InputError("seed", seed, "must be >= 0", "Any whole number from 0 on will do.")
+    for name, value, kind in (("fleet", fleet, Fleet), ("sensors", sensors, Sensors), ("v2x", v2x or V2X(), V2X)):
+        if not isinstance(value, kind):
+            raise InputError(name, repr(value)[:60], f"must be {kind.__name__}", f"Give {kind.__name__}(...).")
+    runs = number("runs", runs, 1, 2**32, kind=int, allowed=">= 1", hint="Use at least one noise run.")
+    seed = number("seed", seed, 0, 2**63, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
     v2x = v2x or V2X.ideal()
-    columns = list(range(len(fleet.ids))) if observers is None else sorted({fleet.index(o) for o in observers})
-    links = find_links(fleet, columns, v2x.max_neighbours, v2x.radius, sensors.min_range)
+    observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
+    watching = tuple(sorted(set(observing)))
+    links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range)
     broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
     drawn, key = (fleet, sensors, runs, seed), (fleet, repr(sensors), runs, seed)
-    seen = Recording(
-        ids=fleet.ids, t=fleet.t,
+    return Recording(
+        ids=fleet.ids,
+        t=fleet.t,
         gnss=_once(("gnss", *key), lambda: _gnss(*drawn)),
         velocity=_once(("velocity", *key), lambda: _velocity(*drawn)),
-        links=links, relative=_relative(links, tuple(columns), v2x, *drawn),
-        broadcasts=broadcasts, arrival=arrival,
-        sensors=assumed or sensors.without_bias(), v2x=v2x, observers=tuple(columns),
-    )  # fmt: skip
-    everywhere = (np.isfinite(fleet.position) | np.isnan(fleet.velocity)).all()
-    return seen.known_complete() if everywhere else seen
+        links=links,
+        relative=_relative(links, watching, v2x, *drawn),
+        broadcasts=broadcasts,
+        arrival=arrival,
+        sensors=assumed or sensors.without_bias(),
+        v2x=v2x,
+        observers=watching,
+    )
 
 
 def find_links(fleet: Fleet, observers: Sequence[int], most: int, radius: float, min_range: float = 0.0) -> Links:
@@ -192,7 +199,7 @@ def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
 
 def _relative(
     links: Links, columns: tuple[int, ...], v2x: V2X, fleet: Fleet, sensors: Sensors, runs: int, seed: int
-) -> Floats:  # fmt: skip
+) -> Floats:
     """(R, L, 3), from a recording of as many or more neighbours where one still exists."""
     drawn, most = ("relative", fleet, repr(sensors), runs, seed, columns, v2x.radius), v2x.max_neighbours
 

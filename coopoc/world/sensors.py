@@ -7,8 +7,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, number
 from ..errors import InputError
+from ..plugins import unknown
 
 BiasMode = Literal["run", "sample"]
 VelocityReading = Literal["axis", "speed"]
@@ -57,21 +58,22 @@ class Sensors:
     """m, centres closer than a vehicle is wide are not measured (a range near zero makes angles seem exact)."""
 
     def __post_init__(self) -> None:
-        for name, size in (("gnss_std", 3), ("gnss_bias", 2)):
-            given = np.asarray(getattr(self, name), dtype=float)
-            if given.shape != (size,):
-                raise InputError(name, getattr(self, name), f"must be {size} numbers", "Give metres in a tuple.")
-            object.__setattr__(self, name, tuple(float(v) for v in given))
+        words = {"gnss_bias_mode": get_args(BiasMode), "velocity_reading": get_args(VelocityReading)}
+        hint = "Give a standard deviation in SI units."
+        for field in fields(self):
+            name, value = field.name, getattr(self, field.name)
+            if name in words:
+                if value not in words[name]:
+                    raise unknown(name, value, words[name])
+            elif isinstance(field.default, tuple):
+                size = len(field.default)
+                if not isinstance(value, tuple | list | np.ndarray) or len(value) != size:
+                    raise InputError(name, value, f"must be {size} numbers", "Give metres in a tuple.")
+                object.__setattr__(self, name, tuple(number(name, v, hint=hint) for v in value))
+            else:
+                object.__setattr__(self, name, number(name, value, hint=hint))
         if self.gnss_bias[0] > self.gnss_bias[1]:
             raise InputError("gnss_bias", self.gnss_bias, "must be (low, high) with low <= high", "Swap the two.")
-        for field in fields(self):
-            value = getattr(self, field.name)
-            numbers = value if isinstance(value, tuple) else (value,)
-            if not isinstance(value, str) and not all(np.isfinite(n) and n >= 0 for n in numbers):
-                raise InputError(field.name, value, "must be finite and >= 0", "Give a standard deviation in SI units.")
-        for name, allowed in (("gnss_bias_mode", BiasMode), ("velocity_reading", VelocityReading)):
-            if getattr(self, name) not in get_args(allowed):
-                raise InputError(name, repr(getattr(self, name)), f"must be one of {get_args(allowed)}", "Pick one.")
         if self.gnss_drift_time <= 0:
             raise InputError("gnss_drift_time", self.gnss_drift_time, "must be > 0 s", "For white noise set the stds.")
         if self.azimuth_std > np.pi or self.inclination_std > np.pi:
@@ -118,8 +120,13 @@ class Sensors:
 
     def check_assumed(self) -> Sensors:
         """Itself, if a method may assume it; InputError where an assumed std is zero."""
-        stds = {"gnss_std": min(self.gnss_std), "range_std": self.range_std, "azimuth_std": self.azimuth_std,
-                "inclination_std": self.inclination_std, "velocity_floor": self.velocity_floor}  # fmt: skip
+        stds = {
+            "gnss_std": min(self.gnss_std),
+            "range_std": self.range_std,
+            "azimuth_std": self.azimuth_std,
+            "inclination_std": self.inclination_std,
+            "velocity_floor": self.velocity_floor,
+        }
         for name, value in stds.items():
             if value <= 0:
                 raise InputError(

@@ -41,8 +41,7 @@ def to_vector(relative: Floats) -> Floats:
 def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     """Covariance J diag(std^2) J^T of `to_vector(relative)`, J its Jacobian: (..., 3, 3) m^2.
 
-    The tangential part uses max(d, min_range): a noisy range near zero would make the angles seem exact
-    (methods.md section 3.5 and performance.md G1 of the design notes).
+    The tangential part uses max(d, min_range): a noisy range near zero would make the angles seem exact.
 
     Args:
         relative: (..., 3) m, rad, rad.

@@ -1,4 +1,4 @@
-"""V2X: who may talk to whom, how often, how late, how reliably and within how many bytes."""
+"""V2X: neighbourhood, rate, latency, loss and byte budget of the channel; the messages that vehicles broadcast."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats
-from ..errors import InputError
+from ..arrays import AnyArray, Bools, Floats, number
+from ..plugins import unknown
 
 Schedule = Literal["nearest", "round robin", "most informative"]
 
@@ -41,20 +41,24 @@ class V2X:
     informative", whose message lowers the bound of its position most (`coopoc.world.informative`)."""
 
     def __post_init__(self) -> None:
-        limits = {"max_neighbours": (0, 1e6, ">= 0"), "radius": (0, np.inf, ">= 0 m"), "rate": (1e-3, 1e4, "> 0 Hz"),
-                  "latency": (0, 3600, ">= 0 s"), "loss": (0, 1, "in [0, 1]"), "burst": (1, 1e6, ">= 1 message"),
-                  "max_age": (0, 3600, ">= 0 s"),
-                  "bytes_per_second": (0, np.inf, ">= 0"), "overhead": (0, 1e6, ">= 0 bytes")}  # fmt: skip
         if self.schedule not in get_args(Schedule):
-            raise InputError("schedule", repr(self.schedule), f"must be one of {get_args(Schedule)}", "Pick one.")
+            raise unknown("schedule", self.schedule, get_args(Schedule))
+        limits: dict[str, tuple[float, float, str]] = {
+            "max_neighbours": (0, 1e6, ">= 0"),
+            "radius": (0, np.inf, ">= 0 m"),
+            "rate": (1e-3, 1e4, "> 0 Hz"),
+            "latency": (0, 3600, ">= 0 s"),
+            "loss": (0, 1, "in [0, 1]"),
+            "burst": (1, 1e6, ">= 1 message"),
+            "max_age": (0, 3600, ">= 0 s"),
+            "bytes_per_second": (0, np.inf, ">= 0"),
+            "overhead": (0, 1e6, ">= 0 bytes"),
+        }
         for name, (low, high, words) in limits.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                mend = "Use 0 for no neighbours." if name == "max_neighbours" else f"Give V2X({name}=...)."
-                raise InputError(name, value, f"must be {words}", mend)
-        if self.max_neighbours != int(self.max_neighbours):
-            raise InputError("max_neighbours", self.max_neighbours, "must be a whole number", "Use an int.")
-        object.__setattr__(self, "max_neighbours", int(self.max_neighbours))
+            value, kind = getattr(self, name), int if name in ("max_neighbours", "overhead") else float
+            if value is not None or name != "rate":
+                hint = "Use 0 for no neighbours." if name == "max_neighbours" else f"Give V2X({name}=...)."
+                object.__setattr__(self, name, number(name, value, low, high, kind=kind, allowed=words, hint=hint))
 
     @classmethod
     def ideal(cls, max_neighbours: int = 6) -> V2X:
@@ -115,9 +119,8 @@ class Message:
 
     def __post_init__(self) -> None:
         for field in ("numbers", "rounds", "opening", "per_neighbour"):
-            value = getattr(self, field)
-            if value != int(value) or value < 0:
-                raise InputError(field, value, "must be a whole number >= 0", f"Give Message({field}=...).")
+            value = number(field, getattr(self, field), kind=int, allowed=">= 0", hint=f"Give Message({field}=...).")
+            object.__setattr__(self, field, value)
 
     @property
     def payload(self) -> int:
@@ -135,11 +138,11 @@ class Message:
 
 NO_MESSAGE = Message("none", 0, rounds=0)
 FIX_AND_VELOCITY = Message("fix and velocity", 8)
-"""GNSS fix (3), velocity (3), id and time (2): LKF-SA's star and the joint filter (methods.md section 3.3)."""
+"""GNSS fix (3), velocity (3), id and time (2): LKF-SA's star and the joint filter."""
 ESTIMATE = Message("estimate", 8, cumulative=True)
 """Position estimate (3), the receiver's own relative measurement is on board; velocity (3), id and time (2)."""
 ESTIMATE_AND_COV = Message("estimate and covariance", 14, cumulative=True)
-"""As ESTIMATE with the six numbers of a symmetric covariance (methods.md section 2.2)."""
+"""As ESTIMATE with the six numbers of a symmetric covariance."""
 
 
 def lost(draws: Floats, loss: float, burst: float) -> Bools:

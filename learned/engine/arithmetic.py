@@ -92,9 +92,13 @@ def window(typing: Any, flat: Any, at: Any, rows: Any, columns: Any) -> Any:
         made, size = context.make_array(shaped)(context, builder), owner.itemsize
         _, at, rows, columns = values
         context.populate_array(
-            made, data=builder.gep(owner.data, [at]), shape=_pair(builder, rows, columns),
-            strides=_pair(builder, builder.mul(columns, size), size), itemsize=size, meminfo=None,
-        )  # fmt: skip
+            made,
+            data=builder.gep(owner.data, [at]),
+            shape=_pair(builder, rows, columns),
+            strides=_pair(builder, builder.mul(columns, size), size),
+            itemsize=size,
+            meminfo=None,
+        )
         return made._getvalue()
 
     return shaped(flat, types.intp, types.intp, types.intp), generate
@@ -105,13 +109,14 @@ def _pair(builder: Any, *values: Any) -> Any:
 
 
 @view
-def lent(typing: Any, array: Any) -> Any:
+def borrowed(typing: Any, array: Any) -> Any:
     """The same array, not counted as a reference; as for `window`, an argument must hold the memory."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         owner, made = (context.make_array(array)(context, builder, *given) for given in (values, ()))
-        context.populate_array(made, data=owner.data, shape=owner.shape, strides=owner.strides, itemsize=owner.itemsize,
-                               meminfo=None)  # fmt: skip
+        context.populate_array(
+            made, data=owner.data, shape=owner.shape, strides=owner.strides, itemsize=owner.itemsize, meminfo=None
+        )
         return made._getvalue()
 
     return array(array), generate

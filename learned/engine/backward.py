@@ -1,4 +1,4 @@
-"""Compiled backpropagation through time of GainNets, from the tape that `kernel_forward` leaves."""
+"""Compiled backpropagation through time of GainNets, from the tape of `forward.follow`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import AnyArray, Bools, Floats, Ints
-from coopoc.kernels.compile import compiled, part
+from coopoc.arrays import Floats
+from coopoc.kernels.compile import part
+from coopoc.learned.engine.arguments import Matrices
 
-from ..nets.gain_net import LOG_FLOOR, SHORTEST
 from . import places as on
-from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, carry, inside, lent, window
+from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, borrowed, carry, inside, window
 from .forward import blend, layer, missing
+from .places import LOG_FLOOR, SHORTEST
 from .product import add_outer, add_product, dots, gated_product
-from .tape import Net, Tape, bias, matrix, pack, rows, span, unpack
+from .tape import Net, Nets, Tape, bias, matrix, net_of, pack, rows, span, unpack
 
 
-class Pull(NamedTuple):
+class Adjoint(NamedTuple):
     """Gradient with respect to the state after a step (`State` of the forward pass), changed in place."""
 
     process: Floats
@@ -29,12 +30,12 @@ class Pull(NamedTuple):
 
 
 class Inner(NamedTuple):
-    """Gradients within a step: new GRU states (B, PAD), innovation, what the first layers read; and a GRU's gates."""
+    """Gradients within a step: new GRU states (B, PAD), innovation, inputs of the first layers; and a GRU's gates."""
 
     process: Floats
     prior: Floats
     innovation: Floats
-    surprise: Floats
+    residual: Floats
     observed: Floats
     evolved: Floats
     updated: Floats
@@ -42,7 +43,7 @@ class Inner(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Memory of a rollback: matrices that are not turned, all gradients, those within a step, of positions."""
+    """Memory of a backward pass: untransposed matrices, all gradients, those within a step, those of positions."""
 
     straight: Floats
     grown: Floats
@@ -50,91 +51,85 @@ class Scratch(NamedTuple):
     positions: Floats
 
 
-@compiled
-def backward(
-    theta: Floats, padded: Floats, layers: Ints, places: AnyArray, gnss: Floats, pulls: Floats, kept: Floats,
-    fields: Ints, size: Index, delta_fields: Ints, delta_size: Index, slots: Index, gradient: Floats, first: Index,
-    last: Index,
-) -> None:  # fmt: skip
-    """Gradient (S, P) of the models first..last - 1 from that of their estimates, `pulls` (T, S, B, 3).
+@part
+def scratch(lanes: Index, size: Index, like: Floats) -> Scratch:
+    """Memory for B lanes and matrices of this size."""
+    return Scratch(
+        aligned(size, like), aligned(size, like), aligned(lanes * 14 * PAD, like), np.empty(3 * lanes * 3, like.dtype)
+    )
+
+
+@inside
+def nets(ahead: Net, matrices: Matrices, room: Scratch, gradient: Floats) -> Nets:
+    """The three forms of a net whose gradient (P,) is wanted."""
+    straight = net_of(ahead.theta, room.straight, matrices, ONE)
+    return Nets(ahead, straight, net_of(gradient, room.grown, matrices, TWO))
+
+
+@part
+def back(
+    nets: Nets, tape: Tape, deltas: Tape, gnss: Floats, adjoints: Floats, s: Index, slots: Index, room: Scratch
+) -> None:
+    """The gradient of one model from that of its estimates, from its tape and its matrices as `follow` left them.
 
     The wide layers are computed again, which is faster than to fetch them from memory. They and the gradients of the
     layers' outputs wait in fields with room for a few steps; when these are full, the gradient of each weight grows by
     one product over all their rows.
 
     Args:
-        theta: (S, P). padded, layers, places, gnss, kept: as `forward` left them. fields, delta_fields: as in `Tape`,
-            the latter of the gradients of the outputs. size, delta_size: of the memory that is not kept, with room for
-            `slots` steps.
+        nets: the model, and its gradient.
+        tape: of the forward pass.
+        deltas: gradients of the layers' outputs.
+        gnss: (T, S, B, 3) m.
+        adjoints: (T, S, B, 3) gradient of the loss with respect to the estimates.
+        s: index of the model.
+        slots: steps for which the fields have room.
+        room: memory.
     """
-    lanes, turned, now = gnss.shape[2], layers[:, 2] > 0, np.zeros(2, np.int64)
-    passing, waiting = aligned(size, theta), aligned(delta_size, theta)
-    room = scratch(lanes, padded.shape[1], theta)
-    for s in range(first, last):
-        net = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(turned), lent(places[0]))
-        tape = Tape(lent(passing), lent(kept[s]), lent(fields), lent(now), lanes)
-        deltas = Tape(lent(waiting), lent(waiting), lent(delta_fields), lent(now), lanes)
-        back(net, tape, deltas, gnss, pulls, s, slots, room, places, gradient[s])
-
-
-@part
-def scratch(lanes: Index, size: Index, like: Floats) -> Scratch:
-    """Memory for B lanes and matrices of this size."""
-    return Scratch(aligned(size, like), aligned(size, like), aligned(lanes * 14 * PAD, like),
-                   np.empty(3 * lanes * 3, like.dtype))  # fmt: skip
-
-
-@part
-def back(
-    ahead: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, s: Index, slots: Index, room: Scratch,
-    places: AnyArray, gradient: Floats,
-) -> None:  # fmt: skip
-    """Gradient (P,) of one model from pulls[:, s], its tape and its matrices as `follow` left them."""
-    turned, longer = ahead.layers[:, 2] < 0, ahead.layers[:, 2] > ahead.layers[:, 3]
-    net = Net(ahead.theta, lent(room.straight), ahead.layers, lent(turned), lent(places[1]))
-    made = Net(lent(gradient), lent(room.grown), ahead.layers, lent(longer), lent(places[2]))
-    _rollback(net, ahead, made, tape, deltas, gnss, pulls, s, slots, room, turned, longer)
-
-
-@part
-def _rollback(
-    net: Net, ahead: Net, made: Net, tape: Tape, deltas: Tape, gnss: Floats, pulls: Floats, s: Index, slots: Index,
-    room: Scratch, turned: Bools, longer: Bools,
-) -> None:  # fmt: skip
-    """`back` with the net's matrices straight and turned, and memory for the gradient; it holds what these are in."""
+    ahead, net, made = nets
     unpack(net)
     made.padded[:] = 0.0
     lanes, recompute, steps = tape.lanes, tape.fields[on.CORRECTED, 2] == 0, len(gnss)
-    fixes, pulled, stride = gnss.reshape(-1), pulls.reshape(-1), gnss.shape[1] * tape.lanes * 3
-    pull, inner = _nothing(lanes, room.inner, room.positions)
+    fixes, flat, stride = gnss.reshape(-1), adjoints.reshape(-1), gnss.shape[1] * tape.lanes * 3
+    adjoint, inner = _nothing(lanes, room.inner, room.positions)
     for t in range(steps - 1, -1, -1):
         tape.now[0], tape.now[1], at = t % slots, t, s * lanes * 3 + t * stride
-        given = window(pulled, at, lanes, THREE)
+        given = window(flat, at, lanes, THREE)
         for b in range(lanes):
             for i in range(3):
-                pull.x[b, i] += given[b, i]
+                adjoint.x[b, i] += given[b, i]
         if recompute:
             _again(ahead, tape)
-        _step(net, ahead, window(fixes, at, lanes, THREE), pull, tape, deltas, inner)
+        _step(net, ahead, window(fixes, at, lanes, THREE), adjoint, tape, deltas, inner)
         if t % slots == 0:
             _collect(made, tape, deltas, min(slots, steps - t))
     pack(made)
 
 
 @part
-def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Pull, Inner]:
+def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Adjoint, Inner]:
     """No gradient yet, in this memory, and room for those within a step."""
     wide, size, step = np.int64(PAD), lanes * PAD, lanes * THREE
     work[:], positions[:] = 0.0, 0.0
-    pull = Pull(window(work, ZERO, lanes, wide), window(work, size, lanes, wide), window(work, 2 * size, lanes, wide),
-                window(positions, ZERO, lanes, THREE), window(positions, step, lanes, THREE),
-                window(positions, 2 * step, lanes, THREE))  # fmt: skip
+    adjoint = Adjoint(
+        window(work, ZERO, lanes, wide),
+        window(work, size, lanes, wide),
+        window(work, 2 * size, lanes, wide),
+        window(positions, ZERO, lanes, THREE),
+        window(positions, step, lanes, THREE),
+        window(positions, 2 * step, lanes, THREE),
+    )
     inner = Inner(
-        window(work, 3 * size, lanes, wide), window(work, 4 * size, lanes, wide), window(work, 5 * size, lanes, wide),
-        window(work, 6 * size, lanes, wide), window(work, 7 * size, lanes, wide), window(work, 8 * size, lanes, wide),
-        window(work, 9 * size, lanes, wide), window(work, 10 * size, lanes, 4 * wide),
-    )  # fmt: skip
-    return pull, inner
+        window(work, 3 * size, lanes, wide),
+        window(work, 4 * size, lanes, wide),
+        window(work, 5 * size, lanes, wide),
+        window(work, 6 * size, lanes, wide),
+        window(work, 7 * size, lanes, wide),
+        window(work, 8 * size, lanes, wide),
+        window(work, 9 * size, lanes, wide),
+        window(work, 10 * size, lanes, 4 * wide),
+    )
+    return adjoint, inner
 
 
 @inside
@@ -146,7 +141,7 @@ def _again(net: Net, tape: Tape) -> None:
     layer(net, on.OBSERVATION, tape, seen, on.FIRST)
     layer(net, on.HIDDEN, tape, rows(tape, on.HIDDEN_OUT), on.FIRST)
     layer(net, on.EXPECTED, tape, seen, 2 * wide)
-    blend(tape, on.PROCESS_OLD, on.PROCESS_GATES, moved, wide)
+    blend(tape, on.PROCESS_OLD, moved, wide)
 
 
 @part
@@ -164,14 +159,14 @@ def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
             add_outer(given, at, inputs, delta, column, matrix(gradient, name))
         else:
             add_outer(delta, column, outputs, given, at, matrix(gradient, name))
-        add_outer(lent(one), ZERO, ONE, delta, column, bias(gradient, name))
+        add_outer(borrowed(one), ZERO, ONE, delta, column, bias(gradient, name))
 
 
 @inside
-def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
-    """Back over a step: `pull` becomes the gradient with respect to the state before it."""
+def _step(net: Net, ahead: Net, gnss: Floats, adjoint: Adjoint, tape: Tape, deltas: Tape, inner: Inner) -> None:
+    """Back over a step: `adjoint` becomes the gradient with respect to the state before it."""
     gain = _room(net, on.GAIN, deltas)
-    _begin(gnss, pull, tape, inner, gain, _room(net, on.POSTERIOR, deltas))
+    _begin(gnss, adjoint, tape, inner, gain, _room(net, on.POSTERIOR, deltas))
     _gate(net, on.POSTERIOR, tape, on.CORE, on.BACK, deltas)
     _add(net, on.POSTERIOR, deltas, on.SECOND, inner.prior)
     _add(net, on.BACK, deltas, on.FIRST, inner.innovation)
@@ -180,19 +175,19 @@ def _step(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Ta
     _add(net, on.HIDDEN, deltas, on.FIRST, inner.prior)
     _add(net, on.HIDDEN, deltas, on.SECOND, inner.innovation)
 
-    _gru(net, on.INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION_GATES, inner.innovation, inner.gates, tape, deltas)
+    _gru(net, on.INNOVATION_X, inner.innovation, inner.gates, tape, deltas)
     _gate(net, on.INNOVATION_X, tape, on.INNOVATION_IN, on.OBSERVATION, deltas)
     _add(net, on.EXPECTED, deltas, on.FIRST, inner.prior)
-    _gru(net, on.PRIOR_X, on.PRIOR_OLD, on.PRIOR_GATES, inner.prior, inner.gates, tape, deltas)
+    _gru(net, on.PRIOR_X, inner.prior, inner.gates, tape, deltas)
     _gate(net, on.PRIOR_X, tape, on.PRIOR_IN, on.EVOLUTION, deltas)
     _add(net, on.PRIOR_X, deltas, net.layers[on.UPDATE, 2], inner.process)
-    _gru(net, on.PROCESS_X, on.PROCESS_OLD, on.PROCESS_GATES, inner.process, inner.gates, tape, deltas)
+    _gru(net, on.PROCESS_X, inner.process, inner.gates, tape, deltas)
     _gate(net, on.PROCESS_X, tape, on.CORRECTED, on.UPDATE, deltas)
-    _end(net, ahead, gnss, pull, tape, deltas, inner)
+    _end(net, ahead, gnss, adjoint, tape, deltas, inner)
 
 
 @inside
-def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, posterior: Floats) -> None:
+def _begin(gnss: Floats, adjoint: Adjoint, tape: Tape, inner: Inner, gain: Floats, posterior: Floats) -> None:
     """Gradients of what a step gives: new states, K and innovation by x = x_prior + K (z - x_prior), posterior.
 
     None of them where there is no fix, so that all further ones of that lane are zero.
@@ -204,20 +199,20 @@ def _begin(gnss: Floats, pull: Pull, tape: Tape, inner: Inner, gain: Floats, pos
         for i in range(3):
             along = zero
             for j in range(3):
-                gain[b, 3 * i + j] = zero if gone else pull.x[b, i] * lengths[b, on.SURPRISE + j]
-                along += core[b, on.CORE_GAIN + 3 * j + i] * pull.x[b, j]
-            inner.surprise[b, i] = zero if gone else along
+                gain[b, 3 * i + j] = zero if gone else adjoint.x[b, i] * lengths[b, on.RESIDUAL + j]
+                along += core[b, on.CORE_GAIN + 3 * j + i] * adjoint.x[b, j]
+            inner.residual[b, i] = zero if gone else along
         for j in range(PAD):
-            inner.process[b, j] = zero if gone else pull.process[b, j]
-            inner.innovation[b, j] = zero if gone else pull.innovation[b, j]
+            inner.process[b, j] = zero if gone else adjoint.process[b, j]
+            inner.innovation[b, j] = zero if gone else adjoint.innovation[b, j]
             inner.prior[b, j] = zero
         for j in range(PAD):
-            posterior[b, j] = zero if gone or posterior_out[b, j] <= zero else pull.prior[b, j]
+            posterior[b, j] = zero if gone or posterior_out[b, j] <= zero else adjoint.prior[b, j]
 
 
 @inside
-def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tape, inner: Inner) -> None:
-    """Gradients of the four changes, and `pull` before the step; without a fix only x and x_before were moved on."""
+def _end(net: Net, ahead: Net, gnss: Floats, adjoint: Adjoint, tape: Tape, deltas: Tape, inner: Inner) -> None:
+    """Gradients of the four changes, and `adjoint` before the step; without a fix only x and x_before were moved on."""
     wide = net.layers[on.UPDATE, 2]
     dots(_room(net, on.OBSERVATION, deltas), 2 * wide, matrix(ahead, on.OBSERVATION), THREE, inner.observed)
     dots(_room(net, on.EVOLUTION, deltas), wide, matrix(ahead, on.EVOLUTION), ZERO, inner.evolved)
@@ -229,17 +224,17 @@ def _end(net: Net, ahead: Net, gnss: Floats, pull: Pull, tape: Tape, deltas: Tap
         _turn(features, lengths, b, THREE, inner.updated)
         if missing(gnss, b):
             for i in range(3):
-                pull.x[b, i] += pull.x_before[b, i]
-                pull.x_before[b, i] = 0.0
+                adjoint.x[b, i] += adjoint.x_before[b, i]
+                adjoint.x_before[b, i] = 0.0
             continue
         for i in range(3):
             evolved, updated = inner.evolved[b, i], inner.updated[b, i]
-            in_surprise = inner.surprise[b, i] + inner.observed[b, i]
-            pull.x[b, i] += pull.prior_before[b, i] + pull.x_before[b, i] - in_surprise + evolved + updated
-            pull.x_before[b, i], pull.prior_before[b, i] = -evolved, -updated
+            in_residual = inner.residual[b, i] + inner.observed[b, i]
+            adjoint.x[b, i] += adjoint.prior_before[b, i] + adjoint.x_before[b, i] - in_residual + evolved + updated
+            adjoint.x_before[b, i], adjoint.prior_before[b, i] = -evolved, -updated
         for j in range(9):
-            pull.process[b, j], pull.prior[b, j] = inner.process[b, j], inner.prior[b, j]
-            pull.innovation[b, j] = inner.innovation[b, j]
+            adjoint.process[b, j], adjoint.prior[b, j] = inner.process[b, j], inner.prior[b, j]
+            adjoint.innovation[b, j] = inner.innovation[b, j]
 
 
 @inside
@@ -270,16 +265,21 @@ def _add(net: Net, name: Index, deltas: Tape, at: Index, out: Floats) -> None:
 @inside
 def _gate(net: Net, name: Index, tape: Tape, reached: Index, below: Index, deltas: Tape) -> None:
     """The gradient of a layer's inputs, where these are positive, as that of the outputs of the layer below."""
-    gated_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name),
-                  rows(tape, reached), _room(net, below, deltas))  # fmt: skip
+    gated_product(
+        _room(net, name, deltas),
+        net.layers[name, 10],
+        net.layers[name, 2],
+        matrix(net, name),
+        rows(tape, reached),
+        _room(net, below, deltas),
+    )
 
 
 @inside
-def _gru(
-    net: Net, name: Index, old: Index, gates_name: Index, after: Floats, work: Floats, tape: Tape, deltas: Tape
-) -> None:
+def _gru(net: Net, name: Index, after: Floats, work: Floats, tape: Tape, deltas: Tape) -> None:
     """Gradients of a GRU's X and H; `after` (B, PAD), that of its new state, becomes its part in the old one's."""
-    one, before, gates = after.dtype.type(1.0), rows(tape, old), rows(tape, gates_name)
+    old, one = net.layers[name + 1, 7], after.dtype.type(1.0)
+    before, gates = rows(tape, old), rows(tape, old + on.GATES_FROM_OLD)
     given, kept = _room(net, name, deltas), _room(net, name + 1, deltas)
     for b in range(tape.lanes):
         for j in range(PAD):

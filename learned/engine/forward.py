@@ -6,14 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import AnyArray, Floats, Ints
+from coopoc.arrays import Floats
 from coopoc.kernels.compile import compiled, part
+from coopoc.learned.engine.arguments import Drives, Matrices, Memory
 
-from ..nets.gain_net import LOG_FLOOR, SHORTEST
 from . import places as on
-from .arithmetic import PAD, THREE, ZERO, Index, aligned, carry, inside, lent, sigmoid, tanh, window
-from .product import affine, spread
-from .tape import Net, Tape, bias, matrix, rows, unpack
+from .arithmetic import PAD, THREE, ZERO, Index, aligned, borrowed, carry, inside, sigmoid, tanh, window
+from .places import LOG_FLOOR, SHORTEST
+from .product import affine, align_gates
+from .tape import Net, Tape, bias, matrix, net_of, rows, unpack
 
 
 class State(NamedTuple):
@@ -46,48 +47,39 @@ class Scratch(NamedTuple):
 
 @compiled
 def forward(
-    theta: Floats, padded: Floats, layers: Ints, places: AnyArray, gnss: Floats, velocity: Floats, x0: Floats,
-    dt: Floats, kept: Floats, fields: Ints, size: Index, keep: Index, x: Floats, first: Index, last: Index,
-) -> None:  # fmt: skip
-    """Estimates x (T, S, B, 3) m of the models first..last - 1, and what backward needs of their tape.
-
-    Args:
-        theta: (S, P). padded: (S, .) for the matrices. layers: as in `Net`. places: as in `Plan`. gnss, velocity:
-            (T, S, B, 3) m, m/s. x0: (S, B, 3) m. dt: (T,) s. kept: (S, .) of the tape. fields: as in `Tape`. size: of
-            its memory that is not kept. keep: 1 keeps all steps, 0 the last.
-    """
-    lanes, turned, now = gnss.shape[2], layers[:, 2] > 0, np.zeros(2, np.int64)
-    passing, room = aligned(size, x), scratch(lanes, x)
-    for s in range(first, last):
-        net = Net(lent(theta[s]), lent(padded[s]), lent(layers), lent(turned), lent(places[0]))
-        tape = Tape(lent(passing), lent(kept[s]), lent(fields), lent(now), lanes)
-        follow(net, tape, gnss, velocity, x0, dt, x, s, keep, room)
+    theta: Floats, matrices: Matrices, drives: Drives, memory: Memory, x: Floats, span: tuple[int, int]
+) -> None:
+    """Estimates x (T, S, B, 3) m of the models of theta (S, P) in `span`; the tape holds one step only."""
+    lanes, now, room = drives.gnss.shape[2], np.zeros(2, np.int64), scratch(drives.gnss.shape[2], x)
+    padded, kept, passing = aligned(memory.padded, x), aligned(memory.kept, x), aligned(memory.passing, x)
+    for s in range(span[0], span[1]):
+        net = net_of(theta[s], padded, matrices, ZERO)
+        tape = Tape(borrowed(passing), borrowed(kept), borrowed(memory.fields), borrowed(now), lanes)
+        follow(net, tape, drives, x, s, 0, room)
 
 
 @part
 def scratch(lanes: Index, like: Floats) -> Scratch:
     """Memory for B lanes."""
-    return Scratch(aligned(2 * lanes * on.GATES, like), aligned(3 * lanes * PAD, like),
-                   np.empty(4 * lanes * 3, like.dtype))  # fmt: skip
+    return Scratch(
+        aligned(2 * lanes * on.GATES, like), aligned(3 * lanes * PAD, like), np.empty(4 * lanes * 3, like.dtype)
+    )
 
 
 @part
-def follow(
-    net: Net, tape: Tape, gnss: Floats, velocity: Floats, x0: Floats, dt: Floats, x: Floats, s: Index, keep: Index,
-    room: Scratch,
-) -> None:  # fmt: skip
-    """Estimates x[:, s] of one model, and its matrices."""
+def follow(net: Net, tape: Tape, drives: Drives, x: Floats, s: Index, keep: Index, room: Scratch) -> None:
+    """Estimates x[:, s] of one model, and its matrices; keep: 1 keeps all steps on the tape, 0 the last."""
     unpack(net)
-    lanes, wide, logs, work = tape.lanes, net.layers[on.UPDATE, 2], net.layers[on.UPDATE, 3] > 3, lent(room.gates)
-    fixes, speeds, made, at = gnss.reshape(-1), velocity.reshape(-1), x.reshape(-1), s * lanes * 3
-    state = _start(window(x0.reshape(-1), at, lanes, THREE), room.grus, room.positions)
-    for t in range(len(dt)):
+    lanes, wide, logs, work = tape.lanes, net.layers[on.UPDATE, 2], net.layers[on.UPDATE, 3] > 3, borrowed(room.gates)
+    fixes, speeds, made, at = drives.gnss.reshape(-1), drives.velocity.reshape(-1), x.reshape(-1), s * lanes * 3
+    state = _start(window(drives.x0.reshape(-1), at, lanes, THREE), room.grus, room.positions)
+    for t in range(len(drives.dt)):
         tape.now[0], tape.now[1] = 0, t * keep
-        seen = Seen(window(fixes, at, lanes, THREE), window(speeds, at, lanes, THREE), dt[t])
+        seen = Seen(window(fixes, at, lanes, THREE), window(speeds, at, lanes, THREE), drives.dt[t])
         _look(seen, state, tape, logs)
         _think(net, state, tape, work)
         _move(seen, state, tape, wide, window(made, at, lanes, THREE))
-        at += gnss.shape[1] * lanes * 3
+        at += drives.gnss.shape[1] * lanes * 3
 
 
 @part
@@ -97,10 +89,14 @@ def _start(x0: Floats, grus: Floats, positions: Floats) -> State:
     grus[:] = 0.0
     size, step = lanes * wide, lanes * THREE
     state = State(
-        window(grus, ZERO, lanes, wide), window(grus, size, lanes, wide), window(grus, 2 * size, lanes, wide),
-        window(positions, ZERO, lanes, THREE), window(positions, step, lanes, THREE),
-        window(positions, 2 * step, lanes, THREE), window(positions, 3 * step, lanes, THREE),
-    )  # fmt: skip
+        window(grus, ZERO, lanes, wide),
+        window(grus, size, lanes, wide),
+        window(grus, 2 * size, lanes, wide),
+        window(positions, ZERO, lanes, THREE),
+        window(positions, step, lanes, THREE),
+        window(positions, 2 * step, lanes, THREE),
+        window(positions, 3 * step, lanes, THREE),
+    )
     for b in range(lanes):
         for i in range(3):
             state.process[b, 4 * i] = state.innovation[b, 4 * i] = 1.0
@@ -126,7 +122,7 @@ def _look(seen: Seen, state: State, tape: Tape, logs: bool) -> None:
             features[b, 3 + i] = fix - (state.x[b, i] + seen.dt * seen.velocity[b, i])
             features[b, 8 + i] = state.x[b, i] - state.x_before[b, i]
             features[b, 12 + i] = state.x[b, i] - state.prior_before[b, i]
-            lengths[b, on.SURPRISE + i] = features[b, 3 + i]
+            lengths[b, on.RESIDUAL + i] = features[b, 3 + i]
         for which in range(4):
             at, log = on.CHANGES[which]
             u, v, w = features[b, at], features[b, at + 1], features[b, at + 2]
@@ -145,11 +141,10 @@ def _think(net: Net, state: State, tape: Tape, work: Floats) -> None:
     layer(net, on.UPDATE, tape, rows(tape, on.CORRECTED), on.FIRST)
     layer(net, on.EVOLUTION, tape, moved, on.FIRST)
     layer(net, on.OBSERVATION, tape, seen, on.FIRST)
-    _gru(net, on.PROCESS_X, on.PROCESS_OLD, on.PROCESS_GATES, state.process, tape, work, moved, wide)
-    _gru(net, on.PRIOR_X, on.PRIOR_OLD, on.PRIOR_GATES, state.prior, tape, work, core, on.CORE_PRIOR)
+    _gru(net, on.PROCESS_X, state.process, tape, work, moved, wide)
+    _gru(net, on.PRIOR_X, state.prior, tape, work, core, on.CORE_PRIOR)
     layer(net, on.EXPECTED, tape, seen, 2 * wide)
-    _gru(net, on.INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION_GATES, state.innovation, tape, work, core,
-         on.CORE_INNOVATION)  # fmt: skip
+    _gru(net, on.INNOVATION_X, state.innovation, tape, work, core, on.CORE_INNOVATION)
     layer(net, on.HIDDEN, tape, rows(tape, on.HIDDEN_OUT), on.FIRST)
     layer(net, on.GAIN, tape, core, on.CORE_GAIN)
     layer(net, on.BACK, tape, back, on.FIRST)
@@ -167,22 +162,20 @@ def layer(net: Net, name: Index, tape: Tape, out: Floats, at: Index) -> None:
 
 
 @inside
-def _gru(
-    net: Net, name: Index, old: Index, gates_name: Index, state: Floats, tape: Tape, work: Floats, out: Floats,
-    at: Index,
-) -> None:  # fmt: skip
+def _gru(net: Net, name: Index, state: Floats, tape: Tape, work: Floats, out: Floats, at: Index) -> None:
     """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h <- n + z (h - n), biases in W and U; h from column `at` on.
 
     Loops run over PAD columns, more than the nine that count, because loops of such a length vectorise.
     """
-    real, before, gates = work.dtype.type, rows(tape, old), rows(tape, gates_name)
+    old = net.layers[name + 1, 7]
+    real, before, gates = work.dtype.type, rows(tape, old), rows(tape, old + on.GATES_FROM_OLD)
     given, kept = window(work, ZERO, tape.lanes, on.GATES), window(work, tape.lanes * on.GATES, tape.lanes, on.GATES)
     for b in range(tape.lanes):
         carry(state, ZERO, before, ZERO, b)
     layer(net, name, tape, given, on.FIRST)
     layer(net, name + 1, tape, kept, on.FIRST)
-    spread(given)
-    spread(kept)
+    align_gates(given)
+    align_gates(kept)
     for b in range(tape.lanes):
         for j in range(PAD):
             reset = sigmoid(given[b, j] + kept[b, j], real)
@@ -190,13 +183,13 @@ def _gru(
             fresh = tanh(given[b, on.FRESH + j] + reset * kept[b, on.FRESH + j], real)
             gates[b, j], gates[b, on.KEEP + j] = reset, keep
             gates[b, on.FRESH + j], gates[b, on.KEPT + j] = fresh, kept[b, on.FRESH + j]
-    blend(tape, old, gates_name, out, at)
+    blend(tape, old, out, at)
 
 
 @inside
-def blend(tape: Tape, old: Index, gates_name: Index, out: Floats, at: Index) -> None:
+def blend(tape: Tape, old: Index, out: Floats, at: Index) -> None:
     """h <- n + z (h - n), the new state of a GRU, into out from column `at` on."""
-    before, gates = rows(tape, old), rows(tape, gates_name)
+    before, gates = rows(tape, old), rows(tape, old + on.GATES_FROM_OLD)
     for b in range(tape.lanes):
         for j in range(PAD):
             fresh = gates[b, on.FRESH + j]
@@ -216,9 +209,11 @@ def _move(seen: Seen, state: State, tape: Tape, wide: Index, x: Floats) -> None:
             if not gone:
                 state.prior_before[b, i], state.gnss_before[b, i] = state.x[b, i], seen.gnss[b, i]
                 row = on.CORE_GAIN + 3 * i
-                state.x[b, i] += (core[b, row] * lengths[b, on.SURPRISE]
-                                  + core[b, row + 1] * lengths[b, on.SURPRISE + 1]
-                                  + core[b, row + 2] * lengths[b, on.SURPRISE + 2])  # fmt: skip
+                state.x[b, i] += (
+                    core[b, row] * lengths[b, on.RESIDUAL]
+                    + core[b, row + 1] * lengths[b, on.RESIDUAL + 1]
+                    + core[b, row + 2] * lengths[b, on.RESIDUAL + 2]
+                )
             x[b, i] = state.x[b, i]
         if not gone:
             for j in range(9):

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from coopoc.arrays import AnyArray, Bools, Ints
+from coopoc.learned.engine.arguments import Matrices, Memory
 
-from ..nets.gain_net import CELLS, GainNet
 from . import places as on
 from .arithmetic import PAD, Index, whole
+from .places import CELLS
 from .tape import room
 
 LAYERS: tuple[tuple[str, int, bool, Index, Index, int], ...] = (
@@ -35,8 +37,14 @@ LAYERS: tuple[tuple[str, int, bool, Index, Index, int], ...] = (
 ReLU follows; field and first column of their inputs; and the field of the deltas for the gradient of their outputs."""
 
 
+Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
+"""Names and shapes of a net's parameters, in the order of theta."""
+PRODUCT = 128
+"""Rows of one weight-gradient product, so few that they stay in the cache until it."""
+
+
 class Layout(NamedTuple):
-    """`fields` of `tape.Tape`, and the lengths of its memory that is not kept and of what is kept."""
+    """`fields` of `tape.Tape`, and the lengths of its memory for a few steps and for all."""
 
     fields: Ints
     passing: int
@@ -45,30 +53,28 @@ class Layout(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """For nets of one shape: `layers` of `tape.Net` and its `places` where all matrices are turned, none, or those with
-    more outputs than inputs (3, P); the lengths of theta and of the memory of the matrices."""
+    """For nets of one shape: layout of the matrices, number of parameters, length of the memory of the matrices."""
 
-    layers: Ints
-    places: AnyArray
+    matrices: Matrices
     parameters: int
     size: int
 
     @lru_cache(maxsize=64)  # noqa: B019  (plans live as long as the process)
-    def tape(self, lanes: int, kept: int, passing: int = 1) -> Layout:
-        """Of B lanes, with slots for so many steps; if there are several, wide fields are computed again, not kept."""
-        wide, hidden = self.layers[on.UPDATE, 2], self.layers[on.HIDDEN, 2]
-        widths = np.array([PAD, PAD, whole(wide), whole(wide + PAD), whole(2 * wide + PAD), *[PAD] * 3, *[4 * PAD] * 3,
-                           3 * PAD, whole(hidden), PAD])  # fmt: skip
+    def memory(self, lanes: int, steps: int, gradient: bool) -> Memory:
+        """Memory for B lanes: for a gradient the tape has all steps, else one.
+
+        With several lanes the wide fields are computed again, not kept.
+        """
+        slots = min(steps, -(-PRODUCT // lanes)) if gradient else 1
+        wide, hidden = (whole(self.matrices.layers[layer, 2]) for layer in (on.UPDATE, on.HIDDEN))
+        seen, moved = whole(2 * wide + PAD), whole(wide + PAD)
+        widths = np.array([PAD, PAD, wide, moved, seen, *[PAD] * 3, *[4 * PAD] * 3, 3 * PAD, hidden, PAD])
         again = np.zeros(len(widths), np.bool_)
         again[[on.CORRECTED, on.PRIOR_IN, on.INNOVATION_IN, on.HIDDEN_OUT]] = lanes > 1
-        return _layout(lanes * widths * np.where(again, passing, kept), widths, ~again)
-
-    @lru_cache(maxsize=64)  # noqa: B019
-    def deltas(self, lanes: int, steps: int) -> Layout:
-        """Of the gradients of the layers' outputs, none of which is kept."""
-        wide, hidden = self.layers[on.UPDATE, 2], self.layers[on.HIDDEN, 2]
-        widths = np.array([whole(wide), whole(wide), whole(2 * wide + PAD), *[3 * PAD] * 6, whole(hidden), *[PAD] * 3])
-        return _layout(lanes * widths * steps, widths, widths < 0)
+        tape = _layout(lanes * widths * np.where(again, slots, steps if gradient else 1), widths, ~again)
+        widths = np.array([wide, wide, seen, *[3 * PAD] * 6, hidden, *[PAD] * 3])
+        deltas = _layout(lanes * widths * slots, widths, widths < 0)
+        return Memory(tape.fields, deltas.fields, self.size, tape.kept, tape.passing, deltas.passing, slots)
 
 
 def _layout(sizes: Ints, widths: Ints, kept: Bools) -> Layout:
@@ -79,30 +85,31 @@ def _layout(sizes: Ints, widths: Ints, kept: Bools) -> Layout:
 
 
 @cache
-def plan_of(settings: tuple[tuple[str, Any], ...]) -> Plan:
-    """The plan of nets with these settings."""
-    begin, shapes, at = {}, {}, 0
-    for name, parameter in GainNet(**dict(settings)).named_parameters():
-        begin[name], shapes[name] = at, parameter.shape
-        at += parameter.numel()
-    found, size = [], 0
+def plan_of(shapes: Shapes) -> Plan:
+    """The plan of nets with parameters of these names and shapes."""
+    begin, at, size, found = {}, 0, 0, []
+    for name, shape in shapes:
+        begin[name] = at
+        at += math.prod(shape)
+    sizes = dict(shapes)
     for name, last, relu, field, column, delta in LAYERS:
-        outputs, inputs = shapes[name]
-        behind = shapes["observation.weight"][0] if name == "prior_to_innovation.weight" else 0
-        found.append([begin[name], begin[name.replace("weight", "bias")], outputs, inputs, size, last, relu, field,
-                      column, delta, behind])  # fmt: skip
+        outputs, inputs = sizes[name]
+        behind = sizes["observation.weight"][0] if name == "prior_to_innovation.weight" else 0
+        starts = begin[name], begin[name.replace("weight", "bias")]
+        found.append([*starts, outputs, inputs, size, last, relu, field, column, delta, behind])
         size += room(outputs, inputs)
     layers = np.array(found)
-    return Plan(layers, np.stack([_places(layers, at, which) for which in range(3)]), at, size)
+    tall = layers[:, 2] > layers[:, 3]
+    turned = np.stack([tall | True, tall & False, tall])
+    return Plan(Matrices(layers, turned, np.stack([_places(layers, at, rows) for rows in turned])), at, size)
 
 
-def _places(layers: Ints, parameters: int, which: int) -> AnyArray:
-    """(P,) a row of `Plan.places`."""
+def _places(layers: Ints, parameters: int, turned: Bools) -> AnyArray:
+    """(P,) a row of `Matrices.places`."""
     places = np.empty(parameters, np.uint32)  # numba asks of every signed index whether it counts from the end
-    for weight, bias, outputs, inputs, at, last, *_ in layers:
+    for (weight, bias, outputs, inputs, at, last, *_), across in zip(layers, turned, strict=True):
         o, i = np.arange(outputs)[:, None], (np.arange(inputs) - last) % inputs
-        turned = (True, False, outputs > inputs)[which]
-        places[weight : weight + outputs * inputs] = (
-            at + (i * whole(outputs) + o if turned else o * whole(inputs + PAD - 9) + i)).ravel()  # fmt: skip
+        padded = i * whole(outputs) + o if across else o * whole(inputs + PAD - 9) + i
+        places[weight : weight + outputs * inputs] = (at + padded).ravel()
         places[bias : bias + outputs] = at + room(outputs, inputs) - whole(outputs) + o[:, 0]
     return places

@@ -15,7 +15,7 @@ from coopoc.arrays import AnyArray
 from coopoc.kernels.compile import summing
 
 from .arithmetic import ONE, PAD, ZERO, Index, apart, inside, instructions
-from .tile import ADD, BYTES, GATE, RELU, shapes, stays
+from .tile import ADD, BYTES, GATE, RELU, Tile, shapes, stays
 
 TALL = 6
 """Most rows of a tile: 6 x 2 sums, two vectors of b and a factor fit the 16 registers of AVX2."""
@@ -32,53 +32,56 @@ def affine(
 
     In all products n is a multiple of PAD. NaN stays NaN.
     """
-    size, end, real = out.itemsize, b.strides[0], out.dtype.type
-    left, into = _at(a) + at * size, _at(out) + column * size
-    if a.shape[0] > 1:
-        _tiles(left, a.strides[0], size, _at(b), end, _at(start), ZERO, _at(start), ZERO, into, out.strides[0],
-               a.shape[0], depth, end, ADD + RELU if relu else ADD, real)  # fmt: skip
+    size, end, real, rows = out.itemsize, b.strides[0], out.dtype.type, a.shape[0]
+    left, row, into, first = _at(a) + at * size, a.strides[0], _at(out) + column * size, _at(start)
+    how = ADD + RELU if relu else ADD
+    given = Tile(left, row, size, _at(b), end, first, ZERO, first, ZERO, into, out.strides[0], rows, end, depth, how)
+    if rows > 1:
+        _tiles(given, real)
     elif relu:
-        _row_relu(left, size, _at(b), end, _at(start), into, end, depth, real)
+        _row_relu(given, real)
     else:
-        _row_sum(left, size, _at(b), end, _at(start), into, end, depth, real)
+        _row_sum(given, real)
 
 
 @inside
 def gated_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, gate: AnyArray, out: AnyArray) -> None:
     """out (m, n) = a[:, at:] (m, depth) b (depth, n) where gate (m, n) is positive, else zero."""
-    size, end, real = out.itemsize, out.strides[0], out.dtype.type
-    if a.shape[0] > 1:
-        _tiles(_at(a) + at * size, a.strides[0], size, _at(b), b.strides[0], _at(out), ZERO, _at(gate), gate.strides[0],
-               _at(out), end, a.shape[0], depth, end, GATE, real)  # fmt: skip
+    size, end, real, rows, into = out.itemsize, out.strides[0], out.dtype.type, a.shape[0], _at(out)
+    left, row, down, shut = _at(a) + at * size, a.strides[0], b.strides[0], _at(gate)
+    given = Tile(left, row, size, _at(b), down, into, ZERO, shut, gate.strides[0], into, end, rows, end, depth, GATE)
+    if rows > 1:
+        _tiles(given, real)
     else:
-        _row_gated(_at(a) + at * size, size, _at(b), b.strides[0], _at(gate), _at(out), end, depth, real)
+        _row_gated(given, real)
 
 
 @inside
 def add_product(a: AnyArray, at: Index, depth: Index, b: AnyArray, column: Index, out: AnyArray) -> None:
     """out (m, n) += a[:, at:] (m, depth) b[:, column:] (depth, n)."""
-    size, end, real = out.itemsize, out.strides[0], out.dtype.type
-    left, right = _at(a) + at * size, _at(b) + column * size
-    if a.shape[0] > 1:
-        _tiles(left, a.strides[0], size, right, b.strides[0], _at(out), end, _at(out), ZERO, _at(out), end, a.shape[0],
-               depth, end, ADD, real)  # fmt: skip
-    else:
-        _row_sum(left, size, right, b.strides[0], _at(out), _at(out), end, depth, real)
+    _add(_at(a) + at * out.itemsize, a.strides[0], out.itemsize, a.shape[0], depth, b, column, out)
 
 
 @inside
 def add_outer(a: AnyArray, at: Index, count: Index, b: AnyArray, column: Index, out: AnyArray) -> None:
     """out (count, n) += a[:, at:] (k, count)^T b[:, column:] (k, n).
 
-    What lies behind rows of b that are shorter is read; the columns of out beyond them then mean nothing.
+    Rows of b that are shorter are read beyond their end; the columns of out beyond them then mean nothing.
     """
-    size, end, real = out.itemsize, out.strides[0], out.dtype.type
-    left, right = _at(a) + at * size, _at(b) + column * size
-    if count > 1:
-        _tiles(left, size, a.strides[0], right, b.strides[0], _at(out), end, _at(out), ZERO, _at(out), end, count,
-               a.shape[0], end, ADD, real)  # fmt: skip
+    _add(_at(a) + at * out.itemsize, out.itemsize, a.strides[0], count, a.shape[0], b, column, out)
+
+
+@inside
+def _add(
+    left: Index, row: Index, step: Index, rows: Index, depth: Index, b: AnyArray, column: Index, out: AnyArray
+) -> None:
+    """out += a b[:, column:], with a from its address and strides in bytes."""
+    end, real, into, right = out.strides[0], out.dtype.type, _at(out), _at(b) + column * out.itemsize
+    given = Tile(left, row, step, right, b.strides[0], into, end, into, ZERO, into, end, rows, end, depth, ADD)
+    if rows > 1:
+        _tiles(given, real)
     else:
-        _row_sum(left, a.strides[0], right, b.strides[0], _at(out), _at(out), end, a.shape[0], real)
+        _row_sum(given, real)
 
 
 @summing
@@ -97,72 +100,77 @@ def dots(a: AnyArray, depth: Index, b: AnyArray, first: Index, out: AnyArray) ->
 
 
 @inside
-def _tiles(
-    a: Index, a_row: Index, a_column: Index, b: Index, b_row: Index, start: Index, start_row: Index, gate: Index,
-    gate_row: Index, out: Index, out_row: Index, rows: Index, depth: Index, end: Index, how: Index, real: Any,
-) -> None:  # fmt: skip
-    """A product from addresses, strides and the length of a row of the result, all in bytes."""
-    wide, j = 4 if rows == 2 else 2, 0
-    while j < end:
-        while wide * BYTES > end - j:
+def _tiles(p: Tile, real: Any) -> None:
+    """A product by tiles."""
+    wide, j = 4 if p.tall == 2 else 2, 0
+    while j < p.wide:
+        while wide * BYTES > p.wide - j:
             wide //= 2
-        for i in range(0, rows, TALL):
-            tall = min(rows - i, TALL)
-            _tile(a + i * a_row, a_row, a_column, b + j, b_row, start + i * start_row + j, start_row,
-                  gate + i * gate_row + j, gate_row, out + i * out_row + j, out_row, tall, wide, depth, how, real)
+        for i in range(0, p.tall, TALL):
+            a, b, tall = p.a + i * p.a_row, p.b + j, min(p.tall - i, TALL)
+            start, gate, out = p.start + i * p.start_row + j, p.gate + i * p.gate_row + j, p.out + i * p.out_row + j
+            rows = p.start_row, p.gate_row, p.out_row
+            tile = Tile(
+                a,
+                p.a_row,
+                p.a_column,
+                b,
+                p.b_row,
+                start,
+                rows[0],
+                gate,
+                rows[1],
+                out,
+                rows[2],
+                tall,
+                wide,
+                p.depth,
+                p.how,
+            )
+            _tile(tile, real)
         j += wide * BYTES
 
 
 @apart
-def _tile(
-    a: Index, a_row: Index, a_column: Index, b: Index, b_row: Index, start: Index, start_row: Index, gate: Index,
-    gate_row: Index, out: Index, out_row: Index, tall: Index, wide: Index, depth: Index, how: Index, real: Any,
-) -> None:  # fmt: skip
-    """A tile of so many rows and vectors at these addresses, in a function of its own: within the loops of `_tiles` the
-    compiler would work out the addresses of every shape before it takes one."""
+def _tile(tile: Tile, real: Any) -> None:
+    """One tile, in a function of its own: within the loops of `_tiles` the compiler would compute the addresses of
+    every shape before it takes one."""
     stays()
-    few_rows(a, a_row, a_column, b, b_row, start, start_row, gate, gate_row, out, out_row, tall, wide, depth, how, real)
+    few_rows(tile, real)
 
 
 @apart
-def _row_sum(
-    a: Index, a_column: Index, b: Index, b_row: Index, start: Index, out: Index, end: Index, depth: Index, real: Any
-) -> None:
+def _row_sum(p: Tile, real: Any) -> None:
     """One row of a product with ADD."""
     stays()
-    _row(a, a_column, b, b_row, start, start, out, end, depth, ADD, real)
+    _row(p, ADD, real)
 
 
 @apart
-def _row_relu(
-    a: Index, a_column: Index, b: Index, b_row: Index, start: Index, out: Index, end: Index, depth: Index, real: Any
-) -> None:
+def _row_relu(p: Tile, real: Any) -> None:
     """One row with ADD and RELU."""
     stays()
-    _row(a, a_column, b, b_row, start, start, out, end, depth, ADD + RELU, real)
+    _row(p, ADD + RELU, real)
 
 
 @apart
-def _row_gated(
-    a: Index, a_column: Index, b: Index, b_row: Index, gate: Index, out: Index, end: Index, depth: Index, real: Any
-) -> None:
+def _row_gated(p: Tile, real: Any) -> None:
     """One row with GATE."""
     stays()
-    _row(a, a_column, b, b_row, gate, gate, out, end, depth, GATE, real)
+    _row(p, GATE, real)
 
 
 @inside
-def _row(
-    a: Index, a_column: Index, b: Index, b_row: Index, start: Index, gate: Index, out: Index, end: Index, depth: Index,
-    how: Index, real: Any,
-) -> None:  # fmt: skip
+def _row(p: Tile, how: Index, real: Any) -> None:
     """One row of a product, as `_tiles`."""
     wide, j = 8, 0
-    while j < end:
-        while wide * BYTES > end - j:
+    while j < p.wide:
+        while wide * BYTES > p.wide - j:
             wide //= 2
-        one_row(a, ZERO, a_column, b + j, b_row, start + j, ZERO, gate + j, ZERO, out + j, ZERO, ONE, wide, depth, how,
-             real)  # fmt: skip
+        b, start, gate, out = p.b + j, p.start + j, p.gate + j, p.out + j
+        one_row(
+            Tile(p.a, ZERO, p.a_column, b, p.b_row, start, ZERO, gate, ZERO, out, ZERO, ONE, wide, p.depth, how), real
+        )
         j += wide * BYTES
 
 
@@ -178,18 +186,18 @@ def _at(typing: Any, array: Any) -> Any:
 
 
 @inside
-def spread(gates: AnyArray) -> None:
+def align_gates(gates: AnyArray) -> None:
     """Of every row of gates (m, 3 PAD), the three nines at 0, 9, 18 to 0, PAD, 2 PAD, where vectors begin.
 
     A vector that is read across two that were just written would wait until these have reached the cache.
     """
     for row in range(gates.shape[0]):
-        _spread(gates, row)
+        _align_row(gates, row)
 
 
 @instructions
-def _spread(typing: Any, gates: Any, row: Any) -> Any:
-    """`spread` of one row."""
+def _align_row(typing: Any, gates: Any, row: Any) -> Any:
+    """`align_gates` of one row."""
 
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         struct = context.make_array(signature.args[0])(context, builder, values[0])

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 from coopoc.arrays import AnyArray, Bools, Ints
 from coopoc.kernels.compile import part
+from coopoc.learned.engine.arguments import Matrices
 
-from .arithmetic import ONE, PAD, Index, inside, whole, window
+from .arithmetic import ONE, PAD, Index, borrowed, inside, whole, window
 
 
 class Net(NamedTuple):
@@ -27,6 +28,14 @@ class Net(NamedTuple):
     places: AnyArray
 
 
+class Nets(NamedTuple):
+    """A net with transposed matrices, as the forward pass reads it, with untransposed ones, and its gradient."""
+
+    ahead: Net
+    straight: Net
+    gradient: Net
+
+
 class Tape(NamedTuple):
     """What the steps of one model leave behind, in memory that is kept for backward and in memory that is not.
 
@@ -39,6 +48,13 @@ class Tape(NamedTuple):
     fields: Ints
     now: Ints
     lanes: Index
+
+
+@inside
+def net_of(theta: AnyArray, padded: AnyArray, matrices: Matrices, which: Index) -> Net:
+    """The net of flat weights with its matrices transposed as row `which` of `Matrices` has it."""
+    places, turned = matrices.places[which], matrices.turned[which]
+    return Net(borrowed(theta), borrowed(padded), borrowed(matrices.layers), borrowed(turned), borrowed(places))
 
 
 @inside

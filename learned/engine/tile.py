@@ -29,7 +29,8 @@ def stays(typing: Any) -> Any:
 
 
 class Tile(NamedTuple):
-    """Arguments of a tile as LLVM's values, in its order."""
+    """A product out = start + a b, gated: addresses, strides and `wide` of a whole product in bytes, other sizes in
+    numbers; `wide` of one tile in vectors."""
 
     a: Any
     a_row: Any
@@ -48,15 +49,12 @@ class Tile(NamedTuple):
     how: Any
 
 
-def shapes(widest: dict[int, int]) -> Callable[..., None]:
+def shapes(widest: dict[int, int]) -> Callable[[Tile, Any], None]:
     """A function of compiled code that computes a tile, its rows a key of `widest`, its vectors at most as many."""
 
-    def tile(
-        typing: Any, a: Any, a_row: Any, a_column: Any, b: Any, b_row: Any, start: Any, start_row: Any, gate: Any,
-        gate_row: Any, out: Any, out_row: Any, tall: Any, wide: Any, depth: Any, how: Any, real: Any,
-    ) -> Any:  # fmt: skip
+    def tile(typing: Any, given: Any, real: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            given, number = Tile(*values[:-1]), context.get_value_type(real.instance_type)
+            given, number = Tile(*cgutils.unpack_tuple(builder, values[0])), context.get_value_type(real.instance_type)
             vector, word = ir.VectorType(number, BYTES * 8 // real.instance_type.bitwidth), given.a.type
             end = builder.append_basic_block("end")
             which = builder.switch(builder.add(builder.mul(given.tall, word(16)), given.wide), end)
@@ -69,8 +67,7 @@ def shapes(widest: dict[int, int]) -> Callable[..., None]:
             builder.position_at_end(end)
             return context.get_dummy_value()
 
-        words = (types.intp,) * len(Tile._fields)
-        return types.void(*words, real), generate
+        return types.void(given, real), generate
 
     return instructions(tile)
 
@@ -79,8 +76,9 @@ def _emit(builder: Any, vector: Any, shape: tuple[int, int], given: Tile) -> Non
     """The instructions of one tile; with few sums, several terms of each are added at once."""
     word, (tall, wide), cells = given.a.type, shape, [(r, v) for r in range(shape[0]) for v in range(shape[1])]
     terms, nothing = max(1, 8 // (tall * wide)), ir.Constant(vector, None)
-    begins, relu, gated = (builder.icmp_signed("!=", builder.and_(given.how, word(int(flag))), word(0))
-                           for flag in (ADD, RELU, GATE))  # fmt: skip
+    begins, relu, gated = (
+        builder.icmp_signed("!=", builder.and_(given.how, word(int(flag))), word(0)) for flag in (ADD, RELU, GATE)
+    )
     always = _splat(builder, builder.not_(builder.or_(relu, gated)), ir.VectorType(ir.IntType(1), vector.count))
 
     def place(base: Any, kind: Any, *steps: tuple[Any, int]) -> Any:
@@ -91,10 +89,14 @@ def _emit(builder: Any, vector: Any, shape: tuple[int, int], given: Tile) -> Non
     def load(base: Any, *steps: tuple[Any, int]) -> Any:
         return builder.load(place(base, vector, *steps), align=4)
 
-    starts = [builder.select(begins, load(given.start, (given.start_row, r), (word(BYTES), v)), nothing)
-              for r, v in cells]  # fmt: skip
-    sums = {(u, *cell): cast(Any, cgutils).alloca_once_value(builder, nothing if u else start)
-            for u in range(terms) for cell, start in zip(cells, starts, strict=True)}  # fmt: skip
+    starts = [
+        builder.select(begins, load(given.start, (given.start_row, r), (word(BYTES), v)), nothing) for r, v in cells
+    ]
+    sums = {
+        (u, *cell): cast(Any, cgutils).alloca_once_value(builder, nothing if u else start)
+        for u in range(terms)
+        for cell, start in zip(cells, starts, strict=True)
+    }
 
     def add(k: Any, u: int) -> None:
         row = builder.add(given.b, builder.mul(k, given.b_row))

@@ -1,4 +1,4 @@
-"""Compression: an update as the bytes that cross the air, and back."""
+"""Compression: encoding of an update as bytes on air, and decoding."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import AnyArray
-from coopoc.errors import InputError
+
+from .rule import within
 
 
 class Compression(ABC):
-    """Bytes of an update (P,) of weights, with what the client keeps back for the next round."""
+    """Codec of updates (P,) of weights, with a residual that the client adds to its next update."""
 
     @abstractmethod
-    def encode(self, update: Tensor, kept: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
-        """Bytes of an update (P,), and what to keep (P,).
+    def encode(self, update: Tensor, residual: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
+        """Bytes of an update (P,), and the new residual (P,).
 
         Args:
-            update: theta_i - theta. kept: what the client kept back so far, zeros at first. draw: the client's dice.
+            update: (P,) theta_i - theta.
+            residual: (P,) of the client's previous rounds, zeros at first.
+            draw: random generator of the client.
         """
 
     @abstractmethod
     def decode(self, sent: bytes, size: int) -> Tensor:
-        """The update (size,) in float32 that the bytes stand for."""
+        """The update (size,) in float32."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,9 @@ class Float16(Compression):
     10
     """
 
-    def encode(self, update: Tensor, kept: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
-        """Rounded to nearest; nothing is kept."""
-        return _little(update.half().numpy()), kept
+    def encode(self, update: Tensor, residual: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
+        """Rounded to nearest, no error feedback."""
+        return _little(update.half().numpy()), residual
 
     def decode(self, sent: bytes, size: int) -> Tensor:
         """As float32."""
@@ -49,26 +52,29 @@ class Float16(Compression):
 
 @dataclass(frozen=True)
 class TopK(Compression):
-    """The k = ceil(share P) largest entries of u + e, the others are kept: e <- u + e - sent (error feedback).
+    """The k = ceil(share P) largest entries of u + e, with error feedback e <- u + e - sent.
 
     k (4 + b) bytes: float32 values, and indices of b = 2 bytes up to 65,536 weights and of 4 beyond.
 
-    Source: Stich, Cordonnier, Jaggi, Sparsified SGD with Memory, NeurIPS 2018, algorithm 1.
+    Args:
+        share: of the weights that are sent.
 
-    >>> sent, kept = TopK(0.5).encode(torch.tensor([3.0, 1.0]), torch.zeros(2), np.random.default_rng())
-    >>> len(sent), kept.tolist()
+    References:
+        Stich, Cordonnier, Jaggi, Sparsified SGD with Memory, NeurIPS 2018, algorithm 1.
+
+    >>> sent, residual = TopK(0.5).encode(torch.tensor([3.0, 1.0]), torch.zeros(2), np.random.default_rng())
+    >>> len(sent), residual.tolist()
     (6, [0.0, 1.0])
     """
 
     share: float = 0.1
 
     def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise InputError("share", self.share, "must be in (0, 1]", "0.1 sends a tenth of the weights.")
+        within("share", self.share, 0 < self.share <= 1, "in (0, 1]", "0.1 sends a tenth of the weights.")
 
-    def encode(self, update: Tensor, kept: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
+    def encode(self, update: Tensor, residual: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
         """Indices, then values; the first of equals goes first."""
-        whole = update.float() + kept
+        whole = update.float() + residual
         order = whole.abs().argsort(descending=True, stable=True)
         chosen = order[: math.ceil(self.share * len(whole))].sort().values
         left = whole.clone()
@@ -92,7 +98,11 @@ class Quantised(Compression):
 
     q = floor(u / m s + xi), s = 2^(bits-1) - 1, xi uniform in [0, 1); 4 + ceil(bits P / 8) bytes.
 
-    Source: Alistarh et al., QSGD, NeurIPS 2017, section 3.1, with the largest entry in place of the norm.
+    Args:
+        bits: of a level.
+
+    References:
+        Alistarh et al., QSGD, NeurIPS 2017, section 3.1, with the largest entry in place of the norm.
 
     >>> len(Quantised(4).encode(torch.ones(5), torch.zeros(5), np.random.default_rng())[0])
     7
@@ -101,21 +111,21 @@ class Quantised(Compression):
     bits: int = 8
 
     def __post_init__(self) -> None:
-        if self.bits != int(self.bits) or not 2 <= self.bits <= 16:
-            raise InputError("bits", self.bits, "must be a whole number in 2..16", "8 is a quarter of float32.")
+        whole = self.bits == int(self.bits) and 2 <= self.bits <= 16
+        within("bits", self.bits, whole, "a whole number in 2..16", "8 is a quarter of float32.")
 
     @property
     def _steps(self) -> int:
         return (1 << (self.bits - 1)) - 1
 
-    def encode(self, update: Tensor, kept: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
-        """The largest entry as float32, then the levels, most significant bit first; nothing is kept."""
+    def encode(self, update: Tensor, residual: Tensor, draw: np.random.Generator) -> tuple[bytes, Tensor]:
+        """The largest entry as float32, then the levels, most significant bit first; no error feedback."""
         numbers = update.double().numpy()
         largest = np.float32(np.abs(numbers).max(initial=0.0))
         scaled = numbers / (largest or 1.0) * self._steps + draw.random(len(numbers))
         levels = np.clip(np.floor(scaled).astype(np.int64), -self._steps, self._steps) + self._steps
         bits = (levels[:, None] >> np.arange(self.bits - 1, -1, -1)) & 1
-        return _little(largest) + np.packbits(bits.astype(np.uint8)).tobytes(), kept
+        return _little(largest) + np.packbits(bits.astype(np.uint8)).tobytes(), residual
 
     def decode(self, sent: bytes, size: int) -> Tensor:
         """Levels times m / s."""

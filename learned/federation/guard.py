@@ -1,4 +1,4 @@
-"""Guard: answers that the server does not let near the weights, each with a reason."""
+"""Guard: answers that are rejected before aggregation, each with a reason."""
 
 from __future__ import annotations
 
@@ -9,27 +9,30 @@ import torch
 from torch import Tensor
 
 LIMIT = 100.0
-"""Times the usual update that an update may be long."""
+"""Longest accepted update, in multiples of the usual one."""
 
 
 def screen(
     theta: Tensor, answers: Mapping[str, Tensor], usual: float | None = None, limit: float = LIMIT
 ) -> tuple[dict[str, str], float | None]:
-    """Why answers are rejected: another shape, weights that are not finite, or a change that is far too large.
+    """Reject answers of another shape, with weights that are not finite, or with a change that is far too large.
 
-    With d_i = ||theta_i - theta||, client i is rejected if d_i > limit median_j d_j over the answers of the round. Two
-    answers or one have no median that a liar could not make (nor have those that mostly changed nothing): then the
-    median of the round before is taken, and in the first round no change may be longer than max(||theta||, 1).
+    With d_i = ||theta_i - theta||, client i is rejected if d_i > limit median_j d_j over the answers of the round. The
+    median of one or two answers is in the hands of one client, and where most answers change nothing it is 0: then the
+    median of the previous round takes its place, and in the first round max(||theta||, 1) is the longest change.
 
     Args:
-        theta: (P,) weights that the clients received. answers: what each sent. usual: median d of the round before.
+        theta: (P,) weights that the clients received.
+        answers: weights that each client sent, by name.
+        usual: median d of the previous round, None in the first.
+        limit: longest accepted update, in multiples of the usual one.
 
     Returns:
-        Reasons by name, and the median d of what is left (that of the round before if nothing is).
+        Reasons by name, and the median d of the accepted answers (`usual` if there are none).
 
     >>> two = {"a": torch.tensor([1.1, 1.0]), "b": torch.tensor([1.0, 200.0])}
     >>> screen(torch.ones(2), two)[0]
-    {'b': 'changes the weights by 199, at most 1.41 is let in'}
+    {'b': 'changes the weights by 199, at most 1.41 is accepted'}
     """
     reasons, far = dict[str, str](), dict[str, float]()
     for name in sorted(answers):
@@ -48,6 +51,6 @@ def screen(
         most = max(float(torch.linalg.vector_norm(theta)), 1.0)
     for name, length in far.items():
         if length > most:
-            reasons[name] = f"changes the weights by {length:.3g}, at most {most:.3g} is let in"
-    kept = [length for name, length in far.items() if name not in reasons]
-    return reasons, median(kept) if kept else usual
+            reasons[name] = f"changes the weights by {length:.3g}, at most {most:.3g} is accepted"
+    accepted = [length for name, length in far.items() if name not in reasons]
+    return reasons, median(accepted) if accepted else usual

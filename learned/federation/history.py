@@ -1,4 +1,4 @@
-"""What a federated training leaves behind: its rounds, the net that is kept, the bytes that everybody moved."""
+"""The record of a federated training: its rounds, the selected net, and the traffic."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ from coopoc.world.fleet import Fleet
 
 from ..nets.gain import Gain
 from ..nets.stack import unflatten
-from .server import NUMBER, SERVER
+from .server import FLOAT32, SERVER
+
+AGREEMENT = 0.1
+"""Excess of a round's median loss over the least one up to which the round may be selected."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +27,16 @@ class Round:
     """A communication round.
 
     Args:
+        number: of the round, 0 for the start.
         weights: (P,) of the server, or without one the mean of the clients' weights.
-        training_loss: (C,) m^2 of each client, NaN where it did not train to the end.
-        validation_loss: (C,) m^2, what each client last reported: `Judge` of `weights` after this round for those whose
-            answer counted, of an earlier round for the others.
-        traffic: bytes by (sender, receiver), payload only. rejected, absent, stragglers: reasons by name.
-        note: why the weights stayed as they were, if they did.
+        training_loss: (C,) m^2, of each client, NaN where its training did not complete.
+        validation_loss: (C,) m^2, last report of each client: `Judge` of `weights` after this round where its answer
+            was accepted, of an earlier round otherwise.
+        traffic: bytes by (sender, receiver), payload only.
+        rejected: reasons of rejected answers, by client.
+        absent: reasons of absence, by client.
+        stragglers: share of local steps that was made, in words, by client.
+        note: reason why the weights are unchanged, if they are.
         disagreement: largest distance between the weights of two clients; 0 with a server.
     """
 
@@ -54,13 +61,24 @@ class Round:
         """Bytes that all clients received."""
         return sum(size for (_, receiver), size in self.traffic.items() if receiver != SERVER)
 
+    @property
+    def card(self) -> dict[str, Any]:
+        """The round in the card of a checkpoint."""
+        names = ("training_loss", "validation_loss", "sent_bytes", "received_bytes", "rejected", "absent", "note")
+        return {"round": self.number} | {name: getattr(self, name) for name in names}
+
 
 @dataclass(frozen=True, eq=False)
 class Federation:
-    """A federated net: the global weights that validated best, every round, the clients, seconds.
+    """A federated net.
 
-    Without a server `model` is the mean of the clients' nets after the best round, and `own` (C, P) is what each client
-    holds in the end; with one `own` is None.
+    Args:
+        model: net of the best round; without a server, the mean of the clients' nets after it.
+        history: rounds, the start first.
+        sizes: (C,) training pieces of each client.
+        seconds: of training.
+        names: (C,) of the clients.
+        own: (C, P) final weights of each client; None with a server.
     """
 
     model: Gain
@@ -72,16 +90,30 @@ class Federation:
 
     @property
     def best(self) -> Round:
-        """The round whose weights are kept: the least validation loss, clients weighted by their sizes."""
-        return min(self.history, key=self.validation_loss)
+        """The selected round: the least `validation_loss` among the rounds on which most clients agree.
+
+        These are the rounds whose median loss over the clients exceeds the least such median by at most `AGREEMENT`
+        times its size (a likelihood's loss may be negative), so that no minority of false reports can select a round
+        that the other clients find poor. One or two reports have no majority: then all rounds compete.
+        """
+        typical = [np.median([_or_infinite(loss) for _, loss in self._reports(row)]) for row in self.history]
+        most = min(typical) + AGREEMENT * abs(min(typical)) if len(self._reports(self.history[0])) > 2 else math.inf
+        agreed = [row for row, middle in zip(self.history, typical, strict=True) if middle <= most]
+        return min(agreed, key=self.validation_loss)
 
     def validation_loss(self, row: Round) -> float:
-        """Validation loss of a round over all clients that were ever heard, m^2; infinite if it is not finite."""
+        """Mean of the clients' last reports, weighted by size, m^2; infinite if it is not finite.
+
+        Clients of which no answer was ever accepted do not count.
+        """
+        reports = self._reports(row)
+        return _or_infinite(sum(n * loss for n, loss in reports) / sum(n for n, _ in reports))
+
+    def _reports(self, row: Round) -> list[tuple[int, float]]:
+        """Sizes and losses, in a round, of the clients that count."""
         out = [{*past.rejected, *past.absent} for past in self.history[1:]]
-        heard = [i for i, name in enumerate(self.names) if not out or any(name not in missing for missing in out)]
-        reports = [(self.sizes[i], row.validation_loss[i]) for i in heard or range(len(self.sizes))]
-        total = sum(n * loss for n, loss in reports) / sum(n for n, _ in reports)
-        return total if math.isfinite(total) else math.inf
+        counted = [i for i, name in enumerate(self.names) if not out or any(name not in missing for missing in out)]
+        return [(self.sizes[i], row.validation_loss[i]) for i in counted or range(len(self.sizes))]
 
     def after(self, number: int) -> Gain:
         """The global net after round `number`, 0 being the start."""
@@ -90,12 +122,17 @@ class Federation:
         return unflatten(self.history[number].weights[None], self.model)[0]
 
 
+def _or_infinite(loss: float) -> float:
+    return loss if math.isfinite(loss) else math.inf
+
+
 def ledger(federation: Federation, overhead: int = 0) -> Ledger:
     """Bytes of every client, and of the server if there is one, over all rounds.
 
-    What a sender tells several receivers in a round it sends once, the longest; each of them receives its copy.
+    Messages to several receivers in one round are sent once, the longest of them; each receiver gets its own copy.
 
     Args:
+        federation: with its traffic.
         overhead: bytes per message on air beyond the payload, as in `V2X`.
     """
     ends = {name for row in federation.history for pair in row.traffic for name in pair}
@@ -115,20 +152,23 @@ def ledger(federation: Federation, overhead: int = 0) -> Ledger:
 
 
 def card_ledger(card: Mapping[str, Any], drives: Fleet) -> Ledger:
-    """The same of trained weights, from their card: payload, on average over the clients.
+    """`ledger` of trained weights from their card: payload, on average over the clients.
 
-    A federation moves the weights both ways in every round; its server may broadcast its own. What is trained in one
-    place needs the raw drives, six float32 per step (noisy fixes and velocities; the reference drive comes on top), and
-    sends the weights back once.
+    A federation moves the weights both ways in every round; its server may broadcast its own. Centralised training
+    needs the raw drives, six float32 per step (noisy fixes and velocities, without the reference drive), and sends the
+    weights back once.
 
     Args:
-        card: of a `Checkpoint`. drives: of the clients.
+        card: of a `Checkpoint`.
+        drives: of the clients.
     """
     if card["settings"]["kind"] == "federated":
         names, rounds = card["clients"], card["history"][1:]
-        up, down = (np.full(len(names), sum(row[way] for row in rounds) / len(names))
-                    for way in ("sent_bytes", "received_bytes"))  # fmt: skip
+        up, down = (
+            np.full(len(names), sum(row[way] for row in rounds) / len(names))
+            for way in ("sent_bytes", "received_bytes")
+        )
     else:
-        names, up = drives.ids, NUMBER * 6.0 * drives.present.sum(axis=0)
-        down = np.full(len(names), float(NUMBER * card["parameters"]))
+        names, up = drives.ids, FLOAT32 * 6.0 * drives.present.sum(axis=0)
+        down = np.full(len(names), float(FLOAT32 * card["parameters"]))
     return of_training([*names, SERVER], [*up, down[0]], [*down, up.sum()], [SERVER])

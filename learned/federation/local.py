@@ -1,4 +1,4 @@
-"""The client's half of a round: local training, of one client alone or of all clients as one stack."""
+"""The clients' half of a round: local training, of one client or of all clients as one stack."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from coopoc.arrays import Ints
 from coopoc.world.noise import stream
 
 from ..nets.gain import Gain
-from ..training.clients import Client, Pieces
+from ..training.clients import Client, Segments
 from ..training.fit import Judge, descend, pooled
 from ..training.machine import one_core
 from ..training.schedule import Schedule, cosine, generator
@@ -34,15 +34,20 @@ def local_fit(
 ) -> tuple[Tensor, float, str | None]:
     """The client's half of round `number`: its weights after local training, from theta (P,) and its own pieces.
 
-    The same numbers, bit for bit, as the client's row of `adapt`, where the net's gradients do not depend on who is
-    computed beside it.
+    The result equals the client's row of `adapt` bit for bit, for nets whose gradients do not depend on the other rows.
 
     Args:
-        model: shape of the net. theta: (P,) received weights, not changed. seed: of the federation. rounds: in all.
-        local: schedule as `Rule.local` gives it, with the local epochs. share: of the steps that are made.
+        model: shape of the net.
+        theta: (P,) received weights, not changed.
+        client: with its pieces.
+        seed: of the federation.
+        number: of the round.
+        rounds: in all.
+        local: schedule as `Rule.local` gives it, with the local epochs.
+        share: of the steps that are made.
 
     Returns:
-        Weights (P,), mean training loss m^2, and why the training broke (None: it did not).
+        Weights (P,), mean training loss m^2, and why the training failed (None: it did not).
     """
     weights, members, key = theta.detach().clone()[None], [np.arange(len(client.training))], [(seed, client.name)]
     with one_core():
@@ -53,7 +58,7 @@ def local_fit(
 def adapt(
     theta: Tensor,
     like: Gain,
-    pool: Pieces,
+    pool: Segments,
     members: Sequence[Ints],
     keys: Sequence[tuple[int, str]],
     number: int,
@@ -64,11 +69,18 @@ def adapt(
     """Local training of every client in round `number`, in place: a pure function of weights, data and (seed, client).
 
     Args:
-        theta: (S, P). pool, members: the clients' pieces. keys: (seed, client name) of each row.
-        shares: (S,) of the steps that each makes, at least one; default all.
+        theta: (S, P) weights.
+        like: shape of the net.
+        pool: pieces of all clients.
+        members: (S,) indices of each client's pieces in the pool.
+        keys: (S,) seed and name of each client.
+        number: of the round.
+        rounds: in all.
+        local: schedule as `Rule.local` gives it.
+        shares: (S,) of the steps that each client makes, at least one; default all.
 
     Returns:
-        Mean training loss (S,) m^2, NaN for a row that broke, and the reasons of those.
+        Mean training loss (S,) m^2, NaN for a row whose training failed, and the reasons of those.
     """
     streams = [stream(seed, "batches", number - 1, name) for seed, name in keys]
     plans = [rows[local.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
@@ -83,25 +95,24 @@ def adapt(
 
 
 class Work(NamedTuple):
-    """What the clients of a federation did in a round: weights (P,) by name of those that came to an end, training
-    losses (C,) m^2, and why others broke."""
+    """Local training of a federation: weights (P,) by name, training losses (C,) m^2, reasons of failures."""
 
     weights: dict[str, Tensor]
     losses: tuple[float, ...]
-    broken: dict[str, str]
+    failed: dict[str, str]
 
 
-class Everyone(NamedTuple):
+class Stack(NamedTuple):
     """All clients of all federations as rows of one stack."""
 
     like: Gain
     teams: Sequence[Group]
-    pool: Pieces
+    pool: Segments
     members: Sequence[Ints]
     judge: Judge
 
-    def judged(self, standings: Sequence[Standing]) -> list[tuple[float, ...]]:
-        """What each client of each federation says of its federation's weights, m^2."""
+    def validated(self, standings: Sequence[Standing]) -> list[tuple[float, ...]]:
+        """Validation losses (C,) m^2 of each federation's weights, by its own clients."""
         scores = self.judge(torch.cat([s.theta.expand_as(s.held) for s in standings]))
         return [tuple(part.tolist()) for part in scores.split([len(team.names) for team in self.teams])]
 
@@ -114,10 +125,10 @@ class Everyone(NamedTuple):
         rows = [row for row, share in enumerate(shares) if share > 0]
         theta, losses, stopped = torch.cat([s.held for s in standings]), torch.full((len(keys),), math.nan), {}
         if rows:
-            mine, members = theta[rows], [self.members[r] for r in rows]
-            whose, made = [keys[r] for r in rows], [shares[r] for r in rows]
-            losses[rows], broken = adapt(mine, self.like, self.pool, members, whose, number, rounds, local, made)
-            theta[rows], stopped = mine, {rows[i]: reason for i, reason in broken.items()}
+            active, members = theta[rows], [self.members[r] for r in rows]
+            names, made = [keys[r] for r in rows], [shares[r] for r in rows]
+            losses[rows], failed = adapt(active, self.like, self.pool, members, names, number, rounds, local, made)
+            theta[rows], stopped = active, {rows[i]: reason for i, reason in failed.items()}
         found, at = [], 0
         for team in self.teams:
             span, at = range(at, at + len(team.names)), at + len(team.names)
@@ -127,9 +138,9 @@ class Everyone(NamedTuple):
         return found
 
 
-def everyone(like: Gain, groups: Sequence[Sequence[Client]], teams: Sequence[Group]) -> Everyone:
+def stacked(like: Gain, groups: Sequence[Sequence[Client]], teams: Sequence[Group]) -> Stack:
     """The clients of all federations, stacked."""
     clients = [client for group in groups for client in group]
     pool, members = pooled([c.training for c in clients])
     judge = Judge([[c.validation for c in clients], [c.long for c in clients]], like)
-    return Everyone(like, teams, pool, members, judge)
+    return Stack(like, teams, pool, members, judge)

@@ -1,4 +1,4 @@
-"""Participation: who is asked in a round, who answers and who finishes; clients that differ, and one that lies."""
+"""Participation: sampling, drop-outs and stragglers of a round; heterogeneous and Byzantine clients."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensors import Sensors
 
-from ..training.clients import Client, Pieces, clients
+from ..training.clients import Client, Segments, clients
+from .rule import within
 
 
 class Turn(NamedTuple):
-    """What becomes of a client in a round: the share of its local steps that it makes, and why it does not answer.
-
-    `asked` clients receive the weights; `absent` is None for those that answer.
-    """
+    """A client's part in a round: whether it is asked, hence receives the weights, the share of its local steps that it
+    makes, and the reason of its absence (None: it answers)."""
 
     asked: bool
     share: float
@@ -30,17 +29,19 @@ class Turn(NamedTuple):
 
 @dataclass(frozen=True)
 class Participation:
-    """Who takes part in a round, drawn anew for every round and client from the training seed.
+    """Random participation, drawn for every round and client from the training seed.
 
     Args:
-        share: of the clients that the server asks, at least one. dropout: probability that a client that was asked
-            never answers. straggle: probability that one that answers has made only a part of its local steps, a
-            uniformly drawn share of them and at least one.
+        share: of the clients that the server asks, at least one.
+        dropout: probability that an asked client does not answer.
+        straggle: probability that an answering client makes only a uniformly drawn share of its local steps, at least
+            one of them.
 
     Raises:
         InputError: a number outside its range.
 
-    Source: McMahan et al., AISTATS 2017 (the share C); Li et al., MLSys 2020 (partial work counts).
+    References:
+        McMahan et al., AISTATS 2017 (the share C); Li et al., MLSys 2020 (partial work).
 
     >>> [turn.asked for turn in Participation(share=0.5).turns(0, 1, ["a", "b"])].count(True)
     1
@@ -51,18 +52,16 @@ class Participation:
     straggle: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0 < self.share <= 1:
-            raise InputError("share", self.share, "must be in (0, 1]", "1 asks everybody.")
+        within("share", self.share, 0 < self.share <= 1, "in (0, 1]", "1 asks all clients.")
         for field in ("dropout", "straggle"):
-            if not 0 <= getattr(self, field) <= 1:
-                raise InputError(field, getattr(self, field), "must be in [0, 1]", "0 for never.")
+            within(field, getattr(self, field), 0 <= getattr(self, field) <= 1, "in [0, 1]", "0 for never.")
 
     def count(self, clients: int) -> int:
-        """How many of so many clients are asked in a round."""
+        """Number of clients, of so many, that are asked in a round."""
         return max(1, round(self.share * clients))
 
     def turns(self, seed: int, number: int, names: Sequence[str]) -> list[Turn]:
-        """What becomes of every named client in round `number`, whatever the order of the names."""
+        """Turns of the named clients in round `number`; they do not depend on the order of the names."""
         lots = {name: float(stream(seed, "asked", number, name).random()) for name in names}
         asked = set(sorted(names, key=lots.__getitem__)[: self.count(len(names))])
         return [self._turn(seed, number, name) if name in asked else Turn(False, 0.0, "not asked") for name in names]
@@ -74,68 +73,71 @@ class Participation:
         return Turn(True, float(1.0 - lots[2]) if lots[1] < self.straggle else 1.0, None)
 
     def answer(self, name: str, number: int, theta: Tensor, weights: Tensor) -> Tensor:
-        """What the server receives from a client that made `weights` (P,) of theta (P,): an honest answer."""
+        """Weights that the server receives from a client that trained `weights` (P,) from theta (P,): these weights."""
         return weights
 
 
 @dataclass(frozen=True)
-class Poison(Participation):
-    """Participation in which some clients send their update times `scale`: theta + scale (theta_i - theta).
+class Byzantine(Participation):
+    """Participation with Byzantine clients, which send theta + scale (theta_i - theta).
 
     Args:
-        who: names of the liars. scale: negative turns the update round. The rest as in `Participation`.
+        names: of the Byzantine clients.
+        scale: of their updates; negative reverses them.
 
-    Source: Blanchard et al., NeurIPS 2017, section 5 (omniscient and Gaussian attackers); Bagdasaryan et al.,
-    How to Backdoor Federated Learning, AISTATS 2020 (scaled updates).
+    References:
+        Blanchard et al., NeurIPS 2017, section 5; Bagdasaryan et al., How to Backdoor Federated Learning, AISTATS 2020.
 
     >>> import torch
-    >>> Poison(who=("a",), scale=-2.0).answer("a", 1, torch.ones(1), torch.tensor([2.0])).tolist()
+    >>> Byzantine(names=("a",), scale=-2.0).answer("a", 1, torch.ones(1), torch.tensor([2.0])).tolist()
     [-1.0]
     """
 
-    who: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
     scale: float = -10.0
 
     def answer(self, name: str, number: int, theta: Tensor, weights: Tensor) -> Tensor:
-        """Scaled if the client lies."""
-        return theta + self.scale * (weights - theta) if name in self.who else weights
+        """Scaled if the client is Byzantine."""
+        return theta + self.scale * (weights - theta) if name in self.names else weights
 
 
-def moved(client: Client, offset: float) -> Client:
-    """The client with a truth that lies `offset` m beside the true one on every axis: poisoned data."""
+def poisoned(client: Client, offset: float) -> Client:
+    """The client with a ground truth that is off by `offset` m on every axis."""
 
-    def part(pieces: Pieces) -> Pieces:
+    def part(pieces: Segments) -> Segments:
         return replace(pieces, truth=pieces.truth + offset)
 
     return replace(client, training=part(client.training), validation=part(client.validation), long=part(client.long))
 
 
-def unlike(fleet: Fleet, sensors: Sequence[Sensors], shares: Sequence[float], **options: Any) -> tuple[Client, ...]:
+def heterogeneous(
+    fleet: Fleet, sensors: Sequence[Sensors], shares: Sequence[float], **options: Any
+) -> tuple[Client, ...]:
     """`clients` of a fleet, each with its own sensors and with a part of its training pieces.
 
     The noise of a vehicle is keyed by its name: it is the same as with these sensors for all.
 
     Args:
-        fleet: drives of C vehicles. sensors: (C,) that act. shares: (C,) in (0, 1] of the training pieces, the first
-            ceil(share n) of them. options: of `clients` (seed, noise, start, piece, split).
+        fleet: drives of C vehicles.
+        sensors: (C,) acting sensors.
+        shares: (C,) in (0, 1], of the training pieces: the first ceil(share n) of them remain.
+        options: of `clients` (seed, noise, start, piece, split).
 
     Raises:
-        InputError: as many sensors or shares as there are not vehicles, a share outside (0, 1], and as in `clients`.
+        InputError: another number of sensors or shares than of vehicles, a share outside (0, 1], and as in `clients`.
 
     >>> import numpy as np
     >>> line = Fleet(("a", "b"), np.arange(66) / 10, np.zeros((66, 2, 3)), np.zeros((66, 2, 3)))
-    >>> [len(c.training) for c in unlike(line, [Sensors(), Sensors()], [1, 0.5], piece=10)]
+    >>> [len(c.training) for c in heterogeneous(line, [Sensors(), Sensors()], [1, 0.5], piece=10)]
     [4, 2]
     """
     for field, given in (("sensors", sensors), ("shares", shares)):
         if len(given) != len(fleet.ids):
             raise InputError(field, f"of {len(given)} clients", f"must be of {len(fleet.ids)}", "Give one per vehicle.")
-    if not all(0 < share <= 1 for share in shares):
-        raise InputError("shares", list(shares), "must be in (0, 1]", "1 keeps all training pieces.")
+    within("shares", list(shares), all(0 < share <= 1 for share in shares), "in (0, 1]", "1 keeps all training pieces.")
     made = {one: clients(fleet, one, **options) for one in dict.fromkeys(sensors)}
-    found = []
-    for column, (one, share) in enumerate(zip(sensors, shares, strict=True)):
-        whole = made[one][column]
-        kept = range(math.ceil(share * len(whole.training)))
-        found.append(replace(whole, training=whole.training.take(kept)))
-    return tuple(found)
+    whole = [made[one][column] for column, one in enumerate(sensors)]
+    return tuple(
+        replace(client, training=client.training.take(range(math.ceil(share * len(client.training)))))
+        for client, share in zip(whole, shares, strict=True)
+    )

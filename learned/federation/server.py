@@ -1,14 +1,15 @@
-"""The two ends of a round: how a client's weights leave it, and what the server makes of all that arrive."""
+"""The server's half of a round: decoding, screening and aggregation of the clients' answers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from coopoc.errors import InputError
 from coopoc.world.noise import stream
 
 from .compression import Compression
@@ -18,24 +19,24 @@ from .rule import Rule, State
 
 SERVER = "server"
 """The server's name in the traffic of a round."""
-NUMBER = 4
+FLOAT32 = 4
 """Bytes of a float32."""
-NOBODY = "nobody answered: the weights stay"
+NO_ANSWER = "no client answered: weights unchanged"
 
 
 class Protection(Protocol):
-    """What hides a client's update before it leaves (privacy)."""
+    """A transformation of updates before they leave their clients (privacy)."""
 
     def protect(self, updates: Tensor, names: Sequence[str], seed: int, number: int) -> Tensor:
         """Updates (C, P) as they leave the named clients in round `number`."""
 
-    def check(self, rule: Any) -> None:
-        """InputError for a rule that it cannot serve."""
+    def check(self, rule: Rule) -> None:
+        """InputError for a rule that the protection does not cover."""
 
 
 class Answer(NamedTuple):
-    """What the server has of a client: its weights (P,), its training pieces, and the validation loss, m^2, that the
-    weights which it received had on its own pieces."""
+    """A client's answer: its weights (P,), its training pieces, and the validation loss, m^2, of the weights that it
+    received, on its own pieces."""
 
     weights: Tensor
     size: int
@@ -43,8 +44,8 @@ class Answer(NamedTuple):
 
 
 class Combined(NamedTuple):
-    """Weights (P,) and state of the rule after a round, reasons of the answers that were rejected, the usual change
-    (`guard.screen`), and why the weights stayed, if they did."""
+    """Weights (P,) and state of the rule after a round, reasons of rejected answers, the usual change
+    (`guard.screen`), and the reason why the weights are unchanged, if they are."""
 
     theta: Tensor
     state: State
@@ -56,29 +57,47 @@ class Combined(NamedTuple):
 def combine(
     rule: Rule, state: State, theta: Tensor, answers: Mapping[str, Answer], usual: float | None = None
 ) -> Combined:
-    """The server's half of a round: screen the answers, then combine what is left, in the order of the names.
+    """The server's half of a round: screen the answers, then combine the accepted ones, in the order of the names.
+
+    Weights and state are unchanged if too few answers are accepted, or if the result is not finite.
 
     Args:
-        rule: how, and its state. theta: (P,) weights that the clients received. answers: by name, in any order.
-        usual: what the last round gave; None at first.
+        rule: aggregation rule.
+        state: of the rule.
+        theta: (P,) weights that the clients received.
+        answers: by name, in any order.
+        usual: of the previous round's result; None at first.
 
-    >>> from coopoc.learned.federation.aggregate import RULES
+    Raises:
+        InputError: a rule whose result has another shape than theta.
+
+    >>> from coopoc.learned.federation.means import FedProx
     >>> two = {"b": Answer(torch.tensor([3.0]), 1, 1.0), "a": Answer(torch.tensor([torch.nan]), 3, 1.0)}
-    >>> done = combine(RULES["mean"], (), torch.tensor([2.0]), two)
+    >>> done = combine(FedProx(), (), torch.tensor([2.0]), two)
     >>> done.theta.tolist(), done.rejected
     ([3.0], {'a': '1 of 1 weights are not finite'})
     """
     rejected, usual = screen(theta, {name: answer.weights for name, answer in answers.items()}, usual)
-    kept = [answers[name] for name in sorted(answers) if name not in rejected]
+    while accepted := [name for name in sorted(answers) if name not in rejected]:
+        weights = torch.stack([answers[name].weights for name in accepted])
+        sizes, uncertainty = (torch.tensor([answers[name][i] for name in accepted]) for i in (1, 2))
+        unfit = rule.unfit(theta, weights, sizes)
+        if not unfit:
+            break
+        rejected |= {accepted[row]: reason for row, reason in unfit.items()}
     if not answers:
-        return Combined(theta, state, rejected, usual, NOBODY)
-    if len(kept) < rule.least:
-        note = f"{len(kept)} answers count, {rule.name} takes at least {rule.least}: the weights stay"
+        return Combined(theta, state, rejected, usual, NO_ANSWER)
+    if len(accepted) < max(rule.least, 1):
+        note = f"{len(accepted)} answers accepted, {rule.name} takes at least {rule.least}: weights unchanged"
         return Combined(theta, state, rejected, usual, note)
-    weights = torch.stack([answer.weights for answer in kept])
-    sizes, uncertainty = (torch.tensor([answer[i] for answer in kept]) for i in (1, 2))
-    theta, state = rule(state, theta, weights, sizes, uncertainty)
-    return Combined(theta, state, rejected, usual, "")
+    found, after = rule(state, theta, weights, sizes, uncertainty)
+    if found.shape != theta.shape:
+        allowed = f"must have the shape {tuple(theta.shape)} of the net's weights"
+        raise InputError("aggregate", f"{rule.name} -> {tuple(found.shape)}", allowed, "Combine over the clients only.")
+    if not all(bool(part.isfinite().all()) for part in (found, *after)):
+        note = f"{rule.name} gives weights that are not finite: weights unchanged"
+        return Combined(theta, state, rejected, usual, note)
+    return Combined(found.to(theta.dtype), after, rejected, usual, "")
 
 
 class Group(NamedTuple):
@@ -91,23 +110,25 @@ class Group(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """What a federation remembers from round to round.
+    """The state of a federation between two rounds.
 
     Args:
-        theta: (P,) its weights: the server's, or without one the mean of the clients'. held: (C, P) weights that each
-            client starts from. state: of the rule. kept: (C, P) what compression kept back.
-        usual: usual change (`guard.screen`) as the server, or without one each client, has seen it.
+        theta: (P,) weights of the server, or without one the mean of the clients'.
+        held: (C, P) weights from which each client starts.
+        state: of the rule.
+        residual: (C, P) part of earlier updates that compression has not sent yet.
+        usual: usual change (`guard.screen`) at the server, or without one at each client.
     """
 
     theta: Tensor
     held: Tensor
     state: State
-    kept: Tensor
+    residual: Tensor
     usual: tuple[float | None, ...]
 
 
 class Exchange(NamedTuple):
-    """What a round moved: reasons of rejected answers, bytes by (sender, receiver), why the weights stayed."""
+    """Reasons of rejected answers, bytes by (sender, receiver), and why the weights are unchanged, of one round."""
 
     rejected: dict[str, str]
     traffic: dict[tuple[str, str], int]
@@ -124,45 +145,56 @@ class Server:
     privacy: Protection | None
 
     def __call__(
-        self, group: Group, standing: Standing, number: int, turns: Sequence[Turn], adapted: Mapping[str, Tensor],
+        self,
+        group: Group,
+        standing: Standing,
+        number: int,
+        turns: Sequence[Turn],
+        adapted: Mapping[str, Tensor],
         reports: Sequence[float],
-    ) -> tuple[Standing, Exchange]:  # fmt: skip
-        """Standing after round `number` and what it moved.
+    ) -> tuple[Standing, Exchange]:
+        """Standing after round `number`, and its exchange.
 
         Args:
-            turns: (C,) of the clients. adapted: weights (P,) of those that trained, by name. reports: (C,) m^2.
+            group: the clients.
+            standing: before the round.
+            number: of the round.
+            turns: (C,) participation of the clients.
+            adapted: weights (P,) after local training, by name.
+            reports: (C,) m^2, validation losses.
         """
         theta = standing.theta
-        sent, kept, size = self._leave(group, standing, number, adapted)
+        sent, residual, size = self._encoded(group, standing, number, adapted)
         asked = [name for name, turn in zip(group.names, turns, strict=True) if turn.asked]
         up, down = self.rule.overhead(max(len(asked), self.rule.least), len(theta))
-        traffic = {(SERVER, name): NUMBER * len(theta) + down for name in asked}
-        traffic |= {(name, SERVER): bytes_ + NUMBER + up for name, bytes_ in size.items()}
+        traffic = {(SERVER, name): FLOAT32 * len(theta) + down for name in asked}
+        traffic |= {(name, SERVER): bytes_ + FLOAT32 + up for name, bytes_ in size.items()}
         answers = {
             name: Answer(self.participation.answer(name, number, theta, sent[name]), pieces, loss)
-            for name, pieces, loss in zip(group.names, group.sizes, reports, strict=True) if name in sent
-        }  # fmt: skip
+            for name, pieces, loss in zip(group.names, group.sizes, reports, strict=True)
+            if name in sent
+        }
         done = combine(self.rule, standing.state, theta, answers, standing.usual[0])
         held = done.theta.expand_as(standing.held)
-        after = Standing(done.theta, held, done.state, kept, (done.usual,))
+        after = Standing(done.theta, held, done.state, residual, (done.usual,))
         return after, Exchange(done.rejected, traffic, done.note)
 
-    def _leave(
+    def _encoded(
         self, group: Group, standing: Standing, number: int, adapted: Mapping[str, Tensor]
     ) -> tuple[dict[str, Tensor], Tensor, dict[str, int]]:
-        """Weights as the server decodes them, what clients keep back, and the bytes of each answer."""
+        """Weights as the server decodes them, residuals of the clients, and the bytes of each answer."""
         theta, names = standing.theta, [name for name in group.names if name in adapted]
-        weights, kept = dict(adapted), standing.kept
+        weights, residual = dict(adapted), standing.residual
         if self.privacy is not None and names:
             updates = torch.stack([adapted[name] - theta for name in names])
-            hidden = self.privacy.protect(updates, names, group.seed, number)
-            weights = {name: theta + update for name, update in zip(names, hidden, strict=True)}
+            protected = self.privacy.protect(updates, names, group.seed, number)
+            weights = {name: theta + update for name, update in zip(names, protected, strict=True)}
         if self.compression is None:
-            return weights, kept, dict.fromkeys(names, NUMBER * len(theta))
-        kept, size = kept.clone(), dict[str, int]()
+            return weights, residual, dict.fromkeys(names, FLOAT32 * len(theta))
+        residual, size = residual.clone(), dict[str, int]()
         for name in names:
             row, draw = group.names.index(name), stream(group.seed, "compress", number, name)
-            payload, kept[row] = self.compression.encode(weights[name] - theta, kept[row], draw)
+            payload, residual[row] = self.compression.encode(weights[name] - theta, residual[row], draw)
             weights[name] = theta + self.compression.decode(payload, len(theta)).to(theta.dtype)
             size[name] = len(payload)
-        return weights, kept, size
+        return weights, residual, size

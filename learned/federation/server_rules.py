@@ -1,4 +1,4 @@
-"""Rules of an adaptive server: a momentum, or an Adam step, along the mean change of the clients."""
+"""Adaptive server optimisers: momentum, or Adam, along the mean change of the clients."""
 
 from __future__ import annotations
 
@@ -8,24 +8,29 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from .means import mean
-from .rule import Rule, State, within
+from .means import OfMean, mean
+from .rule import State, within
 
 
 class Velocity(NamedTuple):
-    """What FedAvgM remembers: velocity (P,)."""
+    """State of FedAvgM: velocity (P,)."""
 
     velocity: Tensor
 
 
 @dataclass(frozen=True)
-class FedAvgM(Rule):
+class FedAvgM(OfMean):
     """Momentum at the server: v <- momentum v + (mean_i theta_i - theta);  theta <- theta + rate v.
 
-    Momentum 0 and rate 1 are `mean`. Momentum makes a constant update 1 / (1 - momentum) times as long; with 0.9, which
-    is usual where there are hundreds of rounds, a net of 20 rounds was still under way at its end.
+    Momentum 0 and rate 1 are `mean`. Momentum makes a constant update 1 / (1 - momentum) times as long: 0.9 suits
+    hundreds of rounds, and with 20 rounds training had not converged.
 
-    Source: Hsu, Qi, Brown, arXiv 1909.06335, section 4.3.
+    Args:
+        rate: of the server.
+        momentum: share of the velocity that is carried over.
+
+    References:
+        Hsu, Qi, Brown, arXiv 1909.06335, section 4.3.
 
     >>> rule, two = FedAvgM(), torch.tensor([[1.0], [3.0]])
     >>> rule(rule.start(torch.zeros(1)), torch.zeros(1), two, torch.ones(2), torch.ones(2))[0].tolist()
@@ -52,22 +57,29 @@ class FedAvgM(Rule):
 
 
 class Moments(NamedTuple):
-    """What FedAdam remembers: first and second moment (P,)."""
+    """State of FedAdam: first and second moment (P,)."""
 
     first: Tensor
     second: Tensor
 
 
 @dataclass(frozen=True)
-class FedAdam(Rule):
+class FedAdam(OfMean):
     """Adam at the server with d = mean_i theta_i - theta as its gradient, and without bias correction:
 
         m <- beta1 m + (1 - beta1) d;  v <- beta2 v + (1 - beta2) d^2;  theta <- theta + rate m / (sqrt(v) + tau),
 
-    where v starts at tau^2: a weight moves by about `rate` per round, by less where d is below tau. As published beta1
+    where v starts at tau^2: a weight moves by about `rate` per round, by less where d is below tau. The published beta1
     is 0.9; with 20 rounds 0.5 is better, see `FedAvgM`.
 
-    Source: Reddi et al., Adaptive Federated Optimization, ICLR 2021, algorithm 2.
+    Args:
+        rate: of the server.
+        beta1: decay of the first moment.
+        beta2: decay of the second moment.
+        tau: added to the root of the second moment.
+
+    References:
+        Reddi et al., Adaptive Federated Optimization, ICLR 2021, algorithm 2.
 
     >>> rule = FedAdam(rate=1.0, beta1=0.0, beta2=0.0, tau=0.5)
     >>> rule(rule.start(torch.zeros(1)), torch.zeros(1), torch.ones(2, 1), torch.ones(2), torch.ones(2))[0].item()

@@ -1,4 +1,4 @@
-"""Topology: training without a server, each vehicle mixing its weights with those of its neighbours."""
+"""Topology: decentralised training, each client mixing its weights with those of its neighbours."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from coopoc.world.fleet import Fleet
 
 from .guard import screen
 from .participation import Participation, Turn
-from .server import NOBODY, NUMBER, Exchange, Group, Standing
+from .server import FLOAT32, NO_ANSWER, Exchange, Group, Standing
 
 
 class Topology(ABC):
-    """Who sends its weights to whom: an undirected graph of the clients."""
+    """An undirected communication graph of the clients."""
 
     @abstractmethod
     def links(self, names: Sequence[str]) -> Bools:
@@ -44,7 +44,7 @@ class Ring(Topology):
 
 @dataclass(frozen=True)
 class Complete(Topology):
-    """Everybody with everybody.
+    """All pairs of clients.
 
     >>> Complete().links(["a", "b", "c"]).sum().item()
     6
@@ -66,7 +66,7 @@ class Pairs(Topology):
     pairs: tuple[tuple[str, str], ...]
 
     def links(self, names: Sequence[str]) -> Bools:
-        """The pairs; InputError if one names a client that is not there."""
+        """The pairs; InputError for an unknown client."""
         there = np.zeros((len(names), len(names)), dtype=bool)
         for pair in self.pairs:
             if not set(pair) <= set(names):
@@ -78,7 +78,11 @@ class Pairs(Topology):
 
 @dataclass(frozen=True, eq=False)
 class V2XGraph(Topology):
-    """Those that were ever within `radius` m of each other while the fleet drove.
+    """Pairs of clients that were ever within `radius` m of each other.
+
+    Args:
+        fleet: drives of the clients.
+        radius: m.
 
     >>> t = np.arange(2) / 10
     >>> x = np.zeros((2, 3, 3)); x[:, 1, 0], x[:, 2, 0] = 20.0, 45.0
@@ -90,7 +94,7 @@ class V2XGraph(Topology):
     radius: float = 30.0
 
     def links(self, names: Sequence[str]) -> Bools:
-        """The pairs that met; InputError for a client that is not in the fleet."""
+        """Pairs within the radius; InputError for a client that is not in the fleet."""
         at = self.fleet.position[:, [self.fleet.index(name) for name in names]]
         met = np.zeros((len(names), len(names)), dtype=bool)
         for i in range(len(names)):
@@ -99,22 +103,26 @@ class V2XGraph(Topology):
 
 
 def connected(topology: Topology, names: Sequence[str]) -> Bools:
-    """Links (C, C) of the clients; InputError if they leave some clients apart from the others."""
+    """Links (C, C) of the clients; InputError if the graph is not connected."""
     links = topology.links(names)
     reached = np.eye(len(names), dtype=bool)[0]
     for _ in names:
         reached = reached | links[reached].any(0)
     if not reached.all():
         apart = [name for name, there in zip(names, reached, strict=True) if not there]
-        mend = "Raise the radius, or add a pair that joins them."
-        raise InputError("topology", f"without a way from {names[0]} to {apart}", "must join all clients", mend)
+        hint = "Increase the radius, or add a pair that connects them."
+        raise InputError("topology", f"without a path from {names[0]} to {apart}", "must be connected", hint)
     return links
 
 
 def metropolis(links: Bools) -> Floats:
     """(C, C) c_ij = 1 / max(deg_i + 1, deg_j + 1) on links, c_ii = 1 - sum_j c_ij: symmetric, rows sum to 1.
 
-    Source: Xiao, Boyd, Systems and Control Letters 53, 2004, section 4.2; methods.md section 4.2.
+    Args:
+        links: (C, C) graph.
+
+    References:
+        Xiao, Boyd, Systems and Control Letters 53, 2004, section 4.2.
 
     >>> metropolis(np.array([[False, True], [True, False]])).tolist()
     [[0.5, 0.5], [0.5, 0.5]]
@@ -138,23 +146,30 @@ def disagreement(held: Tensor) -> float:
 class Mesh:
     """One round without a server: adapt, then combine, theta_i <- sum_j c_ij psi_j over i and its neighbours.
 
-    The weights c are `metropolis` among those that answer; whoever does not answer keeps its weights. Every client
-    screens what it hears as a server would; a share that i refuses to give to j stays with i.
+    The weights c are `metropolis` among the clients that answer; the others keep their weights. Every client screens
+    the weights that it receives as a server would; the share of a rejected neighbour stays with the client itself.
 
     Args:
-        links: (C, C) who hears whom.
+        links: (C, C) graph.
+        participation: of the clients.
 
-    Source: Chen, Sayed, IEEE TSP 60, 2012 (adapt then combine); Lian et al., NeurIPS 2017 (for nets).
+    References:
+        Chen, Sayed, IEEE TSP 60, 2012 (adapt then combine); Lian et al., NeurIPS 2017 (for nets).
     """
 
     links: Bools
     participation: Participation
 
     def __call__(
-        self, group: Group, standing: Standing, number: int, turns: Sequence[Turn], adapted: Mapping[str, Tensor],
+        self,
+        group: Group,
+        standing: Standing,
+        number: int,
+        turns: Sequence[Turn],
+        adapted: Mapping[str, Tensor],
         reports: Sequence[float],
-    ) -> tuple[Standing, Exchange]:  # fmt: skip
-        """Standing after round `number` and what it moved; arguments as of `Server`."""
+    ) -> tuple[Standing, Exchange]:
+        """Standing after round `number`, and its exchange; arguments as of `Server`."""
         held, names = standing.held, group.names
         here = [i for i, name in enumerate(names) if name in adapted]
         near = np.zeros_like(self.links)
@@ -162,14 +177,14 @@ class Mesh:
         sent = {i: self.participation.answer(names[i], number, held[i], adapted[names[i]]) for i in here}
         share, after, usual, rejected = metropolis(near), held.clone(), list(standing.usual), dict[str, str]()
         for i in here:
-            heard = {names[j]: sent[j] for j in np.flatnonzero(near[i]).tolist()} | {names[i]: adapted[names[i]]}
-            bad, usual[i] = screen(held[i], heard, usual[i])
+            received = {names[j]: sent[j] for j in np.flatnonzero(near[i]).tolist()} | {names[i]: adapted[names[i]]}
+            bad, usual[i] = screen(held[i], received, usual[i])
             own = held[i] if names[i] in bad else adapted[names[i]]
-            good = {names[i]: own} | {name: weights for name, weights in heard.items() if name not in bad}
+            good = {names[i]: own} | {name: weights for name, weights in received.items() if name not in bad}
             rejected |= {name: f"{reason} (at {names[i]})" for name, reason in bad.items()}
             parts = [float(share[i, names.index(name)]) * (good[name] - own) for name in sorted(good)]
             after[i] = own + torch.stack(parts).sum(0)
-        traffic = {(names[j], names[i]): NUMBER * held.shape[1] for i, j in np.argwhere(near).tolist()}
+        traffic = {(names[j], names[i]): FLOAT32 * held.shape[1] for i, j in np.argwhere(near).tolist()}
         ordered = after[sorted(range(len(names)), key=names.__getitem__)]
         standing = replace(standing, theta=ordered.mean(0), held=after, usual=tuple(usual))
-        return standing, Exchange(rejected, traffic, "" if here else NOBODY)
+        return standing, Exchange(rejected, traffic, "" if here else NO_ANSWER)

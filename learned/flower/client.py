@@ -1,4 +1,4 @@
-"""ClientApp: a vehicle that trains on its own drive and lets nothing out but a report."""
+"""ClientApp: a vehicle that trains on its own drive and sends a report."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, TypeAlias
 from torch import Tensor
 
 from coopoc.errors import InputError
-from coopoc.fleets import load
+from coopoc.fleets import load_fleet
 
-from ..federation.federated import local_fit
-from ..recipes import Job
+from ..federation.local import local_fit
+from ..recipes import Job, job_clients, untrained
 from ..training.clients import Client
 from ..training.fit import Judge
 from ..training.machine import one_core
-from .job import data, job_of, local, net
+from .job import job_of, local
 from .wire import Report, answer, asked, require_flower
 
 if TYPE_CHECKING:
@@ -32,7 +32,8 @@ def client_app(source: Source | None = None) -> ClientApp:
     """The ClientApp of one vehicle: `local_fit` on its own drive, hence the weights that `federate` would give it.
 
     Args:
-        source: the vehicle with its pieces, and the job; default: what the configurations of node and run say.
+        source: function of the context that gives the vehicle with its pieces, and the job; default: by the
+            configurations of node and run.
 
     Raises:
         MissingLibraryError: Flower is not installed.
@@ -55,37 +56,39 @@ def client_app(source: Source | None = None) -> ClientApp:
 
 def configured(context: Context) -> tuple[Client, Job]:
     """The vehicle by the node's own configuration, `data` (a name or a path) and `vehicle` (an id, not needed if the
-    data hold one vehicle), and the job by the run's. No other vehicle's drive is looked at.
+    data hold one vehicle), and the job by the run's. Drives of other vehicles are not used.
 
     Raises:
-        InputError: no data, or several vehicles and no word on which of them is this node's.
+        InputError: no data, or several vehicles and no `vehicle`.
     """
     own = context.node_config
     if "data" not in own:
         raise InputError("data", "missing", "must name a fleet or a file", "Start the SuperNode with --node-config.")
-    fleet = load(str(own["data"]))
+    fleet = load_fleet(str(own["data"]))
     vehicle = own.get("vehicle", fleet.ids[0] if len(fleet.ids) == 1 else None)
     if vehicle is None:
         raise InputError("vehicle", "missing", f"must be one of {len(fleet.ids)} ids", "Add it to --node-config.")
     job = job_of(context.run_config)
-    (client,) = data(job, fleet.select([str(vehicle)]))
+    (client,) = job_clients(job, fleet.select([str(vehicle)]))
     return client, job
 
 
 @one_core()
 def report(client: Client, job: Job, theta: Tensor, number: int, training: bool) -> Report:
-    """Judge theta (P,) on the client's own pieces and, if asked to, train on them: its half of round `number`."""
-    model = net(job)
+    """Validate theta (P,) on the client's own pieces and, if asked to, train on them: its half of round `number`."""
+    model = untrained(job)
     validation = float(Judge([[client.validation], [client.long]], model)(theta[None]))
-    told = Report(client.name, len(client.training), validation)
+    base = Report(client.name, len(client.training), validation)
     if not training:
-        return told
-    weights, loss, broke = local_fit(model, theta, client, job.setting.seed, number, job.recipe.rounds, local(job))
-    return replace(told, broke=broke) if broke else replace(told, weights=weights, training_loss=loss)
+        return base
+    weights, loss, failure = local_fit(model, theta, client, job.setting.seed, number, job.recipe.rounds, local(job))
+    if failure:
+        return replace(base, failure=failure)
+    return replace(base, weights=weights, training_loss=loss)
 
 
 def _replied(message: Message, context: Context, source: Source, training: bool) -> Message:
-    """The reply. Of an exception only the type leaves, because its text may quote a coordinate."""
+    """The reply. Only the type of an exception leaves, because its text may quote a coordinate."""
     from flwr.app import Error, Message
 
     try:
@@ -93,5 +96,5 @@ def _replied(message: Message, context: Context, source: Source, training: bool)
         return Message(answer(report(client, job, *asked(message.content), training)), reply_to=message)
     except Exception as error:
         traceback.print_exc(file=sys.stderr)
-        reason = f"{type(error).__name__} in the client, whose own log says more"
+        reason = f"{type(error).__name__} in the client, see its own log"
         return Message(Error(code=0, reason=reason), reply_to=message)

@@ -20,12 +20,11 @@ from coopoc.errors import MissingLibraryError
 from coopoc.world.fleet import Fleet
 
 from ..checkpoint import Checkpoint, load, read_card, save
-from ..recipes import Job
+from ..recipes import Job, job_clients
 from ..training.clients import Client
 from ..training.machine import watched
 from .ask import Wait
 from .client import Source, client_app
-from .job import data
 from .rows import Row, checkpoint
 from .server import rounds, server_app
 from .wire import require_flower
@@ -35,18 +34,23 @@ if TYPE_CHECKING:
     from flwr.serverapp import Grid
 
 DAY = 24 * 3600.0
-"""Seconds that a round may take here, where nobody can be absent."""
+"""Seconds that a round may take in a simulation, where no client is absent."""
 QUIET = {
-    "RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0", "FLWR_TELEMETRY_ENABLED": "0",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
+    "FLWR_TELEMETRY_ENABLED": "0",
     "RAY_ENABLE_AUTO_CONNECT": "0",  # or a thread that asks Ray something after the end starts it again
-}  # fmt: skip
+}
 
 
 def train(job: Job, fleet: Fleet, out: Path | str, progress: bool = True) -> dict[str, Checkpoint]:
-    """`simulate` and write the checkpoint, or read it from `out` if Flower made the same before.
+    """`simulate` and write the checkpoint, or read it from `out` if the same job is there.
 
     Args:
-        job: recipe and setting. fleet: the clients' drives. out: folder of the checkpoint. progress: a bar on stderr.
+        job: recipe and setting.
+        fleet: drives of the clients.
+        out: folder of the checkpoint.
+        progress: whether to draw a bar on stderr.
 
     Returns:
         The checkpoint by its label, such as "fedkalmannet-gnss-axis-0".
@@ -62,10 +66,12 @@ def train(job: Job, fleet: Fleet, out: Path | str, progress: bool = True) -> dic
 
 
 def simulate(job: Job, fleet: Fleet, progress: str | None = None, processes: int = 2) -> Checkpoint:
-    """The checkpoint of a federation that Flower's simulation engine ran, with the weights of `federate`.
+    """The checkpoint of a federation on Flower's simulation engine, with the weights of `federate`.
 
     Args:
-        job: recipe and setting. fleet: the clients' drives, one vehicle each. progress: name of a bar on stderr.
+        job: recipe and setting.
+        fleet: drives of the clients.
+        progress: name of a bar on stderr, None for no bar.
         processes: clients that train at the same time; the weights do not depend on it.
 
     Raises:
@@ -90,12 +96,12 @@ def simulate(job: Job, fleet: Fleet, progress: str | None = None, processes: int
             over.set()
     made = checkpoint(rows, job, time.perf_counter() - began)
     card = {**made.card, "key": job.key(fleet), "fleet": fleet.name, "digest": fleet.digest}
-    return replace(made, model=made.model.finished([client.training for client in data(job, fleet)]), card=card)
+    return replace(made, model=made.model.calibrate([client.training for client in job_clients(job, fleet)]), card=card)
 
 
 def partition(context: Context, fleet: Fleet, job: Job) -> tuple[Client, Job]:
     """The vehicle of the fleet that is this virtual node."""
-    return data(job, fleet)[int(context.node_config["partition-id"])], job
+    return job_clients(job, fleet)[int(context.node_config["partition-id"])], job
 
 
 def _simulate(lead: Callable[[Grid, Context], None], source: Source, nodes: int, processes: int) -> None:
@@ -106,10 +112,16 @@ def _simulate(lead: Callable[[Grid, Context], None], source: Source, nodes: int,
         except ImportError:
             raise MissingLibraryError("ray", "training with --flower", "'coopoc[flower]'") from None
         backend: Any = {
-            "init_args": {"num_cpus": processes, "include_dashboard": False, "logging_level": logging.ERROR,
-                          "log_to_driver": False, "_temp_dir": folder, "object_store_memory": 80_000_000},
+            "init_args": {
+                "num_cpus": processes,
+                "include_dashboard": False,
+                "logging_level": logging.ERROR,
+                "log_to_driver": False,
+                "_temp_dir": folder,
+                "object_store_memory": 80_000_000,
+            },
             "client_resources": {"num_cpus": 1.0, "num_gpus": 0.0},
-        }  # fmt: skip
+        }
         try:
             run_simulation(server_app(lead), client_app(source), nodes, backend_config=backend)
         finally:
@@ -118,7 +130,7 @@ def _simulate(lead: Callable[[Grid, Context], None], source: Source, nodes: int,
 
 @contextmanager
 def _quiet() -> Iterator[str]:
-    """No log lines, usage reports or files that stay; a folder for Ray's files while they last."""
+    """Suppress log lines and usage reports; a temporary folder for Ray's files."""
     log, before = logging.getLogger("flwr"), dict(os.environ)
     level = log.level
     log.setLevel(logging.ERROR)

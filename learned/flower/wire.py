@@ -1,4 +1,4 @@
-"""What crosses the wire: weights and a round number to a client; a name, a count, two losses and weights back."""
+"""Messages: weights and a round number to a client; name, size, losses and weights back."""
 
 from __future__ import annotations
 
@@ -16,15 +16,26 @@ if TYPE_CHECKING:
     from flwr.app import RecordDict
 
 LONGEST = 200
-"""Characters of a name or a reason that are read from an answer."""
+"""Characters of a name or a reason in an answer."""
+LARGEST_LOSS = 1e12
+"""m^2, the largest plausible loss: an error of 1,000 km."""
+
+
+class MalformedAnswerError(ValueError):
+    """An answer of a client that cannot be used; the text does not quote the answer beyond a number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """All that leaves a client: its name, how many pieces it trains on, the loss of the weights that it received on its
-    own validation pieces, m^2; and, if it was asked to train, the weights (P,) that it made and its training loss, m^2.
+    """The answer of a client; nothing else leaves it.
 
-    `broke` says why local training came to no end; then there are no weights.
+    Args:
+        name: of the client.
+        pieces: number of its training pieces.
+        validation_loss: m^2, of the received weights on its own validation pieces.
+        training_loss: m^2, if it trained.
+        weights: (P,) after local training, if it trained.
+        failure: reason why local training failed; then there are no weights.
     """
 
     name: str
@@ -32,7 +43,7 @@ class Report:
     validation_loss: float
     training_loss: float = math.nan
     weights: Tensor | None = None
-    broke: str = ""
+    failure: str = ""
 
 
 def require_flower(needed_for: str) -> None:
@@ -49,7 +60,7 @@ def require_flower(needed_for: str) -> None:
 
 
 def question(theta: Tensor, number: int) -> RecordDict:
-    """Content of the message that asks in round `number` with the weights theta (P,)."""
+    """Content of the message of round `number` with the weights theta (P,)."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, RecordDict
 
     arrays = ArrayRecord({"theta": Array(theta.numpy())})
@@ -63,14 +74,14 @@ def asked(content: RecordDict) -> tuple[Tensor, int]:
 
 
 def answer(report: Report) -> RecordDict:
-    """Content of the message that answers, under the names that Flower's own strategies read."""
+    """Content of the answering message, under the names that Flower's own strategies read."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, MetricRecord, RecordDict
 
     metrics, client = MetricRecord({"num-examples": report.pieces}), ConfigRecord({"name": report.name})
     metrics["validation-loss"] = report.validation_loss
     content = RecordDict({"metrics": metrics, "client": client})
-    if report.broke:
-        client["broke"] = report.broke
+    if report.failure:
+        client["failure"] = report.failure
     if report.weights is not None:
         metrics["training-loss"] = report.training_loss
         content["arrays"] = ArrayRecord({"theta": Array(report.weights.numpy())})
@@ -78,29 +89,39 @@ def answer(report: Report) -> RecordDict:
 
 
 def reported(content: RecordDict) -> Report:
-    """The report in an answer, which any client may have written; more than a report holds is not looked at.
+    """The report in an answer, validated; other contents are ignored.
 
     Raises:
-        Exception: of any kind, if something is missing or is not what it should be.
+        MalformedAnswerError: a name, a number or weights outside their range.
+        Exception: of any kind, if something is missing or of another type, as clients may send anything.
     """
-    numbers: Any = content["metrics"]
-    words: Any = content["client"]
-    pieces, broke = int(numbers["num-examples"]), str(words.get("broke", ""))[:LONGEST]
-    if not 1 <= pieces < 2**31:
-        raise ValueError("a number of pieces that cannot be")
-    losses = float(numbers["validation-loss"]), float(numbers.get("training-loss", math.nan))
-    weights = _theta(content) if "arrays" in content and not broke else None
-    return Report(str(words["name"])[:LONGEST], pieces, *losses, weights, broke)
+    metrics: Any = content["metrics"]
+    client: Any = content["client"]
+    name, failure, pieces = client["name"], str(client.get("failure", ""))[:LONGEST], metrics["num-examples"]
+    if not (isinstance(name, str) and 0 < len(name) <= LONGEST and name.isprintable()):
+        raise MalformedAnswerError(f"a name that is not 1 to {LONGEST} printable characters")
+    if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
+        raise MalformedAnswerError("a number of pieces that is not in 1..2^31 - 1")
+    weights = _theta(content) if "arrays" in content and not failure else None
+    training = math.nan if weights is None else _loss(metrics, "training-loss")
+    return Report(name, pieces, _loss(metrics, "validation-loss"), training, weights, failure)
 
 
 def size(content: RecordDict) -> int:
-    """Bytes of a message's records, before Flower frames them."""
+    """Bytes of a message's records, without Flower's framing."""
     return sum(record.count_bytes() for record in content.values())
+
+
+def _loss(metrics: Any, name: str) -> float:
+    loss = float(metrics[name])
+    if not 0 <= loss <= LARGEST_LOSS:
+        raise MalformedAnswerError(f"a {name} of {loss:g} m^2, must be in [0, {LARGEST_LOSS:g}]")
+    return loss
 
 
 def _theta(content: RecordDict) -> Tensor:
     arrays: Any = content["arrays"]
     theta = torch.from_numpy(arrays["theta"].numpy())
     if theta.dtype != torch.float32:
-        raise TypeError(f"weights in {theta.dtype}")
+        raise MalformedAnswerError(f"weights in {theta.dtype}, must be torch.float32")
     return theta

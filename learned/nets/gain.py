@@ -1,10 +1,22 @@
-"""Gain: what training, federation and checkpoints need of a net that filters."""
+"""What a net is to training, federation, checkpoints, streams and studies: `Gain`, and `Recurrent` for one by steps.
+
+A net of your own is one class in one file. Subclass `Recurrent` and write
+
+    start(x0) -> memory              a NamedTuple; its field `x` is the estimate
+    step(memory, gnss, velocity, dt) -> (memory, gain)
+
+and everything else follows: the training loss, a rollout of many nets, the method (Recording -> Track), the stream.
+Where the loss or the method differs, subclass `Gain` and write `losses(theta, batch)` and `method(name, x0)`.
+Arguments of the constructor that are kept as attributes of the same name make the net again from a checkpoint.
+"""
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -12,32 +24,33 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats, Ints
 from coopoc.methods.track import Method
 
-from ..training.clients import Batch, Pieces
+from ..method import LearnedGain
+from ..training.clients import Batch, Segments
 from ..training.schedule import Moving, Schedule, advance
+from .stack import named
 
 
 class Gain(nn.Module, ABC):
-    """A net that filters fixes and velocities; many of one shape are trained together as rows of theta (S, P).
+    """A trainable filter; many nets of one shape are trained together, their flat weights as rows of theta (S, P)."""
 
-    Whoever writes another net gives its losses as a differentiable function of flat weights and has `fit`, `federate`,
-    every aggregation rule, checkpoints and studies at once.
-    """
+    trainable: ClassVar[bool] = True
+    """Studies and commands train it first when it is named as a method."""
 
     @property
-    @abstractmethod
     def settings(self) -> Mapping[str, Any]:
-        """Arguments that make a net of this shape again."""
+        """The constructor's arguments that are attributes of the net: what makes a net of this shape again."""
+        return {name: getattr(self, name) for name in _arguments(type(self)) if hasattr(self, name)}
 
     @abstractmethod
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
-        """Training loss (S, B) of every piece for S nets with weights theta (S, P), differentiable in theta."""
+        """Training loss (S, B) of every segment for S nets with weights theta (S, P), differentiable in theta."""
 
     @abstractmethod
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """This net as a method, Recording -> Track, from the first fix or a known start (R, E, 3) or (E, 3) m."""
 
-    def finished(self, parts: Sequence[Pieces]) -> Gain:
-        """The net after its training, with what the loss could not see set from the training pieces of each client."""
+    def calibrate(self, parts: Sequence[Segments]) -> Gain:
+        """The trained net, with what the loss cannot see set from the training segments of each client."""
         return self
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -51,16 +64,92 @@ class Gain(nn.Module, ABC):
     def descend(
         self, moving: Moving, rows: Ints, batch: Batch, step: int, rates: Floats, schedule: Schedule
     ) -> tuple[Tensor, Tensor]:
-        """One optimiser step (`schedule.advance`) in place: losses (R,) of the rows, and whether each could be taken.
+        """One optimiser step (`schedule.advance`) in place: losses (R,) of the rows, and whether each was taken.
 
         Args:
-            moving: weights and moments (S, P). rows, rates: (R,). batch: what these R models see. step: >= 1.
+            moving: weights and moments (S, P).
+            rows: (R,) models to move.
+            batch: the segments of these R models.
+            step: number of the step, >= 1.
+            rates: (R,) learning rates.
+            schedule: decay, penalties, clipping.
         """
         losses, gradient = self.loss_and_gradient(moving.theta[rows], batch)
-        taken = advance(moving.theta, gradient, *moving[1:], losses, rows.tolist(), step, rates.tolist(), schedule)
-        return losses, taken
+        return losses, advance(moving, gradient, losses, rows, step, rates, schedule)
+
+
+class Recurrent(Gain):
+    """A net that filters step by step and is trained on the squared error of its estimates."""
+
+    positions: tuple[str, ...] = ("x", "x_before", "prior_before", "gnss_before")
+    """Fields of the memory that are positions, m; a stream moves their origin along."""
+
+    @abstractmethod
+    def start(self, x0: Tensor) -> Any:
+        """Memory before the first step at x0 (B, 3) m: a NamedTuple of tensors (B, ...) whose field `x` is x0."""
+
+    @abstractmethod
+    def step(self, memory: Any, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Any, Tensor]:
+        """One step: fix (B, 3) m, NaN where it is missing, velocity (B, 3) m/s, dt s -> memory, gain (B, 3, 3)."""
+
+    def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
+        """Estimates (B, T, 3) m of T steps, one `step` after the other; differentiable in everything.
+
+        Args:
+            gnss: (B, T, 3) m.
+            velocity: (B, T, 3) m/s.
+            x0: (B, 3) m, the start.
+            dt: s, or (T,) s.
+        """
+        memory, estimates = self.start(x0), []
+        steps = torch.as_tensor(dt, dtype=gnss.dtype).expand(gnss.shape[1])
+        for fix, speed, step in zip(gnss.unbind(1), velocity.unbind(1), steps.unbind(), strict=True):
+            memory, _ = self.step(memory, fix, speed, step)
+            estimates.append(memory.x)
+        return torch.stack(estimates, 1)
+
+    def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
+        """Estimates (T, S, B, 3) m of S nets of this shape with weights theta (S, P), differentiable in theta.
+
+        Args:
+            theta: (S, P) weights.
+            gnss: (T, S, B, 3) m.
+            velocity: (T, S, B, 3) m/s.
+            x0: (S, B, 3) m.
+            dt: s, or (T,) s.
+        """
+        rows = []
+        for s in range(len(theta)):
+            weights = {name: view[0] for name, view in named(theta[s : s + 1], self).items()}
+            given = gnss[:, s].transpose(0, 1), velocity[:, s].transpose(0, 1), x0[s], dt
+            rows.append(torch.func.functional_call(self, weights, given).transpose(0, 1))
+        return torch.stack(rows, 1)
+
+    def by_rollout(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
+        """`forward` by the `rollout` of one net, where that is the faster."""
+        theta = nn.utils.parameters_to_vector(self.parameters())
+        lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)
+        return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
+
+    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
+        """(S, B) squared error of each segment, mean over time, sum over components, m^2.
+
+        References:
+            arXiv 2411.05847, equation 7.
+        """
+        x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
+        return over_time((x - batch.truth).square().sum(-1))
+
+    def method(self, name: str, x0: Floats | None = None) -> Method:
+        """`LearnedGain` with this net."""
+        return LearnedGain(self, name, x0)
+
+
+@cache
+def _arguments(kind: type[Gain]) -> tuple[str, ...]:
+    return tuple(inspect.signature(kind).parameters)
 
 
 def over_time(losses: Tensor) -> Tensor:
-    """Mean (S, B) of losses (T, S, B), added in an order that does not depend on how many rows stand side by side."""
+    """Mean (S, B) of losses (T, S, B), summed in an order that does not depend on the number of rows."""
     return losses.movedim(0, -1).contiguous().mean(-1)

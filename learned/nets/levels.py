@@ -1,4 +1,4 @@
-"""Levels: how large a vehicle's noise is, told from its fixes and velocities by running sums, without any filter."""
+"""Levels: running sums over fixes and velocities that estimate a vehicle's noise without a filter."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ FORGET = 1.0 - 1.0 / 300.0
 FADE = 1.0 - 1.0 / 10.0
 """Per step, of sums over velocities: on a turn the noise of an axis changes within a second."""
 GNSS_STD, VELOCITY_SHARE = 2.5, 0.1
-"""m, and a share of the velocity: what is assumed before anything is seen."""
+"""m, and a share of the velocity: the prior before any measurement."""
 WEIGHT = 0.7
-"""Steps that the assumption counts as."""
+"""Steps that the prior counts as."""
 POOL = 60.0
 """Steps that the mean of the axes counts as in the GNSS variance of each; after n fixes, POOL^2 / (POOL + n)."""
 STILL = 0.01
@@ -47,8 +47,15 @@ class Noise(NamedTuple):
 def first(x0: Tensor) -> Levels:
     """Before the first step; x0 (..., 3) m stands for the last fix."""
     one = torch.ones_like(x0)
-    return Levels(x0, 0.0 * one, torch.nan * one, WEIGHT * GNSS_STD**2 * one, WEIGHT * one,
-                  WEIGHT * VELOCITY_SHARE**2 * one, WEIGHT * one)  # fmt: skip
+    return Levels(
+        x0,
+        0.0 * one,
+        torch.nan * one,
+        WEIGHT * GNSS_STD**2 * one,
+        WEIGHT * one,
+        WEIGHT * VELOCITY_SHARE**2 * one,
+        WEIGHT * one,
+    )
 
 
 def after(levels: Levels, gnss: Tensor, velocity: Tensor, dt: float) -> Levels:

@@ -1,13 +1,13 @@
-"""NoiseNet: a small net that tells a vehicle's noise from its own fixes and velocities, and the filter that uses it."""
+"""NoiseNet: a small net that estimates a vehicle's noise from its own fixes and velocities, and its filter."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,25 +26,32 @@ from .gain import Gain, over_time
 from .stack import flatten, layers, named
 
 MEMORY = 100.0
-"""Steps after which what was seen counts 1/e: 10 s at 10 Hz, as long as a training piece."""
+"""Steps after which a measurement counts 1/e: 10 s at 10 Hz, as long as a training piece."""
 GNSS_STD, SHARE, SPEED = 2.5, 0.1, 1.0
-"""m, a share of the speed, and the m/s of it: what one step before the first is taken to have shown."""
+"""m, a share of the speed, and the m/s of it: prior of the sums, worth one step."""
 SHARED = 5.0
 """Steps that all axes together count in the GNSS std of each."""
 EVEN, LEAST = 0.001, 1e-3
-"""What keeps the two shares finite where all axes move alike, and where one of them is nothing."""
+"""Regularisation of the two shares where all axes move alike, and where one of them is zero."""
 
 
 class Variances(NamedTuple):
-    """What is told of the noise, (T, S, B, 3) m^2: of each fix, and of the motion into each step."""
+    """Estimated noise variances (T, S, B, 3) m^2: of each fix, and of the motion into each step."""
 
     fix: Tensor
     process: Tensor
 
 
 class Guess(NamedTuple):
-    """What the net corrects: logs of the GNSS std r m, of the velocity noise's share a of the axis's velocity and its
-    share b of the speed, (T, S, B, 3); what it goes by: features of the fix (..., 2) and of the motion (..., 5)."""
+    """Closed-form estimate that the net corrects, and the net's inputs.
+
+    Args:
+        gnss: (T, S, B, 3) log of the GNSS std r m.
+        axis: (T, S, B, 3) log of a, the velocity noise's share of the axis's velocity.
+        speed: (T, S, B, 3) log of b, its share of the speed.
+        of_fix: (..., 2) features of the fix.
+        of_motion: (..., 5) features of the motion.
+    """
 
     gnss: Tensor
     axis: Tensor
@@ -54,7 +61,7 @@ class Guess(NamedTuple):
 
 
 def evidence(gnss: Tensor, velocity: Tensor, dt: float) -> Tensor:
-    """What fixes and velocities (T, ..., 3) show of their noise whatever a filter makes of them, (4, T, ..., 3).
+    """Sums over fixes and velocities (T, ..., 3) that depend on their noise and on no filter, (4, T, ..., 3).
 
     Forgetting sums up to each step, per axis, of
     0, 1: (z_t - z_{t-1} - dt u_t)^2, whose mean is 2 r^2 + q, and their number;
@@ -62,11 +69,11 @@ def evidence(gnss: Tensor, velocity: Tensor, dt: float) -> Tensor:
     The first velocity is left out: a filter that starts at the first fix never uses it. NaN adds nothing.
     """
     jump = gnss[1:] - gnss[:-1] - dt * velocity[1:]
-    bend = velocity[3:] - 2.0 * velocity[2:-1] + velocity[1:-2]
+    second_difference = velocity[3:] - 2.0 * velocity[2:-1] + velocity[1:-2]
     sums = torch.zeros((len(gnss), 4, *gnss.shape[1:]), dtype=gnss.dtype)
     sums[1:, 0], sums[1:, 1] = jump.square().nan_to_num(0.0), jump.isfinite().to(gnss.dtype)
-    sums[3:, 2] = (bend.square() / 6.0).nan_to_num(0.0)
-    sums[3:, 3] = torch.where(bend.isfinite(), velocity[3:].square(), 0.0)
+    sums[3:, 2] = (second_difference.square() / 6.0).nan_to_num(0.0)
+    sums[3:, 3] = torch.where(second_difference.isfinite(), velocity[3:].square(), 0.0)
     for before, now in pairwise(sums):
         now.add_(before, alpha=1.0 - 1.0 / MEMORY)
     return sums.transpose(0, 1)
@@ -78,20 +85,25 @@ def guess(gnss: Tensor, velocity: Tensor, dt: float) -> Guess:
     r per axis, drawn to that of all axes while little was seen. The velocity's noise variance is a^2 u_i^2 + b^2 |u|^2
     on axis i: a line over the axis's share of the squared speed, fitted to the three axes.
     """
-    jumps, count, bends, moved = evidence(gnss, velocity, dt)
+    jumps, count, second_differences, moved = evidence(gnss, velocity, dt)
     unseen = SHARED / (count + SHARED)
     all_jumps = (jumps.sum(-1, keepdim=True) + 2.0 * GNSS_STD**2) / (count.sum(-1, keepdim=True) + 1.0)
     r = 0.5 * torch.log((jumps + SHARED * all_jumps) / (2.0 * (count + SHARED)))
     driven = moved.sum(-1, keepdim=True) + SPEED**2
-    noise, part = (bends + SHARE**2 * SPEED**2 / 3.0) / driven, (moved + SPEED**2 / 3.0) / driven
+    noise, part = (second_differences + SHARE**2 * SPEED**2 / 3.0) / driven, (moved + SPEED**2 / 3.0) / driven
     mean = noise.mean(-1, keepdim=True)
     slope = ((part * noise).sum(-1, keepdim=True) - mean) / (part.square().sum(-1, keepdim=True) - 1.0 / 3.0 + EVEN)
     slope = torch.minimum(slope.clamp(min=0.0), 3.0 * mean)
     a, b = (0.5 * torch.log(square + LEAST**2).expand_as(r) for square in (slope, mean - slope / 3.0))
     now = velocity.nan_to_num(0.0).square() + 0.01
     speed = now.sum(-1, keepdim=True)
-    motions = [0.5 * (a - math.log(SHARE)), 0.3 * (b - math.log(SHARE)), 0.25 * torch.log(driven / SPEED**2),
-                 torch.log(now / speed) / 8.0, 0.25 * torch.log(speed)]  # fmt: skip
+    motions = [
+        0.5 * (a - math.log(SHARE)),
+        0.3 * (b - math.log(SHARE)),
+        0.25 * torch.log(driven / SPEED**2),
+        torch.log(now / speed) / 8.0,
+        0.25 * torch.log(speed),
+    ]
     of_motion = torch.stack([feature.expand_as(r) for feature in motions], -1)
     return Guess(r, a, b, torch.stack([unseen * (r - math.log(GNSS_STD)), unseen], -1), of_motion)
 
@@ -101,12 +113,14 @@ class NoiseNet(Gain):
 
     var z_t = exp(2 (r + c_1)), q_t = dt^2 (exp(2 (a + c_2)) u_t^2 + exp(2 (b + c_3)) |u_t|^2 + exp(2 (f - 5))):
     r, a and b from `guess`, corrections c from one hidden layer, 0 before training, and f trained. Nothing depends on
-    the state of a filter, so any filter may use it, the net cannot make one unstable, and all steps are told at once.
+    the state of a filter: any filter may use it, the net cannot make one unstable, and all steps are computed at once.
 
     Args:
-        hidden: width. seed: of the initial weights.
+        hidden: width.
+        seed: of the initial weights.
 
-    Source of the training through the recursion: Haarnoja et al., Backprop KF, NeurIPS 2016.
+    References:
+        Haarnoja et al., Backprop KF, NeurIPS 2016 (training through the recursion).
 
     >>> sum(p.numel() for p in NoiseNet().parameters())
     100
@@ -124,13 +138,8 @@ class NoiseNet(Gain):
             nn.init.zeros_(last.bias)
         self.floor = nn.Parameter(torch.zeros(1))
 
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Width."""
-        return {"hidden": self.hidden}
-
     def variances(self, theta: Tensor, gnss: Tensor, velocity: Tensor, dt: float) -> Variances:
-        """What S nets theta (S, P) tell of fixes and velocities (T, S, B, 3) m and m/s, NaN where there was none."""
+        """Variances by S nets theta (S, P) from fixes and velocities (T, S, B, 3) m and m/s, NaN where missing."""
         with torch.no_grad():
             found = guess(gnss, velocity, dt)
         net, floor = layers(theta, self), torch.exp(2.0 * named(theta, self)["floor"] - 10.0)
@@ -147,10 +156,10 @@ class NoiseNet(Gain):
         """(S, B) Gaussian negative log-likelihood of the true error, mean over time, sum over components."""
         gnss = torch.cat([batch.x0[None], batch.gnss])
         velocity = torch.cat([batch.velocity[:1], batch.velocity])
-        told = self.variances(theta, gnss, velocity, batch.dt)
-        x, spread = filtered(gnss, velocity, told, batch.dt, batch.known)
+        noise = self.variances(theta, gnss, velocity, batch.dt)
+        x, relative = filtered(gnss, velocity, noise, batch.dt, batch.known)
         error = (x[1:] - batch.truth).square()
-        return over_time(0.5 * (error / spread[1:] + spread[1:].log()).sum(-1))
+        return over_time(0.5 * (error / relative[1:] + relative[1:].log()).sum(-1))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`NoiseFilter` with this net."""
@@ -158,41 +167,47 @@ class NoiseNet(Gain):
 
 
 def filtered(
-    gnss: Tensor, velocity: Tensor, told: Variances, dt: float, known: Tensor | None = None
+    gnss: Tensor, velocity: Tensor, noise: Variances, dt: float, known: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Kalman filter per axis whose past is revised with its noise: estimate and variance (T, S, B, 3) m, m^2.
 
-    p = s r_t + q_t;  k = p / (p + r_t);  x += k (z - x);  s = k. The spread s is the variance over that of a fix, so a
-    new r_t rescales what older fixes are thought to be worth: gains depend on q / r alone, as they should while r is
-    one unknown number. Where a fix is missing (NaN), k = 0 and s = p / r_t.
+    p = s r_t + q_t;  k = p / (p + r_t);  x += k (z - x);  s = k. The relative variance s is that of the estimate over
+    that of a fix, so a new r_t rescales the weight of older fixes: gains depend on q / r alone, as they should while r
+    is one unknown number. Where a fix is missing (NaN), k = 0 and s = p / r_t.
 
     Args:
-        gnss, velocity: (T, S, B, 3) m, m/s. known: (S, B) where gnss[0] is the exact start.
+        gnss: (T, S, B, 3) m.
+        velocity: (T, S, B, 3) m/s.
+        noise: variances.
+        dt: s.
+        known: (S, B) where gnss[0] is the exact start.
     """
-    x, spread = gnss[0], FORGOTTEN / (FORGOTTEN + told.fix[0])
+    x, relative = gnss[0], FORGOTTEN / (FORGOTTEN + noise.fix[0])
     if known is not None:
-        spread = torch.where(known[..., None], 0.0, spread)
-    xs, ps, whole = [x], [spread * told.fix[0]], bool(gnss.isfinite().all())
-    rows = (gnss[1:], dt * velocity[1:], told.fix[1:], told.process[1:])
+        relative = torch.where(known[..., None], 0.0, relative)
+    xs, ps, whole = [x], [relative * noise.fix[0]], bool(gnss.isfinite().all())
+    rows = (gnss[1:], dt * velocity[1:], noise.fix[1:], noise.process[1:])
     for z, move, fix, process in zip(*rows, strict=True):
-        x, p = x + move, torch.addcmul(process, spread, fix)
-        spread = p / (p + fix)
+        x, p = x + move, torch.addcmul(process, relative, fix)
+        relative = p / (p + fix)
         if whole:
-            x = torch.addcmul(x, spread, z - x)
+            x = torch.addcmul(x, relative, z - x)
         else:
-            x = torch.where(z.isfinite(), torch.addcmul(x, spread, z - x), x)
-            spread = torch.where(z.isfinite(), spread, p / fix)
+            x = torch.where(z.isfinite(), torch.addcmul(x, relative, z - x), x)
+            relative = torch.where(z.isfinite(), relative, p / fix)
         xs.append(x)
-        ps.append(spread * fix)
+        ps.append(relative * fix)
     return torch.stack(xs), torch.stack(ps)
 
 
 @dataclass(frozen=True, eq=False)
 class NoiseFilter:
-    """Position from own fixes and velocities by a Kalman filter with the noise that a NoiseNet tells.
+    """Position from own fixes and velocities by a Kalman filter with the noise that a NoiseNet estimates.
 
     Args:
-        model: trained net. name: in tables. x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        model: trained net.
+        name: label in tables.
+        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
 
     >>> NoiseFilter(NoiseNet()).message.payload
     0
@@ -211,11 +226,11 @@ class NoiseFilter:
         gnss, velocity = (lanes(a[:, :, columns]) for a in (recording.gnss, recording.velocity))
         theta = flatten([self.model]).double()
         with torch.inference_mode():
-            told = self.model.variances(theta, gnss, velocity, recording.dt)
+            noise = self.model.variances(theta, gnss, velocity, recording.dt)
             known = None
             if self.x0 is not None:
                 gnss[0], known = self._start(gnss[0], recording.runs), torch.ones(gnss.shape[1:3], dtype=torch.bool)
-            x, p = (runs(a, recording.runs) for a in filtered(gnss, velocity, told, recording.dt, known))
+            x, p = (runs(a, recording.runs) for a in filtered(gnss, velocity, noise, recording.dt, known))
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), silent, silent, seconds)
@@ -230,12 +245,12 @@ class NoiseFilter:
 
 
 def tell(model: NoiseNet, recording: Recording) -> tuple[Floats, Floats]:
-    """Variances of fixes and of motion (R, T, N, 3) m^2 that every vehicle's own net tells it; run by run."""
+    """Variances of fixes and of motion (R, T, N, 3) m^2 by the net on board of every vehicle; run by run."""
     theta, found = flatten([model]).double(), []
     with one_core(), torch.inference_mode():
         for gnss, velocity in zip(recording.gnss, recording.velocity, strict=True):
-            told = model.variances(theta, lanes(gnss[None]), lanes(velocity[None]), recording.dt)
-            found.append([runs(a, 1)[0] for a in told])
+            noise = model.variances(theta, lanes(gnss[None]), lanes(velocity[None]), recording.dt)
+            found.append([runs(a, 1)[0] for a in noise])
     fix, process = (np.stack(a) for a in zip(*found, strict=True))
     return fix, process
 

@@ -1,4 +1,4 @@
-"""Compiled rollout of RecursiveGains with its own backward pass; `RecursiveGain.reference` is what it equals."""
+"""Compiled rollout of RecursiveGains with its own backward pass; the tests compare it with `RecursiveGain.step`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray
@@ -15,22 +15,27 @@ from coopoc.kernels.compile import compiled, part
 from ..engine.arithmetic import sigmoid, tanh
 from ..training.clients import Batch
 from .levels import FADE, FEATURES, FORGET, GNSS_STD, POOL, STILL, VELOCITY_SHARE, WEIGHT
-from .recursive import HEADS, LIMIT, RecursiveGain
 from .stack import layers
 
+LIMIT = 3.0
+"""Largest correction of a logarithm: at any weights the net stays within exp(+-3) of the filter."""
+HEADS = 4
+"""Corrections of the net: process variance, odds of the gain, Joseph's second term, claimed GNSS variance."""
 Arrays = tuple[Any, ...]
-"""Plain tuples: numba's cache cannot tell which import of this file a named one is of. For S nets, T steps, L lanes:
+"""For S nets, T steps, L lanes:
 
-seen: fix m, motion m, q / r, r m^2 (S, T, L), one axis in each lane; x0 m and its spread (S, L).
+seen: fix m, motion m, q / r, r m^2 (S, T, L), one axis in each lane; x0 m and its relative variance (S, L).
 net: weights of the GRU's input that read the filter (S, 3 H, 3); of its state, with bias; of the heads, with bias.
-tape: estimate, spread, prior spread, gain, surprise e m (NaN where the fix is missing), e normalised (S, T, L); what
-    the net reads of the filter, states before the step, gates r, z, n with the part of n that r scales, corrections.
+tape: estimate, relative variance, its prior, gain, innovation e m (NaN where the fix is missing), e normalised
+    (S, T, L); the net's inputs from the filter, states before the step, gates r, z, n with
+    the part of n that r scales, corrections.
 """
 
 
-def rollout(theta: Tensor, like: RecursiveGain, batch: Batch) -> tuple[Tensor, Tensor]:
+def rollout(theta: Tensor, like: nn.Module, batch: Batch) -> tuple[Tensor, Tensor]:
     """Estimates m and variances m^2 (T, S, B, 3) of S nets theta (S, P), differentiable in theta and in nothing else.
 
+    >>> from coopoc.learned import RecursiveGain
     >>> still = torch.zeros(5, 1, 2, 3)
     >>> rollout(torch.zeros(1, 1364), RecursiveGain(), Batch(still, still, still, still[0], 0.1))[0].abs().max().item()
     0.0
@@ -38,16 +43,24 @@ def rollout(theta: Tensor, like: RecursiveGain, batch: Batch) -> tuple[Tensor, T
     shape, (models, lanes) = batch.gnss.shape, batch.x0.shape[:2]
     fix, velocity = (a.to(theta.dtype).transpose(0, 1).contiguous() for a in (batch.gnss, batch.velocity))
     x0 = batch.x0.to(theta.dtype).contiguous()
-    gnss, ratio, told = torch.empty_like(fix), torch.empty_like(fix), fix.new_empty(*fix.shape, FEATURES)
-    _levels(fix.numpy(), velocity.numpy(), x0.numpy(), batch.dt, gnss.numpy(), ratio.numpy(), told.numpy())
-    spread0 = torch.ones_like(x0) if batch.known is None else (~batch.known)[..., None].to(x0.dtype).expand_as(x0)
-    flat = [a.reshape(models, *a.shape[1:-2], 3 * lanes)
-            for a in (fix, batch.dt * velocity, ratio, gnss, x0, spread0)]  # fmt: skip
+    gnss, ratio, features = torch.empty_like(fix), torch.empty_like(fix), fix.new_empty(*fix.shape, FEATURES)
+    _levels(fix.numpy(), velocity.numpy(), x0.numpy(), batch.dt, gnss.numpy(), ratio.numpy(), features.numpy())
+    relative0 = torch.ones_like(x0) if batch.known is None else (~batch.known)[..., None].to(x0.dtype).expand_as(x0)
+    flat = [
+        a.reshape(models, *a.shape[1:-2], 3 * lanes) for a in (fix, batch.dt * velocity, ratio, gnss, x0, relative0)
+    ]
     net = layers(theta, like)
-    into = torch.baddbmm(net["cell_ih"].bias, told.view(models, -1, FEATURES), net["cell_ih"].transposed[:, :FEATURES])
-    into = into.view(models, shape[0], 3 * lanes, 3 * like.hidden)
-    weights = (net["cell_ih"].weight[:, :, FEATURES:], net["cell_hh"].weight, net["cell_hh"].bias[:, 0],
-               net["heads"].weight, net["heads"].bias[:, 0])  # fmt: skip
+    into = torch.baddbmm(
+        net["cell_ih"].bias, features.view(models, -1, FEATURES), net["cell_ih"].transposed[:, :FEATURES]
+    )
+    into = into.view(models, shape[0], 3 * lanes, -1)
+    weights = (
+        net["cell_ih"].weight[:, :, FEATURES:],
+        net["cell_hh"].weight,
+        net["cell_hh"].bias[:, 0],
+        net["heads"].weight,
+        net["heads"].bias[:, 0],
+    )
     given = tuple(a.contiguous().numpy() for a in flat)
     found = _Rollout.apply(given, into, *weights)  # type: ignore[no-untyped-call]
     x, variance = (a.view(models, shape[0], lanes, 3).transpose(0, 1) for a in found)
@@ -69,15 +82,22 @@ class _Rollout(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, pull_x: Tensor, pull_variance: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, adjoint_x: Tensor, adjoint_variance: Tensor) -> tuple[Tensor | None, ...]:
         own, before, gates = (torch.from_numpy(a) for a in ctx.tape[6:9])
         size = before.shape[-1]
         into, state, heads = (own.new_empty(*own.shape[:3], n) for n in (3 * size, 3 * size, HEADS))
-        pulls = (pull_x.contiguous().numpy(), pull_variance.contiguous().numpy())
-        _backward(ctx.seen, ctx.net, ctx.tape, *pulls, into.numpy(), state.numpy(), heads.numpy())
+        adjoints = (adjoint_x.contiguous().numpy(), adjoint_variance.contiguous().numpy())
+        _backward(ctx.seen, ctx.net, ctx.tape, *adjoints, into.numpy(), state.numpy(), heads.numpy())
         after = torch.lerp(gates[..., 2, :], before, gates[..., 1, :])
-        return (None, into, _product(into, own), _product(state, before), state.sum((1, 2)),
-                _product(heads, after), heads.sum((1, 2)))  # fmt: skip
+        return (
+            None,
+            into,
+            _product(into, own),
+            _product(state, before),
+            state.sum((1, 2)),
+            _product(heads, after),
+            heads.sum((1, 2)),
+        )
 
 
 def _product(delta: Tensor, given: Tensor) -> Tensor:
@@ -87,9 +107,9 @@ def _product(delta: Tensor, given: Tensor) -> Tensor:
 
 @part
 def _levels(
-    fix: AnyArray, velocity: AnyArray, x0: AnyArray, dt: float, gnss: AnyArray, ratio: AnyArray, told: AnyArray
+    fix: AnyArray, velocity: AnyArray, x0: AnyArray, dt: float, gnss: AnyArray, ratio: AnyArray, features: AnyArray
 ) -> None:
-    """`levels.noise` at every step (S, T, B, 3), written to gnss, ratio and told, in double precision."""
+    """`levels.noise` at every step (S, T, B, 3), written to gnss, ratio and features, in double precision."""
     for s in range(fix.shape[0]):
         for b in range(fix.shape[2]):
             last, driven, before = x0[s, b].astype(np.float64), np.zeros(3), velocity[s, 0, b].astype(np.float64)
@@ -115,7 +135,7 @@ def _levels(
                     r = (jumps[a] + weight * pooled) / (count[a] + weight)
                     gnss[s, t, b, a] = r
                     ratio[s, t, b, a] = dt**2 * (share * now + STILL**2) / r
-                    f = told[s, t, b, a]
+                    f = features[s, t, b, a]
                     f[0], f[1] = 0.5 * np.log(r) - 0.7, 0.5 * np.log(share) + 2.3
                     f[2], f[3] = 0.5 * np.log(now + STILL**2) - 1.0, 0.5 * np.log(speed) - 2.0
                     f[4], f[5] = 0.5 * np.log(count[a]) - 2.0, 0.5 * np.log((1.0 - FADE) * turns[a] + STILL**2)
@@ -124,41 +144,44 @@ def _levels(
 @compiled
 def _forward(seen: Arrays, net: Arrays, into: AnyArray, tape: Arrays) -> None:
     """All steps of all nets; `into` (S, T, L, 3 H) is what the GRU's input makes of the levels."""
-    fixes, motion, ratio, gnss, x0, spread0 = seen
+    fixes, motion, ratio, gnss, x0, relative0 = seen
     w_own, w_state, state_bias, w_heads, heads_bias = net
-    estimates, spreads, priors, gains, es, surprises, owns, befores, gates, all_logs = tape
+    estimates, relatives, priors, gains, es, innovations, owns, befores, gates, all_logs = tape
     models, steps, lanes = fixes.shape
     real = gnss.dtype.type
+    zero, one = real(0.0), real(1.0)
     for s in range(models):
         state, heads = np.ascontiguousarray(w_state[s].T), np.ascontiguousarray(w_heads[s].T)
         h = np.zeros((lanes, len(state)), into.dtype)
         back, logs = np.empty((lanes, 3 * len(state)), into.dtype), np.empty((lanes, HEADS), into.dtype)
-        x, spread, surprise = x0[s].copy(), spread0[s].copy(), np.zeros(lanes, into.dtype)
+        x, relative, innovation = x0[s].copy(), relative0[s].copy(), np.zeros(lanes, into.dtype)
         for t in range(steps):
             np.dot(h, state, back)
             befores[s, t] = h
             for lane in range(lanes):
-                p = spread[lane] + ratio[s, t, lane]
-                e = fixes[s, t, lane] - (x[lane] + motion[s, t, lane])
-                es[s, t, lane] = e
-                unit = real(0.0) if np.isnan(e) else e / np.sqrt((real(1.0) + p) * gnss[s, t, lane])
-                own = owns[s, t, lane]
+                at = s, t, lane
+                p = relative[lane] + ratio[at]
+                e = fixes[at] - (x[lane] + motion[at])
+                es[at] = e
+                unit = zero if np.isnan(e) else e / np.sqrt((one + p) * gnss[at])
+                own = owns[at]
                 own[0], own[1] = real(0.25) * np.log(p), np.log1p(unit * unit)
-                own[2] = tanh(unit * surprise[lane], real)
-                surprise[lane] = surprises[s, t, lane] = unit
-                _gru(into[s, t, lane], own, w_own[s], state_bias[s], back[lane], gates[s, t, lane], h[lane])
+                own[2] = tanh(unit * innovation[lane], real)
+                innovation[lane] = innovations[at] = unit
+                _gru(into[at], own, w_own[s], state_bias[s], back[lane], gates[at], h[lane])
             np.dot(h, heads, logs)
             for lane in range(lanes):
-                c = all_logs[s, t, lane]
+                at = s, t, lane
+                c = all_logs[at]
                 for k in range(HEADS):
                     c[k] = real(LIMIT) * tanh((logs[lane, k] + heads_bias[s, k]) / real(LIMIT), real)
-                p = spread[lane] + ratio[s, t, lane] * np.exp(c[0])
-                odds, e = p * np.exp(c[1]), es[s, t, lane]
-                gain = real(0.0) if np.isnan(e) else odds / (real(1.0) + odds)
-                x[lane] += motion[s, t, lane] + (real(0.0) if np.isnan(e) else gain * e)
-                spread[lane] = (real(1.0) - gain) ** 2 * p + gain * gain * np.exp(c[2])
-                priors[s, t, lane], gains[s, t, lane] = p, gain
-                estimates[s, t, lane], spreads[s, t, lane] = x[lane], spread[lane]
+                p = relative[lane] + ratio[at] * np.exp(c[0])
+                odds, e = p * np.exp(c[1]), es[at]
+                gain = zero if np.isnan(e) else odds / (one + odds)
+                x[lane] += motion[at] + (zero if np.isnan(e) else gain * e)
+                relative[lane] = (one - gain) ** 2 * p + gain * gain * np.exp(c[2])
+                priors[at], gains[at] = p, gain
+                estimates[at], relatives[at] = x[lane], relative[lane]
 
 
 @part
@@ -181,74 +204,83 @@ def _gru(
 
 @compiled
 def _backward(
-    seen: Arrays, net: Arrays, tape: Arrays, pull_x: AnyArray, pull_variance: AnyArray, into: AnyArray, state: AnyArray,
+    seen: Arrays,
+    net: Arrays,
+    tape: Arrays,
+    adjoint_x: AnyArray,
+    adjoint_variance: AnyArray,
+    into: AnyArray,
+    state: AnyArray,
     heads: AnyArray,
-) -> None:  # fmt: skip
+) -> None:
     """Gradients (S, T, L, n) of what enters the gates from the input and from the state, and of the heads' outputs."""
-    (fixes, _, ratio, gnss, _, spread0), (w_own, w_state, _, w_heads, _) = seen, net
-    _, spreads, _, gains, es, surprises, owns, befores, gates, _ = tape
+    (fixes, _, ratio, gnss, _, relative0), (w_own, w_state, _, w_heads, _) = seen, net
+    _, relatives, _, gains, es, innovations, owns, befores, gates, _ = tape
     models, steps, lanes = fixes.shape
     real = gnss.dtype.type
+    zero, one = real(0.0), real(1.0)
     for s in range(models):
         size = w_state.shape[2]
         h, more, own = np.zeros((lanes, size), real), np.empty((lanes, size), real), np.empty((lanes, 3), real)
-        x, spread, surprise = np.zeros(lanes, real), np.zeros(lanes, real), np.zeros(lanes, real)
+        x, relative, innovation = np.zeros(lanes, real), np.zeros(lanes, real), np.zeros(lanes, real)
         for t in range(steps - 1, -1, -1):
             for lane in range(lanes):
-                x[lane] += pull_x[s, t, lane]
-                spread[lane] = _filter_back(seen, tape, (s, t, lane), x[lane], spread[lane], pull_variance[s, t, lane],
-                                            heads[s, t, lane])  # fmt: skip
+                at = s, t, lane
+                x[lane] += adjoint_x[at]
+                relative[lane] = _filter_back(seen, tape, at, x[lane], relative[lane], adjoint_variance[at], heads[at])
             np.dot(heads[s, t], w_heads[s], more)
             for lane in range(lanes):
-                _gru_back(gates[s, t, lane], befores[s, t, lane], more[lane], h[lane], into[s, t, lane],
-                          state[s, t, lane])  # fmt: skip
+                at = s, t, lane
+                _gru_back(gates[at], befores[at], more[lane], h[lane], into[at], state[at])
             np.dot(state[s, t], w_state[s], more)
             np.dot(into[s, t], w_own[s], own)
             h += more
             for lane in range(lanes):
-                last = surprises[s, t - 1, lane] if t else real(0.0)
-                before = spreads[s, t - 1, lane] if t else spread0[s, lane]
-                p = before + ratio[s, t, lane]
-                unit, turned = surprises[s, t, lane], own[lane, 2] * (real(1.0) - owns[s, t, lane, 2] ** 2)
-                pull = surprise[lane] + own[lane, 1] * real(2.0) * unit / (real(1.0) + unit * unit) + turned * last
-                surprise[lane] = turned * unit
-                spread[lane] += real(0.25) * own[lane, 0] / p - pull * unit / (real(2.0) * (real(1.0) + p))
-                if not np.isnan(es[s, t, lane]):
-                    x[lane] *= real(1.0) - gains[s, t, lane]
-                    x[lane] -= pull / np.sqrt((real(1.0) + p) * gnss[s, t, lane])
+                at = s, t, lane
+                last = innovations[s, t - 1, lane] if t else zero
+                before = relatives[s, t - 1, lane] if t else relative0[s, lane]
+                p = before + ratio[at]
+                unit, turned = innovations[at], own[lane, 2] * (one - owns[at][2] ** 2)
+                adjoint = innovation[lane] + own[lane, 1] * real(2.0) * unit / (one + unit * unit) + turned * last
+                innovation[lane] = turned * unit
+                relative[lane] += real(0.25) * own[lane, 0] / p - adjoint * unit / (real(2.0) * (one + p))
+                if not np.isnan(es[at]):
+                    x[lane] *= one - gains[at]
+                    x[lane] -= adjoint / np.sqrt((one + p) * gnss[at])
 
 
 @part
-def _filter_back(seen: Arrays, tape: Arrays, at: Any, x: Any, spread: Any, variance: Any, heads: AnyArray) -> Any:
-    """Pull on the spread before a step from those on x, spread and variance after it; those on the heads' outputs."""
-    _, spreads, priors, gains, es, _, _, _, _, logs = tape
-    real, ratio, gnss = heads.dtype.type, seen[2], seen[3]
+def _filter_back(seen: Arrays, tape: Arrays, at: Any, x: Any, relative: Any, variance: Any, heads: AnyArray) -> Any:
+    """Adjoint of the relative variance before a step from those of x, of it and of the variance after; of the heads."""
+    _, relatives, priors, gains, es, _, _, _, _, logs = tape
+    real, (_, _, ratio, gnss, _, _) = heads.dtype.type, seen
+    one = real(1.0)
     c, gain, p, e = logs[at], gains[at], priors[at], es[at]
     claim, second, scale = np.exp(c[3]) * gnss[at], np.exp(c[2]), np.exp(c[1])
-    left = real(1.0) - gain
-    spread = spread + variance * claim
+    left = one - gain
+    relative = relative + variance * claim
     odds = real(0.0)
     if not np.isnan(e):
-        odds = (x * e + spread * real(2.0) * (gain * second - left * p)) * left * left
-    prior = spread * left * left + odds * scale
+        odds = (x * e + relative * real(2.0) * (gain * second - left * p)) * left * left
+    prior = relative * left * left + odds * scale
     heads[0] = prior * ratio[at] * np.exp(c[0])
     heads[1] = odds * p * scale
-    heads[2] = spread * gain * gain * second
-    heads[3] = variance * spreads[at] * claim
+    heads[2] = relative * gain * gain * second
+    heads[3] = variance * relatives[at] * claim
     for k in range(HEADS):
-        heads[k] *= real(1.0) - (c[k] / real(LIMIT)) ** 2
+        heads[k] *= one - (c[k] / real(LIMIT)) ** 2
     return prior
 
 
 @part
 def _gru_back(gates: AnyArray, before: AnyArray, more: AnyArray, h: AnyArray, into: AnyArray, state: AnyArray) -> None:
-    """Pulls through one lane's GRU step; h, the pull on its state, becomes the direct part of that one step before."""
-    size, real = len(h), h.dtype.type
+    """Adjoints of one lane's GRU step; h, the adjoint of its state, becomes the direct part of that one step before."""
+    size, one = len(h), h.dtype.type(1.0)
     for k in range(size):
         reset, keep, fresh, kept = gates[0, k], gates[1, k], gates[2, k], gates[3, k]
         after = h[k] + more[k]
-        candidate = after * (real(1.0) - keep) * (real(1.0) - fresh * fresh)
-        into[k] = state[k] = candidate * kept * reset * (real(1.0) - reset)
-        into[k + size] = state[k + size] = after * (before[k] - fresh) * keep * (real(1.0) - keep)
+        candidate = after * (one - keep) * (one - fresh * fresh)
+        into[k] = state[k] = candidate * kept * reset * (one - reset)
+        into[k + size] = state[k + size] = after * (before[k] - fresh) * keep * (one - keep)
         into[k + 2 * size], state[k + 2 * size] = candidate, candidate * reset
         h[k] = after * keep

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats
-from coopoc.methods.track import Method
-
-from ..training.clients import Batch
-from .gain import Gain, over_time
+from .gain import Recurrent
 from .stack import Layer, layers
 
 SIZE = 3
 START_GAIN = 0.1
 """Diagonal of the untrained gain: a stable closed loop."""
 SCALE = 0.5
-"""m, up to which a feature grows in proportion and beyond which as a logarithm."""
+"""m, where a feature turns from linear to logarithmic."""
 
 
 class Memory(NamedTuple):
-    """What the net carries from step to step, B lanes: state of both GRUs (2, B, H); estimate (B, 3) m, the one before,
-    the last prior and the last fix."""
+    """State of the net for B lanes: both GRUs (2, B, H); estimate (B, 3) m, the previous one, the last prior and the
+    last fix."""
 
     hidden: Tensor
     x: Tensor
@@ -33,19 +28,21 @@ class Memory(NamedTuple):
     gnss_before: Tensor
 
 
-class SplitGain(Gain):
+class SplitGain(Recurrent):
     """Gain K = G_1 G_2: one net stands for the prior covariance, the other for the inverse innovation covariance.
 
     x_prior = x + dt u;  x <- x_prior + G_1 H^T G_2 (z - x_prior) with H = I. G_1 sees the last evolution x - x_before
     and update x - prior_before, G_2 the fix change z - z_before and the innovation z - x_prior, each component v as
     asinh(v / 0.5 m) / 2: with magnitudes, where the paper's KalmanNet has directions only. With H constant, the
     linearisation error is zero and the Jacobian the same at every step, so they are no inputs. A missing fix (NaN) has
-    a gain of zero and leaves the GRUs as they were.
+    a gain of zero and does not change the GRUs.
 
     Args:
-        hidden: width of each net's layer and GRU. seed: of the initial weights; K starts near 0.1 I.
+        hidden: width of each net's layer and GRU.
+        seed: of the initial weights; K starts near 0.1 I.
 
-    Source: Choi, Park, Lim, Jeon, Kim, Shlezinger, Split-KalmanNet, IEEE TVT 2023 (arXiv 2210.09636).
+    References:
+        Choi, Park, Lim, Jeon, Kim, Shlezinger, Split-KalmanNet, IEEE TVT 2023 (arXiv 2210.09636).
 
     >>> sum(p.numel() for p in SplitGain().parameters())
     7986
@@ -65,31 +62,12 @@ class SplitGain(Gain):
                 part.weight.mul_(0.1)
                 part.bias.copy_(START_GAIN**0.5 * torch.eye(SIZE).flatten())
 
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Width."""
-        return {"hidden": self.hidden}
-
-    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
-        """(S, B) squared error of each piece, mean over time, sum over components, m^2."""
-        x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return over_time((x - batch.truth).square().sum(-1))
-
-    def method(self, name: str, x0: Floats | None = None) -> Method:
-        """`LearnedGain` with this net."""
-        from ..method import LearnedGain
-
-        return LearnedGain(cast(Any, self), name, x0)
-
     def start(self, x0: Tensor) -> Memory:
         """Memory before the first step: estimate x0 (B, 3) m, which is also the last fix; GRU states zero."""
         return Memory(torch.zeros(2, len(x0), self.hidden, dtype=x0.dtype), x0, x0, x0, x0)
 
     def step(self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Memory, Tensor]:
-        """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3).
-
-        This is the readable reference of `rollout`.
-        """
+        """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3)."""
         missing = gnss.isnan().any(1, keepdim=True)
         fix, prior = torch.where(missing, memory.gnss_before, gnss), memory.x + dt * velocity
         changes = (memory.x - memory.x_before, memory.x - memory.prior_before), (fix - memory.gnss_before, fix - prior)
@@ -103,17 +81,11 @@ class SplitGain(Gain):
         return Memory(after, x, memory.x, torch.where(missing, memory.prior_before, prior), fix), gain
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (B, T, 3) m of T steps after the start x0 (B, 3) m, from fixes and velocities (B, T, 3)."""
-        theta = nn.utils.parameters_to_vector(self.parameters())
-        fixes, speeds = (a.transpose(0, 1).unsqueeze(1) for a in (gnss, velocity))
-        return self.rollout(theta[None], fixes, speeds, x0[None], dt)[:, 0].transpose(0, 1)
+        """Estimates (B, T, 3) m as in `Recurrent`, by `rollout`."""
+        return self.by_rollout(gnss, velocity, x0, dt)
 
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (T, S, B, 3) m of S nets theta (S, P): `step` with both nets of all S as rows of one product.
-
-        Args:
-            gnss, velocity: (T, S, B, 3) m, m/s. x0: (S, B, 3) m. dt: s, or (T,).
-        """
+        """Estimates (T, S, B, 3) m as in `Recurrent`: `step` with both nets of all S as rows of one product."""
         models, lanes = x0.shape[:2]
         names = ("see_{}", "cell_{}_ih", "cell_{}_hh", "factor_{}")
         see, into, back, factor = (self._pair(theta, name) for name in names)

@@ -1,1 +1,1 @@
-"""What shared weights give away, and what can be done about it."""
+"""Differential privacy, secure aggregation, and membership inference as an attack on shared weights."""

@@ -1,14 +1,16 @@
-"""Masks: what secure aggregation needs of cryptography, and real numbers as integers that masks can hide."""
+"""Cryptographic primitives of secure aggregation, its fixed point, and normal noise from a cryptographic generator."""
 
 from __future__ import annotations
 
 import hashlib
+import secrets
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
 from coopoc.arrays import Floats
 from coopoc.errors import MissingLibraryError
@@ -36,32 +38,41 @@ def decode(words: Words, resolution: float = RESOLUTION) -> Floats:
     return found
 
 
-def public(key: bytes) -> bytes:
+def public_key(key: bytes) -> bytes:
     """X25519 public key of a private one, 32 bytes each; any 32 bytes are a private key.
 
-    Source: RFC 7748.
+    References:
+        RFC 7748.
     """
     found: bytes = _crypto().X25519PrivateKey.from_private_bytes(key).public_key().public_bytes_raw()
     return found
 
 
 def pair_seed(key: bytes, other: bytes) -> bytes:
-    """What a private key and another client's public one agree on (32 bytes): the same from either side."""
+    """Shared secret (32 bytes) of a private key and another client's public one: the same from either side."""
     return _agreed(key, other, b"mask")
 
 
-def stretched(seed: bytes, size: int) -> Words:
+def prg(seed: bytes, size: int) -> Words:
     """Words (size,) of the ChaCha20 key stream of a seed of 32 bytes.
 
-    Source: Bernstein, ChaCha, a variant of Salsa20, 2008; RFC 8439.
+    References:
+        Bernstein, ChaCha, a variant of Salsa20, 2008; RFC 8439.
     """
     crypto = _crypto()
     stream = crypto.Cipher(crypto.ChaCha20(seed, bytes(16)), None).encryptor()
     return np.frombuffer(stream.update(bytes(4 * size)), dtype="<u4").astype(np.uint32)
 
 
+def secure_normal(size: int) -> Floats:
+    """(size,) standard normal draws under a fresh key of the operating system: ChaCha20, 52 bits each, inverted."""
+    high, low = (prg(secrets.token_bytes(KEY), 2 * size).astype(np.uint64) >> 6).reshape(2, size)
+    draws: Floats = ndtri(((high << 26 | low) + 0.5) * 2.0**-52)
+    return draws
+
+
 def box(key: bytes, other: bytes) -> Any:
-    """Authenticated encryption (ChaCha20-Poly1305) under what a private key and another's public one agree on."""
+    """Authenticated encryption (ChaCha20-Poly1305) under the shared secret of a private and a public key."""
     return _crypto().ChaCha20Poly1305(_agreed(key, other, b"box"))
 
 
@@ -81,5 +92,10 @@ def _crypto() -> SimpleNamespace:
         from cryptography.hazmat.primitives.ciphers.algorithms import ChaCha20
     except ModuleNotFoundError:
         raise MissingLibraryError("cryptography", "secure aggregation", "'coopoc[privacy]'") from None
-    return SimpleNamespace(X25519PrivateKey=X25519PrivateKey, X25519PublicKey=X25519PublicKey, Cipher=Cipher,
-                           ChaCha20=ChaCha20, ChaCha20Poly1305=ChaCha20Poly1305)  # fmt: skip
+    return SimpleNamespace(
+        X25519PrivateKey=X25519PrivateKey,
+        X25519PublicKey=X25519PublicKey,
+        Cipher=Cipher,
+        ChaCha20=ChaCha20,
+        ChaCha20Poly1305=ChaCha20Poly1305,
+    )

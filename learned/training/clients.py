@@ -1,4 +1,4 @@
-"""Clients: the training drives, each with its own noise, cut into pieces that never leave it."""
+"""Clients: the training drives, each with its own noise, cut into private segments."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch import Tensor
 
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
+from coopoc.plugins import unknown
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensing import observe
@@ -31,7 +32,7 @@ DRAWS = 8
 
 
 class Batch(NamedTuple):
-    """What S models see at once, each B pieces: gnss, velocity, truth (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is
+    """Input of S models, B segments each: gnss, velocity, truth (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is
     the truth (S, B), None if it never is."""
 
     gnss: Tensor
@@ -43,14 +44,19 @@ class Batch(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
+class Segments:
     """n sub-trajectories of T steps after a start sample, in float32, each relative to its first true position.
 
     Args:
-        gnss, velocity, truth, true_velocity: (n, T + 1, 3) m and m/s; sample 0 only starts the filter.
-        gnss_std, velocity_std: (n, T + 1, 3) m and m/s of the noise, for new draws.
+        gnss: (n, T + 1, 3) m; sample 0 only starts the filter.
+        velocity: (n, T + 1, 3) m/s.
+        truth: (n, T + 1, 3) m.
+        true_velocity: (n, T + 1, 3) m/s.
+        gnss_std: (n, T + 1, 3) m of the noise, for new draws.
+        velocity_std: (n, T + 1, 3) m/s of the noise, for new draws.
         true_start: (n,) whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
-        dt: s. noise: "static" was drawn once; "fresh" is drawn anew at every use; "wide" too, and then every use of a
+        dt: s.
+        noise: "static" was drawn once; "fresh" is drawn anew at every use; "wide" too, and then every use of a
             piece also draws how large its noise is, log-uniformly between the factors `WIDE`.
     """
 
@@ -68,7 +74,7 @@ class Pieces:
         return len(self.truth)
 
     def batch(self, index: Tensor, draws: Sequence[torch.Generator] = ()) -> Batch:
-        """Pieces `index` (S, B); new noise comes from the S generators `draws`."""
+        """Segments `index` (S, B); new noise comes from the S generators `draws`."""
         if self.noise == "static":
             drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
         else:
@@ -99,22 +105,22 @@ class Pieces:
             gnss_std, velocity_std = _widened(gnss_std, velocity_std, draws)
         return self.truth[index] + gnss_std * normals[0], self.true_velocity[index] + velocity_std * normals[1]
 
-    def take(self, index: Sequence[int]) -> Pieces:
+    def take(self, index: Sequence[int]) -> Segments:
         """The pieces `index`."""
         return self._each(lambda name: getattr(self, name)[list(index)])
 
     @classmethod
-    def join(cls, parts: Sequence[Pieces]) -> Pieces:
+    def join(cls, parts: Sequence[Segments]) -> Segments:
         """All pieces of several parts in their order; the parts agree in length, dt and kind of noise."""
         if len({(p.truth.shape[1], p.dt, p.noise) for p in parts}) != 1:
             found = [(p.truth.shape[1], p.dt, p.noise) for p in parts]
             raise InputError("pieces", found, "must agree in length, dt and noise", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
-    def _each(self, made: Callable[[str], Tensor]) -> Pieces:
+    def _each(self, made: Callable[[str], Tensor]) -> Segments:
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
         tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
-        return Pieces(**tensors, dt=self.dt, noise=self.noise)
+        return Segments(**tensors, dt=self.dt, noise=self.noise)
 
 
 def _widened(gnss_std: Tensor, velocity_std: Tensor, draws: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
@@ -156,9 +162,9 @@ class Client:
     """
 
     name: str
-    training: Pieces
-    validation: Pieces
-    long: Pieces
+    training: Segments
+    validation: Segments
+    long: Segments
 
 
 def clients(
@@ -177,14 +183,19 @@ def clients(
     once from the seed. Static noise, drawn once as the paper implies, is the default.
 
     Args:
-        fleet: drives (T, N); a vehicle may leave early. sensors: default `Sensors.paper_training()`.
-        seed: of noise and split. noise: "static", "fresh" (new at every use) or "wide" (new,
-            and of a size that differs from use to use). start: "gnss" (first fix) or "true".
+        fleet: drives (T, N); a vehicle may leave early.
+        sensors: default `Sensors.paper_training()`.
+        seed: of noise and split.
+        noise: "static", "fresh" (new at every use) or "wide" (new, and of a size that differs from use to use).
+        start: "gnss" (first fix) or "true".
+        piece: steps of a segment.
+        split: share of the segments that train.
 
     Raises:
         InputError: a choice that does not exist, or a vehicle with fewer than two pieces.
 
-    Source: arXiv 2411.05847, section IV.A; KalmanNet_TSP for the start at the truth.
+    References:
+        arXiv 2411.05847, section IV.A; KalmanNet_TSP for the start at the truth.
 
     >>> t = np.arange(303) / 10
     >>> line = Fleet(("a",), t, np.zeros((303, 1, 3)), np.zeros((303, 1, 3)))
@@ -193,14 +204,18 @@ def clients(
     """
     for name, value, allowed in (("noise", noise, get_args(Noise)), ("start", start, get_args(Start))):
         if value not in allowed:
-            raise InputError(name, repr(value), f"must be one of {allowed}", "Pick one.")
+            raise unknown(name, value, allowed)
     if piece < 2 or not 0 < split < 1:
         raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
     sensors = sensors or Sensors.paper_training()
     if noise != "static" and (sensors.gnss_bias[1] > 0 or sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0):
         given = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std)
-        raise InputError("gnss_bias, gnss_drift_std, gnss_common_std", given, f"must be zero with {noise} noise",
-                         "Train with white noise, or static.")  # fmt: skip
+        raise InputError(
+            "gnss_bias, gnss_drift_std, gnss_common_std",
+            given,
+            f"must be zero with {noise} noise",
+            "Train with white noise, or static.",
+        )
     seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
     found, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
@@ -211,8 +226,8 @@ def clients(
         drive = [a[there, column] for a in arrays]
         pieces = _cut(drive, sensors, piece, fleet.dt, noise, start)
         if len(pieces) < 2:
-            mend = f"Give it at least {2 * (piece + 1)} steps or shorten the pieces."
-            raise InputError("fleet", f"{name} with {len(pieces)} pieces of {piece}", "needs at least two", mend)
+            hint = f"Give it at least {2 * (piece + 1)} steps or shorten the pieces."
+            raise InputError("fleet", f"{name} with {len(pieces)} pieces of {piece}", "needs at least two", hint)
         order = stream(seed, "split", 0, name).permutation(len(pieces)).tolist()
         count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
         long = _cut(drive, sensors, longest, fleet.dt, noise, start)
@@ -222,8 +237,8 @@ def clients(
     return tuple(found)
 
 
-def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise: Noise, start: Start) -> Pieces:
-    """Pieces of one vehicle's gnss, velocity, truth and true velocity (T, 3)."""
+def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise: Noise, start: Start) -> Segments:
+    """Segments of one vehicle's gnss, velocity, truth and true velocity (T, 3)."""
     count = len(drive[0]) // (piece + 1)
     gnss, velocity, truth, true_velocity = (d[: count * (piece + 1)].reshape(count, piece + 1, 3) for d in drive)
     origin = truth[:, :1]
@@ -233,7 +248,14 @@ def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise
     def tensor(numbers: Floats) -> Tensor:
         return torch.tensor(numbers, dtype=torch.float32)
 
-    return Pieces(
-        tensor(gnss - origin), tensor(velocity), tensor(truth - origin), tensor(true_velocity), tensor(stds[0]),
-        tensor(stds[1]), torch.full((count,), start == "true"), dt, noise,
-    )  # fmt: skip
+    return Segments(
+        tensor(gnss - origin),
+        tensor(velocity),
+        tensor(truth - origin),
+        tensor(true_velocity),
+        tensor(stds[0]),
+        tensor(stds[1]),
+        torch.full((count,), start == "true"),
+        dt,
+        noise,
+    )

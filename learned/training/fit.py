@@ -18,7 +18,7 @@ from coopoc.world.noise import stream
 
 from ..nets.gain import Gain
 from ..nets.stack import flatten, unflatten
-from .clients import Batch, Pieces, mirrored
+from .clients import Batch, Segments, mirrored
 from .machine import one_core, watched
 from .schedule import Moving, Schedule, cosine, generator
 
@@ -28,11 +28,11 @@ class Task:
     """One net to train: its start, its pieces, and the key of its batches: a seed and the name of the data."""
 
     model: Gain
-    training: Pieces
-    validation: Pieces
+    training: Segments
+    validation: Segments
     seed: int = 0
     name: str = ""
-    long: Pieces | None = None
+    long: Segments | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,21 +63,26 @@ class Fit:
 
 def fit(
     model: Gain,
-    training: Pieces,
-    validation: Pieces,
+    training: Segments,
+    validation: Segments,
     schedule: Schedule | None = None,
     seed: int = 0,
     progress: str | None = None,
-    long: Pieces | None = None,
+    long: Segments | None = None,
 ) -> Fit:
     """Minimise 1/T sum_t ||xhat_t - x_t||^2 + gamma ||theta||^2 over batches of pieces.
 
     Args:
-        model: the start; it is not changed. training, validation: pieces. schedule: default `Schedule()`.
-        seed: of the order of the batches. progress: name of the stage for a progress bar on stderr, None for no bar.
-        long: long pieces that weights must hold on to be kept.
+        model: the start; it is not changed.
+        training: segments to train on.
+        validation: segments that select the weights.
+        schedule: default `Schedule()`.
+        seed: of the order of the batches.
+        progress: name of the stage for a progress bar on stderr, None for no bar.
+        long: long segments on which the selected weights must not diverge.
 
-    Source: arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
+    References:
+        arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
 
     >>> from coopoc.world.fleet import Fleet
     >>> from coopoc.learned import GainNet, clients
@@ -133,7 +138,7 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
 def descend(
     theta: Tensor,
     like: Gain,
-    pool: Pieces,
+    pool: Segments,
     plans: Sequence[Ints],
     rates: Sequence[Floats],
     schedule: Schedule,
@@ -155,8 +160,11 @@ def descend(
             batch = mirrored(batch, dice) if schedule.mirror else batch
             rate = np.array([rates[r][step] for r in rows])
             losses[rows], taken = like.descend(moving, np.array(rows), batch, step + 1, rate, schedule)
-            stopped |= {r: f"loss or gradient not finite at step {step + 1}"
-                        for r, good in zip(rows, taken.tolist(), strict=True) if not good}  # fmt: skip
+            stopped |= {
+                r: f"loss or gradient not finite at step {step + 1}"
+                for r, good in zip(rows, taken.tolist(), strict=True)
+                if not good
+            }
         yield step + 1, torch.from_numpy(losses)
 
 
@@ -165,10 +173,10 @@ class Judge:
 
     The kinds are the validation pieces and, where there are any, the long ones: over a long drive a stable filter is
     the better for its start being over, so they decide only against weights that drift away. New noise is drawn once.
-    A score does not depend on who is judged beside it: a model's pieces have dice of their own and are added in order.
+    A score does not depend on the other models: a model's segments have their own random draws and are summed in order.
     """
 
-    def __init__(self, kinds: Sequence[Sequence[Pieces]], like: Gain) -> None:
+    def __init__(self, kinds: Sequence[Sequence[Segments]], like: Gain) -> None:
         self.like = like
         self.batches = [_padded(parts) for parts in kinds]
 
@@ -179,7 +187,7 @@ class Judge:
         return torch.stack(means).nan_to_num(math.inf, math.inf).amax(0)
 
 
-def _padded(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:
+def _padded(parts: Sequence[Segments]) -> tuple[Batch, Tensor]:
     """All pieces of S models as one batch, and the share (S, B) of each in its model's mean, 0 for padding."""
     pool, members = pooled([_drawn(part) for part in parts])
     most = max(map(len, members))
@@ -188,7 +196,7 @@ def _padded(parts: Sequence[Pieces]) -> tuple[Batch, Tensor]:
     return pool.batch(index), share
 
 
-def _drawn(part: Pieces) -> Pieces:
+def _drawn(part: Segments) -> Segments:
     """The same pieces with noise that is drawn once, where it would be new at every use."""
     if part.noise == "static":
         return part
@@ -198,10 +206,10 @@ def _drawn(part: Pieces) -> Pieces:
     return replace(part, gnss=gnss, velocity=velocity, noise="static")
 
 
-def pooled(parts: Sequence[Pieces]) -> tuple[Pieces, list[Ints]]:
+def pooled(parts: Sequence[Segments]) -> tuple[Segments, list[Ints]]:
     """All pieces in one, and the indices of each part in it."""
     ends = np.cumsum([len(p) for p in parts])
-    return Pieces.join(parts), [np.arange(end - len(p), end) for p, end in zip(parts, ends, strict=True)]
+    return Segments.join(parts), [np.arange(end - len(p), end) for p, end in zip(parts, ends, strict=True)]
 
 
 def bar(steps: Iterator[tuple[int, Tensor]], plans: Sequence[Ints], name: str | None) -> Iterator[tuple[int, Tensor]]:

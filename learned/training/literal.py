@@ -19,7 +19,7 @@ from coopoc.world.noise import stream
 
 from ..nets.gain_net import GainNet
 from ..nets.stack import flatten
-from .clients import Pieces, clients
+from .clients import Segments, clients
 from .fit import Judge
 from .machine import one_core
 
@@ -55,18 +55,23 @@ def literal(
     """Train centrally with torch's own optimiser at batch 1 and weight decay 0.3, and report when it breaks.
 
     Args:
-        fleet: clients' drives. optimiser: "sgd", "adam" or "adamw". clipped: limit the gradient's norm to 1.
-        start_gain: None for torch's initial weights as published, or a stable start. steps: at most so many.
+        fleet: clients' drives.
+        optimiser: "sgd", "adam" or "adamw".
+        learning_rate: constant.
+        clipped: limit the gradient's norm to 1.
+        start_gain: None for torch's initial weights as published, or a stable start.
+        steps: at most so many.
+        seed: of noise, split, start and batches.
 
-    Source: arXiv 2411.05847, section IV.A: "Batch size is equal to 1, while learning rate and weight decay are set to
-    0.3".
+    References:
+        arXiv 2411.05847, section IV.A: "Batch size is equal to 1, while learning rate and weight decay are set to 0.3".
 
     >>> line = Fleet(("a",), np.arange(303) / 10, np.zeros((303, 1, 3)), np.zeros((303, 1, 3)))
     >>> literal(line, "adamw", 1e-3, start_gain=0.1, steps=1).steps
     1
     """
     group = clients(fleet, seed=seed)
-    training, validation = (Pieces.join([getattr(c, part) for c in group]) for part in ("training", "validation"))
+    training, validation = (Segments.join([getattr(c, part) for c in group]) for part in ("training", "validation"))
     like = GainNet(start_gain=start_gain, seed=seed)
     theta = flatten([like]).requires_grad_()
     judge, draw = Judge([[validation]], like), stream(seed, "literal", 0, optimiser)
@@ -93,8 +98,11 @@ def _named(start_gain: float | None) -> str:
 def table(outcomes: Sequence[Outcome]) -> str:
     """Markdown: of each way to train, how many seeds stayed finite and the best validation loss of each seed before
     and during the training."""
-    lines = ["| optimiser | rate | clipped | start | finite to the end | median steps before NaN | untrained, m^2 | "
-             "best validation, m^2 |", "|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| optimiser | rate | clipped | start | finite to the end | median steps before NaN | untrained, m^2 | "
+        "best validation, m^2 |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
     ways = dict.fromkeys((o.optimiser, o.learning_rate, o.clipped, o.start) for o in outcomes)
     most = max(o.steps for o in outcomes)
     for way in ways:
@@ -102,22 +110,31 @@ def table(outcomes: Sequence[Outcome]) -> str:
         alive = [o for o in mine if o.steps == most]
         broken = [o.steps for o in mine if o.steps < most]
         median = f"{np.median(broken):.0f}" if broken else "-"
-        before, best = (", ".join(f"{score:.3g}" for score in scores)
-                        for scores in ([o.untrained for o in mine], [o.best for o in mine]))  # fmt: skip
+        before, best = (
+            ", ".join(f"{score:.3g}" for score in scores)
+            for scores in ([o.untrained for o in mine], [o.best for o in mine])
+        )
         name, rate, clipped, start = way
-        lines.append(f"| {name} | {rate:g} | {'yes' if clipped else 'no'} | {start} | {len(alive)} of {len(mine)} | "
-                     f"{median} | {before} | {best} |")  # fmt: skip
+        lines.append(
+            f"| {name} | {rate:g} | {'yes' if clipped else 'no'} | {start} | {len(alive)} of {len(mine)} | "
+            f"{median} | {before} | {best} |"
+        )
     return "\n".join(lines)
 
 
 def main() -> None:
     """Print the table of docs/learned.md for the bundled clients."""
-    from coopoc import load
+    from coopoc import load_fleet
 
-    fleet, ways = load("town10-clients"), [
-        (name, rate, clipped, gain)
-        for rate, clipped in ((0.3, False), (0.3, True), (1e-3, True)) for gain in (None, 0.1) for name in OPTIMISERS
-    ]  # fmt: skip
+    fleet, ways = (
+        load_fleet("town10-clients"),
+        [
+            (name, rate, clipped, gain)
+            for rate, clipped in ((0.3, False), (0.3, True), (1e-3, True))
+            for gain in (None, 0.1)
+            for name in OPTIMISERS
+        ],
+    )
     jobs = [(way, seed) for way in ways for seed in range(3)]
     bar = tqdm(jobs, desc="literal training", unit="run", file=sys.stderr)
     print(table([literal(fleet, n, r, clipped=c, start_gain=g, seed=seed) for (n, r, c, g), seed in bar]))

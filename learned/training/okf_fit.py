@@ -1,4 +1,4 @@
-"""fit_okf: train the nine numbers of an OptimisedKF on all pieces at once, in double precision."""
+"""fit_okf: train the nine parameters of an OptimisedKF on all segments at once, in double precision."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torch import Tensor
 
 from coopoc.world.noise import stream
 
-from ..nets.okf import NoiseNumbers, OptimisedKF, scan
-from .clients import Batch, Pieces
+from ..nets.okf import NoiseParameters, OptimisedKF, scan
+from .clients import Batch, Segments
 from .machine import one_core, watched
 from .schedule import generator
 
@@ -22,7 +22,7 @@ from .schedule import generator
 class OkfFit:
     """A trained filter, its validation loss per check, m^2, and the training seconds."""
 
-    model: NoiseNumbers
+    model: NoiseParameters
     validation_loss: tuple[float, ...]
     seconds: float
 
@@ -32,14 +32,17 @@ class OkfFit:
         return self.model.method("okf")
 
 
-def fit_okf(training: Pieces, validation: Pieces, steps: int = 300, velocity_part: bool = True) -> OkfFit:
-    """Train the noise numbers by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
+def fit_okf(training: Segments, validation: Segments, steps: int = 300, velocity_part: bool = True) -> OkfFit:
+    """Train the noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
 
     The estimates depend on ratios of variances only, so the loss cannot see a common factor per axis; that factor is
     set afterwards so that the training innovations have the variance that the filter claims for them.
 
     Args:
-        training, validation: pieces. steps: of Adam on all training pieces. velocity_part: train b too, else b = 0.
+        training: segments to train on.
+        validation: segments that select the parameters.
+        steps: of Adam on all training segments.
+        velocity_part: train b too, else b = 0.
 
     >>> from coopoc.learned.training.clients import clients
     >>> from coopoc.world.fleet import Fleet
@@ -52,10 +55,13 @@ def fit_okf(training: Pieces, validation: Pieces, steps: int = 300, velocity_par
 
 @one_core()
 def fit_okf_many(
-    tasks: Sequence[tuple[Pieces, Pieces]], steps: int = 300, velocity_part: bool = True, progress: str | None = None
+    tasks: Sequence[tuple[Segments, Segments]],
+    steps: int = 300,
+    velocity_part: bool = True,
+    progress: str | None = None,
 ) -> list[OkfFit]:
     """`fit_okf` for many settings, stacked; `progress` names the stage of a progress bar on stderr."""
-    began, like = time.perf_counter(), NoiseNumbers(velocity_part)
+    began, like = time.perf_counter(), NoiseParameters(velocity_part)
     data, judge = (_stacked([task[i] for task in tasks], kind) for i, kind in enumerate(("training", "validation")))
     logs = like.logs.detach().double().flatten().repeat(len(tasks), 1).requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
@@ -64,34 +70,28 @@ def fit_okf_many(
     for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
-                found = _loss(like.numbers(logs), *judge)
+                found = _loss(like.stds(logs), *judge)
             better = found < lowest
             best[better], lowest[better] = logs.detach()[better], found[better]
             history.append(found.tolist())
         adam.zero_grad()
-        _loss(like.numbers(logs), *data).sum().backward()
+        _loss(like.stds(logs), *data).sum().backward()
         adam.step()
         fall.step()
     with torch.no_grad():
-        best = best.view(-1, 3, 3) + _calibration(like.numbers(best), *data)[:, None].log()
+        best = best.view(-1, 3, 3) + _calibration(like.stds(best), *data)[:, None].log()
     seconds = (time.perf_counter() - began) / len(tasks)
-    return [OkfFit(_of(row, velocity_part), tuple(h), seconds)
-            for row, h in zip(best, zip(*history, strict=True), strict=True)]  # fmt: skip
+    return [
+        OkfFit(like.with_logs(row), tuple(h), seconds) for row, h in zip(best, zip(*history, strict=True), strict=True)
+    ]
 
 
-def _of(logs: Tensor, velocity_part: bool) -> NoiseNumbers:
-    made = NoiseNumbers(velocity_part)
-    with torch.no_grad():
-        made.logs.copy_(logs)
-    return made
-
-
-def _stacked(parts: Sequence[Pieces], kind: str) -> tuple[Batch, Tensor]:
+def _stacked(parts: Sequence[Segments], kind: str) -> tuple[Batch, Tensor]:
     """All pieces of S settings in float64, and their weight (S, B) in the mean, 0 for padding.
 
     New noise is drawn once, the same for every setting and another for training than for validation.
     """
-    pool, most = Pieces.join(parts), max(map(len, parts))
+    pool, most = Segments.join(parts), max(map(len, parts))
     ends = np.cumsum([len(p) for p in parts])
     rows = [np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)]
     index = torch.from_numpy(np.stack(rows))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -13,7 +11,9 @@ from torch import Tensor
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
-from coopoc.kernels.compile import numba_is_there
+from coopoc.learned.engine.arguments import Found, Moments, Update
+
+from ..engine import optimiser
 
 Epoch = Literal["step", "pass"]
 
@@ -27,7 +27,7 @@ class Schedule:
     epoch: Epoch = "step"
     """"step": one optimiser step on one random batch, as KalmanNet's published loop counts. "pass": all the data."""
     batch: int = 2
-    """Pieces per step. The paper's 1 is as accurate and takes half as long again (docs/learned.md)."""
+    """Segments per step. The paper's 1 is as accurate and takes half as long again (docs/learned.md)."""
     learning_rate: float = 1e-3
     """Of AdamW, falling to zero as a half cosine. The paper's 0.3 does not train (docs/learned.md)."""
     weight_decay: float = 0.3
@@ -64,7 +64,7 @@ class Schedule:
 
 
 class Moving(NamedTuple):
-    """What training changes, S models in rows (S, P): weights, where these began, mean gradient, mean square."""
+    """State of the optimiser for S models in rows (S, P): weights, their start, mean gradient, mean square."""
 
     theta: Tensor
     began: Tensor
@@ -83,67 +83,35 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
     return factors
 
 
-def clip(gradient: Tensor, limit: float) -> Tensor:
-    """Gradients (S, P), each scaled to a norm of at most `limit`.
-
-    >>> clip(torch.tensor([[3.0, 4.0]]), 1.0).norm().round(decimals=3).item()
-    1.0
-    """
-    norm = torch.linalg.vector_norm(gradient, dim=1, keepdim=True)
-    return gradient * torch.clamp(limit / (norm + 1e-6), max=1.0)
-
-
-def adamw(
-    theta: Tensor, gradient: Tensor, first: Tensor, second: Tensor, step: int, rate: Tensor, decay: float
-) -> None:
-    """One AdamW step in place for S models: theta, gradient and moments (S, P), step >= 1, rate (S, 1).
-
-    Row by row the same as `torch.optim.AdamW` (beta 0.9, 0.999); stacked, because rows may end at different steps.
-
-    Source: Loshchilov and Hutter, ICLR 2019, algorithm 2.
-    """
-    theta.mul_(1.0 - rate * decay)
-    first.lerp_(gradient, 0.1)
-    second.lerp_(gradient.square(), 0.001)
-    size = (second / (1.0 - 0.999**step)).sqrt_().add_(1e-8)
-    theta.addcdiv_(first * (-rate / (1.0 - 0.9**step)), size)
-
-
 def advance(
-    theta: Tensor, gradient: Tensor, began: Tensor, first: Tensor, second: Tensor, losses: Tensor,
-    rows: Sequence[int], step: int, rates: Sequence[float], schedule: Schedule,
-) -> Tensor:  # fmt: skip
-    """One optimiser step in place for `rows` of theta and moments (S, P); whether each could be taken, (R,) booleans.
+    moving: Moving, gradient: Tensor, losses: Tensor, rows: Ints, step: int, rates: Floats, schedule: Schedule
+) -> Tensor:
+    """One optimiser step in place for `rows` of the weights and moments; whether each was taken, (R,) booleans.
 
     The gradient of the penalties gamma ||theta||^2 + mu / 2 ||theta - began||^2 is added, the sum clipped, and AdamW
-    moves the weights; a row whose loss or gradient is not finite stays as it is. Compiled where numba is installed.
+    (beta 0.9, 0.999) moves the weights; a row whose loss or gradient is not finite does not change.
 
     Args:
-        gradient, losses: (R, P) and (R,) of the rows. began: (S, P), where training started. step: >= 1.
+        moving: weights and moments (S, P).
+        gradient: (R, P).
+        losses: (R,).
+        rows: (R,) models to move.
+        step: number of the step, >= 1.
+        rates: (R,) learning rates.
+        schedule: decay, penalties, clipping.
+
+    References:
+        Loshchilov and Hutter, ICLR 2019, algorithm 2.
     """
-    if engine := _compiled():
-        finite = np.empty(len(rows), np.bool_)
-        engine.advance(*(a.numpy() for a in (theta, gradient, began, first, second, losses)), np.array(rows), step,
-                       np.array(rates), float(schedule.weight_decay), float(schedule.l2), float(schedule.proximal),
-                       float(schedule.clip), finite)  # fmt: skip
-        return torch.from_numpy(finite)
-    good = losses.isfinite() & gradient.isfinite().all(1)
-    at = torch.tensor(rows)[good]
-    mine, m, v = theta[at], first[at], second[at]
-    rate = torch.tensor(rates, dtype=theta.dtype)[good, None]
-    pulled = gradient[good] + 2 * schedule.l2 * mine + schedule.proximal * (mine - began[at])
-    adamw(mine, clip(pulled, schedule.clip), m, v, step, rate, schedule.weight_decay)
-    theta[at], first[at], second[at] = mine, m, v
-    return good
+    found = Found(gradient.numpy(), losses.numpy(), np.empty(len(rows), np.bool_))
+    optimiser.advance(Moments(*(a.numpy() for a in moving)), found, update_of(rows, step, rates, schedule))
+    return torch.from_numpy(found.finite)
 
 
-def _compiled() -> ModuleType | None:
-    """The compiled step; None where numba is missing."""
-    if not numba_is_there("AdamW runs in torch, several times slower than compiled"):
-        return None
-    from ..engine import optimiser
-
-    return optimiser
+def update_of(rows: Ints, step: int, rates: Floats, schedule: Schedule) -> Update:
+    """The step as the compiled optimiser takes it."""
+    law = schedule.weight_decay, schedule.l2, schedule.proximal, schedule.clip
+    return Update(rows, step, rates, *map(float, law))
 
 
 def generator(draw: np.random.Generator) -> torch.Generator:

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from coopoc.evaluate.metrics import max_error, rt_le
-from coopoc.methods.gnss import Gnss
+from coopoc.methods.gnss import GNSS
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.kalman import Kalman
+from coopoc.study.pivot import pivot
 from coopoc.study.results import Results
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table
@@ -24,7 +25,7 @@ from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
-METHODS: dict[str, Any] = {"gnss": Gnss, "kalman": Kalman, "joint": JointFilter}
+METHODS: dict[str, Any] = {"gnss": GNSS, "kalman": Kalman, "joint": JointFilter}
 
 
 def circle() -> Fleet:
@@ -64,10 +65,17 @@ def cell(p: Params) -> list[Row]:
     track = METHODS[p["method"]]()(recording(p["max_neighbours"], p["runs"], p["seed"]), egos=p["egos"])
     error, worst = rt_le(track, circle()), max_error(track, circle())
     return [
-        {"run": r, "ego": circle().ids[ego], "rt_le_m": error[r, e], "max_error_m": worst[r, e],
-         "bytes_per_second": track.received_bytes[r, e] / 4.0, "seconds": time.perf_counter() - began}
-        for e, ego in enumerate(p["egos"]) for r in range(p["runs"])
-    ]  # fmt: skip
+        {
+            "run": r,
+            "ego": circle().ids[ego],
+            "rt_le_m": error[r, e],
+            "max_error_m": worst[r, e],
+            "bytes_per_second": track.received_bytes[r, e] / 4.0,
+            "seconds": time.perf_counter() - began,
+        }
+        for e, ego in enumerate(p["egos"])
+        for r in range(p["runs"])
+    ]
 
 
 def key(p: Params) -> dict[str, Any]:
@@ -78,7 +86,7 @@ def key(p: Params) -> dict[str, Any]:
 
 def table(results: Results) -> Table:
     """RT-LE against neighbours."""
-    return results.table("max_neighbours", "method", "rt_le_m", caption="RT-LE [m] at a GNSS noise of 3.5 m.")
+    return pivot(results, "max_neighbours", "method", "rt_le_m", caption="RT-LE [m] at a GNSS noise of 3.5 m.")
 
 
 def figure(results: Results) -> Any:
@@ -89,13 +97,19 @@ def figure(results: Results) -> Any:
 
 
 STUDY = Study(
-    name="small", question="What is a neighbour worth on a circle?", cell=cell, key=key,
+    name="small",
+    question="What is a neighbour worth on a circle?",
+    cell=cell,
+    key=key,
     grid={"max_neighbours": (0, 1, 2), "method": tuple(METHODS)},
     settings={"runs": 4, "seed": 0, "egos": (0, 2), "pause": 0.0, "trouble": "no such file", "data": "circle"},
-    shares=("max_neighbours",), tables={"rt_le": table}, figures={"rt_le": figure},
+    shares=("max_neighbours",),
+    tables={"rt_le": table},
+    figures={"rt_le": figure},
     findings=lambda r: [f"KF: {r.interval('rt_le_m', method='kalman', max_neighbours=0)} m."],
-    recipe=lambda r: {"training": "none: nothing here learns"}, limitations=("Nobody drives in circles.",),
-)  # fmt: skip
+    recipe=lambda r: {"training": "none: nothing here learns"},
+    limitations=("No vehicle drives in circles.",),
+)
 
 
 def greet(name: str = "you") -> int:

@@ -4,30 +4,27 @@ The expressions (see `symbolic`) are differentiated once per structure; measurem
 parameters, so that the next problem of the structure pays for its solution only. Poses are steps in a chart around a
 centre that moves to each answer until the step is below the tolerance.
 
-Three methods. "ipopt" is an interior-point method: robust, the one for inequalities and for many unknowns. "fatrop"
-is the same algorithm with dense elimination, which takes a fifth of the time for a star; without inequalities it ends
-in the same minimum, with them it often does not end and is refused. "sqp" solves quadratic programmes by an active-set
-method (qrqp), first with J^T J, which is never indefinite, then with the exact Hessian; it may end in another minimum.
-"auto" takes fatrop where that is at its best and ipopt elsewhere. Where an answer fails the checks of `solve`, ipopt
-has another try (see `second`).
+Two methods. "ipopt" is an interior-point method: robust, the one for inequalities and for many unknowns. "fatrop" is
+the same algorithm with dense elimination, which takes a fifth of the time for a star; without inequalities it ends in
+the same minimum, with them it often does not end and is refused. "auto" takes fatrop where that is at its best and
+ipopt elsewhere. Where an answer fails the checks of `solve`, ipopt has another try (see `fallback`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
+from ...plugins import unknown
 from ..active import steerable
+from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..problem import Problem
-from ..symbolic import Structure, numbers_of, structure_of
-from .casadi_programme import Programme, Solver, programme
-from .run import Ended, Run
+from ..symbolic import LOSSES, Structure, numbers_of, structure_of
+from .casadi_programme import NlpSolver, Programme, programme
 
 DENSE = 200
 """Numbers that can move up to which fatrop is faster than ipopt: 2.0 against 3.8 ms for 165 of a window, 6.6 against
@@ -35,27 +32,23 @@ DENSE = 200
 ROUNDS = 10
 """How often the chart of the poses is moved."""
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
-"""What CasADi says where another chart would not help."""
-METHODS = ("auto", "fatrop", "ipopt", "sqp")
-NO_SIDES = np.empty(0), np.empty(0)
+"""Statuses of CasADi after which another chart would not help."""
+METHODS = ("auto", "fatrop", "ipopt")
 
 
-def build(
-    problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, method: str = "auto",
-    codegen: bool = False,
-) -> Run:  # fmt: skip
-    """Solver of one problem.
+def prepare(
+    structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, method: str = "auto"
+) -> Solver:
+    """Solver of a structure.
 
     Args:
-        max_iterations: of the method's own. tolerance: m or rad, step of a pose below which its chart is kept.
-        method: "auto", "fatrop", "ipopt" or "sqp".
-        codegen: compile the derivatives with gcc. It buys little: of 200 us for a star of 10 it takes 45, of 2.8 ms for
-            a window of 10 steps (sqp 9.4 ms) 0.5 ms (4.7 ms), after 2 s and 27 s of compilation (sqp 81 s). Only long
-            runs over one structure repay it.
+        structure: a problem whose structure counts, and which of its constraints are equalities.
+        max_iterations: of the method's own.
+        tolerance: m or rad, step of a pose below which its chart is kept.
+        method: "auto", "fatrop" or "ipopt".
 
     Raises:
-        InputError: an unknown method, inequalities for fatrop, a truncated loss, more equalities than numbers that can
-            move, no gcc to compile.
+        InputError: an unknown method, inequalities for fatrop, more equalities than numbers that can move.
 
     >>> from coopoc.optimize import solve
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -64,24 +57,33 @@ def build(
     """
     check_limits(max_iterations, tolerance)
     if method not in METHODS:
-        raise InputError("method", repr(method), f"must be one of {METHODS}", "Leave it out for auto.")
-    structure, sides = structure_of(problem), _sides(problem)
+        raise unknown("method", method, METHODS)
+    form, sides = structure_of(structure), _sides(structure)
     if method == "fatrop" and not np.array_equal(*sides):
         raise InputError("method", repr(method), "does not hold inequalities", "Leave it out: ipopt takes those.")
-    equal, moving = int((sides[0] == sides[1]).sum()), int(structure.free.sum())
+    equal, moving = int((sides[0] == sides[1]).sum()), int(form.movable.sum())
     if equal > moving:
-        raise InputError("constraints", f"{equal} equalities", f"must be at most the {moving} numbers that can move",
-                         "Leave out those that follow from the others.")  # fmt: skip
-    if not moving:
-        return lambda x: Ended(x, 0)
-    found = programme(structure, _chosen(structure, sides, method), int(max_iterations), bool(codegen))
-    return lambda x: _run(found, problem, sides, x, tolerance)
+        raise InputError(
+            "constraints",
+            f"{equal} equalities",
+            f"must be at most the {moving} numbers that can move",
+            "Leave out those that follow from the others.",
+        )
+    found = programme(form, _chosen(form, sides, method), int(max_iterations))
+
+    def solver(problem: Problem, x: Floats) -> SolverResult:
+        numbers, nlp = _numbers(problem, x), NlpSolver(found.solver)
+        parts = (problem.pick(b) if problem.batch else problem for b in range(len(x)))
+        each = [_run(found, nlp, *given, sides, tolerance) for given in zip(parts, numbers, x, strict=True)]
+        counts, hopeless = (np.array([getattr(e, name) for e in each]) for name in ("iterations", "infeasible"))
+        return SolverResult(np.stack([e.x for e in each]), counts, hopeless, each[0].extras)
+
+    return solver
 
 
-def second(problem: Problem, options: dict[str, Any]) -> dict[str, Any] | None:
+def fallback(problem: Problem, options: dict[str, Any]) -> dict[str, Any] | None:
     """The options with which `solve` tries again where an answer fails its checks: ipopt's, None where it was that."""
-    structure = structure_of(problem)
-    if not structure.free.any() or _chosen(structure, _sides(problem), options.get("method", "auto")) == "ipopt":
+    if _chosen(structure_of(problem), _sides(problem), options.get("method", "auto")) == "ipopt":
         return None
     return {**options, "method": "ipopt"}
 
@@ -90,63 +92,39 @@ def _chosen(structure: Structure, sides: tuple[Floats, Floats], method: str) -> 
     """What "auto" takes."""
     if method != "auto":
         return method
-    return "fatrop" if structure.free.sum() <= DENSE and np.array_equal(*sides) else "ipopt"
+    return "fatrop" if structure.movable.sum() <= DENSE and np.array_equal(*sides) else "ipopt"
 
 
-def each(
-    problem: Problem, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE,
-    method: str = "auto", codegen: bool = False,
-) -> list[Ended]:  # fmt: skip
-    """`build` of B realisations without constraints, from x (B, n, width): points share all but the solution."""
-    structure = structure_of(problem)
-    if problem.space.turning or not structure.free.any():
-        parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
-        return [build(part, max_iterations, tolerance, method, codegen)(a) for part, a in zip(parts, x, strict=True)]
-    build(problem, max_iterations, tolerance, method, codegen)  # checks the options
-    found = programme(structure, _chosen(structure, NO_SIDES, method), int(max_iterations), bool(codegen))
-    numbers, solvers = _numbers(problem, x), found.ready()
-    return [_once(found, solvers, given, NO_SIDES, a, NO_SIDES[0])[0] for given, a in zip(numbers, x, strict=True)]
-
-
-def _run(found: Programme, problem: Problem, sides: tuple[Floats, Floats], x: Floats, tolerance: float) -> Ended:
-    """Solve around x, and for poses again around the answer until it stays."""
+def _run(
+    found: Programme,
+    nlp: NlpSolver,
+    problem: Problem,
+    numbers: Floats,
+    x: Floats,
+    sides: tuple[Floats, Floats],
+    tolerance: float,
+) -> SolverResult:
+    """Solve around x (n, ambient), and for poses again around the answer until it stays."""
+    space, free, count, rounds = found.structure.space, found.structure.movable, 0, 0
     multipliers: Floats = np.zeros(len(sides[0]))
-    solvers, count = found.ready(), 0
-    for rounds in range(1, ROUNDS + 1):
-        ended, multipliers = _once(found, solvers, _numbers(problem, x[None])[0], sides, x, multipliers)
-        count += ended.iterations
-        ended = replace(ended, iterations=count, extras=ended.extras | {"rounds": rounds})
-        still = np.abs(ended.x - x).max(initial=0.0) <= tolerance
-        if not found.structure.space.turning or still or ended.extras["return_status"] in HOPELESS:
+    while rounds < ROUNDS:
+        at, multipliers, iterations, status = nlp(np.zeros(int(free.sum())), numbers, sides, multipliers)
+        before, step, count, rounds = x, np.zeros(free.shape), count + iterations, rounds + 1
+        step[free] = at
+        if np.isfinite(at).all():
+            x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
+        if not space.has_rotation or status in HOPELESS or np.abs(x - before).max(initial=0.0) <= tolerance:
             break
-        x = ended.x
-    return ended
+        numbers = _numbers(problem, x[None])[0]
+    extras = {"method": found.method, "return_status": status, "rounds": rounds}
+    return SolverResult(x, count, status == HOPELESS[0], extras)
 
 
 def _numbers(problem: Problem, x: Floats) -> Floats:
-    """(B, .) the parameters around x (B, n, width), and last by what the cost is multiplied: 1 / max diag J^T J."""
+    """(B, .) the parameters around x (B, n, ambient), and last by what the cost is multiplied: 1 / max diag J^T J."""
     numbers = numbers_of(problem, x)
     curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
     return np.append(numbers, 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
-
-
-def _once(
-    found: Programme, solvers: Sequence[Solver], numbers: Floats, sides: tuple[Floats, Floats], x: Floats,
-    multipliers: Floats,
-) -> tuple[Ended, Floats]:  # fmt: skip
-    """Where the solvers end, and the multipliers."""
-    space, free = found.structure.space, found.structure.free
-    at: Floats = np.zeros(int(free.sum()))
-    count, said = 0, ""
-    for solver in solvers:
-        at, multipliers, iterations, said = solver(at, numbers, sides, multipliers)
-        count += iterations
-    step = np.zeros(free.shape)
-    step[free] = at
-    if np.isfinite(step).all():
-        x = space.retract(x, _exponential(step, space.dimension) if space.turning else step)
-    extras = {"method": found.method, "return_status": said, "rounds": 1}
-    return Ended(x, count, extras, said == HOPELESS[0]), multipliers
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
@@ -164,3 +142,13 @@ def _exponential(step: Floats, dimension: int) -> Floats:
     half = 0.5 * np.linalg.norm(w, axis=-1, keepdims=True)
     ratio = np.where(half > 1e-9, np.arctan(half) / np.where(half > 1e-9, half, 1.0), 1.0)
     return np.concatenate([step[:, :dimension], ratio * w], axis=-1)
+
+
+BACKEND = Backend(
+    "casadi",
+    prepare,
+    "nonlinear programming by FATROP or IPOPT, any constraints",
+    "casadi",
+    Capabilities(batched=True, losses=tuple(LOSSES), constraints="all"),
+    fallback,
+)

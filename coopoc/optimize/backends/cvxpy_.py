@@ -10,86 +10,72 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
+from ...plugins import unknown
+from ..backend import Backend, Capabilities, Solver, SolverResult, looped
 from ..convex.certificate import lower_bound
-from ..convex.qcqp import Multipliers, Quadratic
-from ..convex.quadratic import quadratic
-from ..convex.relaxation import first_vectors, framed, in_balls, polished, rounded, small
+from ..convex.qcqp import Multipliers
+from ..convex.quadratic import TERMS, quadratic
+from ..convex.relaxation import first_vectors, polished, rounded, small
 from ..convex.schur import Dense
 from ..linear import entries
 from ..problem import Problem
-from .gauss_newton import build as gauss_newton
-from .run import Ended, Run
+from . import gauss_newton
 
-RELAXATIONS = ("auto", "qp", "socp", "sdp")
+RELAXATIONS = ("auto", "qp", "sdp")
 SOLVER = {"solver": "CLARABEL", "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10, "max_threads": 1}
 
 
-def build(problem: Problem, relaxation: str = "auto", refine: bool = True) -> Run:
-    """Solver of one problem.
+def prepare(structure: Problem, relaxation: str = "auto", refine: bool = True) -> Solver:
+    """Solver of a structure.
 
     Args:
-        relaxation: "qp" (linear problems), "sdp" (Shor) or "socp" (balls in place of spheres); "auto": qp, else sdp.
+        structure: a problem whose structure counts.
+        relaxation: "qp" (linear problems) or "sdp" (Shor); "auto": qp, else sdp.
         refine: from the rounded point to a minimum; without it the answer is the relaxation's own. A qp needs none.
 
     Raises:
         InputError: an unknown relaxation, or a problem that it cannot take: it lists what it can.
     """
     if relaxation not in RELAXATIONS:
-        raise InputError("relaxation", repr(relaxation), f"must be one of {RELAXATIONS}", "Leave it out for auto.")
-    if relaxation == "auto":
-        relaxation = "qp" if problem.linear and not problem.poses else "sdp"
-    if relaxation == "qp":
-        if not problem.linear or problem.poses:
-            raise InputError("relaxation", "'qp'", "needs points and only position and displacement", "Use sdp.")
-        return lambda x: _linear(problem, x[None])[0]
-    form = small(quadratic(problem))
-    relax = _balls(framed(form)) if relaxation == "socp" else _semidefinite(form)
-
-    def run(x: Floats) -> Ended:
-        began = time.perf_counter()
-        reduced = Dense(form)
-        X, bound, gap, count = relax(reduced)
-        found = rounded(problem, form, reduced, X, bound, gap, began, refine=False)
-        extras = {"relaxation": relaxation, "lower_bound": found.lower_bound, "rank_gap": found.rank_gap,
-                  "rounded_cost": found.cost, "refined": refine}  # fmt: skip
-        x = gauss_newton(problem)(polished(problem, form, reduced, found.x)[0]).x if refine else found.x
-        return Ended(x, count, extras)
-
-    return run
+        raise unknown("relaxation", relaxation, RELAXATIONS)
+    convex = structure.linear and not structure.poses
+    if relaxation == "qp" and not convex:
+        raise InputError("relaxation", "'qp'", "needs points and only position and displacement", "Use sdp.")
+    return _linear if convex and relaxation != "sdp" else looped(partial(_relaxed, refine))
 
 
-def _semidefinite(form: Quadratic) -> Callable[[Dense], tuple[Floats, float, float, int]]:
-    """X of rank d, lower bound, rank gap and iterations of Shor's relaxation."""
-    programme = _sdp(form.stiefel.shape, form.sphere.shape)
+def _relaxed(refine: bool, problem: Problem, x: Floats) -> SolverResult:
+    """Shor's relaxation, rounded and, if `refine`, followed to a minimum; x is not looked at."""
+    began, form = time.perf_counter(), small(quadratic(problem))
+    reduced = Dense(form)
+    stiefel, sphere, Z, count = _sdp(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
+    bound, *_ = lower_bound(reduced, Multipliers(form, stiefel, sphere))
+    found = rounded(problem, form, reduced, *first_vectors(Z, form.columns), bound, began, refine=False)
+    extras = {
+        "relaxation": "sdp",
+        "lower_bound": found.lower_bound,
+        "rank_gap": found.rank_gap,
+        "rounded_cost": found.cost,
+        "refined": refine,
+    }
+    if not refine:
+        return SolverResult(found.x, count, extras=extras)
+    near = polished(problem, form, reduced, found.x)[0]
+    return SolverResult(gauss_newton.prepare(problem)(problem, near[None]).x[0], count, extras=extras)
 
-    def relax(reduced: Dense) -> tuple[Floats, float, float, int]:
-        stiefel, sphere, Z, count = programme(reduced.matrix)
-        bound, *_ = lower_bound(reduced, Multipliers(form, stiefel, sphere))
-        X, gap = first_vectors(Z, form.columns)
-        return X, bound, gap, count
 
-    return relax
-
-
-def each(problem: Problem, x: Floats, relaxation: str = "auto", refine: bool = True) -> list[Ended]:
-    """`build` of B realisations from x (B, n, width): linear problems share all but the solution."""
-    if problem.linear and not problem.poses and relaxation in ("auto", "qp"):
-        return _linear(problem, x)
-    parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
-    return [build(part, relaxation, refine)(start) for part, start in zip(parts, x, strict=True)]
-
-
-def _linear(problem: Problem, x: Floats) -> list[Ended]:
-    """Of x (B, n, width) only what is held counts: the programmes begin away from it, as it may be the answer."""
+def _linear(problem: Problem, x: Floats) -> SolverResult:
+    """Quadratic programmes; of x (B, n, ambient) only what is fixed counts: they begin away from it, as it may be the
+    answer."""
     batch, n, d = x.shape
-    free = np.ones((n, d), dtype=bool) if problem.free is None else problem.free
+    free = np.ones((n, d), dtype=bool) if problem.movable is None else problem.movable
     moved = np.where(free, x.mean(axis=1, keepdims=True), x)
     linear = problem.linearise(moved)
     data, row, col = entries(linear, problem.factors, d)
@@ -98,8 +84,8 @@ def _linear(problem: Problem, x: Floats) -> list[Ended]:
     solve = _qp(rest.shape[1], int(free.sum()), row[kept].tobytes(), place[col[kept]].tobytes())
     steps = [solve(*given) for given in zip(data[:, kept], rest, strict=True)]
     moved[:, free] += np.stack([step for step, _ in steps])
-    extras = {"relaxation": "qp", "refined": False}
-    return [Ended(end, count, dict(extras)) for end, (_, count) in zip(moved, steps, strict=True)]
+    counts = np.array([count for _, count in steps])
+    return SolverResult(moved, counts, extras={"relaxation": "qp", "refined": False})
 
 
 def _cvxpy() -> Any:
@@ -145,38 +131,20 @@ def _sdp(stiefel: tuple[int, int], sphere: tuple[int, int]) -> Callable[[Floats]
         programme.solve(**SOLVER)
         duals = np.array([block.dual_value for block in blocks]).reshape(n, k, k)
         spheres = np.zeros(0) if units is None else np.asarray(units.dual_value)
-        return (-scale * 0.5 * (duals + np.swapaxes(duals, 1, 2)), -scale * spheres, np.asarray(Z.value),
-                int(programme.solver_stats.num_iters))  # fmt: skip
+        return (
+            -scale * 0.5 * (duals + np.swapaxes(duals, 1, 2)),
+            -scale * spheres,
+            np.asarray(Z.value),
+            int(programme.solver_stats.num_iters),
+        )
 
     return run
 
 
-def _balls(form: Quadratic) -> Callable[[Dense], tuple[Floats, float, float, int]]:
-    """The same of the ball relaxation: min 1/2 <C, [I; s] [I; s]^T> over |s_e| <= 1."""
-    programme = _socp(form.stiefel.size, form.columns, form.sphere.shape)
-
-    def relax(reduced: Dense) -> tuple[Floats, float, float, int]:
-        s, count = programme(reduced.matrix)
-        return *in_balls(form, reduced, s), count
-
-    return relax
-
-
-@lru_cache(maxsize=64)
-def _socp(frame: int, columns: int, sphere: tuple[int, int]) -> Callable[[Floats], tuple[Floats, int]]:
-    cp = _cvxpy()
-
-    m, q = sphere
-    root = cp.Parameter((frame + m * q, frame + m * q))
-    s = cp.Variable((m * q, columns))
-    balls = [cp.norm(s[q * e : q * e + q], "fro") <= 1 for e in range(m)]
-    residual = root[:, :frame] @ np.eye(frame, columns) + root[:, frame:] @ s
-    programme = cp.Problem(cp.Minimize(0.5 * cp.sum_squares(residual)), balls)
-
-    def run(cost: Floats) -> tuple[Floats, int]:
-        values, vectors = np.linalg.eigh(cost)
-        root.value = np.sqrt(np.maximum(values, 0.0) / max(float(values[-1]), 1e-300))[:, None] * vectors.T
-        programme.solve(**SOLVER)
-        return np.asarray(s.value), int(programme.solver_stats.num_iters)
-
-    return run
+BACKEND = Backend(
+    "cvxpy",
+    prepare,
+    "convex relaxations: the QP, Shor's SDP with a lower bound",
+    "cvxpy",
+    Capabilities(batched=True, kinds=tuple(TERMS), losses=()),
+)

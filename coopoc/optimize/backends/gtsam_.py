@@ -14,75 +14,65 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ...errors import InputError
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
+from ...plugins import unknown
+from ..backend import Backend, Capabilities, Solver, SolverResult, looped
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..linear import Linear
 from ..problem import Problem
 from .gtsam_forms import forms
-from .gtsam_native import estimate, hold, native_graph, values, which_turn
-from .gtsam_optimizers import OPTIMIZERS, all_native, graduation, levenberg_marquardt
-from .run import Ended, Run
+from .gtsam_native import estimate, fix_nodes, native_graph, values, which_turn
+from .gtsam_optimizers import OPTIMIZERS, all_native, gnc, levenberg_marquardt
 
 
-def build(
-    problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, optimizer: str = "elimination"
-) -> Run:
-    """Solver of one problem.
+def prepare(
+    structure: Problem,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+    optimizer: str = "elimination",
+) -> Solver:
+    """Solver of a structure.
 
     Args:
-        max_iterations: of linear solves. tolerance: m or rad, largest move of a node in the last step.
-        optimizer: "elimination" is Levenberg-Marquardt of ours with GTSAM's elimination, for every problem. "lm",
-            "dogleg" and "isam2" are GTSAM's own, for problems of its own factors only; the last step is "lm"'s, since
-            GTSAM's dogleg ends at a trust region of 1e-5. So is "gnc", graduated non-convexity for losses "truncated"
-            or "geman-mcclure" of one scale: it needs no good start to tell who is wrong; what has no loss is believed,
-            and extras["weights"] has (M,) weights of each factor's measurements.
+        structure: a problem whose structure counts.
+        max_iterations: of linear solves.
+        tolerance: m or rad, largest move of a node in the last step.
+        optimizer: "elimination" is our Levenberg-Marquardt with GTSAM's elimination, for every problem. "lm" is GTSAM's
+            own, for problems of its own factors only. "gnc" is its graduated non-convexity for losses "truncated" or
+            "geman-mcclure" of one scale, then "lm": it needs no good start to find the outliers; a factor without a
+            loss is a known inlier, and extras["weights"] has the weights (M,) of each factor's measurements.
 
     Raises:
-        InputError: an unknown optimizer, factors that it does not have (they are named).
+        InputError: an unknown optimizer, factors that GTSAM lacks (they are named).
     """
     check_limits(max_iterations, tolerance)
     if optimizer == "elimination":
-        step = linear_step(problem)
-
-        def run(x: Floats) -> Ended:
-            if problem.linear and max_iterations:
-                return Ended(one_step(problem, step, x[None])[0], 1)
-            end = descend(problem, step, x[None], max_iterations, tolerance)
-            return Ended(end.x[0], int(end.iterations[0]))
-
-        return run
+        step = linear_step(structure)
+        return lambda problem, x: minimise(problem, step, x, max_iterations, tolerance)
     if optimizer not in OPTIMIZERS:
-        known = ["elimination", *OPTIMIZERS]
-        raise InputError("optimizer", repr(optimizer), f"must be one of {known}", "Leave it out for elimination.")
-    return _optimising(problem, max_iterations, tolerance, optimizer)
+        raise unknown("optimizer", optimizer, OPTIMIZERS)
+    return looped(lambda problem, x: _optimised(problem, x, max_iterations, tolerance, optimizer))
 
 
-def _optimising(problem: Problem, max_iterations: int, tolerance: float, optimizer: str) -> Run:
-    said, posed, space = forms(problem), which_turn(problem), problem.space
-    all_native(problem, said, optimizer)
-    graph, keys = native_graph(problem, said).graph, range(len(problem.names))
-    hold(problem, graph)
-    graduate = graduation(problem, said) if optimizer == "gnc" else None
-
-    def run(x: Floats) -> Ended:
-        at, before, count = values(space, posed, x, keys), 0, 0
-        extras: dict[str, Any] = {}
-        advance = OPTIMIZERS[optimizer]
-        try:
-            if graduate is not None:
-                at, before, extras["weights"] = graduate(at, max_iterations)
-                x = estimate(space, posed, at, keys)
-            while count < max_iterations:
-                at, used = advance(graph, at, max_iterations - count)
-                last, x, count = x, estimate(space, posed, at, keys), count + used
-                if advance is levenberg_marquardt and np.abs(x - last).max(initial=0.0) <= tolerance:
-                    break
-                advance = levenberg_marquardt
-        except RuntimeError:  # a singular system: `solve` says which nodes are free
-            pass
-        return Ended(x, before + count, extras)
-
-    return run
+def _optimised(problem: Problem, x: Floats, max_iterations: int, tolerance: float, optimizer: str) -> SolverResult:
+    """The result of GTSAM's own optimiser from x (n, ambient)."""
+    forms_, posed, space = forms(problem), which_turn(problem), problem.space
+    all_native(problem, forms_, optimizer)
+    graph, keys = native_graph(problem, forms_).graph, range(len(problem.names))
+    fix_nodes(problem, graph)
+    at, before, count = values(space, posed, x, keys), 0, 0
+    extras: dict[str, Any] = {}
+    try:
+        if optimizer == "gnc":
+            at, before, extras["weights"] = gnc(problem, forms_)(at, max_iterations)
+            x = estimate(space, posed, at, keys)
+        while count < max_iterations:
+            at, used = levenberg_marquardt(graph, at, max_iterations - count)
+            last, x, count = x, estimate(space, posed, at, keys), count + used
+            if np.abs(x - last).max(initial=0.0) <= tolerance:
+                break
+    except RuntimeError:  # a singular system: `solve` names the nodes that are free
+        pass
+    return SolverResult(x, before + count, extras=extras)
 
 
 def linear_step(problem: Problem) -> Step:
@@ -91,10 +81,13 @@ def linear_step(problem: Problem) -> Step:
 
     unit, nothing = _units(), np.zeros(problem.space.dof)
     own = unit[problem.space.dof]
-    held = [] if problem.free is None else [(i, np.diag(1.0 - problem.free[i]))
-                                            for i in np.flatnonzero(~problem.free.all(axis=1)).tolist()]  # fmt: skip
+    fixed = (
+        []
+        if problem.movable is None
+        else [(i, np.diag(1.0 - problem.movable[i])) for i in np.flatnonzero(~problem.movable.all(axis=1)).tolist()]
+    )
     touched = tuple((f.nodes.shape[1], f.nodes.tobytes()) for f in problem.factors)
-    orderings = _orderings(touched, tuple(i for i, _ in held))
+    orderings = _orderings(touched, tuple(i for i, _ in fixed))
 
     def step(linear: Linear, damping: Floats) -> Floats:
         dx, rows = np.full_like(damping, np.nan), _rows(problem, linear)
@@ -102,7 +95,7 @@ def linear_step(problem: Problem) -> Step:
         for b in range(len(dx)):
             graph = gtsam.GaussianFactorGraph()
             _add(graph, rows, b, unit)
-            for i, root in (*held, *(enumerate(map(np.diag, np.sqrt(damping[b]))) if damped[b] else ())):
+            for i, root in (*fixed, *(enumerate(map(np.diag, np.sqrt(damping[b]))) if damped[b] else ())):
                 graph.add(i, root, nothing, own)
             if damped[b] not in orderings:  # what is damped has every node, even one without measurements
                 orderings[damped[b]] = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
@@ -126,7 +119,7 @@ def _units() -> dict[int, Any]:
 
 
 @lru_cache(maxsize=256)
-def _orderings(factors: tuple[tuple[int, bytes], ...], held: tuple[int, ...]) -> dict[bool, Any]:
+def _orderings(factors: tuple[tuple[int, bytes], ...], fixed: tuple[int, ...]) -> dict[bool, Any]:
     """Of the graphs of a structure, without and with damping, as they are found."""
     return {}
 
@@ -137,19 +130,32 @@ def _rows(problem: Problem, linear: Linear) -> list[tuple[list[list[int]], list[
     The derivatives are read-only: GTSAM's wrapper takes those a tenth faster.
     """
     found = []
-    for factor, residual, slopes in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
-        wide = [np.broadcast_to(slope, (*residual.shape, slope.shape[-1])) for slope in slopes]
+    for factor, residual, jacobians in zip(
+        problem.factors, linear.residual, linear.by_node(problem.factors), strict=True
+    ):
+        wide = [np.broadcast_to(jacobian, (*residual.shape, jacobian.shape[-1])) for jacobian in jacobians]
         found.append((factor.nodes.T.tolist(), wide, -residual))
     return found
 
 
 def _add(graph: Any, rows: list[tuple[list[list[int]], list[Floats], Floats]], b: int, unit: dict[int, Any]) -> None:
     """Realisation b of the rows as JacobianFactors."""
-    for nodes, slopes, goal in rows:
+    for nodes, jacobians, goal in rows:
         model = unit[goal.shape[-1]]
         if len(nodes) == 1:
-            for i, slope, rhs in zip(nodes[0], slopes[0][b], goal[b], strict=True):
-                graph.add(i, slope, rhs, model)
+            for i, jacobian, rhs in zip(nodes[0], jacobians[0][b], goal[b], strict=True):
+                graph.add(i, jacobian, rhs, model)
         else:
-            for i, first, j, second, rhs in zip(nodes[0], slopes[0][b], nodes[1], slopes[1][b], goal[b], strict=True):
+            for i, first, j, second, rhs in zip(
+                nodes[0], jacobians[0][b], nodes[1], jacobians[1][b], goal[b], strict=True
+            ):
                 graph.add(i, first, j, second, rhs, model)
+
+
+BACKEND = Backend(
+    "gtsam",
+    prepare,
+    "elimination by GTSAM, or its own Levenberg-Marquardt and GNC (optimizer=)",
+    "gtsam",
+    Capabilities(batched=True),
+)

@@ -29,7 +29,7 @@ Given: TypeAlias = Callable[[Any], list[tuple[Any, ...]]]
 
 
 class Part(NamedTuple):
-    """A GTSAM class that says a factor, or those of its residuals that `root` keeps.
+    """A GTSAM class that states a factor, or those of its residuals that `root` keeps.
 
     Args:
         root: (M or 1, k, k) S, square root of the information of its k errors.
@@ -80,7 +80,7 @@ def _inverse(raw: bytes) -> Floats:
 
 
 def pose_of(gtsam: Any, d: int, x: Floats) -> Any:
-    """gtsam.Pose2 or Pose3 of a pose (width,)."""
+    """gtsam.Pose2 or Pose3 of a pose (ambient,)."""
     if d == 2:
         return gtsam.Pose2(x[0], x[1], np.arctan2(x[4], x[2]))
     return gtsam.Pose3(gtsam.Rot3(x[3:].reshape(3, 3)), x[:3])
@@ -97,7 +97,7 @@ def _displacement(factor: Factor, W: Floats, d: int) -> Form:
 
 def _displacement_of_poses(factor: Factor, W: Floats, d: int) -> Form:
     """GTSAM's chord T_i - Z T_j with Z = (-z, I), whose translation is minus our residual."""
-    z = Space(d, turning=True).join(-factor.z)
+    z = Space(d, has_rotation=True).join(-factor.z)
     root = np.zeros((len(W), (d + 1) ** 2, (d + 1) ** 2))
     root[:, -d - 1 : -1, -d - 1 : -1] = W
     names: Names = {(POSE, POSE): f"FrobeniusLeftBetweenFactorPose{d}"}
@@ -133,7 +133,7 @@ def _body_spherical(factor: Factor, W: Floats, d: int) -> Form:
 
 
 def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
-    z = Space(d, turning=True).join(factor.z)
+    z = Space(d, has_rotation=True).join(factor.z)
     return _turned(W, {0: np.arange(d)}, lambda gtsam: [(pose_of(gtsam, d, each),) for each in z], d)
 
 
@@ -183,7 +183,7 @@ def _turned(W: Floats, columns: dict[int, Any], given: Given, d: int) -> Form:
 def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     if not _apart(W, d):
         return "its std must not couple position and rotation"
-    turned = Space(d, turning=True).rotation(factor.z)
+    turned = Space(d, has_rotation=True).rotation(factor.z)
     back = np.swapaxes(turned, -1, -2)
 
     def rotation(gtsam: Any) -> list[tuple[Any, ...]]:
@@ -192,8 +192,10 @@ def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     def position(gtsam: Any) -> list[tuple[Any, ...]]:
         return list(zip(factor.z[:, :d], strict=True))
 
-    return [Part({(POSE,): f"PoseTranslationPrior{d}D"}, position, W[:, :d, :d] @ back),
-            Part({(POSE,): f"PoseRotationPrior{d}D"}, rotation, W[:, d:, d:])]  # fmt: skip
+    return [
+        Part({(POSE,): f"PoseTranslationPrior{d}D"}, position, W[:, :d, :d] @ back),
+        Part({(POSE,): f"PoseRotationPrior{d}D"}, rotation, W[:, d:, d:]),
+    ]
 
 
 def _chordal_prior(factor: Factor, W: Floats, d: int) -> Form:
@@ -217,10 +219,18 @@ def _apart(W: Floats, d: int) -> bool:
 
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
-    "position": _position, "displacement": _displacement, "range": _range, "speed": _range, "bearing": _bearing,
-    "body_spherical": _body_spherical, "relative_position": _relative_position, "relative_pose": _relative_pose,
-    "relative_pose_chordal": _relative_chordal, "pose": _pose_prior, "pose_chordal": _chordal_prior,
-}  # fmt: skip
+    "position": _position,
+    "displacement": _displacement,
+    "range": _range,
+    "speed": _range,
+    "bearing": _bearing,
+    "body_spherical": _body_spherical,
+    "relative_position": _relative_position,
+    "relative_pose": _relative_pose,
+    "relative_pose_chordal": _relative_chordal,
+    "pose": _pose_prior,
+    "pose_chordal": _chordal_prior,
+}
 """(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 OF_POSES = {"displacement": _displacement_of_poses}
 """The same where all nodes are poses and points would need another class."""

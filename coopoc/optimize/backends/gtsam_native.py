@@ -20,30 +20,34 @@ from ..space import Space
 from .gtsam_forms import Form, pose_of
 
 ESTIMATORS = {
-    "huber": "Huber", "cauchy": "Cauchy", "geman-mcclure": "GemanMcClure", "truncated": "TruncatedLeastSquares",
-}  # fmt: skip
+    "huber": "Huber",
+    "cauchy": "Cauchy",
+    "geman-mcclure": "GemanMcClure",
+    "truncated": "TruncatedLeastSquares",
+}
 """GTSAM's names of our losses; their values and weights are the same."""
 
 
 @dataclass(frozen=True, eq=False)
 class Native:
-    """A gtsam.NonlinearFactorGraph and, in its order, which factor of the problem each part says, with the noise models
-    of its measurements; None: it says nothing and is not in the graph."""
+    """A gtsam.NonlinearFactorGraph and, in its order, the factor of the problem that each part states with the noise
+    models of its measurements; None: it has no information and is not in the graph."""
 
     graph: Any
     models: list[tuple[int, list[Any]]]
 
     @property
     def place(self) -> list[tuple[int, int]]:
-        """Of each factor of the graph, which (factor, row) of the problem it says."""
+        """Of each factor of the graph, which (factor, row) of the problem it states."""
         return [(f, k) for f, models in self.models for k, model in enumerate(models) if model is not None]
 
 
-def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | None = None) -> Native:
+def native_graph(problem: Problem, forms_: Sequence[Form], keys: Sequence[int] | None = None) -> Native:
     """The graph of the factors that have parts.
 
     Args:
-        said: of `forms`. keys: GTSAM's names of the nodes, default their indices.
+        forms_: of `forms`.
+        keys: GTSAM's names of the nodes, default their indices.
     """
     import gtsam
 
@@ -51,12 +55,15 @@ def native_graph(problem: Problem, said: Sequence[Form], keys: Sequence[int] | N
     add = native.graph.add
     named = np.arange(len(problem.names)) if keys is None else np.array(keys)
     posed = which_turn(problem) if problem.poses else []
-    for f, (factor, parts) in enumerate(zip(problem.factors, said, strict=True)):
+    for f, (factor, parts) in enumerate(zip(problem.factors, forms_, strict=True)):
         if isinstance(parts, str):
             continue
         called = named[factor.nodes].tolist()
-        turns = [(False,) * len(called[0])] * len(called) if not posed else [
-            tuple([posed[i] for i in row]) for row in factor.nodes.tolist()]  # fmt: skip
+        turns = (
+            [(False,) * len(called[0])] * len(called)
+            if not posed
+            else [tuple([posed[i] for i in row]) for row in factor.nodes.tolist()]
+        )
         for part in parts:
             models = _models(part.root, factor)
             classes: dict[tuple[bool, ...], Any] = {at: getattr(gtsam, name) for at, name in part.names.items()}
@@ -73,33 +80,36 @@ def _swapped(made: Any) -> Any:
     return lambda first, second, *given: made(second, first, *given)
 
 
-def hold(problem: Problem, graph: Any) -> None:
-    """Add to a graph GTSAM's equalities of the nodes that are held."""
+def fix_nodes(problem: Problem, graph: Any) -> None:
+    """Add to a graph GTSAM's equalities of the nodes that are fixed."""
     import gtsam
 
     posed = which_turn(problem)
-    for i in problem.held:
+    for i in problem.fixed:
         assert problem.x0 is not None
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
         graph.add(getattr(gtsam, name)(i, _node(gtsam, problem.dimension, problem.x0[i], posed[i])))
 
 
 def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) -> Any:
-    """gtsam.Values of nodes x (n, width), which are points or `posed`, under their keys."""
+    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their keys."""
     import gtsam
 
     found = gtsam.Values()
-    nodes = x if not space.turning else (
-        _node(gtsam, space.dimension, node, turns) for node, turns in zip(x, posed, strict=True))  # fmt: skip
+    nodes = (
+        x
+        if not space.has_rotation
+        else (_node(gtsam, space.dimension, node, turns) for node, turns in zip(x, posed, strict=True))
+    )
     for key, node in zip(keys, nodes, strict=True):
         found.insert(key, node)
     return found
 
 
 def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Iterable[int]) -> Floats:
-    """x (n, width) of the nodes in gtsam.Values."""
-    d, x = space.dimension, np.empty((len(posed), space.width))
-    if not space.turning:
+    """x (n, ambient) of the nodes in gtsam.Values."""
+    d, x = space.dimension, np.empty((len(posed), space.ambient))
+    if not space.has_rotation:
         at = found.atPoint3 if d == 3 else found.atPoint2
         return np.array([at(key) for key in keys]).reshape(x.shape)
     for i, (turns, key) in enumerate(zip(posed, keys, strict=True)):
@@ -120,19 +130,19 @@ def which_turn(problem: Problem) -> list[bool]:
 
 
 def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
-    """Of each node of x (n, width) the (dof, own) matrix T with our step = T GTSAM's, which has `own` numbers.
+    """Of each node of x (n, ambient) the (dof, own) matrix T with our step = T GTSAM's, which has `own` numbers.
 
     GTSAM moves a pose in its body's directions, in space with the rotation first; we move its position in the world's.
     A covariance of GTSAM's becomes T C T^T, a derivative by our step times T is one by GTSAM's.
 
     >>> from coopoc.optimize import pose
-    >>> tangent(Space(2, turning=True), [True], pose([[5.0, 1.0]], np.pi / 2))[0].round(3) + 0.0
+    >>> tangent(Space(2, has_rotation=True), [True], pose([[5.0, 1.0]], np.pi / 2))[0].round(3) + 0.0
     array([[ 0., -1.,  0.],
            [ 1.,  0.,  0.],
            [ 0.,  0.,  1.]])
     """
     d, still, found = space.dimension, np.eye(space.dof, space.dimension), []
-    if not space.turning:
+    if not space.has_rotation:
         return [still] * len(posed)
     rotation = space.rotation(x)
     for i, turns in enumerate(posed):
@@ -146,18 +156,18 @@ def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
 
 
 def linearised(problem: Problem, which: Sequence[int], x: Floats, keys: Sequence[int]) -> list[Any]:
-    """The factors `which` as gtsam.LinearContainerFactors, linear around x (n, width) for good."""
+    """The factors `which` as gtsam.LinearContainerFactors, linear around x (n, ambient) for good."""
     import gtsam
 
     jacobian: Any = gtsam.JacobianFactor
     factors, posed = [problem.factors[f] for f in which], which_turn(problem)
     linear, found = linearise(problem.space, factors, None, x[None]), []
     turn, at = tangent(problem.space, posed, x), values(problem.space, posed, x, keys)
-    for factor, residual, slopes in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+    for factor, residual, jacobians in zip(factors, linear.residual, linear.by_node(factors), strict=True):
         unit = gtsam.noiseModel.Unit.Create(factor.size)
-        wide = [np.broadcast_to(slope[0], (len(factor.nodes), *slope.shape[2:])) for slope in slopes]
+        wide = [np.broadcast_to(jacobian[0], (len(factor.nodes), *jacobian.shape[2:])) for jacobian in jacobians]
         for k in np.flatnonzero(factor.informative).tolist():
-            blocks = [(keys[i], slope[k] @ turn[i]) for i, slope in zip(factor.nodes[k], wide, strict=True)]
+            blocks = [(keys[i], jacobian[k] @ turn[i]) for i, jacobian in zip(factor.nodes[k], wide, strict=True)]
             found.append(gtsam.LinearContainerFactor(jacobian(*chain(*blocks), -residual[0, k], unit), at))
     return found
 
@@ -167,7 +177,7 @@ def _node(gtsam: Any, d: int, x: Floats, posed: bool) -> Any:
 
 
 def _models(root: Floats, factor: Factor) -> list[Any]:
-    """A noise model per measurement of roots (M or 1, k, k), one object for equal ones; None: it says nothing."""
+    """A noise model per measurement of roots (M or 1, k, k), one object for equal ones; None: it has no information."""
     size, loss = root.shape[-1], factor.loss
     return [_model(row.tobytes(), size, loss) for row in root] * (len(factor.nodes) if len(root) == 1 else 1)
 

@@ -1,12 +1,12 @@
 """osqp: sequential quadratic programming with one workspace per structure, whose values are updated at every step.
 
 Bounds on positions and displacements are rows l - h <= C dx <= u - h of each quadratic programme. The start is first
-moved onto them by the least step; from then on every step keeps them, so that the cost alone says which step is better.
+moved onto them by the least step; from then on every step keeps them, so that the cost alone decides between steps.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,25 +15,30 @@ import numpy as np
 from ...arrays import Floats
 from ..active import bounded, constraint_rows
 from ..arrowhead import structure
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
+from ..backend import Backend, Capabilities, Solver, SolverResult
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..linear import Linear
 from ..local import local
 from ..normal import Pattern, normal_equations
 from ..problem import Problem
 from .osqp_programme import CLOSE, Infeasible, Programme, filled
-from .run import Ended, Run
 
 FAR = 1e-6
 """What a step of 1 m costs beside a violation of 1 m, where none can be avoided."""
 
 
-def build(
-    problem: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, kkt_tolerance: float = 1e-9
-) -> Run:
-    """Solver of one problem. A linear one is a single quadratic programme.
+def prepare(
+    structure: Problem,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+    kkt_tolerance: float = 1e-9,
+) -> Solver:
+    """Solver of a structure. A linear problem is a single quadratic programme.
 
     Args:
-        max_iterations: of quadratic programmes. tolerance: m, largest move of a point in the last step.
+        structure: a problem whose structure counts, and its constraints.
+        max_iterations: of quadratic programmes.
+        tolerance: m, largest move of a point in the last step.
         kkt_tolerance: largest |P dx + q + C^T y| that is accepted, as a share of |q| or of the largest |P_ij dx_j|.
 
     >>> from coopoc.optimize import solve
@@ -42,28 +47,21 @@ def build(
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    limits = _limits(problem)
-    programme, step = _programme(problem, limits, kkt_tolerance)
+    limits = _limits(structure)
+    programme, step = _programme(structure, limits, kkt_tolerance)
 
-    def run(x: Floats) -> Ended:
-        try:
-            if problem.constraints:
-                x, feasible = _nearest(limits, x)
-                if not feasible:
-                    return Ended(x, 0, dict(programme.counts), infeasible=True)
-        except np.linalg.LinAlgError:
-            return Ended(x, 0, dict(programme.counts))
-        if problem.linear and max_iterations:
-            return Ended(one_step(problem, step, x[None])[0], 1, dict(programme.counts))
-        end = descend(problem, step, x[None], max_iterations, tolerance)
-        return Ended(end.x[0], int(end.iterations[0]), dict(programme.counts))
+    def solver(problem: Problem, x: Floats) -> SolverResult:
+        if problem.constraints:
+            try:
+                start, feasible = _nearest(limits, x[0])
+            except np.linalg.LinAlgError:
+                return SolverResult(x, np.zeros(1, dtype=np.int64), extras=dict(programme.counts))
+            x = start[None]
+            if not feasible:
+                return SolverResult(x, np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool), dict(programme.counts))
+        return replace(minimise(problem, step, x, max_iterations, tolerance), extras=dict(programme.counts))
 
-    return run
-
-
-def linear_step(problem: Problem, kkt_tolerance: float = 1e-9) -> Step:
-    """The quadratic programme without constraints of each realisation, one after the other in one workspace."""
-    return _programme(problem, _limits(problem.having(constraints=())), kkt_tolerance)[1]
+    return solver
 
 
 def _programme(problem: Problem, limits: _Limits, tolerance: float) -> tuple[Programme, Step]:
@@ -97,7 +95,7 @@ class _Limits:
     upper: Floats
 
     def around(self, x: Floats) -> tuple[Floats, Floats]:
-        """What C dx may be at x (n, width)."""
+        """What C dx may be at x (n, ambient)."""
         space, constraints = self.problem.space, self.problem.constraints
         seen = [local(space, c.measurement, x[None], c.nodes)[0][0][bounded(c)] for c in constraints]
         value = np.concatenate([np.empty(0), *seen])
@@ -110,7 +108,7 @@ def _limits(problem: Problem) -> _Limits:
     n, space = len(problem.names), problem.space
     if not problem.constraints:
         return _Limits(problem, _none(n * space.dof), np.empty(0), np.empty(0))
-    rows = constraint_rows(problem, np.zeros((n, space.width)))
+    rows = constraint_rows(problem, np.zeros((n, space.ambient)))
     return _Limits(problem, csc_matrix(rows.matrix), rows.lower, rows.upper)
 
 
@@ -154,3 +152,12 @@ def _upper(scheme: Pattern, dof: int) -> tuple[Any, Any]:
     numbered = csc_array((flat[keep] + 1.0, (row[keep], col[keep])), shape=shape)
     numbered.sort_indices()
     return csc_matrix(numbered), (numbered.data - 1).astype(np.int64)
+
+
+BACKEND = Backend(
+    "osqp",
+    prepare,
+    "sequential quadratic programming, persistent workspace",
+    "osqp",
+    Capabilities(batched=True, constraints="linear"),
+)

@@ -1,7 +1,7 @@
-"""One quadratic programme whose values are updated, solved by OSQP, its answers held against their KKT conditions.
+"""One quadratic programme whose values are updated, solved by OSQP, its answers checked against their KKT conditions.
 
-Settings matter (performance.md G4 of the design notes): OSQP says "solved" and can be a metre off when odometry weighs
-5e5 times as much as GNSS. Scaling is off, the tolerance is tight, and every answer is held against its own KKT
+Settings matter: OSQP reports "solved" and can be a metre off when odometry weighs
+5e5 times as much as GNSS. Scaling is off, the tolerance is tight, and every answer is checked against its own KKT
 conditions and repaired where it fails. Without constraints over-relaxation is off too (alpha = 1: an iteration is then
 a proximal step with the weight sigma, and 1.6 would make 40 of them out of one), and a repair is further iterations.
 With them rho adapts, and a repair solves exactly for the active set that the iterations have found (polishing).
@@ -19,13 +19,29 @@ import numpy as np
 from ...arrays import Bools, Floats
 
 SETTINGS = {
-    "scaling": 0, "rho": 1e-4, "alpha": 1.0, "sigma": 1e-6, "eps_abs": 1e-12, "eps_rel": 1e-12, "max_iter": 200,
-    "check_termination": 1, "polishing": False, "adaptive_rho": 0, "warm_starting": True, "verbose": False,
-}  # fmt: skip
+    "scaling": 0,
+    "rho": 1e-4,
+    "alpha": 1.0,
+    "sigma": 1e-6,
+    "eps_abs": 1e-12,
+    "eps_rel": 1e-12,
+    "max_iter": 200,
+    "check_termination": 1,
+    "polishing": False,
+    "adaptive_rho": 0,
+    "warm_starting": True,
+    "verbose": False,
+}
 BOUNDED = {
-    "rho": 0.1, "alpha": 1.6, "eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 4000, "check_termination": 10,
-    "polish_refine_iter": 10, "adaptive_rho": 1,
-}  # fmt: skip
+    "rho": 0.1,
+    "alpha": 1.6,
+    "eps_abs": 1e-9,
+    "eps_rel": 1e-9,
+    "max_iter": 4000,
+    "check_termination": 10,
+    "polish_refine_iter": 10,
+    "adaptive_rho": 1,
+}
 """What changes where there are constraints."""
 NEGLIGIBLE = 1e-11
 """m, an error of a coordinate that no tolerance asks to be smaller."""
@@ -96,11 +112,11 @@ class Programme:
             if workspace.solver.info.status.startswith("primal infeasible"):
                 raise Infeasible
             dx, y = np.array(answer.x), np.array(answer.y)
-            pushed = bool(np.any((upper - self._rows @ dx < y) | (self._rows @ dx - lower < -y)))
-            if self._holds(half, q, lower, upper, dx, y) and self._polishing >= pushed:
+            active = bool(np.any((upper - self._rows @ dx < y) | (self._rows @ dx - lower < -y)))
+            if self._holds(half, q, lower, upper, dx, y) and self._polishing >= active:
                 return dx
-            self.counts["repairs"] += attempt < REPAIRS and self._polishing >= pushed
-            self._polish(workspace, pushed)
+            self.counts["repairs"] += attempt < REPAIRS and self._polishing >= active
+            self._polish(workspace, active)
         raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
 
     def each(self, half: Any, values: Floats, q: Floats) -> Floats:
@@ -113,8 +129,8 @@ class Programme:
         for b, now in enumerate(values):
             workspace.update(now, q[b])
             dx[b] = self._solve(workspace).x
-        weight, force = self._product(structure, values, dx)
-        for b in np.flatnonzero(~self._stationary(force + q, weight, q, dx)).tolist():
+        weight, product = self._product(structure, values, dx)
+        for b in np.flatnonzero(~self._stationary(product + q, weight, q, dx)).tolist():
             try:
                 dx[b] = self.solve(filled(half, values[b]), q[b], nothing, nothing)
             except np.linalg.LinAlgError:
@@ -146,14 +162,14 @@ class Programme:
 
     def _holds(self, half: Any, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
-        weight, force = self._product(_raw(half), half.data[None], dx[None])
-        if not self._stationary(force + q + self._rows.T @ y, weight, q[None], dx[None])[0]:
+        weight, product = self._product(_raw(half), half.data[None], dx[None])
+        if not self._stationary(product + q + self._rows.T @ y, weight, q[None], dx[None])[0]:
             return False
         weak = self._tolerance * _size(weight, q[None], dx[None])[0]
         value = self._rows @ dx
         kept = (value >= lower - CLOSE) & (value <= upper + CLOSE)
-        pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
-        return bool(np.all(kept & pushed))
+        active = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
+        return bool(np.all(kept & active))
 
     def _product(self, structure: tuple[bytes, bytes], values: Floats, dx: Floats) -> tuple[Floats, Floats]:
         """Diagonal of P and P dx, (B, n)."""

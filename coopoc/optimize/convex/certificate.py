@@ -22,8 +22,11 @@ class Certificate:
     """What is known of a solution's cost against the smallest cost of any point.
 
     Args:
-        certified: no point has a cost smaller by more than the tolerance. sentence: the verdict in words.
-        cost: of the solution. lower_bound: no point has a smaller cost. smallest_eigenvalue: of C - L.
+        certified: no point has a cost smaller by more than the tolerance.
+        sentence: the verdict in words.
+        cost: of the solution.
+        lower_bound: no point has a smaller cost.
+        smallest_eigenvalue: of C - L.
         surrogate: what was replaced; all the above then is about the surrogate and its own minimum.
     """
 
@@ -50,12 +53,14 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
 
         1/2 tr L + 1/2 tr(X X^T) min(0, lambda_min(C - L)),       tr(X X^T) fixed by the constraints,
 
-    and 1/2 tr L is the solution's own cost (Lagrangian duality; CORA, arXiv 2302.11614, methods.md section 6.1). Where
+    and 1/2 tr L is the solution's own cost (Lagrangian duality; CORA, arXiv 2302.11614). Where
     lambda_min is negative the solution may be a local minimum, or the relaxation is not tight there: `shor` or
     `staircase` then give a better bound.
 
     Args:
-        problem: one that `quadratic` takes. solution: of it. tolerance: largest gap, as a share of max(cost, 1).
+        problem: one that `quadratic` takes.
+        solution: of it.
+        tolerance: largest gap, as a share of max(cost, 1).
         surrogate: replace what is not quadratic (`surrogate`), solve that from the solution and certify its minimum;
             the sentence says what was replaced and how far the two points are apart.
 
@@ -76,10 +81,14 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
     reduced = reduce(form)
     bound, smallest, _ = lower_bound(reduced, multipliers(form, X, reduced.times(X)))
     certified = solution.cost - bound <= tolerance * max(solution.cost, 1.0)
-    sentence = f"certified global optimum of {problem!r}" if certified else (
-        f"not certified: cost {solution.cost:.6g}, no point of {problem!r} costs less than {max(bound, 0.0):.6g} "
-        f"(smallest eigenvalue {smallest:.1e}); a local minimum, or the relaxation is not tight"
-    )  # fmt: skip
+    sentence = (
+        f"certified global optimum of {problem!r}"
+        if certified
+        else (
+            f"not certified: cost {solution.cost:.6g}, no point of {problem!r} costs less than {max(bound, 0.0):.6g} "
+            f"(smallest eigenvalue {smallest:.1e}); a local minimum, or the relaxation is not tight"
+        )
+    )
     return Certificate(certified, sentence, solution.cost, max(bound, 0.0), smallest)
 
 

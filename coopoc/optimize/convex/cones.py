@@ -1,7 +1,7 @@
-"""The two cone programmes of relaxation.py in Clarabel's own form, built once per shape.
+"""The semidefinite programme of relaxation.py in Clarabel's own form, built once per shape.
 
 Clarabel solves min 1/2 x'Px + q'x, A x + s = b, s in a cone. Its matrices keep their pattern, so that a new problem is
-an update of b, or of P and q: for ten ranges 3.3 ms, against 4.4 ms through CVXPY with a parameter for C; for three
+an update of b: for ten ranges 3.3 ms, against 4.4 ms through CVXPY with a parameter for C; for three
 0.3 and 1.4 ms (one core).
 """
 
@@ -30,7 +30,8 @@ def semidefinite(
     It takes C (bound, bound) and returns L on Stiefel blocks (n, k, k) and on spheres (m,), and Z (bound, bound).
 
     Args:
-        stiefel, sphere: shapes (n, k) and (m, q) of the blocks, which follow each other.
+        stiefel: shapes (n, k) and (m, q) of the blocks, which follow each other.
+        sphere: as `stiefel`.
     """
     clarabel = _clarabel()
     from scipy.sparse import csc_matrix
@@ -48,8 +49,9 @@ def semidefinite(
     row = np.concatenate([blocks.ravel(), diagonal])
     A = csc_matrix((stretch[row], (row, column)), shape=(len(i), n * pairs + m))
     goal = np.concatenate([np.tile((low == high).astype(float), n), np.ones(m)])
-    solver = clarabel.DefaultSolver(csc_matrix((len(goal),) * 2), -goal, A, np.zeros(len(i)),
-                                    [clarabel.PSDTriangleConeT(size)], _settings())  # fmt: skip
+    solver = clarabel.DefaultSolver(
+        csc_matrix((len(goal),) * 2), -goal, A, np.zeros(len(i)), [clarabel.PSDTriangleConeT(size)], _settings()
+    )
 
     def run(C: Floats) -> tuple[Floats, Floats, Floats]:
         scale = max(float(np.trace(C)) / size, 1e-300)
@@ -60,40 +62,6 @@ def semidefinite(
         block = np.zeros((n, k, k))
         block[:, low, high] = block[:, high, low] = value[: n * pairs].reshape(n, pairs)
         return block, value[n * pairs :], half + np.triu(half, 1).T
-
-    return run
-
-
-@lru_cache(maxsize=64)
-def second_order(columns: int, sphere: tuple[int, int]) -> Callable[[Floats, Floats], Floats]:
-    """Solver of min 1/2 <P, s s^T> + <Q, s> over |s_e| <= 1: it takes P and Q and returns s (m q, columns).
-
-    Args:
-        columns: of s. sphere: shape (m, q) of the spheres, which follow each other.
-    """
-    clarabel = _clarabel()
-    from scipy.sparse import csc_matrix
-
-    m, q = sphere
-    count, size, reach = m * q, m * q * columns, q * columns
-    i, j = _triangle(count)
-    source = np.tile(np.arange(len(i)), columns)
-    shift = np.repeat(np.arange(columns) * count, len(i))
-    row, col = np.tile(i, columns) + shift, np.tile(j, columns) + shift
-    order = np.lexsort((row, col))
-    pattern = csc_matrix((np.ones(len(order)), (row[order], col[order])), shape=(size, size))
-    rows = np.arange(count).reshape(m, q)
-    member = (rows[:, :, None] + count * np.arange(columns)).reshape(m, reach)
-    at = (1 + reach) * np.arange(m)[:, None] + 1 + np.arange(reach)
-    A = csc_matrix((-np.ones(at.size), (at.ravel(), member.ravel())), shape=(m * (1 + reach), size))
-    b = np.tile(np.eye(1, 1 + reach)[0], m)
-    cones = [clarabel.SecondOrderConeT(1 + reach)] * m
-    solver = clarabel.DefaultSolver(pattern, np.zeros(size), A, b, cones, _settings())
-
-    def run(P: Floats, Q: Floats) -> Floats:
-        scale = max(float(np.trace(P)) / count, 1e-300)
-        solver.update(P=P[i, j][source][order] / scale, q=Q.T.ravel() / scale)
-        return np.array(solver.solve().x).reshape(columns, count).T
 
     return run
 

@@ -60,9 +60,13 @@ class Stationary:
 
 
 def minimise(
-    problem: Quadratic, reduced: Reduced, X: Floats, tolerance: float = 1e-13, max_iterations: int = MAX_ITERATIONS,
+    problem: Quadratic,
+    reduced: Reduced,
+    X: Floats,
+    tolerance: float = 1e-13,
+    max_iterations: int = MAX_ITERATIONS,
     tick: Callable[[], object] = lambda: None,
-) -> Stationary:  # fmt: skip
+) -> Stationary:
     """A stationary point near X (bound, p), to second order: Newton's steps converge quadratically.
 
     Args:
@@ -118,7 +122,7 @@ class _Tangent:
         turns = XU[:, None, i] * vectors[:, j] - XU[:, None, j] * vectors[:, i]
         return np.asarray(turns.reshape(self.X.size, -1) / np.sqrt(length))
 
-    def bend(self, V: Floats) -> Floats:
+    def second_derivative(self, V: Floats) -> Floats:
         """Hess[V]."""
         return self.project(self.reduced.times(V) - self.L.times(V))
 
@@ -167,7 +171,7 @@ def _truncated(here: _Tangent, gradient: Floats, radius: float) -> tuple[Floats,
     radius = radius or np.sqrt(max(start, 0.0))
     size, along, reach, edge = 0.0, 0.0, strength, False
     for _ in range(INNER * (start > 1e-30)):
-        bent = here.bend(direction)
+        bent = here.second_derivative(direction)
         curvature = float(np.sum(direction * bent))
         alpha = strength / curvature if curvature > 0 else 0.0
         edge = curvature <= 0 or size + 2 * alpha * along + alpha * alpha * reach >= radius * radius

@@ -1,7 +1,7 @@
 """Quadratic: a quadratic cost with quadratic equalities (QCQP), the form of a problem that relaxations need.
 
 The rows of X are points on simple manifolds, every measurement is linear in them, and the cost is 1/2 |A X|_F^2
-(CORA, arXiv 2302.11614; methods.md section 6.1):
+(CORA, arXiv 2302.11614):
 
     X = [ H ; R_k^T ; s_e ; t_i ]       H H^T = I,  R_k R_k^T = I,  |s_e| = 1,  t_i free
 
@@ -27,10 +27,16 @@ class Quadratic:
 
     Args:
         rows: sparse A (M, N). The first `bound` rows of X are constrained, the others free positions.
-        stiefel: (n, k) rows of X. sphere: (m, q) rows of X, q = d if the columns are stacked, else 1.
-        dimension: d. stacked: one column instead of d. framed: the first Stiefel block is H.
-        nodes, poses: whose position, and whose rotation, X holds; the others stay as they are in `position` (n, d) m
-            and `rotation` (n, d, d). edges: (m, 2) nodes of the ranges. origin: (d,) m, subtracted from positions.
+        stiefel: (n, k) rows of X.
+        sphere: (m, q) rows of X, q = d if the columns are stacked, else 1.
+        dimension: d.
+        stacked: one column instead of d.
+        framed: the first Stiefel block is H.
+        nodes: whose position, and whose rotation, X holds; the others stay as they are in `position` (n, d) m and
+            `rotation` (n, d, d).
+        poses: as `nodes`.
+        edges: (m, 2) nodes of the ranges.
+        origin: (d,) m, subtracted from positions.
     """
 
     rows: Any

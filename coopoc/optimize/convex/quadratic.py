@@ -42,50 +42,61 @@ def quadratic(problem: Problem) -> Quadratic:
     fixes = [f.z[:, :d] for f in world if f.kind != "displacement"]
     origin = np.concatenate(fixes).mean(axis=0) if fixes else np.zeros(d)
     edges = [f.nodes for f in problem.factors if f.kind == "range"]
-    place = _Place(d, n, np.array(problem.poses, dtype=np.int64), stacked, bool(world or problem.held),
-                   sum(map(len, edges)))  # fmt: skip
+    place = _Place(
+        d, n, np.array(problem.poses, dtype=np.int64), stacked, bool(world or problem.fixed), sum(map(len, edges))
+    )
     terms, first = [], 0
     for factor in problem.factors:
         terms += TERMS[factor.kind](place, factor, first if factor.kind == "range" else origin)
         first += len(factor.nodes) * (factor.kind == "range")
-    x = np.zeros((n, problem.space.width)) if problem.x0 is None else problem.x0
+    x = np.zeros((n, problem.space.ambient)) if problem.x0 is None else problem.x0
     position, rotation = problem.space.position(x), np.array(problem.space.rotation(x))
-    if not problem.held:
+    if not problem.fixed:
         rotation[:] = np.eye(d)
-    rows, kept = _hold(_sparse(terms, place.size), place, np.array(problem.held, np.int64), position - origin, rotation)
-    poses = np.setdiff1d(place.poses, problem.held)
+    rows, kept = _hold(
+        _sparse(terms, place.size), place, np.array(problem.fixed, np.int64), position - origin, rotation
+    )
+    poses = np.setdiff1d(place.poses, problem.fixed)
     k, top = len(place.frame) if stacked else d, len(place.frame) + d * len(poses)
     return Quadratic(
-        rows=rows[:, kept], stiefel=np.arange(top).reshape(-1, k),
-        sphere=top + np.arange(place.ranges * place.width).reshape(place.ranges, place.width), dimension=d,
-        stacked=stacked, framed=place.framed, nodes=np.setdiff1d(np.arange(n), problem.held), poses=poses,
-        position=position, rotation=rotation, origin=origin,
+        rows=rows[:, kept],
+        stiefel=np.arange(top).reshape(-1, k),
+        sphere=top + np.arange(place.ranges * place.width).reshape(place.ranges, place.width),
+        dimension=d,
+        stacked=stacked,
+        framed=place.framed,
+        nodes=np.setdiff1d(np.arange(n), problem.fixed),
+        poses=poses,
+        position=position,
+        rotation=rotation,
+        origin=origin,
         edges=np.concatenate(edges) if edges else np.empty((0, 2), np.int64),
-    )  # fmt: skip
+    )
 
 
-def _hold(rows: Any, place: _Place, held: Ints, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
-    """A with what held nodes say moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to keep."""
-    if not len(held):
+def _hold(rows: Any, place: _Place, fixed: Ints, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
+    """A with what fixed nodes say moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to keep."""
+    if not len(fixed):
         return rows, np.arange(place.size)
     from scipy.sparse import csr_array
 
-    at = place.position(held)
-    columns, values = [at.ravel()], [position[held].reshape(at.size, -1)]
-    turned = np.intersect1d(held, place.poses)
+    at = place.position(fixed)
+    columns, values = [at.ravel()], [position[fixed].reshape(at.size, -1)]
+    turned = np.intersect1d(fixed, place.poses)
     if len(turned):
         columns.append(place.rotation(turned).ravel())
         values.append(np.swapaxes(rotation[turned], 1, 2).reshape(-1, place.dimension))
     gone = np.concatenate(columns)
     moved = rows[:, gone] @ csr_array(np.concatenate(values))
-    total = rows + moved @ csr_array((np.ones(len(place.frame)), (np.arange(len(place.frame)), place.frame)),
-                                     shape=(len(place.frame), place.size))  # fmt: skip
+    total = rows + moved @ csr_array(
+        (np.ones(len(place.frame)), (np.arange(len(place.frame)), place.frame)), shape=(len(place.frame), place.size)
+    )
     return csr_array(total), np.setdiff1d(np.arange(place.size), gone)
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """Where the rows of X are: `width` of them per unit vector and per position."""
+    """Where the rows of X are: `ambient` of them per unit vector and per position."""
 
     dimension: int
     nodes: int
@@ -183,9 +194,13 @@ def _relative_pose(place: _Place, factor: Factor, origin: Floats) -> Terms:
 
 
 TERMS: dict[str, Callable[[_Place, Factor, Any], Terms]] = {
-    "position": _position, "displacement": _displacement, "range": _range, "relative_position": _relative_position,
-    "pose_chordal": _pose, "relative_pose_chordal": _relative_pose,
-}  # fmt: skip
+    "position": _position,
+    "displacement": _displacement,
+    "range": _range,
+    "relative_position": _relative_position,
+    "pose_chordal": _pose,
+    "relative_pose_chordal": _relative_pose,
+}
 """What has this form."""
 WORLD = ("position", "displacement", "pose_chordal")
 """What is measured in the world's frame."""
@@ -229,15 +244,17 @@ def _check(problem: Problem) -> None:
         raise InputError("constraints", problem.constraints[0], "have no place in a relaxation", "Leave them out.")
     for factor in problem.factors:
         if factor.kind not in TERMS:
-            mend = "Use surrogate(problem), which replaces what it can and says by what."
-            raise InputError("kind", repr(factor.kind), f"is not quadratic: it must be one of {sorted(TERMS)}", mend)
+            hint = "Use surrogate(problem), which replaces what it can and lists it."
+            raise InputError("kind", repr(factor.kind), f"is not quadratic: it must be one of {sorted(TERMS)}", hint)
         if factor.loss is not None:
             raise InputError("loss", factor.loss.name, "is not quadratic: must be None", "Use least squares.")
 
 
 def _refuse(factor: Factor) -> NoReturn:
     raise InputError(
-        f"std of {factor.kind}", "differs between axes", "must be one number for the position and one for the rotation "
+        f"std of {factor.kind}",
+        "differs between axes",
+        "must be one number for the position and one for the rotation "
         "where poses turn: other weights are no QCQP of this form, and would cost the relaxation its tightness",
-        "Use surrogate(problem), which replaces them by one and says so.",
-    )  # fmt: skip
+        "Use surrogate(problem), which replaces them by one and lists it.",
+    )

@@ -93,7 +93,7 @@ class Sparse:
 
     @cached_property
     def _kept(self) -> Bools:
-        """False for the first position of each part that could be moved as a whole: it is held at zero."""
+        """False for the first position of each part that could be moved as a whole: it is fixed at zero."""
         from scipy.sparse import csc_array
         from scipy.sparse.csgraph import connected_components
 

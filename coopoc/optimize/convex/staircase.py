@@ -31,12 +31,14 @@ def staircase(problem: Problem, refine: bool = True, seed: int = 0, height: int 
 
     minimise 1/2 <C, Y Y^T> over Y with p columns; if C - L has a negative eigenvalue there, its eigenvector in a new
     column p + 1 leads down, else the relaxation is solved: whatever the start, the bound is that of `shor` (CORA, arXiv
-    2302.11614, section 6.1 of methods.md). Poses need not be known even roughly: the start is random unless the problem
+    2302.11614). Poses need not be known even roughly: the start is random unless the problem
     has an x0. A thousand poses take seconds.
 
     Args:
-        problem: one that `quadratic` takes. refine: follow by `solve` from the rounded point.
-        seed: of the random start. height: columns beyond d at which to give up.
+        problem: one that `quadratic` takes.
+        refine: follow by `solve` from the rounded point.
+        seed: of the random start.
+        height: columns beyond d at which to give up.
 
     Raises:
         InputError: as `quadratic`; height below 1.
@@ -55,7 +57,7 @@ def staircase(problem: Problem, refine: bool = True, seed: int = 0, height: int 
     _, values, rows = np.linalg.svd(found.X, full_matrices=False)
     d = form.columns
     gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
-    return rounded(problem, form, reduced, found.X @ rows[:d].T, bound, gap, began, refine)
+    return rounded(problem, form, reduced, found.X @ rows[:d].T, gap, bound, began, refine)
 
 
 def _start(problem: Problem, form: Quadratic, seed: int) -> Floats:

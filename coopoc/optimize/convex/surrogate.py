@@ -30,7 +30,8 @@ def surrogate(problem: Problem, isotropic: bool = False) -> Surrogate:
     std^2 = trace(cov) / d, and a rotation's std^2 = var (2-D) or 2 trace(cov) / 3 (3-D), as PyFG and SE-Sync have it.
 
     Args:
-        problem: a single one. isotropic: one weight per measurement even among points, which needs d times fewer rows.
+        problem: a single one.
+        isotropic: one weight per measurement even among points, which needs d times fewer rows.
 
     Raises:
         InputError: a kind that has no surrogate: an angle without a distance, a speed; no finite variance to average.
@@ -41,13 +42,13 @@ def surrogate(problem: Problem, isotropic: bool = False) -> Surrogate:
     """
     factors, lines = [], []
     for factor in problem.factors:
-        new, said = _quadratic(problem, factor)
+        new, notes = _quadratic(problem, factor)
         sides = 2 if new.kind.endswith("chordal") else 1
         if (problem.poses or isotropic) and new.kind != "range" and not _scalar(new, sides):
-            new, said = _isotropic(new), [*said, "one weight for all axes"]
+            new, notes = _isotropic(new), [*notes, "one weight for all axes"]
         factors.append(new)
-        if said:
-            lines.append(f"{factor.kind} -> {new.kind} by {', '.join(said)}")
+        if notes:
+            lines.append(f"{factor.kind} -> {new.kind} by {', '.join(notes)}")
     return Surrogate(replace(problem, factors=tuple(factors)), tuple(dict.fromkeys(lines)))
 
 
@@ -63,8 +64,8 @@ def _quadratic(problem: Problem, factor: Factor) -> tuple[Factor, list[str]]:
         return replace(vector, kind="relative_position"), ["its vector d u"]
     if factor.kind in ("pose", "relative_pose"):
         return _chordal(factor, problem.dimension), ["chords in place of angles"]
-    mend = "Measure angles together with a distance, as spherical or body_spherical."
-    raise InputError("kind", repr(factor.kind), "has no quadratic surrogate", mend)
+    hint = "Measure angles together with a distance, as spherical or body_spherical."
+    raise InputError("kind", repr(factor.kind), "has no quadratic surrogate", hint)
 
 
 def _chordal(factor: Factor, d: int) -> Factor:
@@ -85,8 +86,8 @@ def _covariance(factor: Factor) -> Floats:
     """(M, size, size); InputError where there is none."""
     information = np.swapaxes(factor.root, 1, 2) @ factor.root
     if np.linalg.matrix_rank(information).min(initial=information.shape[1]) < information.shape[1]:
-        mend = "Give every component a finite standard deviation."
-        raise InputError(f"std of {factor.kind}", "infinite in some direction", "must have an average", mend)
+        hint = "Give every component a finite standard deviation."
+        raise InputError(f"std of {factor.kind}", "infinite in some direction", "must have an average", hint)
     return np.linalg.inv(information)
 
 

@@ -1,0 +1,162 @@
+"""What each method costs when the input is not the plain case: gaps, absences, drift, smoothed output, a stream.
+
+    OMP_NUM_THREADS=1 python benchmarks/cliffs.py            # a Markdown table on stdout, about two minutes
+
+Whole methods with their inbox and Track, on town traffic at K = 6, ten runs. A row is its time per step, run and
+estimated vehicle; its ratio, to that of the plain case in the same rounds, is not to exceed 1.5; of a stream, to
+filterpy's step of the same state. Right means finite estimates for every ego at every step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+from tabulate import tabulate
+from timing import medians, timed
+
+import coopoc as co
+from coopoc.learned import CooperativeGain, NoiseNet
+from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.drift_filter import DriftFilter
+
+ROUNDS, NEIGHBOURS, STEPS, RUNS, EGO = 5, 6, 60, 10, 0
+GAPS = (
+    "kalman",
+    "lkf-sa",
+    "lkf-sa-edge",
+    "msmv-r",
+    "joint",
+    "drift",
+    "ci",
+    "split-ci",
+    "cooperative-map",
+    "cooperative-map-5",
+    "fixed-lag",
+    "mhe",
+    "gbp",
+    "admm",
+    "central-filter",
+    "batch-smoother",
+)
+"""Methods that are tried with missing fixes and with vehicles that come and go."""
+NOISE = co.Sensors.paper_scenario2()
+
+
+class Case(NamedTuple):
+    """One row: its name, the name of the row that it is compared with, the call, and the estimates that it makes."""
+
+    name: str
+    plain: str
+    call: Callable[[], Any]
+    count: int
+
+
+def missing(recording: co.Recording, share: float = 0.1) -> co.Recording:
+    """The recording without a share of its fixes; the first ones stay."""
+    gnss = recording.gnss.copy()
+    gone = np.random.default_rng(0).uniform(size=gnss.shape[:3]) < share
+    gone[:, 0] = False
+    gnss[gone] = np.nan
+    return replace(recording, gnss=gnss)
+
+
+def absent(fleet: co.Fleet) -> co.Fleet:
+    """The fleet whose every third vehicle but the ego is away for a third of the drive."""
+    position, velocity = fleet.position.copy(), fleet.velocity.copy()
+    third = len(fleet.t) // 3
+    for array in (position, velocity):
+        array[third : 2 * third, 1::3] = np.nan
+    return replace(fleet, position=position, velocity=velocity)
+
+
+def seen(fleet: co.Fleet, noise: co.Sensors, everyone: bool, **channel: Any) -> co.Recording:
+    """What the ego, or everyone, measures."""
+    v2x = co.V2X(max_neighbours=NEIGHBOURS, **channel)
+    return co.observe(fleet, noise, v2x, runs=RUNS, observers=None if everyone else [EGO])
+
+
+def method_cases() -> Iterator[Case]:
+    """Each method plain, with missing fixes, with absences and over a late and lossy channel."""
+    fleet = co.load_fleet("town10").between(0, STEPS)
+
+    def case(name: str, plain: str, method: Any, recording: co.Recording, everyone: bool) -> Case:
+        members = len(fleet.ids) if everyone else 1 + len(recording.links.of(EGO)) / STEPS
+        return Case(name, plain, lambda: method(recording, [EGO]).x, round(STEPS * RUNS * members))
+
+    for name in GAPS:
+        method, everyone = METHODS[name]("nominal"), name in WHOLE_FLEET
+        recording = seen(fleet, NOISE, everyone)
+        yield case(f"{name}, plain", f"{name}, plain", method, recording, everyone)
+        yield case(f"{name}, missing fixes", f"{name}, plain", method, missing(recording), everyone)
+        yield case(f"{name}, absences", f"{name}, plain", method, seen(absent(fleet), NOISE, everyone), everyone)
+        late = seen(fleet, NOISE, everyone, latency=0.2, loss=0.3)
+        yield case(f"{name}, late and lost", f"{name}, plain", method, late, everyone)
+    recording, drifting = seen(fleet, NOISE, False), replace(NOISE, gnss_drift_std=2.0, gnss_common_std=1.0)
+    others = {
+        "drift, time-correlated errors": (DriftFilter(), seen(fleet, drifting, False), "joint, plain"),
+        "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
+        "kalman-variational": (co.VariationalKalman(), recording, "kalman, plain"),
+        "fixed-lag, smoothed": (co.FixedLagSmoother(smoothed=True), recording, "fixed-lag, plain"),
+        "cooperative gain, newest fix": (CooperativeGain(NoiseNet(), sums=False), recording, "joint, plain"),
+        "cooperative gain, sums": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
+    }
+    for name, (method, measured_by, plain) in others.items():
+        yield case(name, plain, method, measured_by, False)
+
+
+def stream_cases() -> Iterator[Case]:
+    """A stream's step beside filterpy's of the same state: solo, and a star of ten."""
+    z, u, steps = np.zeros(3), np.array([9.0, 1.0, 0.0]), 200
+    known = co.NoiseModel.nominal(NOISE)
+    for n, name in ((1, "kalman stream"), (11, "joint stream, ten neighbours")):
+        peer = KalmanFilter(dim_x=3 * n, dim_z=6 * n - 3, dim_u=3 * n)
+        peer.R, peer.B, peer.P = np.eye(6 * n - 3), 0.1 * np.eye(3 * n), np.eye(3 * n)
+        edges = np.hstack([-np.tile(np.eye(3), (n - 1, 1)), np.eye(3 * n - 3)])
+        peer.H = np.vstack([np.eye(3 * n), edges.reshape(3 * n - 3, 3 * n)])
+
+        def theirs(peer: Any = peer, n: int = n) -> Any:
+            for _ in range(steps):
+                peer.predict(u=np.tile(u, n))
+                peer.update(np.zeros(6 * n - 3))
+            return peer.x
+
+        around = [[15.0, 0.6 * k, np.pi / 2] for k in range(n - 1)]
+        relative = [co.RelativeMeasurement(f"v{k}", seen, z, u) for k, seen in enumerate(around)]
+        stream = co.Kalman(known).start() if n == 1 else co.JointFilter(known).start()
+        more = {} if n == 1 else {"neighbours": relative}
+
+        def ours(stream: Any = stream, more: Any = more) -> Any:
+            return [stream.step(z, u, 0.1, **more)[0] for _ in range(steps)][-1]
+
+        yield Case(f"filterpy, {3 * n} numbers", f"filterpy, {3 * n} numbers", theirs, steps)
+        yield Case(name, f"filterpy, {3 * n} numbers", ours, steps)
+
+
+def measured(rounds: int = ROUNDS) -> list[dict[str, Any]]:
+    """Rows: microseconds per estimate, and the ratio to the plain case."""
+    cases = [*method_cases(), *stream_cases()]
+    right = {case.name: bool(np.isfinite(case.call()).all()) for case in cases}
+    spent = medians({case.name: (lambda case=case: timed(case.call) / case.count) for case in cases}, rounds)
+    return [
+        {
+            "name": case.name,
+            "us": 1e6 * spent[case.name],
+            "ratio": spent[case.name] / spent[case.plain],
+            "right": right[case.name],
+        }
+        for case in cases
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
+    print(tabulate(lines, ["", "us", "x plain", "right"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""The public names of coopoc, each with its home. `__init__.py` reads them here."""
+
+from .errors import InputError as InputError
+from .errors import MissingLibraryError as MissingLibraryError
+from .evaluate.bounds import bound_rt_le as bound_rt_le
+from .evaluate.bounds import fleet_bound as fleet_bound
+from .evaluate.bounds import posterior_bound as posterior_bound
+from .evaluate.ledger import Ledger as Ledger
+from .evaluate.ledger import break_even as break_even
+from .evaluate.metrics import max_error as max_error
+from .evaluate.metrics import nees as nees
+from .evaluate.metrics import rt_le as rt_le
+from .evaluate.statistics import paired_difference as paired_difference
+from .fleets import load_fleet as load_fleet
+from .methods.adaptive import AdaptiveKalman as AdaptiveKalman
+from .methods.admm import ConsensusADMM as ConsensusADMM
+from .methods.batch_smoother import BatchSmoother as BatchSmoother
+from .methods.central_filter import CentralFilter as CentralFilter
+from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
+from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
+from .methods.diffusion import Diffusion as Diffusion
+from .methods.fixed_lag import FixedLagSmoother as FixedLagSmoother
+from .methods.gbp import GaussianBeliefPropagation as GaussianBeliefPropagation
+from .methods.gnss import GNSS as GNSS
+from .methods.joint_filter import JointFilter as JointFilter
+from .methods.kalman import Kalman as Kalman
+from .methods.lkf_sa import LKFSA as LKFSA
+from .methods.mds import MDS as MDS
+from .methods.moving_horizon import MovingHorizon as MovingHorizon
+from .methods.msmv import MSMV as MSMV
+from .methods.noise_model import NoiseModel as NoiseModel
+from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
+from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
+from .methods.track import Method as Method
+from .methods.track import Track as Track
+from .methods.variational import VariationalKalman as VariationalKalman
+from .optimize.backend import Backend as Backend
+from .optimize.backend import backends as backends
+from .optimize.constraint import Constraint as Constraint
+from .optimize.factor import Factor as Factor
+from .optimize.graphs import read_graph as read_graph
+from .optimize.losses import Loss as Loss
+from .optimize.problem import Problem as Problem
+from .optimize.solution import Solution as Solution
+from .optimize.solve import solve as solve
+from .optimize.space import pose as pose
+from .study.results import Results as Results
+from .study.run import run_study as run_study
+from .study.study import Study as Study
+from .world.channel_load import channel_load as channel_load
+from .world.fleet import Fleet as Fleet
+from .world.links import Links as Links
+from .world.recording import Recording as Recording
+from .world.sensing import observe as observe
+from .world.sensors import Sensors as Sensors
+from .world.v2x import V2X as V2X
+from .world.v2x import Message as Message
+
+__version__: str
+__all__: list[str]

@@ -1,0 +1,76 @@
+"""Dead reckoning: the noise of a motion dt u, and the newest motions of one vehicle, so that a late fix can follow."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+from ..arrays import AnyArray, Floats
+from .compile import compiled, part
+
+ROUNDING = 1e-9
+"""s, by how much sums of time steps may miss a time."""
+
+
+class MotionNoise(NamedTuple):
+    """Process noise of one step: q = dt / interval (base^2 + (interval max(ratio s, floor))^2) m^2 per axis.
+
+    s is the measured speed on the axis, or of the whole velocity. So a step of 0.2 s is as uncertain as two of 0.1 s.
+
+    Args:
+        base: (3,) m per step of `interval`. ratio: (3,) share of the speed. floor: m/s. of_speed: 1.0 for a share of
+            the whole speed, 0.0 for one of each axis. interval: s.
+    """
+
+    base: Floats
+    ratio: Floats
+    floor: float
+    of_speed: float
+    interval: float
+
+
+@part
+def process_variance(noise: MotionNoise, velocity: AnyArray, dt: float, axis: int) -> float:
+    """Variance m^2 of dt u on one axis."""
+    speed = abs(velocity[axis])
+    if noise.of_speed > 0.0:
+        speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+    moved = noise.interval * max(noise.ratio[axis] * speed, noise.floor)
+    variance: float = dt / noise.interval * (noise.base[axis] ** 2 + moved * moved)
+    return variance
+
+
+# A history is one array (1 + capacity, 7), a ring. Row 0: first row in use, rows in use, seconds they span, seconds
+# asked for. Each other row is a step: dt s, motion (3,) m, its variance (3,) m^2.
+
+
+@compiled
+def push(history: AnyArray, dt: float, moved: Any, variance: Any) -> None:
+    """Add the newest step, and drop the oldest ones that are not needed to reach back as far as is asked for."""
+    capacity = len(history) - 1
+    first, count, seen = int(history[0, 0]), int(history[0, 1]), history[0, 2] + dt
+    row = 1 + (first + count) % capacity
+    history[row, 0] = dt
+    for c in range(3):
+        history[row, 1 + c], history[row, 4 + c] = moved[c], variance[c]
+    count += 1
+    while count > 1 and seen - history[1 + first, 0] >= history[0, 3]:
+        seen -= history[1 + first, 0]
+        first, count = (first + 1) % capacity, count - 1
+    history[0, 0], history[0, 1], history[0, 2] = first, count, seen
+
+
+@compiled
+def since(history: AnyArray, age: float, moved: AnyArray, variance: AnyArray) -> None:
+    """Motion (3,) m in the last `age` seconds and its variance (3,) m^2; of a step that is cut, its share."""
+    capacity, left = len(history) - 1, age
+    moved[:3], variance[:3] = 0.0, 0.0
+    for k in range(int(history[0, 1]) - 1, -1, -1):
+        if left <= 0.0:
+            break
+        row = 1 + (int(history[0, 0]) + k) % capacity
+        share = min(left / history[row, 0], 1.0)
+        for c in range(3):
+            moved[c] += share * history[row, 1 + c]
+            variance[c] += share * history[row, 4 + c]
+        left -= history[row, 0]

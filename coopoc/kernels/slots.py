@@ -1,0 +1,151 @@
+"""The last steps of one ego's star in LANES runs, slot by slot."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from .compile import inlined, inner
+from .edges import edge
+from .lanes import LANES
+from .messages import MOVED, POSITION, PROCESS, RELATIVE, Assumptions, Measurements, Star, gather
+from .small import load, store, subtract, times
+
+ONE, ROW = (0.0,) * 9, (0.0,) * 3
+"""Any block, any row."""
+LEAST_PROCESS = 1e-90
+"""m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
+
+
+class Window(NamedTuple):
+    """The last steps of one ego's star in LANES runs; step t stands in slot t modulo h + 1, member k of slot s in place
+    s stride + k.
+
+    Args:
+        sizes: (h + 1,) members. member, previous, later, joined: (places,) column, index in the star before and after,
+            or -1, and the step since which it has been in the star.
+        status, motion, relative: of `coopoc.kernels.messages.Star`, place by place. fix, used: (3 places, LANES) 1/m^2,
+            information of the positions that count, and the same times their GNC weights.
+        edge, eta: (9 places, LANES), (3 places, LANES), information of the relative measurements around the points.
+        point: (3 places, LANES) m. odometry: (1, LANES) GNC weight of the ego's odometry.
+    """
+
+    sizes: Ints
+    member: Ints
+    previous: Ints
+    later: Ints
+    joined: Ints
+    status: Floats
+    motion: Floats
+    relative: Floats
+    fix: Floats
+    used: Floats
+    edge: Floats
+    eta: Floats
+    point: Floats
+    odometry: Floats
+    stride: int
+
+
+@inner
+def new_window(length: int, most: int) -> Window:
+    """Room for windows of `length` steps of at most `most` members."""
+    places = (length + 1) * most
+    return Window(
+        np.zeros(length + 1, np.int64),
+        np.zeros(places, np.int64),
+        np.full(places, -1, np.int64),
+        np.full(places, -1, np.int64),
+        np.zeros(places, np.int64),
+        np.zeros((5 * places, LANES)),
+        np.zeros((12 * places, LANES)),
+        np.zeros((8 * places, LANES)),
+        np.zeros((3 * places, LANES)),
+        np.zeros((3 * places, LANES)),
+        np.zeros((9 * places, LANES)),
+        np.zeros((3 * places, LANES)),
+        np.zeros((3 * places, LANES)),
+        np.ones((1, LANES)),
+        most,
+    )
+
+
+@inlined
+def place_of(window: Window, step: int, k: int) -> int:
+    """Of member k of a step."""
+    return int(step % len(window.sizes) * window.stride + k)
+
+
+@inlined
+def count_of(window: Window, step: int) -> int:
+    """Members of a step."""
+    return int(window.sizes[step % len(window.sizes)])
+
+
+@inlined
+def enter(window: Window, star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int) -> None:
+    """Gather what is known of step t into its slot."""
+    old = count_of(window, t - 1) if t > 0 else 0
+    n, here, before = gather(star, seen, known, runs, t, old), place_of(window, t, 0), place_of(window, t - 1, 0)
+    window.sizes[t % len(window.sizes)] = n
+    for k in range(n):
+        place = here + k
+        window.member[place], window.previous[place], window.later[place] = star.member[k], star.previous[k], -1
+        window.joined[place] = t
+        if star.previous[k] >= 0:
+            window.later[before + star.previous[k]] = k
+            window.joined[place] = window.joined[before + star.previous[k]]
+    window.motion[12 * here : 12 * (here + n)] = star.motion[: 12 * n]
+    window.relative[8 * here : 8 * (here + n)] = star.relative[: 8 * n]
+    window.status[5 * here : 5 * (here + n)] = star.status[: 5 * n]
+
+
+@inlined
+def linearise(window: Window, span: Any, assumed: Any, how: int) -> None:
+    """The relative measurements as edges at the points, in one of the ways of `edge`."""
+    for step in range(span[0], span[1] + 1):
+        ego = place_of(window, step, 0)
+        origin = load(window.point, ego, ROW)
+        for place in range(ego + 1, ego + count_of(window, step)):
+            gap = subtract(load(window.point, place, ROW), origin)
+            information, eta = edge(gap, load(window.relative, place, RELATIVE), assumed, how)
+            store(window.edge, place, information)
+            store(window.eta, place, eta)
+
+
+@inlined
+def fix_gap(window: Window, place: int) -> Any:
+    """Measured position less the point, m."""
+    return subtract(load(window.motion, 4 * place + POSITION, ROW), load(window.point, place, ROW))
+
+
+@inlined
+def motion(window: Window, here: int, there: int) -> Any:
+    """Information 1/m^2 of the motion from a place to the one after, and its eta on the latter's point."""
+    p, q, r = load(window.motion, 4 * there + PROCESS, ROW)
+    stiff = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
+    moved = subtract(load(window.point, there, ROW), load(window.point, here, ROW))
+    return stiff, times(stiff, subtract(load(window.motion, 4 * there + MOVED, ROW), moved))
+
+
+@inner
+def largest_of(v: Any) -> Any:
+    """Largest of three absolute values."""
+    return max(max(abs(v[0]), abs(v[1])), abs(v[2]))
+
+
+@inlined
+def star_at(window: Window, step: int) -> Star:
+    """The star of a step, and of the one before it, in the window's own memory."""
+    here, before, n = place_of(window, step, 0), place_of(window, step - 1, 0), window.stride
+    return Star(
+        window.member[here : here + n],
+        window.previous[here : here + n],
+        window.status[5 * here : 5 * (here + n)],
+        window.motion[12 * here : 12 * (here + n)],
+        window.relative[8 * here : 8 * (here + n)],
+        window.member[before : before + n],
+        window.status[5 * before : 5 * (before + n)],
+    )

@@ -1,0 +1,146 @@
+"""NoiseModel: what a filter assumes about the noise. It is an axis of every study, never a hidden default."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..world.fleet import Fleet
+from ..world.recording import Recording
+from ..world.sensors import Sensors
+from ..world.spherical import vector_cov
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Assumed process, GNSS and relative noise.
+
+    - `identity`: unit matrices, as the paper's baselines (section IV.A of the paper).
+    - `nominal`: the Sensors that a method may know, without their bias.
+    - `fitted`: constants estimated on the *training* recordings only, exactly what the nets saw.
+    - `oracle`: nominal with the process noise of the true velocity; a reference line, not a method.
+
+    Args:
+        name: one of the above.
+        sensors: relative and velocity noise; None for identity.
+        process_std: (3,) m per step, constant; None to follow the velocity.
+        gnss_std: (3,) m.
+        velocity: (T, N, 3) m/s true velocity, for the oracle only.
+    """
+
+    name: str
+    sensors: Sensors | None = None
+    process_std: tuple[float, float, float] | None = None
+    gnss_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    velocity: Floats | None = None
+
+    def __post_init__(self) -> None:
+        for field in ("process_std", "gnss_std"):
+            value = getattr(self, field)
+            if value is not None and not all(np.isfinite(v) and v > 0 for v in value):
+                raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
+
+    @classmethod
+    def identity(cls) -> NoiseModel:
+        """Unit covariances: 1 m per step, 1 m GNSS, 1 m relative vector, per axis."""
+        return cls("identity", process_std=(1.0, 1.0, 1.0))
+
+    @classmethod
+    def nominal(cls, sensors: Sensors) -> NoiseModel:
+        """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
+        an azimuth as if it were white and its own."""
+        sensors = sensors.check_assumed().without_bias()
+        sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
+        return cls("nominal", sensors, gnss_std=sensors.fix_std)
+
+    @classmethod
+    def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:
+        """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is held against."""
+        return replace(cls.nominal(sensors), name="oracle", velocity=fleet.velocity)
+
+    @classmethod
+    def fitted(cls, recording: Recording, fleet: Fleet) -> NoiseModel:
+        """Per-axis standard deviations of a training recording against its truth.
+
+        process: rms of x_t - x_{t-1} - dt u_t, at least dt times the velocity floor; GNSS: rms of z_t - x_t. Relative
+        measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them.
+
+        Args:
+            recording: what the training vehicles measured. fleet: where they were.
+        """
+        moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
+        floor = recording.dt * recording.sensors.velocity_floor
+        process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)
+        gnss = np.sqrt(np.nanmean((recording.gnss - fleet.position) ** 2, axis=(0, 1, 2)))
+        return cls("fitted", recording.sensors, _three(process), _three(gnss))
+
+    def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
+        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, N, 3) or to the columns of these."""
+        if self.process_std is not None:
+            return np.square(self.process_std)[None, None, None]
+        assert self.sensors is not None
+        velocity = recording.velocity if self.velocity is None else self.velocity[None]
+        velocity = velocity if columns is None else velocity.take(columns, axis=2)
+        floor = 1e-6 if self.velocity is not None else self.sensors.velocity_floor
+        variance = np.empty(velocity.shape)
+        for run, one in enumerate(velocity):  # a run at a time stays in the cache
+            np.square(recording.dt * self.sensors.velocity_std(one, floor), out=variance[run])
+        return variance
+
+    @property
+    def pace(self) -> Floats:
+        """(3,) what makes the process noise from a measured velocity: ratio, floor m/s, 1 for a ratio of the speed; of
+        no length where it comes from elsewhere."""
+        another = type(self).process_variance is not NoiseModel.process_variance
+        if another or self.sensors is None or self.process_std is not None or self.velocity is not None:
+            return np.empty(0)
+        of_speed = float(self.sensors.velocity_reading == "speed")
+        return np.array([self.sensors.velocity_std_ratio, self.sensors.velocity_floor, of_speed])
+
+    def fix_variance(self, recording: Recording) -> Floats:
+        """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
+        return self.gnss_variance[None, None, None]
+
+    @property
+    def gnss_variance(self) -> Floats:
+        """(3,) m^2."""
+        return np.square(self.gnss_std)
+
+    @property
+    def exact_relative(self) -> bool:
+        """True if relative noise is known in range and angles, so that an exact Gauss-Newton step has a meaning."""
+        return self.sensors is not None
+
+    def relative_cov(self, relative: Floats) -> Floats:
+        """Covariance (..., 3, 3) m^2 of the converted relative vectors of measurements (..., 3)."""
+        if self.sensors is None:
+            return np.broadcast_to(np.eye(3), (*relative.shape, 3))
+        return vector_cov(relative, self.sensors.relative_std, self.sensors.min_range)
+
+
+def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
+    """A NoiseModel itself, or `identity` / `nominal` by name from what the recording says its sensors are.
+
+    >>> resolve("identity", None).gnss_std
+    (1.0, 1.0, 1.0)
+    """
+    if isinstance(noise_model, NoiseModel):
+        return noise_model
+    if noise_model == "identity":
+        return NoiseModel.identity()
+    if noise_model == "nominal":
+        return NoiseModel.nominal(recording.sensors)
+    raise InputError(
+        "noise_model",
+        repr(noise_model),
+        "must be 'identity', 'nominal' or a NoiseModel",
+        "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
+    )
+
+
+def _three(values: Floats) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -1,0 +1,91 @@
+"""QCQPRelaxation: ranges and fixes of one step as a QCQP, its semidefinite relaxation, rounded and refined."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..optimize.convex.relaxation import shor
+from ..optimize.problem import Problem
+from ..optimize.solve import solve
+from ..world.inbox import Inbox
+from ..world.recording import Recording
+from ..world.v2x import FIX_AND_VELOCITY, Message
+from .bridge import bridge
+from .egos import Estimate, follow_egos
+from .noise_model import NoiseModel, resolve
+from .star import StarStep, star_steps
+from .track import Track
+
+
+@dataclass(frozen=True, eq=False)
+class QCQPRelaxation:
+    """Per step and run: Shor's relaxation of the star's ranges and fixes, rounded, then Gauss-Newton.
+
+    minimise 1/2 sum_i |x_i - z_i|^2 / sigma_i^2 + 1/2 sum_j (|x_j - x_0| - r_j)^2 / sigma_r^2, which is not convex:
+    with a unit vector per range it is a QCQP. Angles are not used, and no step depends on another. Where the relaxation
+    is tight the refined point is the global optimum of its step; the notes report how often. A semidefinite programme
+    takes milliseconds per step and run, and is not batched: this is a baseline and a certificate for short drives. Late
+    fixes, whose axes differ in variance, make it slower. The covariance is that of the problem linearised at the point
+    found. A missing fix is the last one brought forward; a vehicle without a range takes no part.
+
+    Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
+
+    References:
+        Beck, Stoica and Li, "Exact and Approximate Solutions of Source Localization Problems", IEEE TSP 56, 2008.
+    """
+
+    noise_model: NoiseModel | str = "nominal"
+    name: str = "qcqp-relaxation"
+    cooperative: bool = True
+    message: Message = FIX_AND_VELOCITY
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
+
+        Raises:
+            MissingLibraryError: Clarabel is not installed.
+        """
+        recording, known, notes = bridge(recording, resolve(self.noise_model, recording))
+        tight: list[bool] = []
+
+        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
+            for star in star_steps(recording, ego, box, known):
+                held = box.newest[:, box.start[star.step] : box.start[star.step + 1]] >= 0
+                held &= np.isfinite(star.relative[..., 0])
+                points, spread = np.full_like(star.fix, np.nan), np.empty((recording.runs, 3, 3))
+                for run in range(recording.runs):
+                    members = np.concatenate([[0], 1 + np.flatnonzero(held[run])])
+                    points[run, members], spread[run] = _locate(range_star(star, run, members, known), tight)
+                yield Estimate(star.step, points[:, 0], spread, star.links, points[:, 1:])
+
+        track = follow_egos(self, recording, egos, follow, missing=True)
+        return replace(track, notes=(f"{sum(tight)} of {len(tight)} relaxations were tight", *notes))
+
+
+def _locate(problem: Problem, tight: list[bool]) -> tuple[Floats, Floats]:
+    """Points (n, 3) and the ego's covariance (3, 3); whether the relaxation was tight is appended."""
+    if len(problem.names) == 1:
+        solution = solve(problem)
+    else:
+        relaxed = shor(problem)
+        assert relaxed.solution is not None
+        solution = relaxed.solution
+        tight.append(relaxed.tight)
+    return solution.x, solution.covariance[0]
+
+
+def range_star(star: StarStep, run: int, members: Ints, known: NoiseModel) -> Problem:
+    """Fixes of these members and the ego's ranges to them in one run, the ego first; no angles."""
+    variance = np.broadcast_to(star.fix_variance, star.fix.shape)[run, members]
+    problem = Problem(tuple(map(str, range(len(members)))), separator=(0,))
+    problem = problem.add("position", list(range(len(members))), star.fix[run, members], std=np.sqrt(variance))
+    if len(members) == 1:
+        return problem
+    std = 1.0 if known.sensors is None else known.sensors.range_std
+    pairs = [(0, j) for j in range(1, len(members))]
+    return problem.add("range", pairs, star.relative[run, members[1:] - 1, :1], std=std)

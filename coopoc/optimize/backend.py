@@ -1,0 +1,211 @@
+"""Backend: the protocol of a solver, what it can solve as data, and the backends by name."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints
+from ..errors import InputError, MissingLibraryError
+from ..one_file import in_file
+from ..plugins import find, names
+from .problem import Problem
+
+Options: TypeAlias = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class SolverResult:
+    """What a solver returns and `solve` verifies; with a leading axis B where the solver was given one.
+
+    Args:
+        x: (n, ambient) nodes, see Space.
+        iterations: how many it took.
+        infeasible: True if the solver found that no point satisfies the constraints.
+        extras: numbers of its own, for `Solution.extras`; a batch drops them.
+    """
+
+    x: Floats
+    iterations: int | Ints
+    infeasible: bool | Bools = False
+    extras: dict[str, Any] = field(default_factory=dict)
+
+
+Solver: TypeAlias = Callable[[Problem, Floats], SolverResult]
+"""(problem, start) -> result. The problem has the structure for which the solver was prepared, with numbers of its own.
+A batched solver gets B realisations and starts (B, n, ambient), any other a single problem and start (n, ambient)."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """Which problems a backend can solve; `solve`, its errors and the table of the documentation are made from it.
+
+    Args:
+        batched: the solver takes B realisations in one call; `solve_batch` calls any other once per realisation.
+        compiled: the methods have a compiled form of the same algorithm and run it in place of the solver.
+        kinds: of measurement; None: all that are registered, those of other distributions too.
+        losses: robust losses; None: all.
+        poses: nodes may have a rotation.
+        dimensions: of the space.
+        constraints: "none", "linear" (on kinds whose formula is linear) or "all".
+        inequalities: the two sides of a constraint may differ.
+    """
+
+    batched: bool = False
+    compiled: bool = False
+    kinds: tuple[str, ...] | None = None
+    losses: tuple[str, ...] | None = None
+    poses: bool = True
+    dimensions: tuple[int, ...] = (2, 3)
+    constraints: Literal["none", "linear", "all"] = "none"
+    inequalities: bool = True
+
+    def lacking(self, problem: Problem) -> list[str]:
+        """What the problem needs and these capabilities lack, in words; empty if the problem can be solved.
+
+        >>> problem = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=0.0)
+        >>> Capabilities().lacking(problem), Capabilities(constraints="linear").lacking(problem)
+        (['a constraint on position'], [])
+        """
+        kinds = {f.kind for f in problem.factors} - set(self.kinds or [f.kind for f in problem.factors])
+        losses = {f.loss.name for f in problem.factors if f.loss is not None}
+        losses -= set(losses if self.losses is None else self.losses)
+        barred = [c for c in problem.constraints if not self._can_hold(c.measurement.linear, bool(c.equality.all()))]
+        return [
+            *(f"kind {kind}" for kind in sorted(kinds)),
+            *(f"loss {loss}" for loss in sorted(losses)),
+            *(["poses"] if problem.poses and not self.poses else []),
+            *([f"dimension {problem.dimension}"] if problem.dimension not in self.dimensions else []),
+            *(f"a constraint on {kind}" for kind in sorted({c.kind for c in barred})),
+        ]
+
+    def _can_hold(self, linear: bool, equality: bool) -> bool:
+        known = self.constraints == "all" or (self.constraints == "linear" and linear)
+        return known and (equality or self.inequalities)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A solver by name, what it is for and what it can solve.
+
+    Args:
+        name: as in `solve(problem, name)`.
+        prepare: `prepare(problem, **options)` returns the Solver of the problem's structure; it reads no numbers.
+        purpose: one line for lists.
+        library: that it imports, None if it needs none but those of coopoc.
+        capabilities: which problems it can solve.
+        fallback: (problem, options) -> options with which to try again where an answer fails the checks, or None.
+    """
+
+    name: str
+    prepare: Callable[..., Solver]
+    purpose: str = ""
+    library: str | None = None
+    capabilities: Capabilities = Capabilities()
+    fallback: Callable[[Problem, Options], Options | None] = lambda problem, options: None
+
+    @property
+    def installed(self) -> bool:
+        """True if its library is there."""
+        return self.library is None or find_spec(self.library) is not None
+
+    def solver(self, problem: Problem, options: Options) -> Solver:
+        """The solver of a problem; it takes (B, n, ambient) starts whether the backend is batched or not.
+
+        Raises:
+            InputError: an unknown option, or a problem beyond the capabilities; it names the backends that can.
+        """
+        allowed = _options(self.prepare)
+        for name in options:
+            if name not in allowed:
+                raise InputError(
+                    name, options[name], f"is no option of {self.name}, which has {allowed}", "Leave it out."
+                )
+        if lacking := self.capabilities.lacking(problem):
+            able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
+            allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"
+            raise InputError("problem", f"with {', '.join(lacking)}", allowed_, "Name one that can, or change it.")
+        if problem.movable is not None and not problem.movable.any():
+            return lambda part, x: SolverResult(x, np.zeros(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool))
+        solver = self.prepare(problem, **options)
+        return solver if self.capabilities.batched else looped(solver)
+
+
+def looped(solver: Solver) -> Solver:
+    """The solver of single problems as one of B realisations."""
+
+    def each(problem: Problem, x: Floats) -> SolverResult:
+        parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+        found = [solver(part, start) for part, start in zip(parts, x, strict=True)]
+        iterations, infeasible = (np.array([getattr(f, name) for f in found]) for name in ("iterations", "infeasible"))
+        return SolverResult(np.stack([f.x for f in found]), iterations, infeasible, found[0].extras)
+
+    return each
+
+
+@lru_cache(maxsize=64)
+def _options(prepare: Any) -> list[str]:
+    """Names of what `prepare` takes besides the problem."""
+    return list(inspect.signature(prepare).parameters)[1:]
+
+
+def backends() -> dict[str, Backend]:
+    """The backends by name, those of other distributions too: the entry points of group "coopoc.backends".
+
+    >>> backends()["gauss-newton"].installed
+    True
+    """
+    return {name: _registered(name) for name in names("coopoc.backends")}
+
+
+def require_backend(backend: str | Backend) -> Backend:
+    """The backend of a name, or of "folder/mine.py:BACKEND"; a Backend itself is returned.
+
+    Raises:
+        InputError: no such backend (lists the names and the nearest), or the object is no Backend.
+        MissingLibraryError: its library is not installed; carries the line that installs it.
+    """
+    if isinstance(backend, str):
+        backend = _checked(backend) if in_file(backend) else _registered(backend)
+    if not backend.installed:
+        raise MissingLibraryError(str(backend.library), f"backend {backend.name!r}", str(backend.library))
+    return backend
+
+
+@lru_cache(maxsize=64)
+def _registered(name: str) -> Backend:
+    """The backend of an entry point; kept, since reading the entry points takes longer than a small solve."""
+    return _checked(name)
+
+
+def _checked(name: str) -> Backend:
+    found = find("coopoc.backends", name)
+    if not isinstance(found, Backend):
+        hint = "Give coopoc.Backend(name, prepare, purpose)."
+        raise InputError("backend", repr(name), f"is a {type(found).__name__}, no Backend", hint)
+    return found
+
+
+def capability_table() -> str:
+    """The capabilities of all backends as a Markdown table: the one of docs/optimize.md.
+
+    >>> print(capability_table().splitlines()[4][:40])
+    | `gauss-newton` | all | all | yes | non
+    """
+    head = "| backend | kinds | losses | poses | constraints | realisations |"
+    rows = [head, "|---|---|---|---|---|---|"]
+    for name, known in backends().items():
+        able = known.capabilities
+        kinds, losses = ("all" if given is None else ", ".join(given) or "none" for given in (able.kinds, able.losses))
+        equal = "" if able.inequalities or able.constraints == "none" else ", equalities only"
+        batch = "in one call" if able.batched else "one by one"
+        rows.append(
+            f"| `{name}` | {kinds} | {losses} | {'yes' if able.poses else 'no'} | {able.constraints}{equal} | {batch} |"
+        )
+    return "\n".join(rows)

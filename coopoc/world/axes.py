@@ -1,0 +1,98 @@
+"""The axes of a drive: vehicles with unique names, equally spaced instants."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import Floats, checked
+from ..errors import InputError
+from ..plugins import unknown
+
+
+def names(ids: Iterable[object]) -> tuple[str, ...]:
+    """Ids of vehicles as a tuple of words; InputError if there is none, or one stands twice.
+
+    >>> names([7, "b"])
+    ('7', 'b')
+    """
+    if isinstance(ids, str) or not isinstance(ids, Iterable):
+        raise InputError("ids", repr(ids), "must be a sequence of names", 'Give a tuple such as ("a", "b").')
+    found = tuple(str(i) for i in ids)
+    if not found:
+        raise InputError("ids", "no vehicle", "must be at least one", "Check that the file holds a drive.")
+    if len(set(found)) != len(found):
+        twice = sorted(i for i, count in Counter(found).items() if count > 1)
+        raise InputError("ids", twice[:3], "must be unique", "Rename the vehicles that share an id.")
+    return found
+
+
+def column(field: str, vehicle: object, ids: Sequence[str]) -> int:
+    """Column of a vehicle given by id or index; InputError, which proposes the nearest id, if there is none.
+
+    >>> column("ego", "b", ("a", "b"))
+    1
+    """
+    if isinstance(vehicle, str):
+        if vehicle in ids:
+            return ids.index(vehicle)
+        raise unknown(field, vehicle, ids)
+    if isinstance(vehicle, int | np.integer) and not isinstance(vehicle, bool) and 0 <= vehicle < len(ids):
+        return int(vehicle)
+    raise InputError(field, repr(vehicle), f"must be an index in 0..{len(ids) - 1} or an id", "List them with .ids.")
+
+
+def columns(field: str, vehicles: Iterable[object], ids: Sequence[str]) -> list[int]:
+    """Columns of several vehicles; InputError for one that is unknown, and for a single one outside a list.
+
+    >>> columns("egos", ["b", 0], ("a", "b"))
+    [1, 0]
+    """
+    if isinstance(vehicles, str) or not isinstance(vehicles, Iterable):
+        raise InputError(field, repr(vehicles), "must be a sequence of indices or ids", f"Give [{vehicles!r}].")
+    return [column(field, vehicle, ids) for vehicle in vehicles]
+
+
+def clock(t: npt.ArrayLike) -> Floats:
+    """Instants (T,) s as a read-only array.
+
+    Raises:
+        InputError: fewer than two, or instants that are not finite, not increasing or not equally spaced.
+
+    >>> clock([0, 1]).tolist()
+    [0.0, 1.0]
+    """
+    times = checked("t", t, "(T,)", (-1,))
+    if len(times) < 2:
+        raise InputError("t", f"{len(times)} steps", "needs at least 2", "Check that the file holds a drive.")
+    if not np.isfinite(times).all():
+        step = int(np.argmin(np.isfinite(times)))
+        raise InputError("t", f"{times[step]} at step {step}", "must be finite", "Give seconds for every step.")
+    gaps = np.diff(times)
+    if not (gaps > 0).all():
+        raise InputError(
+            "dt",
+            f"{gaps.min():g} s at step {int(np.argmin(gaps)) + 1}",
+            "must be > 0",
+            "Sort the rows by time and drop repeated stamps.",
+        )
+    if np.ptp(gaps) > 1e-3 * gaps.mean() + 1e-6:
+        raise InputError(
+            "t",
+            f"steps between {gaps.min():g} and {gaps.max():g} s",
+            "must be equally spaced",
+            "Resample first: coopoc data convert --dt 0.1.",
+        )
+    return times
+
+
+def interval(t: Floats) -> float:
+    """Sampling interval of a clock, s.
+
+    >>> interval(np.array([0.0, 0.1, 0.2]))
+    0.1
+    """
+    return round(float((t[-1] - t[0]) / (len(t) - 1)), 9)

@@ -1,0 +1,183 @@
+"""The joint filter of a star whose vehicles send their noise, by the compiled step of `JointFilter`.
+
+Two kinds of messages: the newest fix and velocity, or sums since departure, of which the receiver takes the difference
+to the last ones of that vehicle: what happened while messages were lost is not lost.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coopoc.arrays import AnyArray, Floats
+from coopoc.kernels.compile import as_written, inner, inside
+from coopoc.kernels.elimination import rescale
+from coopoc.kernels.joint import Joint, new_joint
+from coopoc.kernels.joint_filter import step, write
+from coopoc.kernels.lanes import LANES
+from coopoc.kernels.messages import (
+    HELD,
+    MOVED,
+    NEW,
+    POSITION,
+    PROCESS,
+    RELATIVE,
+    ROW,
+    VARIANCE,
+    Assumptions,
+    Measurements,
+    Star,
+    gather,
+    largest,
+    new_star,
+)
+from coopoc.kernels.relative import vector
+from coopoc.kernels.small import add, load, square, store
+
+SUMS, LAST, STEP, JOINED, GUESSED, PACE, WORTH, SIZE = 0, 12, 24, 25, 26, 29, 32, 35
+"""Of a vehicle: motion m, its variance m^2, 1/r and (fix - motion)/r, each summed since departure, three axes each; the
+same as its last message said; the step of that, -1 for none; 1 if it came since the vehicle joined; m that it has been
+moved by guess since, m that it moves per step, and 1/r of its fixes as sent last."""
+
+
+class Accounts(NamedTuple):
+    """(LANES, N, SIZE) numbers of each vehicle, and (3 most, LANES) 1/r of the members' fixes as sent last, now and in
+    the last star, 0 if never."""
+
+    vehicle: Floats
+    worth: Floats
+    last_worth: Floats
+
+
+@as_written
+def follow(seen: Measurements, known: Assumptions, sums: bool) -> tuple[Floats, Floats, Floats]:
+    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; `known` holds what the vehicles send."""
+    runs, steps, vehicles = seen.gnss.shape[:3]
+    out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
+    most = largest(seen.start) + 1
+    for first in range(0, runs, LANES):
+        star, joint, old, last = new_star(most), new_joint(most, ROW), 0, min(first + LANES, runs) - 1
+        accounts = Accounts(np.zeros((LANES, vehicles, SIZE)), np.zeros((3 * most, LANES)), np.zeros((3 * most, LANES)))
+        for lane in range(LANES):
+            for k in range(vehicles):
+                accounts.vehicle[lane, k, STEP] = -1.0
+        for t in range(steps):
+            n = gather(star, seen, known, (first, last), t, old)
+            for lane in range(LANES):
+                run = min(first + lane, last)
+                if sums:
+                    for k in range(vehicles):
+                        enter(accounts.vehicle[lane, k], seen, known, run, t, k)
+                for k in range(n):
+                    news = k == 0 or (
+                        seen.fresh[run, seen.start[t] + k - 1] if sums else star.status[5 * k + HELD, lane] > 0.0
+                    )
+                    if sums:
+                        settle(star, accounts.vehicle[lane, star.member[k]], t, (k, lane, news))
+                    revise(star, accounts, known, (run, t), (k, lane, news, sums))
+            revalue(star, joint, accounts, n, old)
+            step(star, joint, known, True, None, (n, old), ROW)
+            relocate(star, joint, n)
+            for i in range(3 * n):
+                store(accounts.last_worth, i, load(accounts.worth, i, (0.0,)))
+            write(out, joint, (first, last, t, seen.start[t]), n, ROW)
+            old = n
+    return out
+
+
+@inside
+def at(values: AnyArray, run: int, t: int, k: int, axis: int) -> float:
+    """Of what is broadcastable to (R, T, N, 3)."""
+    value: float = values[min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(k, values.shape[2] - 1), axis]
+    return value
+
+
+@inside
+def enter(account: AnyArray, seen: Measurements, known: Assumptions, run: int, t: int, k: int) -> None:
+    """Add a step to the sums of a vehicle; what is missing adds nothing."""
+    for c in range(3):
+        step, q = seen.dt * seen.velocity[run, t, k, c], at(known.process, run, t, k, c)
+        fix, r = seen.gnss[run, t, k, c], at(known.fixes, run, t, k, c)
+        if not np.isnan(fix):
+            account[6 + c] += 1.0 / r
+            account[9 + c] += (fix - account[c] - step) / r
+        if not np.isnan(step):
+            account[c] += step
+            account[3 + c] += q
+
+
+@inner
+def settle(star: Star, account: AnyArray, t: int, member: Any) -> None:
+    """What a member did since its last message, if one has come now; else it moves on as before, which the next message
+    takes back, and its covariance waits.
+
+    Averaging n fixes along the motion adds (n - 1)(2 n - 1) / (6 n^2) of the motion's variance to that of the average.
+    """
+    (k, lane, news), row = member, 12 * member[0]
+    if star.previous[k] < 0:
+        account[JOINED] = 0.0
+    again = news and account[JOINED] > 0.0
+    steps = t - account[STEP]
+    late = (steps - 1.0) * (2.0 * steps - 1.0) / (6.0 * steps * steps) if steps > 0.0 else 0.0
+    star.status[5 * k + NEW, lane] = 1.0 if news and account[6] > account[18] else 0.0
+    for c in range(3):
+        moved, q, w = account[c] - account[LAST + c], account[3 + c] - account[15 + c], account[6 + c] - account[18 + c]
+        star.motion[row + 3 * MOVED + c, lane] = moved - account[GUESSED + c] if again else account[PACE + c]
+        star.motion[row + 3 * PROCESS + c, lane] = q if again else 0.0
+        w = w if news and w > 0.0 else 1.0
+        mean = (account[9 + c] - account[21 + c]) / w
+        star.motion[row + 3 * POSITION + c, lane] = mean + account[c]
+        star.motion[row + 3 * VARIANCE + c, lane] = 1.0 / w + late * q
+        if news:
+            account[GUESSED + c], account[PACE + c] = 0.0, moved / steps if again else 0.0
+        else:
+            account[GUESSED + c] += account[PACE + c]
+    if news:
+        account[STEP], account[JOINED] = t, 1.0
+        for i in range(LAST):
+            account[LAST + i] = account[SUMS + i]
+    star.status[5 * k + HELD, lane] = account[JOINED]
+
+
+@inside
+def revise(star: Star, accounts: Accounts, known: Assumptions, source: Any, member: Any) -> None:
+    """1/r of a fix as sent last; without news the measurement of the member counts nothing."""
+    (run, t), (k, lane, news, sums) = source, member
+    sent, account = t if sums else int(star.status[5 * k, lane]), accounts.vehicle[lane, star.member[k]]
+    for c in range(3):
+        if news:
+            account[WORTH + c] = 1.0 / at(known.fixes, run, sent, star.member[k], c)
+        else:
+            star.relative[8 * k + 5 + c, lane] = np.inf
+        accounts.worth[3 * k + c, lane] = account[WORTH + c] if news or sums else 0.0
+
+
+@inner
+def revalue(star: Star, joint: Joint, accounts: Accounts, n: int, old: int) -> None:
+    """Scale the covariance, per axis, by the sum over members of 1/r as sent before over what it is now: what is known
+    keeps its mean, and is worth what fixes are worth now."""
+    for lane in range(LANES):
+        for c in range(3):
+            before, now = 0.0, 0.0
+            for k in range(n):
+                if star.previous[k] >= 0:
+                    p, q = accounts.last_worth[3 * star.previous[k] + c, lane], accounts.worth[3 * k + c, lane]
+                    if p > 0.0 and q > 0.0:
+                        before, now = before + p, now + q
+            for k in range(old):
+                joint.move[3 * k + c, lane] = math.sqrt(now / before) if now > 0.0 else 1.0
+    rescale(joint.information, old, joint.stride, joint.move, square(ROW), ROW)
+
+
+@inner
+def relocate(star: Star, joint: Joint, n: int) -> None:
+    """Put a member of which nothing is known where the ego measures it."""
+    for k in range(1, n):
+        there = add(load(joint.state, 0, ROW), vector(load(star.relative, k, RELATIVE)))
+        store(joint.scratch, 2 * k + 3, there)
+        for lane in range(LANES):
+            if star.status[5 * k + HELD, lane] == 0.0:
+                for c in range(3):
+                    joint.state[3 * k + c, lane] = joint.scratch[3 * (2 * k + 3) + c, lane]

@@ -1,0 +1,188 @@
+"""Training of recipes: `train_all` makes every checkpoint that a study needs, or finds it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from coopoc.one_file import in_file
+from coopoc.workers import leave_with
+from coopoc.world.fleet import Fleet
+from coopoc.world.sensors import VelocityReading
+
+from .checkpoint import Checkpoint, load, read_card, save
+from .federation.federated import federate_many
+from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
+from .training.clients import Client, Segments, Start
+from .training.fit import Fit, Task, fit_many
+from .training.machine import reporting_on
+from .training.okf_fit import fit_okf_many
+
+
+def train_all(
+    fleet: Fleet,
+    out: Path | str,
+    *,
+    seeds: Sequence[int] = range(5),
+    starts: Sequence[Start] = ("gnss",),
+    readings: Sequence[VelocityReading] = ("axis",),
+    recipes: Sequence[str] | None = None,
+    aggregate: str | None = None,
+    jobs: int = 1,
+    progress: bool = True,
+) -> dict[str, Checkpoint]:
+    """Train every recipe in every setting, or read it from `out` where the same was trained before.
+
+    All settings of a recipe are trained together, on one core; recipes side by side on `jobs` cores. A checkpoint is
+    reused if its card's key, the hash of all that changes the weights, is the same; each is written whole or
+    not at all.
+
+    Args:
+        fleet: the clients' drives, such as the bundled "town10-clients".
+        out: folder of the checkpoints.
+        seeds: of the settings; every combination with starts and readings is trained.
+        starts: of the filter, "gnss" or "true".
+        readings: of "10 % of the velocity", "axis" or "speed".
+        recipes: names, or "mine.py:NAME" of a Recipe or a net; default all of `RECIPES`.
+        aggregate: rule of the federations by name or path, default that of the recipe.
+        jobs: processes; the weights do not depend on it.
+        progress: bars on stderr that name the stage.
+
+    Returns:
+        Checkpoints by label, such as "fedkalmannet-gnss-axis-0".
+
+    Raises:
+        InputError: an unknown recipe.
+    """
+    settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
+    wanted = {
+        name: [job for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
+        for name in (RECIPES if recipes is None else recipes)
+    }
+    paths = {job: Path(out) / f"{job.label}.safetensors" for group in wanted.values() for job in group}
+    groups = ([job for job in group if not _made(paths[job], job.key(fleet))] for group in wanted.values())
+    missing = [group for group in groups if group]
+    if jobs > 1 and len(missing) > 1:
+        with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+            todo = [
+                pool.submit(_in_worker, group, fleet, Path(out), line if progress else None, os.getpid())
+                for line, group in enumerate(missing)
+            ]
+            for done in todo:
+                done.result()
+    else:
+        for group in missing:
+            _train(group, fleet, Path(out), progress)
+    return {job.label: _loaded(job, path) for job, path in paths.items()}
+
+
+def _loaded(job: Job, path: Path) -> Checkpoint:
+    """The checkpoint of a job, which names the file of its net."""
+    return load(path, job.recipe.net if in_file(job.recipe.net) else "")
+
+
+def _train(group: Sequence[Job], fleet: Fleet, out: Path, progress: bool) -> None:
+    """Train and save the checkpoints of one recipe."""
+    for job, checkpoint in zip(group, trained(group, fleet, progress), strict=True):
+        save(out / f"{job.label}.safetensors", checkpoint)
+
+
+def trained(group: Sequence[Job], fleet: Fleet, progress: bool = True) -> list[Checkpoint]:
+    """Checkpoints of jobs of one recipe, trained together now."""
+    data = {job.setting: job_clients(job, fleet) for job in group}
+    found = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
+    return [
+        replace(made, card=_card(job, fleet, data[job.setting]) | dict(made.card))
+        for job, made in zip(group, found, strict=True)
+    ]
+
+
+def _in_worker(group: Sequence[Job], fleet: Fleet, out: Path, line: int | None, parent: int) -> None:
+    leave_with(parent)
+    with reporting_on(line or 0):
+        _train(group, fleet, out, line is not None)
+
+
+Data = dict[Setting, tuple[Client, ...]]
+Trainer = Callable[[Sequence[Job], Data, str | None], list[Checkpoint]]
+
+
+def _made(path: Path, key: str) -> bool:
+    return path.is_file() and read_card(path).get("key") == key
+
+
+def _card(job: Job, fleet: Fleet, data: Sequence[Client]) -> dict[str, Any]:
+    used = [c for i, c in enumerate(data) if job.client in (None, i + 1)]
+    return {
+        "key": job.key(fleet),
+        "recipe": job.name,
+        "settings": asdict(job.recipe) | asdict(job.setting),
+        "noise": asdict(sensors(job.setting)),
+        "client": job.client,
+        "fleet": fleet.name,
+        "digest": fleet.digest,
+        "clients": [c.name for c in used],
+        "training_pieces": [len(c.training) for c in used],
+        "validation_pieces": [len(c.validation) for c in used],
+    }
+
+
+def _joined(data: Sequence[Client], client: int | None, part: str) -> Segments:
+    return Segments.join([getattr(c, part) for i, c in enumerate(data) if client in (None, i + 1)])
+
+
+def _task(job: Job, data: Sequence[Client]) -> Task:
+    training, validation, long = (_joined(data, job.client, part) for part in ("training", "validation", "long"))
+    return Task(untrained(job), training, validation, job.setting.seed, str(job.client or ""), long)
+
+
+def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
+    done = federate_many(
+        nets,
+        [data[j.setting] for j in todo],
+        [j.setting.seed for j in todo],
+        recipe.rounds,
+        recipe.aggregate,
+        recipe.local_epochs,
+        recipe.schedule,
+        stage,
+        recipe.local_epoch,
+    )
+    found = []
+    for job, federation in zip(todo, done, strict=True):
+        rows = [row.card for row in federation.history]
+        weights = torch.stack([r.weights for r in federation.history])
+        card = {"history": rows, "best": federation.best.number, "seconds": federation.seconds}
+        model = federation.model.calibrate([client.training for client in data[job.setting]])
+        found.append(Checkpoint(model, card, weights))
+    return found
+
+
+def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    fits = fit_many([_task(job, data[job.setting]) for job in todo], todo[0].recipe.schedule, stage)
+    return [_of_fit(fit) for fit in fits]
+
+
+def _of_fit(fit: Fit) -> Checkpoint:
+    rows = [
+        {"step": r.step, "training_loss": r.training_loss, "validation_loss": r.validation_loss} for r in fit.history
+    ]
+    card = {"history": rows, "best": fit.best.step, "stopped": fit.stopped, "seconds": fit.seconds}
+    return Checkpoint(fit.model, card, torch.stack([r.weights for r in fit.history]))
+
+
+def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
+    tasks = [(_joined(data[j.setting], None, "training"), _joined(data[j.setting], None, "validation")) for j in todo]
+    fits = fit_okf_many(tasks, todo[0].recipe.schedule.epochs, progress=stage)
+    return [Checkpoint(f.model, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
+
+
+TRAINERS: dict[str, Trainer] = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

@@ -1,0 +1,117 @@
+"""The joint filter in covariance form with dense matrices, one run: state (x_0, x_1, ..., x_k), the ego first.
+
+Predict x_j += moved_j, P += Q. Update in information form with H and R as they stand; then, for exact measurements, one
+Gauss-Newton step of the same cost at the solution of the linear update, with range and angles themselves.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coopoc import NoiseModel
+from coopoc.arrays import Floats
+from coopoc.methods.star import FORGOTTEN
+from coopoc.world.spherical import spherical, to_vector, wrap
+from oracles.messages import Member
+
+
+def follow(stars: list[list[Member]], known: NoiseModel, exact: bool) -> tuple[Floats, Floats, list[Floats]]:
+    """x (T, 3), covariance (T, 3, 3) and the neighbours (k, 3) at each step."""
+    x, p, found = np.zeros((0, 3)), np.zeros((0, 0)), []
+    for star in stars:
+        x, p = predict(x, p, star)
+        x, p = update(x, p, star, known, exact)
+        found.append((x, p[:3, :3]))
+    return np.array([x[0] for x, _ in found]), np.array([p for _, p in found]), [x[1:] for x, _ in found]
+
+
+def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
+    """Members that stay move; a member that joins is where the ego measures it, with a flat prior."""
+    n, m = len(star), len(x)
+    new = np.zeros((n, 3))
+    q = np.concatenate([np.full(3, FORGOTTEN) if one.before is None else one.process for one in star])
+    pick = np.zeros((3 * n, 3 * m))
+    for k, one in enumerate(star):
+        if one.before is not None:
+            pick[3 * k : 3 * k + 3, 3 * one.before : 3 * one.before + 3] = np.eye(3)
+            new[k] = x[one.before] + one.moved
+        else:
+            new[k] = (
+                one.position if k == 0 else new[0] + to_vector(np.where(np.isnan(one.relative), EAST, one.relative))
+            )
+    return new, pick @ p @ pick.T + np.diag(q)
+
+
+EAST = np.array([0.0, 0.0, np.pi / 2])
+"""Stands for a missing component where a vehicle joins."""
+
+
+def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel, exact: bool) -> tuple[Floats, Floats]:
+    """Fixes and converted vectors at the predicted geometry; then one exact step."""
+    n = len(star)
+    information, eta = np.linalg.inv(p), np.zeros(3 * n)
+    for k, one in enumerate(star):
+        if one.new:
+            at = slice(3 * k, 3 * k + 3)
+            information[at, at] += np.diag(1 / one.variance)
+            eta[at] += (one.position - x[k]) / one.variance
+    linear, linear_eta = information.copy(), eta.copy()
+    for k in range(1, n):
+        h, r, z = converted(star[k].relative, x[k] - x[0], known)
+        add(linear, linear_eta, k, h.T @ r @ h, h.T @ r @ z)
+    move = np.linalg.solve(linear, linear_eta)
+    if not exact:
+        return x + move.reshape(-1, 3), np.linalg.inv(linear)
+    at = x + move.reshape(-1, 3)
+    for k in range(1, n):
+        jacobian, residual = whitened(star[k].relative, at[k] - at[0], known)
+        ahead = move[3 * k : 3 * k + 3] - move[:3]
+        add(information, eta, k, jacobian.T @ jacobian, jacobian.T @ (residual + jacobian @ ahead))
+    p = np.linalg.inv(information)
+    return x + (p @ eta).reshape(-1, 3), p
+
+
+def add(information: Floats, eta: Floats, k: int, weight: Floats, push: Floats) -> None:
+    """Information about x_k - x_0."""
+    b = np.zeros((3, len(eta)))
+    b[:, 3 * k : 3 * k + 3], b[:, :3] = np.eye(3), -np.eye(3)
+    information += b.T @ weight @ b
+    eta += b.T @ push
+
+
+def converted(relative: Floats, gap: Floats, known: NoiseModel) -> tuple[Floats, Floats, Floats]:
+    """Unit directions of range, azimuth and inclination (rows) at `gap`, their information, and the converted vector
+    less `gap` along them; a missing component has no row."""
+    there = np.isfinite(relative)
+    expected = np.array(spherical(*gap))
+    seen = np.where(there, relative, expected)
+    _, az, inc = expected
+    rows = np.array(
+        [
+            [np.cos(az) * np.sin(inc), np.sin(az) * np.sin(inc), np.cos(inc)],
+            [-np.sin(az), np.cos(az), 0.0],
+            [np.cos(az) * np.cos(inc), np.sin(az) * np.cos(inc), -np.sin(inc)],
+        ]
+    )
+    cov = rows @ np.atleast_2d(known.relative_cov(expected)) @ rows.T
+    return rows[there], np.diag(1 / np.diag(cov)[there]), rows[there] @ (to_vector(seen) - gap)
+
+
+def whitened(relative: Floats, gap: Floats, known: NoiseModel) -> tuple[Floats, Floats]:
+    """Jacobian and residual of what was measured, in standard deviations."""
+    assert known.sensors is not None
+    there, (x, y, z) = np.isfinite(relative), gap
+    expected = np.array(spherical(*gap))
+    residual = relative - expected
+    residual[1:] = wrap(residual[1:])
+    d = max(expected[0], known.sensors.min_range)
+    ground = max(np.hypot(x, y), 1e-3 * d)
+    jacobian = np.array(
+        [
+            gap / expected[0],
+            [-y / ground**2, x / ground**2, 0.0],
+            [x * z / (ground * d**2), y * z / (ground * d**2), -ground / d**2],
+        ]
+    )
+    std = known.sensors.relative_std
+    return (jacobian / std[:, None])[there], (residual / std)[there]

@@ -1,0 +1,86 @@
+"""LKF-SA with dense matrices, one run, axis by axis: z = [delta; fixes], H = [L; I], L the Laplacian of the star.
+
+delta_i = -sum_j (x_j - x_i) as measured, of variance 1, or deg_i times the mean variance per axis of the measured
+vectors. A member whose measurement is incomplete has no edge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coopoc import NoiseModel
+from coopoc.arrays import Floats
+from coopoc.methods.star import FORGOTTEN
+from coopoc.world.spherical import to_vector
+from oracles.messages import Member
+
+
+def follow(
+    stars: list[list[Member]], known: NoiseModel, transition: str = "identity", membership: str = "keep"
+) -> tuple[Floats, Floats, list[Floats]]:
+    """x (T, 3), variance (T, 3) and the neighbours (k, 3) at each step."""
+    x, p, found = np.zeros((0, 3)), np.zeros((3, 0, 0)), []
+    for star in stars:
+        before = [one.before for one in star]
+        if membership == "reset" and before != list(range(len(x))):
+            x, p = restart(x, star)
+        else:
+            x, p = predict(x, p, star, transition)
+            x, p = update(x, p, star, known)
+        found.append((x, p[:, 0, 0]))
+    return np.array([x[0] for x, _ in found]), np.array([p for _, p in found]), [x[1:] for x, _ in found]
+
+
+def restart(x: Floats, star: list[Member]) -> tuple[Floats, Floats]:
+    """argmin |[L; I] x - z|^2 from nothing, and unit covariance."""
+    n, ego = len(star), star[0]
+    start = ego.position if ego.new or ego.before is None else x[ego.before] + ego.moved
+    x = np.array([start, *(start + to_vector(one.relative) for one in star[1:])])
+    x, _ = update(x, np.broadcast_to(FORGOTTEN * np.eye(n), (3, n, n)), star, NoiseModel.identity())
+    return x, np.broadcast_to(np.eye(n), (3, n, n))
+
+
+def predict(x: Floats, p: Floats, star: list[Member], transition: str) -> tuple[Floats, Floats]:
+    """Members that stay move; with "ones" each entry of their covariance is the sum of all."""
+    n, pick = len(star), np.zeros((len(star), len(x)))
+    new, q = np.zeros((n, 3)), np.full((n, 3), FORGOTTEN)
+    for k, one in enumerate(star):
+        if one.before is None:
+            new[k] = one.position if k == 0 else new[0] + to_vector(one.relative)
+        else:
+            pick[k, one.before] = 1.0
+            new[k], q[k] = x[one.before] + one.moved, one.process
+    stays, out = pick.sum(axis=1), []
+    for c in range(3):
+        spread = pick @ p[c] @ pick.T
+        spread = spread.sum() * np.outer(stays, stays) if transition == "ones" else spread
+        out.append(spread + np.diag(q[:, c]))
+    return new, np.array(out)
+
+
+def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel) -> tuple[Floats, Floats]:
+    """Each axis by itself: P^-1 += L W L + diag(1/r)."""
+    n = len(star)
+    edges = [k for k in range(1, n) if np.isfinite(star[k].relative).all()]
+    laplacian, vectors = np.zeros((n, n)), {k: to_vector(star[k].relative) for k in edges}
+    for k in edges:
+        b = np.zeros(n)
+        b[0], b[k] = -1.0, 1.0
+        laplacian += np.outer(b, b)
+    delta = np.zeros((n, 3))
+    for k, vector in vectors.items():
+        delta[0] -= vector
+        delta[k] += vector
+    variance = np.ones(n)
+    if known.sensors is not None and edges:
+        mean = np.mean([np.trace(known.relative_cov(star[k].relative)) / 3 for k in edges])
+        variance = np.maximum(np.diag(laplacian), 1.0) * mean
+    found = []
+    for c in range(3):
+        fixes = np.array([1 / one.variance[c] if one.new else 0.0 for one in star])
+        position = np.array([one.position[c] for one in star])
+        weight = laplacian @ np.diag(1 / variance)
+        cov = np.linalg.inv(np.linalg.inv(p[c]) + weight @ laplacian + np.diag(fixes))
+        eta = weight @ (delta[:, c] - laplacian @ x[:, c]) + fixes * (position - x[:, c])
+        found.append((x[:, c] + cov @ eta, cov))
+    return np.stack([x for x, _ in found], axis=1), np.array([p for _, p in found])

@@ -1,0 +1,112 @@
+"""What the oracles of whole-fleet methods share, from the equations: rows of measurements, solo steps, late answers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coopoc.world.spherical import spherical, to_vector, wrap
+
+
+class Drive:
+    """One run of a recording whose pairs exchange messages by the steps `arrival` (P,), -1 for never."""
+
+    def __init__(self, recording, known, met, arrival, run):  # type: ignore[no-untyped-def]
+        self.known, self.met, self.dt, self.arrival = known, met, recording.dt, arrival
+        self.gnss, self.velocity, self.relative = (
+            values[run] for values in (recording.gnss, recording.velocity, recording.relative)
+        )
+        self.q, self.r = (
+            np.broadcast_to(values, recording.gnss.shape)[run]
+            for values in (known.process_variance(recording), known.fix_variance(recording))
+        )
+        self.steps, self.vehicles = self.gnss.shape[:2]
+        self.active = np.zeros((self.steps, self.vehicles), dtype=bool)
+        for t, n in np.ndindex(self.active.shape):
+            before = t > 0 and self.active[t - 1, n]
+            self.active[t, n] = np.isfinite(self.velocity[t, n]).all() and (
+                before or np.isfinite(self.gnss[t, n]).all()
+            )
+
+    def here(self, t):  # type: ignore[no-untyped-def]
+        """Active vehicles of a step."""
+        return np.flatnonzero(self.active[t]).tolist()
+
+    def stays(self, t, n):  # type: ignore[no-untyped-def]
+        return t > 0 and self.active[t - 1, n]
+
+    def pairs(self, t):  # type: ignore[no-untyped-def]
+        """(index, first, second) of those that take part."""
+        span = range(self.met.start[t], self.met.start[t + 1])
+        ends = [(k, int(self.met.first[k]), int(self.met.second[k])) for k in span if self.arrival[k] >= 0]
+        return [(k, i, j) for k, i, j in ends if self.active[t, i] and self.active[t, j]]
+
+    def factor(self, k, vector, converted):  # type: ignore[no-untyped-def]
+        """Information and information vector of both measurements of a pair at `vector`."""
+        W, eta = np.zeros((3, 3)), np.zeros(3)
+        for link, sign in ((self.met.link[k], 1.0), (self.met.link_back[k], -1.0)):
+            if link >= 0:
+                H, r = rows(sign * vector, self.relative[link], self.known.sensors, converted)
+                W, eta = W + H.T @ H, eta + sign * H.T @ r
+        return W, eta
+
+    def factor_at_agreement(self, k, vector, cov):  # type: ignore[no-untyped-def]
+        """`factor` where belief and converted measurement agree; eta refers to `vector`."""
+        W, eta = self.factor(k, vector, True)
+        if self.known.sensors is None:
+            return W, eta
+        shift = np.linalg.solve(np.eye(3) + cov @ W, cov @ eta)
+        W, eta = self.factor(k, vector + shift, False)
+        return W, eta + W @ shift
+
+    def solo(self, t, n, x, P):  # type: ignore[no-untyped-def]
+        """One step of the textbook Kalman filter; an axis without a fix is predicted only."""
+        x, P = x + self.dt * self.velocity[t, n], P + np.diag(self.q[t, n])
+        H = np.eye(3)[np.isfinite(self.gnss[t, n])]
+        if len(H):
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + H @ np.diag(self.r[t, n]) @ H.T)
+            x, P = x + K @ (self.gnss[t, n][np.isfinite(self.gnss[t, n])] - H @ x), P - K @ H @ P
+        return x, P
+
+    def start(self, t, n):  # type: ignore[no-untyped-def]
+        return self.gnss[t, n].copy(), np.diag(self.r[t, n])
+
+    def late(self, x, P, n, rounds, fixes=True):  # type: ignore[no-untyped-def]
+        """What vehicle n believes at each step: the answer whose messages have arrived, and its own steps since."""
+        ready, when = np.zeros(self.vehicles, dtype=int), []
+        for t in range(self.steps):
+            ready = np.maximum(ready, t)
+            for _ in range(rounds):
+                before = ready.copy()
+                for k, i, j in self.pairs(t):
+                    ready[[i, j]] = np.maximum(ready[[i, j]], max(self.arrival[k], before[i], before[j]))
+            when.append(ready[n])
+        out = []
+        for t in range(self.steps):
+            held = [s for s in range(t + 1) if when[s] <= t]
+            s = held[-1] if held else 0
+            one = (x[s, n], P[s, n]) if held else self.start(0, n)
+            for u in range(s + 1, t + 1):
+                one = self.solo(u, n, *one) if fixes else (one[0] + self.dt * self.velocity[u, n], one[1])
+            out.append(one)
+        return np.array([a for a, _ in out]), np.array([b for _, b in out])
+
+
+def rows(vector, seen, sensors, converted):  # type: ignore[no-untyped-def]
+    """Whitened Jacobian and residual of what was measured of range, azimuth, inclination; without sensors, unit rows
+    along the three axes of the measured direction."""
+    there, least = np.isfinite(seen), sensors.min_range if sensors else 0.0
+    seen = np.where(there, seen, np.array(spherical(*vector)))
+    at = to_vector(seen) if converted or sensors is None else vector
+    r, ground = np.linalg.norm(at), np.hypot(at[0], at[1])
+    d = max(r, least)
+    ground = max(ground, 1e-3 * d)
+    J = np.array([at / r, [-at[1] / ground**2, at[0] / ground**2, 0.0], [0.0, 0.0, -ground / d**2]])
+    J[2, :2] = at[:2] * at[2] / (ground * d**2)
+    if sensors is None:
+        J /= np.linalg.norm(J, axis=1)[:, None]
+        return J[there], J[there] @ (at - vector)
+    J /= sensors.relative_std[:, None]
+    off = seen - np.array(spherical(*vector))
+    off[1:] = wrap(off[1:])
+    residual = J @ (at - vector) if converted else off / sensors.relative_std
+    return J[there], residual[there]

@@ -1,0 +1,91 @@
+"""The sections of docs/extend.md on nets and recipes, as they stand: trained, federated, saved, streamed, studied."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from test_extend import blocks, commands, shell
+
+from coopoc import InputError
+from coopoc.learned import Checkpoint, load, save
+from coopoc.learned.export import to_onnx
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.recipes import recipe_of
+from coopoc.plugins import find
+
+LEARNED = Path(__file__).resolve().parents[1] / "learned"
+NET = "constant_gain.py:ConstantGain"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (text,) = (text for text in blocks("python") if text.startswith("# constant_gain.py"))
+    (tmp_path / "constant_gain.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder: Path) -> None:
+    (block,) = (text for text in blocks("python") if "load_method" in text)
+    script = folder / "own_net.py"
+    script.write_text(f"{block}\nassert abs(x - track.x[0, -1, 0]).max() < 1e-4\n")
+    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder: Path) -> None:
+    trained, ran = (line for line in commands("constant_gain.py"))
+    assert "constant_gain.RECIPE-gnss-axis-0.safetensors  3 parameters" in shell(trained, folder)
+    table = shell(ran, folder)
+    rows = dict(re.findall(r"^\| (\S.*?) +\| \w+ +\| +\**([\d.]+)\**", table, flags=re.MULTILINE))
+    assert float(rows["RECIPE"]) < 2.0, table
+
+
+def test_a_checkpoint_of_a_file_runs_no_file_by_itself(folder: Path) -> None:
+    net = find("coopoc.nets", NET)()
+    path = save(folder / "own.safetensors", Checkpoint(net, {}))
+    with pytest.raises(InputError, match="names a file, whose code does not run"):
+        load(path)
+    assert torch.equal(flatten([load(path, NET).model]), flatten([net]))
+    with pytest.raises(InputError, match="must be a GainNet"):
+        to_onnx(net, folder / "own.onnx")
+
+
+def test_what_is_neither_recipe_nor_net_is_refused(folder: Path) -> None:
+    assert recipe_of(NET).net == NET
+    with pytest.raises(InputError, match="no Recipe and no net"):
+        recipe_of("constant_gain.py:nn")
+    with pytest.raises(InputError, match="Did you mean split"):
+        recipe_of("splitt")
+
+
+def imported(path: Path) -> set[Path]:
+    """Files of learned/ that a file imports, anywhere in it."""
+    package, found = path.relative_to(LEARNED).parts[:-1], set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        words = (node.module or "").split(".") if node.module else []
+        if node.level:
+            base = [*package[: len(package) - node.level + 1], *words]
+        elif words[:2] == ["coopoc", "learned"]:
+            base = words[2:]
+        else:
+            continue
+        stem = LEARNED.joinpath(*base)
+        found |= {stem / f"{alias.name}.py" for alias in node.names} | {stem.with_suffix(".py")}
+    return {file for file in found if file.is_file()} - {path}
+
+
+def test_no_file_of_the_learned_package_imports_in_a_circle() -> None:
+    left = {file: imported(file) for file in LEARNED.rglob("*.py")}
+    while free := [file for file, needs in left.items() if not needs & left.keys()]:
+        for file in free:
+            del left[file]
+    assert not left, sorted(str(file.relative_to(LEARNED)) for file in left)

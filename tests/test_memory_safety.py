@@ -1,0 +1,187 @@
+"""No array reaches compiled code that does not fit: a wrong recording is refused where it is made."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import corrupted
+import numpy as np
+import pytest
+
+from coopoc import V2X, Factor, Fleet, InputError, JointFilter, Links, Message, Problem, Sensors, observe, rt_le
+from coopoc.arrays import checked, frozen, number
+
+KERNELS = ("kalman", "lkf-sa", "msmv-r", "joint", "ci", "gbp", "batch-smoother")
+FLEET = Fleet(("a", "b"), [0, 0.1], np.tile([[0, 0, 0], [9, 0, 0]], (2, 1, 1)), np.zeros((2, 2, 3)))
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["complete", "with gaps"])
+def test_arrays_that_do_not_fit_are_refused(whole: bool) -> None:
+    """Every field cut, shifted, reordered, of another kind, or not finite: an InputError, by `replace` too."""
+    valid, cases = corrupted.recording(whole=whole), 0
+    for what, parts in corrupted.wrong(valid):
+        with pytest.raises(InputError) as caught:
+            corrupted.with_parts(valid, **parts)
+        assert caught.value.hint, what
+        cases += 1
+    assert cases > 200
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"arrival": np.full((1, 72), -1)}, r"arrival = shape \(1, 72\): must have shape \(R, L\) = \(4, 72\)"),
+        ({"neighbour": 1000 + np.arange(72)}, r"links\.neighbour\[0\] = 1000: must be in 0\.\.2"),
+        ({"arrival": np.full((4, 72), -7)}, r"arrival\[0, 0\] = -7: must be -1"),
+        ({"broadcasts": np.ones((12, 3))}, "broadcasts = dtype float64: must be an array of booleans"),
+        ({"t": [0.0, 0.1]}, r"gnss = shape .*\(R, T, N, 3\) = \(any, 2, 3, 3\)"),
+        ({"sensors": V2X()}, "sensors = V2X"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_the_error_names_field_value_and_allowed(parts: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        corrupted.with_parts(corrupted.recording(), **parts)
+
+
+def program(*given: str, **env: str) -> str:
+    """What tests/corrupted.py complains about, in a process that may crash."""
+    command = [sys.executable, str(Path(corrupted.__file__)), *given]
+    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **env})
+    assert done.returncode in (0, 1), f"{given}: ended by signal {-done.returncode}\n{done.stderr[-2000:]}"
+    return done.stdout
+
+
+def test_every_method_reads_any_memory_layout_and_survives_odd_recordings() -> None:
+    """Views, Fortran order, unaligned and swapped bytes give the digits of the valid recording; none crashes."""
+    assert program("odd", *KERNELS) == ""
+
+
+def test_what_is_held_cannot_be_written_to() -> None:
+    valid = corrupted.recording()
+    given = {name: np.array(array) for name, array in corrupted.arrays(valid).items()}
+    held = corrupted.with_parts(valid, **given)
+    for name, array in corrupted.arrays(held).items():
+        given[name][...] = 0
+        np.testing.assert_array_equal(array, corrupted.arrays(valid)[name])
+        assert array.flags.c_contiguous
+        assert not array.flags.writeable
+
+
+def test_whole_numbers_are_as_good_as_floats() -> None:
+    given = Sensors(gnss_std=[2, 2, 2], range_std=1, min_range=2, gnss_drift_time=np.int64(9))  # type: ignore[arg-type]
+    assert isinstance(given.min_range, float)
+    assert given == Sensors((2.0,) * 3, range_std=1.0, min_range=2.0, gnss_drift_time=9.0)
+    seen = observe(FLEET, given, V2X(radius=30, rate=10, latency=0), runs=np.int64(2))  # type: ignore[arg-type]
+    assert JointFilter()(seen, [0]).x.shape == (2, 2, 1, 3)
+
+
+SEEN = observe(FLEET, Sensors())
+WRONG = [None, True, "1", float("nan"), [1.0], 1j]
+CONFIGURED = {
+    "range_std": lambda v: Sensors(range_std=v),
+    "gnss_std": lambda v: Sensors(gnss_std=(1.0, v, 1.0)),
+    "min_range": lambda v: Sensors(min_range=v),
+    "radius": lambda v: V2X(radius=v),
+    "max_neighbours": lambda v: V2X(max_neighbours=v),
+    "loss": lambda v: V2X(loss=v),
+    "bytes_per_second": lambda v: V2X(bytes_per_second=v),
+    "numbers": lambda v: Message("fix", v),
+    "runs": lambda v: observe(FLEET, Sensors(), runs=v),
+    "seed": lambda v: observe(FLEET, Sensors(), seed=v),
+}
+
+
+@pytest.mark.parametrize("value", WRONG, ids=repr)
+@pytest.mark.parametrize("name", CONFIGURED)
+def test_what_is_no_number_is_refused_by_name(name: str, value: Any) -> None:
+    with pytest.raises(InputError, match=name):
+        CONFIGURED[name](value)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: Sensors(range_std=np.inf),
+        lambda: Sensors(gnss_drift_time=np.inf),
+        lambda: V2X(max_neighbours=2.0),  # type: ignore[arg-type]
+        lambda: Message("fix", 8.0),  # type: ignore[arg-type]
+        lambda: observe(FLEET, Sensors(), runs=1.5),  # type: ignore[arg-type]
+        lambda: observe(FLEET, Sensors(), observers=0),  # type: ignore[arg-type]
+        lambda: observe(FLEET, Sensors(), observers="a"),
+        lambda: observe(FLEET, V2X()),  # type: ignore[arg-type]
+        lambda: observe(FLEET, Sensors(), assumed=3),  # type: ignore[arg-type]
+        lambda: FLEET.select([]),
+        lambda: FLEET.select(0),  # type: ignore[arg-type]
+        lambda: FLEET.index(True),
+        lambda: SEEN.columns(0),  # type: ignore[arg-type]
+        lambda: SEEN.columns([]),
+        lambda: SEEN.of_runs(np.array([1])),
+        lambda: SEEN.of_runs(slice(0, 0)),
+        lambda: replace(FLEET, t=[0, np.inf]),
+        lambda: replace(FLEET, ids="ab"),
+        lambda: replace(FLEET, position=np.zeros((2, 2, 3), complex)),
+        lambda: rt_le(JointFilter()(SEEN, [1]), FLEET.select([0])),
+        lambda: Links([0.0], [0.0], [1.0]),  # type: ignore[arg-type]
+        lambda: Links([0, 0], [0, 0], [1, 1]),  # type: ignore[arg-type]
+        lambda: Factor("range", [[0, -1]], [[5.0]], std=1.0),  # type: ignore[arg-type]
+        lambda: Factor("range", [[0, 1]], [[True]], std=1.0),  # type: ignore[arg-type]
+        lambda: Factor("range", [[0, 1]], [[5.0]], std="1"),  # type: ignore[arg-type]
+        lambda: Problem(("a", "b"), (Factor("range", [[0, 2]], [[5.0]], std=1.0),)),  # type: ignore[arg-type]
+        lambda: Problem(("a",), ("position",)),  # type: ignore[arg-type]
+        lambda: Problem(("a",), x0=np.zeros((1, 3), complex)),
+    ],
+)
+def test_wrong_calls_end_in_an_input_error(call: Any) -> None:
+    with pytest.raises(InputError):
+        call()
+
+
+def test_checks_of_single_arrays_and_numbers() -> None:
+    view = np.arange(6.0).reshape(2, 3).T
+    assert frozen(view).flags.c_contiguous
+    assert frozen(view) is not view
+    assert checked("x", [], "(L,)", (0,), int).dtype == np.int64
+    assert number("x", np.float32(2)) == 2.0
+    with pytest.raises(InputError, match="whole number"):
+        number("x", 2.0, kind=int)
+
+
+CODE = """
+import numpy as np
+from coopoc.kernels.abreast import put, take
+from coopoc.kernels.compile import part
+from coopoc.kernels.lanes import subtract
+
+@part
+def copied(array, at):
+    put(array, np.uint64(0), take(array, np.uint64(at)))
+
+@part
+def lowered(array, at):
+    subtract(array, at, array, 0, array, 0, 4, 1)
+
+@part
+def plain(array, at):
+    array[at] = 0.0
+
+for function, last in ((copied, 2), (lowered, 0), (plain, 11)):
+    function(np.zeros(12), last)
+    try:
+        function(np.zeros(12), last + 1)
+    except IndexError:
+        print(function.__name__, "checks")
+"""
+
+
+def test_under_the_switch_scalar_and_vector_access_is_checked() -> None:
+    """NUMBA_BOUNDSCHECK=1 holds for the intrinsics, which work on pointers, too."""
+    command = [sys.executable, "-c", CODE]
+    env = {**os.environ, "NUMBA_BOUNDSCHECK": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    assert done.stdout.split("\n")[:-1] == ["copied checks", "lowered checks", "plain checks"]
