@@ -43,17 +43,14 @@ def meaningful(p: Params) -> bool:
     """
     from coopoc.learned.federation.aggregate import rule
 
-    condition, method, asked = (
-        p["condition"],
-        p["method"],
-        int(p["members"]) // (2 if p["condition"] == "half absent" else 1),
-    )
+    condition, method, asked = str(p["condition"]), str(p["method"]), int(p["members"])
+    if condition == "half absent":
+        asked //= 2
     if method in BESIDE:
         return condition in ("iid", "heterogeneous")
     if method in (*WIRES, "bound"):
         return condition == "iid"
-    enough: bool = rule(method).least <= asked
-    return enough and (method != "uniform" or condition == "heterogeneous")
+    return (method != "uniform" or condition == "heterogeneous") and bool(rule(method).least <= asked)
 
 
 def cell(p: Params) -> list[Row]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
+import numba
 import numpy as np
 import pytest
 
@@ -18,6 +21,16 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the shared data folder is not beside the project")
     return SHARED
+
+
+def callable_part(part: Callable[..., Any]) -> Callable[..., Any]:
+    """A part of a kernel, which compiled code alone may call, for callers from Python."""
+
+    @numba.njit(error_model="numpy")
+    def call(*given):  # type: ignore[no-untyped-def]
+        return part(*given)
+
+    return cast(Callable[..., Any], call)
 
 
 def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) -> Fleet:

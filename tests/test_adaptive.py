@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from conftest import callable_part
 from scipy import optimize, special, stats
 
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, load_fleet, observe
@@ -129,7 +130,7 @@ def test_the_fixed_point_maximises_the_evidence_bound(z: float, rho: float) -> N
     """scipy's optimiser over mean, variance and beta ends where the iterations end."""
     p, r, weight = 2.0, 5.0, 8.0
     method = VariationalKalman(rho=rho, iterations=200)
-    noise, new = revised((0.0, 0.0, p, r, weight), z, 0.0, method.fixes)
+    noise, new = callable_part(revised)((0.0, 0.0, p, r, weight), z, 0.0, method.fixes)
     bound = partial(evidence, z, p, r, rho * weight, new)
     best = optimize.minimize(lambda q: -bound(q), [z / 2, 0.0, 2.0], method="BFGS", options={"gtol": 1e-8})
     gain = p / (p + noise)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet
+from conftest import callable_part, crossing_fleet
 from filterpy.kalman import KalmanFilter
 from oracles.central_filter import central_filter
 from oracles.whole_fleet import Drive
@@ -114,7 +114,7 @@ def matrix(members: int, rng: np.random.Generator, share: float) -> tuple[Any, A
         root[3 * j : 3 * j + 3] = -root[3 * i : 3 * i + 3]
         info += root @ root.T
     root, plan = rng.normal(size=(n, 2 * n)), np.zeros((6, members + 1), np.int64)
-    arrange(np.zeros(members, np.int64), plan)
+    callable_part(arrange)(np.zeros(members, np.int64), plan)
     return root @ root.T / n, info, near | near.T, plan
 
 
@@ -123,7 +123,7 @@ def matrix(members: int, rng: np.random.Generator, share: float) -> tuple[Any, A
 def test_what_a_sparse_information_adds_is_what_numpy_inverts(members: int, share: float) -> None:
     """From the upper triangle of P and the lower one of F, whatever stands in the others' place of P."""
     from coopoc.kernels.components import STRIDE
-    from coopoc.kernels.low_rank import learn, scratch
+    from coopoc.kernels.low_rank import scratch, update
 
     rng = np.random.default_rng(members)
     spread, info, near, plan = matrix(members, rng, share)
@@ -133,7 +133,7 @@ def test_what_a_sparse_information_adds_is_what_numpy_inverts(members: int, shar
     p[:n, :n], f[:n, :n] = np.triu(spread) + np.tril(np.full((n, n), 7.0), -1), np.tril(info)
     flat = p.ravel()
     eta, moved = rng.normal(size=(2, members, 3)), np.empty((2, stride))
-    learn(plan, 0, flat, f.ravel(), near, scratch(members, stride), eta.copy(), moved)
+    callable_part(update)(plan, 0, flat, f.ravel(), near, scratch(members, stride), eta.copy(), moved)
     found = np.triu(flat.reshape(stride, stride)[:n, :n])
     np.testing.assert_allclose(found, np.triu(wanted), atol=1e-12 * np.abs(wanted).max())
     np.testing.assert_allclose(moved[:, :n], eta.reshape(2, n) @ wanted, atol=1e-11)
@@ -142,6 +142,7 @@ def test_what_a_sparse_information_adds_is_what_numpy_inverts(members: int, shar
 def test_components_merge_where_vehicles_meet_and_stay_together() -> None:
     from coopoc.kernels.components import BEGIN, HOME, MEMBER, arrange, connect
 
+    arrange, connect = callable_part(arrange), callable_part(connect)
     label, plan = np.full(5, -1), np.zeros((6, 6), np.int64)
     all_active, none_active = np.ones(5, bool), np.zeros(5, bool)
     first, second = np.array([0, 1]), np.array([3, 4])

@@ -6,9 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import callable_part
 from scipy.optimize import minimize_scalar
 
-from coopoc.kernels.fusion import Fusion, add_up, best_weight, describe, fuse
+from coopoc.kernels import fusion as kernel
+from coopoc.kernels.fusion import Fusion
+
+add_up, best_weight, describe, fuse = map(
+    callable_part, (kernel.add_up, kernel.best_weight, kernel.describe, kernel.fuse)
+)
 
 
 def covariance(rng: np.random.Generator) -> Any:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import inlined, inner
+from .compile import inner, storage
 from .joint import Joint, block_of
 from .lanes import LANES
 from .slots import ONE, ROW, Window, count_of, motion, place_of
@@ -46,7 +46,7 @@ class Past(NamedTuple):
     kept_eta: Floats
 
 
-@inner
+@storage
 def new_past(length: int, most: int) -> Past:
     """Room for windows of `length` steps of at most `most` members."""
     rows = (3 * (length + 1) * most, LANES)
@@ -61,18 +61,18 @@ def new_past(length: int, most: int) -> Past:
     )
 
 
-@inlined
+@storage
 def kept_of(window: Window, past: Past, step: int) -> Floats:
     """What is kept of a step."""
-    size = 9 * window.stride * (window.stride + 2)
+    size = 9 * window.layout[1] * (window.layout[1] + 2)
     slot = step % len(window.sizes)
     return past.kept[slot * size : (slot + 1) * size]
 
 
-@inlined
+@inner
 def stiffness(window: Window, joint: Joint, step: int) -> None:
     """Inverse process noise of the members that stay for the next step, zero of the others."""
-    ego, after, m = place_of(window, step, 0), place_of(window, step + 1, 0), count_of(window, step)
+    ego, after, m = place_of(window.layout, step, 0), place_of(window.layout, step + 1, 0), count_of(window.sizes, step)
     for k in range(m):
         later = window.later[ego + k]
         stiff = zeros(load(window.point, ego, ROW)[0], ROW)
@@ -81,19 +81,23 @@ def stiffness(window: Window, joint: Joint, step: int) -> None:
         store(joint.process, block_of(k, m), stiff)
 
 
-@inlined
+@inner
 def advance_points(window: Window, moves: AnyArray, step: int, share: Any) -> None:
     """Move the points of a step."""
-    ego, n = place_of(window, step, 0), count_of(window, step)
+    ego, n = place_of(window.layout, step, 0), count_of(window.sizes, step)
     for k in range(n):
         moved = scale(load(moves, block_of(k, n), ROW), share)
         store(window.point, ego + k, add(load(window.point, ego + k, ROW), moved))
 
 
-@inlined
+@inner
 def go_back(window: Window, past: Past, joint: Joint, step: int) -> None:
     """Moves of the points of a step, those of the next one being known."""
-    here, after, m = place_of(window, step, 0), place_of(window, step + 1, 0), count_of(window, step)
+    here, after, m = (
+        place_of(window.layout, step, 0),
+        place_of(window.layout, step + 1, 0),
+        count_of(window.sizes, step),
+    )
     kept = kept_of(window, past, step)
     stiffness(window, joint, step)
     for k in range(m):
@@ -111,18 +115,18 @@ def go_back(window: Window, past: Past, joint: Joint, step: int) -> None:
         store(joint.move, k, minus_apply(load(kept, columns + m, ONE), eta))
 
 
-@inlined
+@inner
 def ego_covariance(window: Window, past: Past, joint: Joint, span: Any) -> Any:
     """Minus the ego's covariance at the first step of a span, all later steps known: -sum V^T S^-1 V over the steps,
     V being D S^-1 V of the step before and, of the first one, the ego's columns."""
     first, last = span
     nothing = zeros(load(window.point, 0, ROW)[0], ONE)
     unit = nothing[0] + 1.0
-    m, cov = count_of(window, first), nothing
+    m, cov = count_of(window.sizes, first), nothing
     for k in range(m):
         store(joint.scratch, k, add_diagonal(nothing, (unit, unit, unit)) if k == m - 1 else nothing)
     for step in range(first, last + 1):
-        m = count_of(window, step)
+        m = count_of(window.sizes, step)
         kept, offset, row = joint.factor, 0, joint.stride
         if step < last:
             kept, offset, row = kept_of(window, past, step), m, m + 1
@@ -145,14 +149,14 @@ def ego_covariance(window: Window, past: Past, joint: Joint, span: Any) -> Any:
                 own = less_transposed_product(own, transpose(load(kept, at + j, ONE)), load(joint.scratch, j, ONE))
             store(joint.scratch, k, minus_product(load(kept, at + m, ONE), own))
         stiffness(window, joint, step)
-        here, n = place_of(window, step, 0), count_of(window, step + 1)
+        here, n = place_of(window.layout, step, 0), count_of(window.sizes, step + 1)
         for k in range(n):
-            store(joint.scratch, window.stride + block_of(k, n), nothing)
+            store(joint.scratch, window.layout[1] + block_of(k, n), nothing)
         for k in range(m):
             later, i = window.later[here + k], block_of(k, m)
             if later >= 0:
                 one = scale_rows(load(joint.process, i, ROW), load(joint.scratch, i, ONE))
-                store(joint.scratch, window.stride + block_of(later, n), one)
+                store(joint.scratch, window.layout[1] + block_of(later, n), one)
         for k in range(n):
-            store(joint.scratch, k, load(joint.scratch, window.stride + k, ONE))
+            store(joint.scratch, k, load(joint.scratch, window.layout[1] + k, ONE))
     return cov

@@ -11,7 +11,7 @@ from ..arrays import AnyArray
 from .compile import compiled, part
 from .components import BASE, BEGIN, HOME, MEMBER, ROW, STRIDE, arrange, connect, move, padded, place
 from .fleet_graph import VECTOR, Assumed, Measured, Pairs, at, pair_at_agreement
-from .low_rank import Scratch, learn, scratch
+from .low_rank import Scratch, scratch, update
 from .small import from_upper, load, store, subtract
 
 FORGOTTEN = 1e6
@@ -123,7 +123,7 @@ def follow(
         for run in range(first, first + runs[1]):
             sum_vectors(measured, pairs, assumed, run, first, x[run, t], t, step)
         for component in range(state.now[1]):
-            learn(plan, component, spread, step.information, step.near, step.scratch, step.total, step.moved)
+            update(plan, component, spread, step.information, step.near, step.scratch, step.total, step.moved)
             for run in range(runs[1]):
                 write(plan, component, spread, step.moved[run], x[first + run, t], cov[first + run, t])
 

@@ -14,7 +14,7 @@ from numpy import uint64
 
 from ..arrays import Floats
 from .abreast import take
-from .compile import inlined, inner
+from .compile import inner, storage
 from .elimination import eliminate, substitute
 from .lanes import LANES
 from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, place_of
@@ -58,7 +58,7 @@ class Memory(NamedTuple):
     active: Floats
 
 
-@inner
+@storage
 def new_memory(length: int, most: int) -> Memory:
     """Scratch for the same."""
     places = (length + 1) * most
@@ -76,7 +76,7 @@ def new_memory(length: int, most: int) -> Memory:
     )
 
 
-@inlined
+@inner
 def move(window: Window, span: Any, memory: Memory, share: Any) -> Any:
     """Move all points by a share of the Gauss-Newton step; the largest step m of each run. Minus the covariance of the
     ego's newest point is in `memory.cov`."""
@@ -84,25 +84,27 @@ def move(window: Window, span: Any, memory: Memory, share: Any) -> Any:
     h = last - first + 1
     assemble_ego(window, span, memory)
     for step in range(first, last + 1):
-        for place in range(place_of(window, step, 1), place_of(window, step, count_of(window, step))):
+        for place in range(
+            place_of(window.layout, step, 1), place_of(window.layout, step, count_of(window.sizes, step))
+        ):
             if step == first or window.previous[place] < 0:
                 fold(window, span, step, place, memory)
     store(memory.cov, 0, eliminate(memory.a, memory.a, memory.b, h, h, memory.row, ONE, ROW))
     substitute(memory.a, memory.b, h, h, ONE, ROW)
     most = 0.0 * share
     for step in range(last, first - 1, -1):
-        ego = place_of(window, step, 0)
+        ego = place_of(window.layout, step, 0)
         own = load(memory.b, step - first, ROW)
         most = max(most, largest_of(own))
         store(window.point, ego, add(load(window.point, ego, ROW), scale(own, share)))
-        for place in range(ego + 1, ego + count_of(window, step)):
+        for place in range(ego + 1, ego + count_of(window.sizes, step)):
             moved = unfold(window, span, step, place, memory)
             most = max(most, largest_of(moved))
             store(window.point, place, add(load(window.point, place, ROW), scale(moved, share)))
     return most
 
 
-@inlined
+@inner
 def assemble_ego(window: Window, span: Any, memory: Memory) -> None:
     """Information and eta of the ego's points: fixes, odometry, and the ego's end of each edge."""
     first, last = span
@@ -110,26 +112,26 @@ def assemble_ego(window: Window, span: Any, memory: Memory) -> None:
     trust = take(window.odometry, uint64(0))
     nothing = zeros(trust, ONE)
     for s in range(h):
-        ego = place_of(window, first + s, 0)
+        ego = place_of(window.layout, first + s, 0)
         own, gap = load(window.used, ego, ROW), fix_gap(window, ego)
         block, eta = add_diagonal(nothing, own), times(own, gap)
         for j in range(s + 1, h):
             store(memory.a, s * h + j, nothing)
         if s > 0:
-            stiff, off = motion(window, place_of(window, first + s - 1, 0), ego)
+            stiff, off = motion(window, place_of(window.layout, first + s - 1, 0), ego)
             stiff, off = scale(stiff, trust), scale(off, trust)
             block, eta = add_diagonal(block, stiff), add(eta, off)
             before = s - 1
             store(memory.a, before * (h + 1), add_diagonal(load(memory.a, before * (h + 1), ONE), stiff))
             store(memory.a, before * (h + 1) + 1, add_diagonal(nothing, negate(stiff)))
             store(memory.b, before, subtract(load(memory.b, before, ROW), off))
-        for place in range(ego + 1, ego + count_of(window, first + s)):
+        for place in range(ego + 1, ego + count_of(window.sizes, first + s)):
             block, eta = add(block, load(window.edge, place, ONE)), subtract(eta, load(window.eta, place, ROW))
         store(memory.a, s * (h + 1), block)
         store(memory.b, s, eta)
 
 
-@inlined
+@inner
 def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> None:
     """Eliminate the chain that begins at a place onto the ego's points."""
     first, last = span
@@ -148,7 +150,7 @@ def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> No
         after = window.later[place] if step < last else -1
         stiff, off = nothing, nothing
         if after >= 0:
-            after = place_of(window, step + 1, after)
+            after = place_of(window.layout, step + 1, after)
             stiff, off = motion(window, place, after)
         eta = subtract(eta, off)
         pivot = negate(inverse(add_diagonal(own, stiff)))
@@ -173,7 +175,7 @@ def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> No
         step, place = step + 1, after
 
 
-@inlined
+@inner
 def unfold(window: Window, span: Any, step: int, place: int, memory: Memory) -> Any:
     """The move of a point of a chain, those of the ego and of the next one being known."""
     first, last = span
@@ -181,12 +183,12 @@ def unfold(window: Window, span: Any, step: int, place: int, memory: Memory) -> 
     begin = step
     here = place
     while begin > first and window.previous[here] >= 0:
-        begin, here = begin - 1, place_of(window, begin - 1, window.previous[here])
+        begin, here = begin - 1, place_of(window.layout, begin - 1, window.previous[here])
     for i in range(begin - first, step - first + 1):
         eta = less_applied(eta, load(memory.arm, place * h + i, ONE), load(memory.b, i, ROW))
     after = window.later[place] if step < last else -1
     if after >= 0:
-        after = place_of(window, step + 1, after)
+        after = place_of(window.layout, step + 1, after)
         stiff, _ = motion(window, place, after)
         eta = add(eta, times(stiff, load(memory.move, after, ROW)))
     moved = minus_apply(load(memory.pivot, place, ONE), eta)

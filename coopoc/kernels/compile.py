@@ -27,29 +27,32 @@ def as_written(function: Function) -> Function:
 
 
 def part(function: Function) -> Function:
-    """Compiled as `compiled` is, together with the first kernel that calls it, and kept in that one's machine code."""
-    return cast(Function, _made(function, {"contract"}))
+    """Compiled as `compiled` is, for compiled callers only, and kept in their machine code.
+
+    References to arrays are not counted within: whoever calls it holds them. So it allocates nothing and returns no
+    array; counting every array of every NamedTuple would take longer than the sums, and to compile.
+    """
+    return _within(function, {"contract"})
 
 
 def summing(function: Function) -> Function:
     """A part that adds many terms: it may do so in several sums, in one way for all arguments."""
-    return cast(Function, _made(function, {"contract", "reassoc"}))
-
-
-def inside(function: Function) -> Function:
-    """Compiled as `as_written` is, and copied into whoever calls it: a call would hand over every number that describes
-    an array, which takes longer than to read three of its elements."""
-    return cast(Function, _made(function, set(), forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True))
+    return _within(function, {"contract", "reassoc"})
 
 
 def inner(function: Function) -> Function:
-    """Compiled as `as_written` is, for compiled callers only, and kept in their machine code."""
-    return cast(Function, _made(function, set(), no_cpython_wrapper=True, no_cfunc_wrapper=True))
+    """A part, rounded as `as_written` is."""
+    return _within(function, set())
 
 
-def inlined(function: Function) -> Function:
-    """Copied into compiled callers before they are typed: a call would hand over every number that describes the arrays
-    of a NamedTuple, which takes longer to compile than the function."""
+def inside(function: Function) -> Function:
+    """As `inner`, and copied into whoever calls it: a call would hand over every number that describes an array, which
+    takes longer than to read three of its elements."""
+    return _within(function, set(), forceinline=True)
+
+
+def storage(function: Function) -> Function:
+    """A function that allocates arrays or returns views of them, typed as if its lines stood in its caller."""
     return cast(Function, _made(function, set(), inline="always"))
 
 
@@ -88,6 +91,12 @@ def _made(function: Function, liberties: set[str], **options: Any) -> Any:
 
     _announcing()
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
+
+
+def _within(function: Function, liberties: set[str], **options: bool) -> Function:
+    """Without wrappers for callers from Python, and without counts of references."""
+    made = _made(function, liberties, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
+    return cast(Function, made)
 
 
 def _kept(made: Any, function: Function) -> Function:

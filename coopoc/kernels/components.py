@@ -32,7 +32,9 @@ def connect(
         alive: (P,) whether the pair takes part.
         label: (N,) component, -1 where absent.
     """
-    changed, fresh = False, label.max() + 1
+    changed, fresh = False, 0
+    for c in range(len(label)):
+        fresh = max(fresh, label[c] + 1)
     for c in range(len(label)):
         changed = changed or before[c] != here[c]
         if not here[c]:

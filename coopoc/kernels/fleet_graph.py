@@ -10,7 +10,7 @@ import math
 from typing import Any, NamedTuple
 
 from ..arrays import AnyArray
-from .compile import compiled, part
+from .compile import compiled, part, storage
 from .relative import at_measurement, completed, exact
 from .small import add, apply, from_upper, load, plus_applied, scale, store, subtract
 
@@ -73,7 +73,7 @@ class Assumed(NamedTuple):
     min_range: float
 
 
-@part
+@storage
 def at(values: AnyArray, run: int, t: int, n: int) -> Any:
     """Row (3,) of an array that is broadcastable to (R, T, N, 3)."""
     return values[min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(n, values.shape[2] - 1)]

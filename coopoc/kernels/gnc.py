@@ -15,7 +15,7 @@ from numpy import uint64
 from ..arrays import Bools, Floats
 from .abreast import choose, put, take
 from .abreast import lane as lane_of
-from .compile import inlined, inner
+from .compile import inner, storage
 from .lanes import LANES
 from .slots import ROW, Window, count_of, fix_gap, motion, place_of
 from .small import load, scale, store, times
@@ -59,7 +59,7 @@ class Weights(NamedTuple):
     blind: Bools
 
 
-@inner
+@storage
 def new_weights(vehicles: int) -> Weights:
     """Room for the weights of all vehicles."""
     n = vehicles + 1
@@ -74,45 +74,50 @@ def new_weights(vehicles: int) -> Weights:
     )
 
 
-@inlined
+@inner
 def trust_all(window: Window, span: Any, weights: Weights, ego: bool) -> bool:
     """Note which groups are in the window, all of weight one; False if there is none."""
     odometry = len(weights.weight) - 1
     weights.member[:], weights.weight[:] = False, 1.0
     weights.member[odometry] = ego and span[0] < span[1]
     for step in range(span[0], span[1] + 1):
-        here = place_of(window, step, 0)
-        for place in range(here if ego else here + 1, here + count_of(window, step)):
+        here = place_of(window.layout, step, 0)
+        for place in range(here if ego else here + 1, here + count_of(window.sizes, step)):
             weights.member[window.member[place]] = True
-    return bool(weights.member.any())
+    found = False
+    for member in weights.member:
+        found = found or member
+    return found
 
 
-@inlined
+@inner
 def weigh(window: Window, span: Any, weights: Weights) -> None:
     """Put the weights of the groups into the window."""
     put(window.odometry, uint64(0), take(weights.weight, uint64(len(weights.weight) - 1)))
     for step in range(span[0], span[1] + 1):
-        for place in range(place_of(window, step, 0), place_of(window, step, count_of(window, step))):
+        for place in range(
+            place_of(window.layout, step, 0), place_of(window.layout, step, count_of(window.sizes, step))
+        ):
             weight = take(weights.weight, uint64(window.member[place]))
             store(window.used, place, scale(load(window.fix, place, ROW), weight))
 
 
-@inlined
+@inner
 def residuals(window: Window, span: Any, weights: Weights, ego: bool) -> None:
     """r^2 and number of fixes of each group at the points."""
     odometry = len(weights.weight) - 1
     weights.square[:], weights.fixes[:] = 0.0, 0.0
     for step in range(span[0], span[1] + 1):
-        here = place_of(window, step, 0)
+        here = place_of(window.layout, step, 0)
         if ego and step > span[0]:
-            information, off = motion(window, place_of(window, step - 1, 0), here)
+            information, off = motion(window, place_of(window.layout, step - 1, 0), here)
             gap = off[0] / information[0], off[1] / information[1], off[2] / information[2]
             add_square(weights, odometry, information, gap)
-        for place in range(here if ego else here + 1, here + count_of(window, step)):
+        for place in range(here if ego else here + 1, here + count_of(window.sizes, step)):
             add_square(weights, window.member[place], load(window.fix, place, ROW), fix_gap(window, place))
 
 
-@inlined
+@inner
 def add_square(weights: Weights, group: int, information: Any, gap: Any) -> None:
     """Add one fix to a group, where it has any information."""
     row, (p, q, r) = uint64(group), times(information, times(gap, gap))
@@ -121,7 +126,7 @@ def add_square(weights: Weights, group: int, information: Any, gap: Any) -> None
     put(weights.fixes, row, take(weights.fixes, row) + choose(information[0], one, one - one))
 
 
-@inlined
+@inner
 def reweigh(weights: Weights, gnc: GNC, lane: int) -> bool:
     """The next mu of a run, and its weights of the surrogate loss; True once they no longer change."""
     worst = 0.0
@@ -148,18 +153,20 @@ def reweigh(weights: Weights, gnc: GNC, lane: int) -> bool:
     return done
 
 
-@inlined
+@inner
 def ratio_of(weights: Weights, gnc: GNC, group: int, lane: int) -> float:
     """r^2 / c^2."""
     return float(weights.square[group, lane] / gnc.bound[int(weights.fixes[group, lane])])
 
 
-@inlined
+@inner
 def restore(window: Window, span: Any, weights: Weights, active: Floats) -> None:
     """Where no fix has any weight nothing says where the window is: there all groups get weight one for good."""
     total = 0.0 * take(window.odometry, uint64(0))
     for step in range(span[0], span[1] + 1):
-        for place in range(place_of(window, step, 0), place_of(window, step, count_of(window, step))):
+        for place in range(
+            place_of(window.layout, step, 0), place_of(window.layout, step, count_of(window.sizes, step))
+        ):
             total = total + load(window.used, place, ROW)[0]
     for lane in range(LANES):
         if active[lane] > 0.0 and lane_of(total, lane) == 0.0:

@@ -16,7 +16,7 @@ from numpy import uint64
 from ..arrays import AnyArray, Bools, Floats
 from .abreast import put, take
 from .back import Past, ego_covariance, new_past
-from .compile import as_written, inlined
+from .compile import as_written, inner
 from .joint import Joint, new_joint
 from .lanes import LANES
 from .messages import (
@@ -34,7 +34,7 @@ from .messages import (
     new_star,
     receive,
 )
-from .slots import ROW, Window, count_of, enter, new_window, place_of, star_at
+from .slots import ROW, Window, any_positive, count_of, enter, new_window, place_of, star_at
 from .small import load, negate, store
 from .sweep import distance, start_points, sweep
 
@@ -139,7 +139,7 @@ def advance(
             find_moving(window, past, span, settings, mask, joint.scratch)
             for lane in range(runs[1] - runs[0] + 1):
                 found.moving[runs[0] + lane, t] = settings.exact and mask[lane] > 0.0
-            if mask.max() == 0.0:
+            if not any_positive(mask):
                 break
         late = t - settings.length + 1
         for step in range(max(late, 0), (t if t == end else late) + 1 if settings.smoothed else 0):
@@ -148,7 +148,7 @@ def advance(
                 write_lane(window, joint.scratch, seen.start[step], (runs[0] + lane, lane), step, found)
 
 
-@inlined
+@inner
 def find_moving(window: Window, past: Past, span: Any, settings: Settings, mask: AnyArray, scratch: AnyArray) -> None:
     """Mask the runs in which a vector has left the one at which its measurement is linear."""
     put(scratch, uint64(0), distance(window, past, span))
@@ -156,7 +156,7 @@ def find_moving(window: Window, past: Past, span: Any, settings: Settings, mask:
         mask[lane] = 1.0 if scratch[0, lane] > settings.strayed else 0.0
 
 
-@inlined
+@inner
 def listen(
     window: Window,
     seen: Measurements,
@@ -170,8 +170,8 @@ def listen(
     """Put the messages that have arrived by now where they belong: the message of a step moves its sender there, or
     the last one before that has arrived and is not too old, as if it had done so since it was sent, and its fix stands
     at the step at which it was sent."""
-    star, here = star_at(window, step), place_of(window, step, 0)
-    for k in range(1, count_of(window, step)):
+    star, here = star_at(window, step), place_of(window.layout, step, 0)
+    for k in range(1, count_of(window.sizes, step)):
         link, place, changed = seen.start[step] + k - 1, window.previous[here + k], step == now
         for run in range(runs[0], runs[1] + 1):
             come = 0 <= arrival[run, link] <= now
@@ -193,23 +193,25 @@ def listen(
             interpret(star, known, k, seen.dt)
 
 
-@inlined
+@inner
 def use_fixes(window: Window, first: int, last: int) -> None:
     """Information of the new fixes of some steps."""
     for step in range(first, last + 1):
-        for place in range(place_of(window, step, 0), place_of(window, step, count_of(window, step))):
+        for place in range(
+            place_of(window.layout, step, 0), place_of(window.layout, step, count_of(window.sizes, step))
+        ):
             new = take(window.status, uint64(5 * place + NEW))
             p, q, r = load(window.motion, 4 * place + VARIANCE, ROW)
             store(window.used, place, (new / p, new / q, new / r))
 
 
-@inlined
+@inner
 def write_lane(window: Window, cov: AnyArray, link: int, which: Any, t: int, found: Found) -> None:
     """Copy one run's points and the ego's covariance."""
-    (run, lane), ego = which, place_of(window, t, 0)
+    (run, lane), ego = which, place_of(window.layout, t, 0)
     for i in range(3):
         found.x[run, t, i] = window.point[3 * ego + i, lane]
         for j in range(3):
             found.covariance[run, t, i, j] = cov[3 * min(i, j) + max(i, j), lane]
-        for k in range(1, count_of(window, t)):
+        for k in range(1, count_of(window.sizes, t)):
             found.neighbours[run, link + k - 1, i] = window.point[3 * (ego + k) + i, lane]

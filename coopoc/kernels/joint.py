@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import inner, inside
+from .compile import inner, inside, storage
 from .elimination import eliminate, substitute
 from .lanes import LANES
 from .messages import MOVED, POSITION, PROCESS, RELATIVE, ROW, Star, clear
@@ -65,7 +65,7 @@ def joint_size(most: int, row: Any) -> int:
     return 4 * len(row) * most + 2 * len(row) ** 2 * (most * most + most)
 
 
-@inner
+@storage
 def joint_in(memory: AnyArray, most: int, row: Any) -> Joint:
     """A Gaussian of up to `most` members, whose state is as long as `row`, in memory (>= joint_size LANES,)."""
     d, size = len(row), joint_size(most, row)
@@ -83,7 +83,7 @@ def joint_in(memory: AnyArray, most: int, row: Any) -> Joint:
     )
 
 
-@inner
+@storage
 def new_joint(most: int, row: Any) -> Joint:
     """Room for `most` members."""
     return joint_in(np.zeros(joint_size(most, row) * LANES), most, row)

@@ -17,7 +17,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray
 from .abreast import less, pack, put, take
-from .compile import part
+from .compile import part, storage
 from .components import BASE, BEGIN, MEMBER, STRIDE, TILE
 from .lanes import LANES, subtract
 
@@ -50,7 +50,7 @@ class Scratch(NamedTuple):
     diagonal: AnyArray
 
 
-@part
+@storage
 def scratch(vehicles: int, wide: int) -> Scratch:
     """For so many vehicles and a stride."""
     return Scratch(
@@ -64,7 +64,7 @@ def scratch(vehicles: int, wide: int) -> Scratch:
 
 
 @part
-def learn(
+def update(
     plan: AnyArray,
     component: int,
     spread: AnyArray,

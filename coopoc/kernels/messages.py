@@ -15,7 +15,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray, Bools, Floats, Ints
 from .abreast import choose, take
-from .compile import inner, inside
+from .compile import inner, inside, storage
 from .lanes import LANES
 from .small import add, load, scale, store, times
 
@@ -92,7 +92,7 @@ class Star(NamedTuple):
     last_status: Floats
 
 
-@inner
+@storage
 def star_in(memory: AnyArray, columns: AnyArray, most: int) -> Star:
     """A star of up to `most` members in memory (>= 30 most LANES,) and columns (>= 3 most,)."""
     rows = memory[: 30 * most * LANES].reshape((30 * most, LANES))
@@ -107,7 +107,7 @@ def star_in(memory: AnyArray, columns: AnyArray, most: int) -> Star:
     )
 
 
-@inner
+@storage
 def new_star(most: int) -> Star:
     """Room for `most` members."""
     return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy import uint64
 
-from ..arrays import Floats, Ints
-from .compile import inlined, inner
+from ..arrays import AnyArray, Floats, Ints
+from .abreast import put, take
+from .compile import inner, storage
 from .edges import edge
 from .lanes import LANES
 from .messages import MOVED, POSITION, PROCESS, RELATIVE, Assumptions, Measurements, Star, gather
@@ -21,7 +23,7 @@ LEAST_PROCESS = 1e-90
 
 class Window(NamedTuple):
     """The last steps of one ego's star in LANES runs; step t stands in slot t modulo h + 1, member k of slot s in place
-    s stride + k.
+    s most + k.
 
     Args:
         sizes: (h + 1,) members. member, previous, later, joined: (places,) column, index in the star before and after,
@@ -29,7 +31,8 @@ class Window(NamedTuple):
         status, motion, relative: of `coopoc.kernels.messages.Star`, place by place. fix, used: (3 places, LANES) 1/m^2,
             information of the positions that count, and the same times their GNC weights.
         edge, eta: (9 places, LANES), (3 places, LANES), information of the relative measurements around the points.
-        point: (3 places, LANES) m. odometry: (1, LANES) GNC weight of the ego's odometry.
+        point: (3 places, LANES) m. odometry: (1, LANES) GNC weight of the ego's odometry. layout: slots
+            h + 1, and most members, places of a slot.
     """
 
     sizes: Ints
@@ -46,10 +49,10 @@ class Window(NamedTuple):
     eta: Floats
     point: Floats
     odometry: Floats
-    stride: int
+    layout: tuple[int, int]
 
 
-@inner
+@storage
 def new_window(length: int, most: int) -> Window:
     """Room for windows of `length` steps of at most `most` members."""
     places = (length + 1) * most
@@ -68,27 +71,28 @@ def new_window(length: int, most: int) -> Window:
         np.zeros((3 * places, LANES)),
         np.zeros((3 * places, LANES)),
         np.ones((1, LANES)),
-        most,
+        (length + 1, most),
     )
 
 
-@inlined
-def place_of(window: Window, step: int, k: int) -> int:
+@inner
+def place_of(layout: tuple[int, int], step: int, k: int) -> int:
     """Of member k of a step."""
-    return int(step % len(window.sizes) * window.stride + k)
+    return step % layout[0] * layout[1] + k
 
 
-@inlined
-def count_of(window: Window, step: int) -> int:
+@inner
+def count_of(sizes: Ints, step: int) -> int:
     """Members of a step."""
-    return int(window.sizes[step % len(window.sizes)])
+    return int(sizes[step % len(sizes)])
 
 
-@inlined
+@inner
 def enter(window: Window, star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int) -> None:
     """Gather what is known of step t into its slot."""
-    old = count_of(window, t - 1) if t > 0 else 0
-    n, here, before = gather(star, seen, known, runs, t, old), place_of(window, t, 0), place_of(window, t - 1, 0)
+    old = count_of(window.sizes, t - 1) if t > 0 else 0
+    n = gather(star, seen, known, runs, t, old)
+    here, before = place_of(window.layout, t, 0), place_of(window.layout, t - 1, 0)
     window.sizes[t % len(window.sizes)] = n
     for k in range(n):
         place = here + k
@@ -97,31 +101,47 @@ def enter(window: Window, star: Star, seen: Measurements, known: Assumptions, ru
         if star.previous[k] >= 0:
             window.later[before + star.previous[k]] = k
             window.joined[place] = window.joined[before + star.previous[k]]
-    window.motion[12 * here : 12 * (here + n)] = star.motion[: 12 * n]
-    window.relative[8 * here : 8 * (here + n)] = star.relative[: 8 * n]
-    window.status[5 * here : 5 * (here + n)] = star.status[: 5 * n]
+    copy_rows(window.motion, 12 * here, star.motion, 12 * n)
+    copy_rows(window.relative, 8 * here, star.relative, 8 * n)
+    copy_rows(window.status, 5 * here, star.status, 5 * n)
 
 
-@inlined
+@inner
+def any_positive(mask: AnyArray) -> bool:
+    """Whether any number is."""
+    found = False
+    for value in mask:
+        found = found or value > 0.0
+    return found
+
+
+@inner
+def copy_rows(out: AnyArray, at: int, source: AnyArray, count: int) -> None:
+    """The first rows of LANES numbers; an assignment of slices would compile the text of its errors."""
+    for row in range(count):
+        put(out, uint64(at + row), take(source, uint64(row)))
+
+
+@inner
 def linearise(window: Window, span: Any, assumed: Any, how: int) -> None:
     """The relative measurements as edges at the points, in one of the ways of `edge`."""
     for step in range(span[0], span[1] + 1):
-        ego = place_of(window, step, 0)
+        ego = place_of(window.layout, step, 0)
         origin = load(window.point, ego, ROW)
-        for place in range(ego + 1, ego + count_of(window, step)):
+        for place in range(ego + 1, ego + count_of(window.sizes, step)):
             gap = subtract(load(window.point, place, ROW), origin)
             information, eta = edge(gap, load(window.relative, place, RELATIVE), assumed, how)
             store(window.edge, place, information)
             store(window.eta, place, eta)
 
 
-@inlined
+@inner
 def fix_gap(window: Window, place: int) -> Any:
     """Measured position less the point, m."""
     return subtract(load(window.motion, 4 * place + POSITION, ROW), load(window.point, place, ROW))
 
 
-@inlined
+@inner
 def motion(window: Window, here: int, there: int) -> Any:
     """Information 1/m^2 of the motion from a place to the one after, and its eta on the latter's point."""
     p, q, r = load(window.motion, 4 * there + PROCESS, ROW)
@@ -136,10 +156,10 @@ def largest_of(v: Any) -> Any:
     return max(max(abs(v[0]), abs(v[1])), abs(v[2]))
 
 
-@inlined
+@storage
 def star_at(window: Window, step: int) -> Star:
     """The star of a step, and of the one before it, in the window's own memory."""
-    here, before, n = place_of(window, step, 0), place_of(window, step - 1, 0), window.stride
+    here, before, n = place_of(window.layout, step, 0), place_of(window.layout, step - 1, 0), window.layout[1]
     return Star(
         window.member[here : here + n],
         window.previous[here : here + n],

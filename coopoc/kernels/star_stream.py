@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Floats, Ints
-from .compile import as_written, inner, inside
+from .compile import as_written, inner, inside, storage
 from .joint import joint_in, joint_size
 from .joint_filter import step
 from .lanes import LANES
@@ -76,7 +76,7 @@ def packed(noise: Noise) -> Floats:
     return np.concatenate([motion.base, motion.ratio, motion[2:], known.fixes.ravel(), std, rest])
 
 
-@inside
+@storage
 def unpacked(values: AnyArray) -> Noise:
     """The Noise of an array; a message holds a fix and a velocity."""
     motion = MotionNoise(values[:3], values[3:6], values[6], values[7], values[8])

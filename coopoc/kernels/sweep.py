@@ -14,7 +14,7 @@ from numpy import uint64
 from ..arrays import AnyArray
 from .abreast import take
 from .back import Past, advance_points, go_back, kept_of, stiffness
-from .compile import inlined
+from .compile import inner
 from .edges import AT_GAP, EXACT, edge
 from .elimination import predict
 from .joint import Joint, add_relative, block_of, copy, rearrange, solve
@@ -40,14 +40,14 @@ from .small import (
 )
 
 
-@inlined
+@inner
 def start_points(window: Window, past: Past, known: Assumptions, t: int) -> None:
     """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it.
 
     Its relative measurements are converted vectors, weighted by that geometry.
     """
-    ego, before = place_of(window, t, 0), place_of(window, t - 1, 0)
-    for k in range(count_of(window, t)):
+    ego, before = place_of(window.layout, t, 0), place_of(window.layout, t - 1, 0)
+    for k in range(count_of(window.sizes, t)):
         place, previous = ego + k, window.previous[ego + k]
         fix = load(window.motion, 4 * place + POSITION, ROW)
         if previous >= 0:
@@ -62,16 +62,16 @@ def start_points(window: Window, past: Past, known: Assumptions, t: int) -> None
             gap = subtract(fix, load(window.point, ego, ROW))
             put_edge(window, past, known, place, gap, AT_GAP, 0.0 * gap[0] + 1.0)
     if t == 0:
-        n = count_of(window, t)
+        n = count_of(window.sizes, t)
         nothing = zeros(load(window.point, 0, ROW)[0], ONE)
         clear(past.information)
         clear(past.eta)
         for k in range(n):
             prior = 1.0 / known.flat + nothing[0]
-            store(past.information, k * (window.stride + 1), add_diagonal(nothing, (prior, prior, prior)))
+            store(past.information, k * (window.layout[1] + 1), add_diagonal(nothing, (prior, prior, prior)))
 
 
-@inlined
+@inner
 def put_edge(window: Window, past: Past, known: Assumptions, place: int, gap: Any, how: int, mask: Any) -> None:
     """The relative measurement of a place, linear at the vector `gap`, where the mask is positive: E and E v + eta."""
     z = load(window.relative, place, RELATIVE)
@@ -82,32 +82,32 @@ def put_edge(window: Window, past: Past, known: Assumptions, place: int, gap: An
     store(past.base, place, choose_each(mask, gap, load(past.base, place, ROW)))
 
 
-@inlined
+@inner
 def linearise_step(window: Window, past: Past, known: Assumptions, step: int, joint: Joint, mask: Any) -> None:
     """The relative measurements of a step in range and angles, where its points are, moved by `joint.move`."""
-    ego, n = place_of(window, step, 0), count_of(window, step)
+    ego, n = place_of(window.layout, step, 0), count_of(window.sizes, step)
     for k in range(1, n):
         ahead = subtract(load(joint.move, block_of(k, n), ROW), load(joint.move, block_of(0, n), ROW))
         gap = subtract(load(window.point, ego + k, ROW), load(window.point, ego, ROW))
         put_edge(window, past, known, ego + k, add(gap, ahead), EXACT, mask)
 
 
-@inlined
+@inner
 def distance(window: Window, past: Past, span: Any) -> Any:
     """m by which a vector has left the one at which its measurement is linear, the largest along an axis."""
-    most = 0.0 * load(window.point, place_of(window, span[1], 0), ROW)[0]
+    most = 0.0 * load(window.point, place_of(window.layout, span[1], 0), ROW)[0]
     for step in range(span[0], span[1] + 1):
-        ego = place_of(window, step, 0)
-        for place in range(ego + 1, ego + count_of(window, step)):
+        ego = place_of(window.layout, step, 0)
+        for place in range(ego + 1, ego + count_of(window.sizes, step)):
             gap = subtract(load(window.point, place, ROW), load(window.point, ego, ROW))
             most = max(most, largest_of(subtract(gap, load(past.base, place, ROW))))
     return most
 
 
-@inlined
+@inner
 def assemble(window: Window, past: Past, joint: Joint, step: int) -> None:
     """From what the past says around `at` to what it and the fixes of a step say around its points."""
-    ego, n, stride = place_of(window, step, 0), count_of(window, step), joint.stride
+    ego, n, stride = place_of(window.layout, step, 0), count_of(window.sizes, step), joint.stride
     for k in range(n):
         place = ego + k
         store(joint.move, block_of(k, n), subtract(load(past.at, place, ROW), load(window.point, place, ROW)))
@@ -126,10 +126,10 @@ def assemble(window: Window, past: Past, joint: Joint, step: int) -> None:
         store(joint.eta, i, add(load(joint.eta, i, ROW), times(fix, fix_gap(window, ego + k))))
 
 
-@inlined
+@inner
 def add_edges(window: Window, a: AnyArray, eta: AnyArray, stride: int, step: int) -> None:
     """Add the relative measurements of a step."""
-    ego, n = place_of(window, step, 0), count_of(window, step)
+    ego, n = place_of(window.layout, step, 0), count_of(window.sizes, step)
     for k in range(1, n):
         gap = subtract(load(window.point, ego + k, ROW), load(window.point, ego, ROW))
         information = load(window.edge, ego + k, ONE)
@@ -137,11 +137,11 @@ def add_edges(window: Window, a: AnyArray, eta: AnyArray, stride: int, step: int
         add_relative(a, eta, stride, (k, n), edge, ROW)
 
 
-@inlined
+@inner
 def go_on(window: Window, past: Past, joint: Joint, known: Assumptions, step: int) -> None:
     """A step becomes the past of the next one; what it takes to go back is kept."""
-    m, n, stride = count_of(window, step), count_of(window, step + 1), joint.stride
-    here, after = place_of(window, step, 0), place_of(window, step + 1, 0)
+    m, n, stride = count_of(window.sizes, step), count_of(window.sizes, step + 1), joint.stride
+    here, after = place_of(window.layout, step, 0), place_of(window.layout, step + 1, 0)
     stiffness(window, joint, step)
     kept = kept_of(window, past, step)
     predict(joint.information, m, stride, joint.process, kept, ONE, ROW, m + 1)
@@ -165,16 +165,16 @@ def go_on(window: Window, past: Past, joint: Joint, known: Assumptions, step: in
         store(joint.eta, block_of(k, n), eta)
 
 
-@inlined
+@inner
 def recall(window: Window, past: Past, joint: Joint, step: int) -> None:
     """Begin with the arrival cost of the first step."""
-    n = count_of(window, step)
+    n = count_of(window.sizes, step)
     copy(past.information, joint.information, n, joint.stride, ONE)
     for k in range(n):
         store(joint.eta, k, load(past.eta, k, ROW))
 
 
-@inlined
+@inner
 def copy_system(joint: Joint, n: int, information: AnyArray, eta: AnyArray) -> None:
     """The information matrix and vector of n members."""
     copy(joint.information, information, n, joint.stride, ONE)
@@ -182,7 +182,7 @@ def copy_system(joint: Joint, n: int, information: AnyArray, eta: AnyArray) -> N
         store(eta, k, load(joint.eta, k, ROW))
 
 
-@inlined
+@inner
 def sweep(
     window: Window, past: Past, joint: Joint, known: Assumptions, span: Any, exact: bool, entered: bool, mask: AnyArray
 ) -> None:
@@ -204,16 +204,16 @@ def sweep(
             a, eta = joint.information, joint.eta
             if count < passes - 1:
                 a, eta = joint.factor, joint.move
-                copy_system(joint, count_of(window, step), a, eta)
+                copy_system(joint, count_of(window.sizes, step), a, eta)
             elif exact and step > leaving:
                 linearise_step(window, past, known, step, joint, moves)
             add_edges(window, a, eta, joint.stride, step)
             if step == last:
-                cov = solve(a, joint, eta, count_of(window, step), ROW)
+                cov = solve(a, joint, eta, count_of(window.sizes, step), ROW)
         if step < last:
             go_on(window, past, joint, known, step)
         if step == leaving:
-            copy_system(joint, count_of(window, first), past.information, past.eta)
+            copy_system(joint, count_of(window.sizes, first), past.information, past.eta)
     store(joint.scratch, 0, negate(cov))
     advance_points(window, joint.eta, last, moves)
     for step in range(last - 1, first - 1, -1):

@@ -15,12 +15,12 @@ from numpy import uint64
 from ..arrays import AnyArray, Bools, Floats, Ints
 from .abreast import put, take
 from .chains import Memory, move, new_memory
-from .compile import as_written, inlined
+from .compile import as_written, inner
 from .edges import AT_MEASUREMENT, EXACT
 from .gnc import GNC, Weights, new_weights, residuals, restore, reweigh, trust_all, weigh
 from .lanes import LANES
 from .messages import HELD, NEW, POSITION, USES, VARIANCE, Assumptions, Measurements, Star, largest, new_star
-from .slots import ROW, Window, count_of, enter, linearise, new_window, place_of
+from .slots import ROW, Window, any_positive, count_of, enter, linearise, new_window, place_of
 from .small import load, store, subtract
 
 SOLVED, MET, LOST, BLIND = range(4)
@@ -103,13 +103,13 @@ def gather_window(
     use_fixes(window, seen.start, fresh, runs, span)
 
 
-@inlined
+@inner
 def use_fixes(window: Window, start: AnyArray, fresh: Fresh, runs: Any, span: Any) -> None:
     """Start from the positions, with the information of those that count: one that is not new counts where the window
     meets its vehicle, and never twice in a window."""
     for step in range(span[0], span[1] + 1):
-        for k in range(count_of(window, step)):
-            place, link = place_of(window, step, k), start[step] + k - 1
+        for k in range(count_of(window.sizes, step)):
+            place, link = place_of(window.layout, step, k), start[step] + k - 1
             meets = step == span[0] if k == 0 else fresh.met[link] < span[0]
             for lane in range(LANES):
                 run = min(runs[0] + lane, runs[1])
@@ -123,7 +123,7 @@ def use_fixes(window: Window, start: AnyArray, fresh: Fresh, runs: Any, span: An
             store(window.point, place, load(window.motion, 4 * place + POSITION, ROW))
 
 
-@inlined
+@inner
 def solve(
     window: Window,
     seen: Measurements,
@@ -143,7 +143,7 @@ def solve(
     for lane in range(LANES):
         memory.active[lane] = 1.0 if lane <= runs[1] - runs[0] else 0.0
         weights.going[lane], weights.blind[lane], weights.mu[lane] = False, False, 0.0
-    while memory.active.max() > 0.0:
+    while any_positive(memory.active):
         how = EXACT if exact and stage != START and stage != MEETING else AT_MEASUREMENT
         descend(window, span, (known.relative_std, known.min_range), how, settings, memory, here, found)
         if stage == START:
@@ -157,12 +157,12 @@ def solve(
                 continue
         if stage == ROBUST:
             sharpen(window, span, weights, gnc, memory, here, found)
-        if stage != MEETING and exact and memory.active.max() == 0.0:
+        if stage != MEETING and exact and not any_positive(memory.active):
             stage = MEETING
             find_met(window, span, settings, memory, here, found)
 
 
-@inlined
+@inner
 def descend(
     window: Window, span: Any, assumed: Any, how: int, settings: Settings, memory: Memory, here: Any, found: Found
 ) -> None:
@@ -178,14 +178,14 @@ def descend(
             if memory.active[lane] > 0.0 and (memory.most[lane] <= enough or how != EXACT):
                 memory.active[lane] = 0.0
                 record(window, memory, lane, here, found)
-        if memory.active.max() == 0.0:
+        if not any_positive(memory.active):
             break
     for lane in range(LANES):
         if memory.active[lane] > 0.0:
             found.ended[here[0][0] + lane, here[1]], memory.active[lane] = LOST, 0.0
 
 
-@inlined
+@inner
 def sharpen(window: Window, span: Any, weights: Weights, gnc: GNC, memory: Memory, here: Any, found: Found) -> None:
     """The next weights of the runs whose weights still change; these are active then."""
     runs, t, _ = here
@@ -203,7 +203,7 @@ def sharpen(window: Window, span: Any, weights: Weights, gnc: GNC, memory: Memor
         restore(window, span, weights, memory.active)
 
 
-@inlined
+@inner
 def find_met(window: Window, span: Any, settings: Settings, memory: Memory, here: Any, found: Found) -> None:
     """Runs in which a neighbour is `apart` or less from the ego; the converted problem answers there."""
     runs, t, _ = here
@@ -213,29 +213,29 @@ def find_met(window: Window, span: Any, settings: Settings, memory: Memory, here
             memory.active[lane], found.ended[runs[0] + lane, t] = 1.0, MET
 
 
-@inlined
+@inner
 def nearest(window: Window, span: Any) -> Any:
     """m on the ground between the ego and a neighbour, the least of all steps."""
     least = 0.0 * take(window.odometry, uint64(0)) + 1e300
     for step in range(span[0], span[1] + 1):
-        ego = place_of(window, step, 0)
-        for place in range(ego + 1, ego + count_of(window, step)):
+        ego = place_of(window.layout, step, 0)
+        for place in range(ego + 1, ego + count_of(window.sizes, step)):
             x, y, _ = subtract(load(window.point, place, ROW), load(window.point, ego, ROW))
             least = -max(-least, -math.sqrt(x * x + y * y))
     return least
 
 
-@inlined
+@inner
 def record(window: Window, memory: Memory, lane: int, here: Any, found: Found) -> None:
     """What one of the runs has found."""
     runs, t, link = here
-    run, ego = runs[0] + lane, place_of(window, t, 0)
+    run, ego = runs[0] + lane, place_of(window.layout, t, 0)
     found.ended[run, t] = MET if found.ended[run, t] == MET else SOLVED
     for i in range(3):
         found.x[run, t, i] = window.point[3 * ego + i, lane]
         for j in range(3):
             found.covariance[run, t, i, j] = -memory.cov[3 * min(i, j) + max(i, j), lane]
-    for k in range(1, count_of(window, t)):
+    for k in range(1, count_of(window.sizes, t)):
         held = window.status[5 * (ego + k) + HELD, lane] > 0.0
         for i in range(3):
             point = window.point[3 * (ego + k) + i, lane]

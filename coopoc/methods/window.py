@@ -73,7 +73,7 @@ def steps_of(window: Any, recording: Recording, box: Inbox, run: int, span: Span
 def places(window: Any, step: int) -> slice:
     """Of the members of a step in the arrays of a compiled window."""
     slot = step % len(window.sizes)
-    return slice(slot * window.stride, slot * window.stride + int(window.sizes[slot]))
+    return slice(slot * window.layout[1], slot * window.layout[1] + int(window.sizes[slot]))
 
 
 def vehicles_of(window: Any, span: Span) -> Ints:

@@ -52,8 +52,8 @@ def arrival_of(horizon: Any, run: int, step: int) -> Arrival:
     lane, here = run % window.motion.shape[1], places(window, step)
     n = here.stop - here.start
     order = np.append(n - 1, np.arange(n - 1))  # the ego's block is the last
-    blocks = past.information[:, lane].reshape(-1, 3, 3)[: window.stride**2]
-    blocks = blocks.reshape(window.stride, window.stride, 3, 3)[:n, :n]
+    blocks = past.information[:, lane].reshape(-1, 3, 3)[: window.layout[1] ** 2]
+    blocks = blocks.reshape(window.layout[1], window.layout[1], 3, 3)[:n, :n]
     upper = np.triu(np.moveaxis(blocks, 2, 1).reshape(3 * n, 3 * n))
     full = (upper + np.triu(upper, 1).T).reshape(n, 3, n, 3)[order][:, :, order].reshape(3 * n, 3 * n)
     eta = past.eta[:, lane].reshape(-1, 3)[:n][order]

@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import Function, part
+from coopoc.kernels.compile import Function
 
 PAD = 16
 """Columns of matrices come in multiples of this: whole vectors in either precision."""
@@ -20,6 +20,11 @@ ZERO, ONE, TWO, THREE = np.arange(4)
 """NumPy's integers, because numba compiles a function anew for each constant of Python's."""
 Index: TypeAlias = int | np.integer[Any]
 """What kernels count and index with: Python's integers, and NumPy's that come from tables of them."""
+
+
+def part(function: Function) -> Function:
+    """Compiled with the first kernel that calls it, and kept in that one's machine code; it may return views."""
+    return cast(Function, njit(nogil=True, error_model="numpy", fastmath={"contract"})(function))
 
 
 def inside(function: Function) -> Function:

@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import part
 from coopoc.learned.engine.arguments import Matrices
 
 from . import places as on
-from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, borrowed, carry, inside, window
+from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, borrowed, carry, inside, part, window
 from .forward import blend, layer, missing
 from .places import LOG_FLOOR, SHORTEST
 from .product import add_outer, add_product, dots, gated_product

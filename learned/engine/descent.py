@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import compiled, part
+from coopoc.kernels.compile import compiled
 from coopoc.learned.engine.arguments import Drives, Found, Matrices, Memory, Moments, Update
 
 from . import backward, forward
-from .arithmetic import ZERO, Index, aligned, borrowed
+from .arithmetic import ZERO, Index, aligned, borrowed, part
 from .optimiser import advance_row
 from .tape import Tape, net_of
 

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import compiled, part
+from coopoc.kernels.compile import compiled
 from coopoc.learned.engine.arguments import Drives, Matrices, Memory
 
 from . import places as on
-from .arithmetic import PAD, THREE, ZERO, Index, aligned, borrowed, carry, inside, sigmoid, tanh, window
+from .arithmetic import PAD, THREE, ZERO, Index, aligned, borrowed, carry, inside, part, sigmoid, tanh, window
 from .places import LOG_FLOOR, SHORTEST
 from .product import affine, align_gates
 from .tape import Net, Tape, bias, matrix, net_of, rows, unpack

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import compiled, part, summing
+from coopoc.kernels.compile import compiled, summing
 from coopoc.learned.engine.arguments import Found, Moments, Update
 
-from .arithmetic import Index, borrowed
+from .arithmetic import Index, borrowed, part
 
 
 @compiled

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from coopoc.arrays import AnyArray, Bools, Ints
-from coopoc.kernels.compile import part
 from coopoc.learned.engine.arguments import Matrices
 
-from .arithmetic import ONE, PAD, Index, borrowed, inside, whole, window
+from .arithmetic import ONE, PAD, Index, borrowed, inside, part, whole, window
 
 
 class Net(NamedTuple):

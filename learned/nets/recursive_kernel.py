@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import compiled, part
+from coopoc.kernels.compile import compiled
 
-from ..engine.arithmetic import sigmoid, tanh
+from ..engine.arithmetic import part, sigmoid, tanh
 from ..training.clients import Batch
 from .levels import FADE, FEATURES, FORGET, GNSS_STD, POOL, STILL, VELOCITY_SHARE, WEIGHT
 from .stack import layers
@@ -105,7 +105,7 @@ def _product(delta: Tensor, given: Tensor) -> Tensor:
     return delta.flatten(1, 2).mT @ given.flatten(1, 2)
 
 
-@part
+@compiled
 def _levels(
     fix: AnyArray, velocity: AnyArray, x0: AnyArray, dt: float, gnss: AnyArray, ratio: AnyArray, features: AnyArray
 ) -> None:
