@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from coopoc import InputError
-from coopoc.kernels.compile import part
 from coopoc.learned import Gain, GainNet
-from coopoc.learned.engine.arithmetic import sigmoid, tanh
+from coopoc.learned.engine.arithmetic import part, sigmoid, tanh
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch

@@ -155,7 +155,7 @@ def test_checks_of_single_arrays_and_numbers() -> None:
 CODE = """
 import numpy as np
 from coopoc.kernels.abreast import put, take
-from coopoc.kernels.compile import part
+from coopoc.kernels.compile import as_written, part
 from coopoc.kernels.lanes import subtract
 
 @part
@@ -170,12 +170,21 @@ def lowered(array, at):
 def plain(array, at):
     array[at] = 0.0
 
-for function, last in ((copied, 2), (lowered, 0), (plain, 11)):
-    function(np.zeros(12), last)
+@as_written
+def call(which, array, at):
+    if which == 0:
+        copied(array, at)
+    elif which == 1:
+        lowered(array, at)
+    else:
+        plain(array, at)
+
+for which, (name, last) in enumerate((("copied", 2), ("lowered", 0), ("plain", 11))):
+    call(which, np.zeros(12), last)
     try:
-        function(np.zeros(12), last + 1)
+        call(which, np.zeros(12), last + 1)
     except IndexError:
-        print(function.__name__, "checks")
+        print(name, "checks")
 """
 
 
