@@ -29,7 +29,20 @@ from .joint import (
     solve,
 )
 from .lanes import LANES
-from .messages import NEW, POSITION, ROW, VARIANCE, Assumptions, Measurements, Star, clear, gather, largest, new_star
+from .messages import (
+    NEW,
+    NONE,
+    POSITION,
+    ROW,
+    VARIANCE,
+    Assumptions,
+    Measurements,
+    Star,
+    clear,
+    gather,
+    largest,
+    new_star,
+)
 from .small import first3, load, negate, square, store, subtract, with_first3
 
 
@@ -46,7 +59,7 @@ def follow(
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
     most = largest(seen.start) + 1
     for first in range(0, runs, LANES):
-        last, old = min(first + LANES, runs) - 1, 0
+        last, old = min(first + LANES, runs) - 1, NONE
         star, joint = new_star(most), new_joint(most, row)
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)

@@ -19,6 +19,7 @@ from .lanes import LANES
 from .messages import (
     MOVED,
     NEW,
+    NONE,
     POSITION,
     PROCESS,
     VARIANCE,
@@ -48,7 +49,7 @@ def follow(seen: Measurements, known: Assumptions, ones: bool, reset: bool) -> t
     most = largest(seen.start)
     size = joint_size(most, ONE) * LANES + 16 * LANES
     for first in range(0, runs, LANES):
-        last, old = min(first + LANES, runs) - 1, 0
+        last, old = min(first + LANES, runs) - 1, NONE
         star, memory = new_star(most), np.zeros((LANES, size))
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)

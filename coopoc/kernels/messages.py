@@ -14,7 +14,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray, Bools, Floats, Ints
-from .abreast import choose, take
+from .abreast import choose, put, take
 from .compile import inner, inside, storage
 from .lanes import LANES
 from .small import add, load, scale, store, times
@@ -28,6 +28,8 @@ age in steps, 1 if there is one, and 1 if its position counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
+NONE = np.int64(0)
+"""Members before the first star. For a constant of Python's numba would compile the whole step once more."""
 
 
 class Measurements(NamedTuple):
@@ -135,11 +137,11 @@ def gather(star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int
         link = seen.start[t] + k - 1
         star.member[k] = member = seen.ego if k == 0 else seen.neighbour[link]
         star.previous[k] = place = index_of(member, star.last_member, old)
-        for lane in range(LANES):
-            run = min(runs[0] + lane, runs[1])
+        for lane in range(uint64(LANES)):
+            run = min(runs[0] + int(lane), runs[1])
             receive(star, seen, known, (run, t, link), (k, place, lane))
             if k > 0:
-                measured(star.relative, seen.relative[run, link], known.relative_std, k, lane)
+                measured(star.relative, five_of(seen.relative, run, link), known.relative_std, k, lane)
         if len(known.velocity_noise):
             velocity = load(star.motion, 4 * k + MOVED, ROW)
             store(star.motion, 4 * k + PROCESS, motion_variance(known.velocity_noise, velocity, seen.dt))
@@ -152,9 +154,8 @@ def remember(star: Star, old: int) -> None:
     """Make the star the last one."""
     for k in range(old):
         star.last_member[k] = star.member[k]
-        for lane in range(LANES):
-            for row in (5 * k + SENT, 5 * k + USES):
-                star.last_status[row, lane] = star.status[row, lane]
+        for row in (uint64(5 * k + SENT), uint64(5 * k + USES)):
+            put(star.last_status, row, take(star.status, row))
 
 
 @inside
@@ -178,25 +179,24 @@ def index_of(member: int, members: AnyArray, count: int) -> int:
 def receive(star: Star, seen: Measurements, known: Assumptions, source: Any, target: Any) -> None:
     """Copy the last message of a member in one run: velocity, process noise, position, its variance, and its status."""
     (run, t, link), (k, place, lane) = source, target
-    member = star.member[k]
-    sent = t if k == 0 else seen.newest[run, link]
+    i, here, before, status = uint64(run), uint64(link), uint64(5 * max(place, 0)), uint64(5 * k)
+    sent = t if k == 0 else seen.newest[i, here]
     when = sent if sent >= 0 else t
-    again = place >= 0 and star.last_status[5 * place + SENT, lane] == sent
-    star.status[5 * k + SENT, lane] = sent
-    star.status[5 * k + USES, lane] = star.last_status[5 * place + USES, lane] + 1.0 if again else 1.0
-    star.status[5 * k + AGE, lane] = t - when
-    star.status[5 * k + HELD, lane] = 1.0 if sent >= 0 else 0.0
-    i, j, m = uint64(run), uint64(when), uint64(member)
-    at = uint64(12 * k)
+    again = place >= 0 and star.last_status[before + uint64(SENT), lane] == sent
+    star.status[status + uint64(SENT), lane] = sent
+    star.status[status + uint64(USES), lane] = star.last_status[before + uint64(USES), lane] + 1.0 if again else 1.0
+    star.status[status + uint64(AGE), lane] = t - when
+    star.status[status + uint64(HELD), lane] = 1.0 if sent >= 0 else 0.0
+    j, m, at = uint64(when), uint64(star.member[k]), uint64(12 * k)
     put_lane(star.motion, at, lane, three_of(seen.velocity, i, j, m))
     put_lane(star.motion, at + uint64(3), lane, three_of(known.process, i, j, m))
-    fresh = k == 0 or seen.fresh[run, link]
+    fresh = k == 0 or seen.fresh[i, here]
     x, y, z = three_of(seen.gnss, i, j, m) if k == 0 else three_of(seen.broadcast, i, j, m)
     there = math.isfinite(x + y + z)
     put_lane(star.motion, at + uint64(6), lane, (x, y, z) if there else (0.0, 0.0, 0.0))
     variance = three_of(known.fixes, i, j, m) if k == 0 else three_of(known.broadcast, i, j, m)
     put_lane(star.motion, at + uint64(9), lane, variance if there else (NOWHERE, NOWHERE, NOWHERE))
-    star.status[5 * k + NEW, lane] = 1.0 if fresh and there else 0.0
+    star.status[status + uint64(NEW), lane] = 1.0 if fresh and there else 0.0
 
 
 @inside
@@ -240,15 +240,20 @@ def position_or_nan(star: Star, k: int, axis: int, lane: int) -> float:
 @inside
 def measured(relative: AnyArray, seen: Any, std: AnyArray, k: int, lane: int) -> None:
     """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
-    d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
-    at, unit = 8 * k, len(std) == 0
+    d, sa, ca, si, ci = seen
+    at, unit = uint64(8 * k), len(std) == 0
     has_azimuth, has_inclination = sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
     relative[at, lane] = max(d, 0.0)
-    relative[at + 1, lane], relative[at + 2, lane] = sa, ca if has_azimuth else 1.0
-    relative[at + 3, lane], relative[at + 4, lane] = si if has_inclination else 1.0, ci
-    relative[at + 5, lane] = (1.0 if unit else std[0]) if d >= 0.0 else math.inf
-    relative[at + 6, lane] = (1.0 if unit else std[1]) if has_azimuth else math.inf
-    relative[at + 7, lane] = (1.0 if unit else std[2]) if has_inclination else math.inf
+    range_std, azimuth_std, inclination_std = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
+    azimuth = sa, ca if has_azimuth else 1.0, si if has_inclination else 1.0
+    put_lane(relative, at + uint64(1), lane, azimuth)
+    relative[at + uint64(4), lane] = ci
+    deviations = (
+        range_std if d >= 0.0 else math.inf,
+        azimuth_std if has_azimuth else math.inf,
+        inclination_std if has_inclination else math.inf,
+    )
+    put_lane(relative, at + uint64(5), lane, deviations)
 
 
 @inside
@@ -270,6 +275,19 @@ def three_of(values: AnyArray, run: Any, t: Any, member: Any) -> Any:
     i, j = min(run, uint64(values.shape[0]) - one), min(t, uint64(values.shape[1]) - one)
     k = min(member, uint64(values.shape[2]) - one)
     return values[i, j, k, uint64(0)], values[i, j, k, one], values[i, j, k, uint64(2)]
+
+
+@inside
+def five_of(relative: AnyArray, run: int, link: int) -> Any:
+    """The five numbers of a measurement of `components`."""
+    i, j = uint64(run), uint64(link)
+    return (
+        relative[i, j, uint64(0)],
+        relative[i, j, uint64(1)],
+        relative[i, j, uint64(2)],
+        relative[i, j, uint64(3)],
+        relative[i, j, uint64(4)],
+    )
 
 
 @inside

@@ -74,3 +74,20 @@ def since(history: AnyArray, age: float, moved: AnyArray, variance: AnyArray) ->
             moved[c] += share * history[row, 1 + c]
             variance[c] += share * history[row, 4 + c]
         left -= history[row, 0]
+
+
+@compiled
+def bridge(x: AnyArray, variance: AnyArray, new: AnyArray, velocity: AnyArray, process: AnyArray, dt: float) -> None:
+    """Write dead reckoning where no fix is new: x + dt u m and its variance + q m^2, from the step before.
+
+    Args:
+        x: (R, T, N, 3) m, changed in place. variance: (R, T, N, 3) m^2, changed in place. new: (R, T, N).
+        velocity: (R, T, N, 3) m/s. process: (R, T, N, 3) m^2.
+    """
+    for run in range(x.shape[0]):
+        for t in range(1, x.shape[1]):
+            for n in range(x.shape[2]):
+                if not new[run, t, n]:
+                    for i in range(3):
+                        x[run, t, n, i] = x[run, t - 1, n, i] + dt * velocity[run, t, n, i]
+                        variance[run, t, n, i] = variance[run, t - 1, n, i] + process[run, t, n, i]

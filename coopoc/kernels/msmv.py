@@ -12,6 +12,7 @@ from .lanes import LANES
 from .messages import (
     MOVED,
     NEW,
+    NONE,
     POSITION,
     PROCESS,
     RELATIVE,
@@ -44,7 +45,7 @@ def follow(seen: Measurements, known: Assumptions) -> tuple[Floats, Floats, Floa
     )
     most, state = largest(seen.start), np.zeros((12, LANES))
     for first in range(0, runs, LANES):
-        star, old, last = new_star(most), 0, min(first + LANES, runs) - 1
+        star, old, last = new_star(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)
             fuse(star, known, state, n, old)

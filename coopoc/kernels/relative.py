@@ -14,7 +14,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray, Floats, Ints
 from .abreast import Abreast, choose, lane, less, pack, plus, put
-from .compile import as_written, inside
+from .compile import as_written, inner, inside
 from .lanes import LANES
 
 QUARTER = (math.pi / 2, 6.123233995736766e-17)
@@ -96,7 +96,7 @@ def series(sine: float, cosine: float) -> float:
     return small
 
 
-@as_written
+@inner
 def one_angle(sine: Any, cosine: Any, which: int) -> float:
     """The `angle` of one run."""
     y, x = lane(sine, which), lane(cosine, which)

@@ -35,13 +35,11 @@ def dead_reckoned(recording: Recording, known: NoiseModel) -> Positions:
     variance = np.ascontiguousarray(known.fix_variance(recording))
     if recording.complete:
         return Positions(recording.gnss, variance, new)
-    x, process = recording.gnss.copy(), known.process_variance(recording)
-    variance = np.broadcast_to(variance, x.shape).copy()
-    process = np.broadcast_to(process, x.shape)
-    for t in range(1, len(recording.t)):
-        run, vehicle = np.nonzero(~new[:, t])
-        x[run, t, vehicle] = x[run, t - 1, vehicle] + recording.dt * recording.velocity[run, t, vehicle]
-        variance[run, t, vehicle] = variance[run, t - 1, vehicle] + process[run, t, vehicle]
+    from ..kernels.motion import bridge
+
+    x = recording.gnss.copy()
+    variance, process = np.broadcast_to(variance, x.shape).copy(), known.process_variance(recording)
+    bridge(x, variance, new, recording.velocity, np.broadcast_to(process, x.shape), recording.dt)
     x.flags.writeable = False  # as the fixes are, for the same compiled code
     return Positions(x, variance, new)
 

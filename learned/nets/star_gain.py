@@ -21,6 +21,7 @@ from coopoc.kernels.messages import (
     HELD,
     MOVED,
     NEW,
+    NONE,
     POSITION,
     PROCESS,
     RELATIVE,
@@ -58,7 +59,7 @@ def follow(seen: Measurements, known: Assumptions, sums: bool) -> tuple[Floats, 
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
     most = largest(seen.start) + 1
     for first in range(0, runs, LANES):
-        star, joint, old, last = new_star(most), new_joint(most, ROW), 0, min(first + LANES, runs) - 1
+        star, joint, old, last = new_star(most), new_joint(most, ROW), NONE, min(first + LANES, runs) - 1
         accounts = Accounts(np.zeros((LANES, vehicles, SIZE)), np.zeros((3 * most, LANES)), np.zeros((3 * most, LANES)))
         for lane in range(LANES):
             for k in range(vehicles):
