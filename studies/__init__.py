@@ -1,1 +1,1 @@
-"""Studies: one short script each: what varies, what is held, which tables and figures answer the question."""
+"""Studies, one file each: a grid, its settings, and the tables, figures and findings that answer a question."""

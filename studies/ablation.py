@@ -1,11 +1,11 @@
-"""What each choice in an estimator is worth: the window, the iterations, the exact step, the knowledge of the noise."""
+"""Value of each choice in an estimator: the window, the iterations, the exact step, the noise model."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.evaluate.statistics import paired_difference
 from coopoc.methods.admm import ConsensusADMM
 from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.fixed_lag import FixedLagSmoother
@@ -14,9 +14,13 @@ from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.moving_horizon import MovingHorizon
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.numbers import Number, Where, difference, mean, present, ran, sentence
+from coopoc.study.pivot import across, crossed
+from coopoc.study.study import Params, Row
+from coopoc.study.style import look
 
-from . import lineup, scene, views
+from . import lineup, scene
+from .lineup import BOUND, of
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -34,171 +38,139 @@ CHOICES: Mapping[tuple[str, str], tuple[Made, tuple[int, ...], int]] = {
 }
 """Method and choice -> how it is made, the values, the method's default."""
 KNOWN = ("kalman", "lkf-sa", "joint", "cooperative-map")
-KNOWLEDGE = ("identity", "fitted", "nominal", "oracle")
+NOTE = "K = {max_neighbours}."
+MODELS = ("identity", "fitted", "nominal", "oracle")
 
 
 def _grid() -> list[dict[str, Any]]:
-    grid = [
-        {"method": method, "choice": choice, "value": value, "noise_model": "nominal"}
-        for (method, choice), (_, values, _) in CHOICES.items()
-        for value in values
+    return [
+        *(at(method, choice, value) for (method, choice), (_, values, _) in CHOICES.items() for value in values),
+        *(at(method, "noise_model", 0, known) for method in KNOWN for known in MODELS),
+        of(*BOUND, choice="none", value=0),
     ]
-    grid += [
-        {"method": m, "choice": "noise_model", "value": 0, "noise_model": known} for m in KNOWN for known in KNOWLEDGE
-    ]
-    return [*grid, {"method": "bound", "choice": "none", "value": 0, "noise_model": "bound"}]
 
 
 def cell(p: Params) -> list[Row]:
     """Rows of one method with one value of one of its choices; of the bound, one row per ego."""
-    if p["method"] == "bound":
-        return lineup.bound_rows(p)
-    if p["choice"] == "noise_model":
-        return lineup.rows(p)
-    return lineup.rows(p, own=CHOICES[p["method"], p["choice"]][0](lineup.noise_model(p), int(p["value"])))
+    if p["choice"] in ("none", "noise_model"):
+        return lineup.cell(p)
+    make = CHOICES[p["method"], p["choice"]][0]
+    return lineup.rows(p, made=[(None, make(lineup.noise_model(p), int(p["value"])))])
 
 
 def at(method: str, choice: str, value: int, known: str = "nominal") -> dict[str, Any]:
     """A selection."""
-    return {"method": method, "choice": choice, "value": value, "noise_model": known}
+    return of(method, known, choice=choice, value=value)
 
 
 def _choices(results: Results) -> Table | None:
     """Each value beside the method's default, on the same draws."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
+    rows = [
+        ((look(method).label, choice, value), at(method, choice, value))
+        for (method, choice), (_, values, _) in CHOICES.items()
+        for value in values
+        if present(results, at(method, choice, value))
+    ]
 
-    body: list[tuple[Any, ...]] = []
-    for (method, choice), (_, values, usual) in CHOICES.items():
-        for value in values:
-            where = at(method, choice, value)
-            if views.present(results, where) is None:
-                continue
-            base = views.present(results, at(method, choice, usual))
-            gap = (
-                None
-                if base is None or value == usual
-                else paired_difference(results.values("rt_le_m", where), results.values("rt_le_m", base))
-            )
-            body.append(
-                (
-                    look(method).label,
-                    choice,
-                    value,
-                    views.mean(results, where),
-                    gap if gap else "default",
-                    views.mean(results, where, "nees"),
-                    _microseconds(results, where),
-                )
-            )
-    header = ("Method", "Choice", "Value", "RT-LE [m]", "Less the default's [m]", "NEES", "Time [µs]")
+    def less(results: Results, where: Where) -> Any:
+        usual = {**where, "value": CHOICES[where["method"], where["choice"]][2]}
+        return (difference(results, where, usual) if where != usual else None) or "default"
+
+    def microseconds(results: Results, where: Where) -> int | None:
+        seconds, steps = mean(results, where, "seconds"), len(scene.fleet(results.settings["data"]).t)
+        return None if seconds is None else round(1e6 * seconds / steps)
+
+    columns: list[tuple[str, Number]] = [
+        ("RT-LE [m]", mean),
+        ("Less the default's [m]", less),
+        ("NEES", partial(mean, value="nees")),
+        ("Time [µs]", microseconds),
+    ]
     text = (
         "Nominal noise model. Differences are paired: the same noise draws. Time: wall microseconds per ego, step and "
-        f"run on one thread of this machine, with the compiling where it is the first call. {_conditions(results)}"
+        "run on one thread of this machine, with the compiling where it is the first call."
     )
-    return Table(header, tuple(body), text, decimals=3) if body else None
+    return crossed(
+        results, ("Method", "Choice", "Value"), rows, columns, scene.caption(results, text, NOTE), decimals=3
+    )
 
 
-def _microseconds(results: Results, where: dict[str, Any]) -> int | None:
-    seconds = views.mean(results, where, "seconds")
-    steps = len(scene.fleet(results.settings["data"]).t)
-    return None if seconds is None else round(1e6 * seconds / steps)
+def _noise_models(results: Results, value: str, text: str, decimals: int) -> Table | None:
+    rows = [((look(method).label,), {"method": method, "choice": "noise_model"}) for method in KNOWN]
+    columns = across(partial(mean, value=value), {known: {"noise_model": known} for known in MODELS})
+    return crossed(results, ("Method",), rows, columns, scene.caption(results, text, NOTE), decimals=decimals)
 
 
-def _conditions(results: Results) -> str:
-    return f"K = {results.settings['max_neighbours']}. {scene.conditions(results.settings)}"
+def _each(results: Results, method: str, choice: str) -> dict[int, float | None]:
+    """Value of a choice -> RT-LE, m."""
+    return {value: mean(results, at(method, choice, value)) for value in CHOICES[method, choice][1]}
 
 
-def _knowledge(value: str, text: str, decimals: int) -> Any:
-    def number(results: Results, where: dict[str, Any]) -> float | None:
-        return views.mean(results, where, value)
-
-    def table(results: Results) -> Table | None:
-        from coopoc.study.style import look
-
-        rows = [((look(method).label,), {"method": method, "choice": "noise_model"}) for method in KNOWN]
-        columns = [(known, {"noise_model": known}) for known in KNOWLEDGE]
-        return views.crossed(results, ("Method",), rows, columns, number, f"{text} {_conditions(results)}", decimals)
-
-    return table
-
-
-PANELS = {"window, lag or horizon [steps]": ("window", "lag", "horizon"), "rounds of messages": ("rounds",)}
+PANELS = {"Window, lag or horizon [steps]": ("window", "lag", "horizon"), "Rounds of messages": ("rounds",)}
 
 
 def _figure(results: Results) -> Plot | None:
     """RT-LE against the steps of a window, and against rounds of messages."""
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
+    from coopoc.study.lines import Line, draw
+    from coopoc.study.plot import Plot, canvas, legend, plain_log
 
-    if views.present(results, {"choice": [choice for _, choice in CHOICES]}) is None:
+    if present(results, {"choice": [choice for _, choice in CHOICES]}) is None:
         return None
-    bound = views.mean(results, {"method": "bound"})
     with canvas(1, 2, width=7.4, height=3.2, sharey=True) as (figure, panels):
-        drawn: list[dict[str, Any]] = []
+        drawn = []
         for panel, (label, choices) in zip(panels, PANELS.items(), strict=True):
-            for (method, choice), (_, values, _) in CHOICES.items():
-                found = {v: views.mean(results, at(method, choice, v)) for v in values} if choice in choices else {}
-                ran = {v: error for v, error in found.items() if error is not None}
-                if ran:
-                    panel.plot(list(ran), list(ran.values()), **strokes({"method": method}))
-                    drawn.append({"method": method})
-            if bound is not None:
-                panel.axhline(bound, **strokes({"method": "bound", "noise_model": "bound"}))
-            panel.set(xlabel=label[0].upper() + label[1:])
+            lines = [Line({"method": m}, _each(results, m, choice)) for m, choice in CHOICES if choice in choices]
+            drawn += draw(panel, lines)
+            panel.set(xlabel=label)
+        bound = [Line(of(*BOUND), mean(results, {"method": "bound"}))]
+        drawn += draw(panels[0], bound) and draw(panels[1], bound)
         panels[1].set_xscale("log")
         panels[1].set_xticks([1, 2, 3, 5, 10, 30], labels=["1", "2", "3", "5", "10", "30"])
         panels[1].minorticks_off()
         plain_log(panels[0].yaxis)
         panels[0].set(ylabel="RT-LE [m]")
-        legend(panels[1], [*drawn, *([{"method": "bound"}] if bound is not None else [])])
-    return Plot(figure, f"RT-LE against what is spent on a step; horizontal: the bound. {_conditions(results)}")
+        legend(panels[1], drawn)
+    return Plot(figure, scene.caption(results, "RT-LE against what is spent on a step; horizontal: the bound.", NOTE))
 
 
-def _findings(results: Results) -> Sequence[str]:
-    from coopoc.study.style import look
-
-    found = []
-    for (method, choice), (_, values, _) in CHOICES.items():
-        each = {v: views.mean(results, at(method, choice, v)) for v in values}
-        ran = {v: error for v, error in each.items() if error is not None}
-        if len(ran) > 1:
-            (low, first), *_, (high, last) = ran.items()
-            found.append(f"{look(method).label}, {choice} {low} to {high}: {first:.3f} m to {last:.3f} m.")
+def _findings(results: Results) -> dict[str, str]:
+    found = {}
+    for method, choice in CHOICES:
+        each = ran(_each(results, method, choice))
+        if len(each) > 1:
+            (low, first), *_, (high, last) = each.items()
+            text = f"{look(method).label}, {choice} {low} to {high}: {first:.3f} m to {last:.3f} m."
+            found[f"{method}, {choice}"] = text
     for method in KNOWN:
-        two = [
-            views.mean(results, {"method": method, "choice": "noise_model", "noise_model": k})
-            for k in ("identity", "nominal")
-        ]
-        if two[0] is not None and two[1] is not None:
-            found.append(f"{look(method).label}: {two[0]:.3f} m with unit covariances, {two[1]:.3f} m with nominal.")
+        found[f"{method}, noise_model"] = sentence(
+            "{label}: {identity:.3f} m with unit covariances, {nominal:.3f} m with nominal.",
+            label=look(method).label,
+            **{known: mean(results, at(method, "noise_model", 0, known)) for known in ("identity", "nominal")},
+        )
     return found
 
 
-STUDY = Study(
-    name="ablation",
-    question="What is each choice in an estimator worth: window, iterations, exact step, knowledge of the noise?",
+STUDY = lineup.study(
+    "ablation",
+    "What is each choice in an estimator worth: window, iterations, exact step, knowledge of the noise?",
     cell=cell,
-    key=lineup.key,
     grid=_grid(),
     settings={
-        "data": "town10",
-        "clients": "town10-clients",
-        "weights": "runs/weights",
-        "scenario": 2,
-        "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "radius_m": 30.0,
+        **scene.TOWN,
+        **scene.WEIGHTS,
         "max_neighbours": 6,
         "backend": "gauss-newton",
-        "egos": "auto",
         "runs": 8,
-        "seed": 0,
         "train_seeds": 0,
     },
     tables={
         "choices": _choices,
-        "noise_model": _knowledge("rt_le_m", "RT-LE [m] by what is assumed of the noise.", 3),
-        "knowledge_nees": _knowledge("nees", "NEES by what is assumed of the noise (3 is consistent).", 1),
+        "noise_model": partial(
+            _noise_models, value="rt_le_m", text="RT-LE [m] by what is assumed of the noise.", decimals=3
+        ),
+        "knowledge_nees": partial(
+            _noise_models, value="nees", text="NEES by what is assumed of the noise (3 is consistent).", decimals=1
+        ),
     },
     figures={"choices": _figure},
     findings=_findings,
@@ -208,5 +180,4 @@ STUDY = Study(
     ),
     minutes=8,
     metrics={"rt_le_m": "lower", "nees": 3.0},
-    reference=views.reference("ablation"),
 )

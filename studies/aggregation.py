@@ -1,29 +1,25 @@
-"""Which rule combines the clients' nets best when they are alike, differ, lie or stay away (the paper's outlook)."""
+"""Which rule combines nets best when clients are alike, differ, are Byzantine or absent (the paper's outlook)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from coopoc.arrays import Floats
-from coopoc.errors import InputError
-from coopoc.evaluate.metrics import rt_le
+from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
-from coopoc.methods.track import Method
+from coopoc.study.numbers import Where, interval, listed, mean, per_seed, present
+from coopoc.study.pivot import across, crossed
 from coopoc.study.study import Params, Row, Study
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
+from coopoc.study.style import look
+from coopoc.study.tables import Table
 
-from . import lineup, scene, views
+from . import lineup, scene
 from .federations import CONDITIONS, GRAPHS, RULES, WIRES, fitted, members, trained
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 LOST = 1e6
 """m, the RT-LE of a net whose estimates left every bound; a mean above a thousandth of it is shown as "diverged"."""
@@ -43,111 +39,57 @@ def meaningful(p: Params) -> bool:
     """
     from coopoc.learned.federation.aggregate import rule
 
-    condition, method, asked = str(p["condition"]), str(p["method"]), int(p["members"])
-    if condition == "half absent":
-        asked //= 2
+    condition, method = str(p["condition"]), str(p["method"])
     if method in BESIDE:
         return condition in ("iid", "heterogeneous")
     if method in (*WIRES, "bound"):
         return condition == "iid"
-    return (method != "uniform" or condition == "heterogeneous") and bool(rule(method).least <= asked)
+    asked = int(p["members"]) // (2 if condition == "half absent" else 1)
+    enough: bool = rule(method).least <= asked
+    return enough and (method != "uniform" or condition == "heterogeneous")
 
 
 def cell(p: Params) -> list[Row]:
     """Rows of a method under a condition in a scenario: RT-LE of the kept weights and of those of the last round."""
     if p["method"] == "bound":
         return lineup.bound_rows(p)
-    recording, who, drive = scene.recording(p), scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"])
+    trial = scene.trial(p)
     if p["method"] == "kalman":
-        return _rows(rt_le(Kalman(fitted(p))(recording, who), drive), who)
+        return rows_of({"rt_le_m": bounded_rt_le(Kalman(fitted(p)), *trial, LOST)}, trial[1])
     training = tuple((name, value) for name, value in p.items() if name not in OF_THE_TEST)
     found: list[Row] = []
     for seed, net in enumerate(trained(p["condition"], p["method"], training)):
-        kept, last = (_score(one.method(p["method"]), recording, who, drive) for one in (net.kept, net.last))
-        more = {
-            "train_seed": seed,
-            "sent_kb": net.sent / 1e3,
-            "received_kb": net.received / 1e3,
-            "rejected": net.rejected,
-            "idle_rounds": net.idle,
-            "train_seconds": net.seconds,
-        }
-        found += [
-            {**row, "last_rt_le_m": end["rt_le_m"], **more}
-            for row, end in zip(_rows(kept, who), _rows(last, who), strict=True)
-        ]
+        kept, last = (bounded_rt_le(one.method(p["method"]), *trial, LOST) for one in (net.kept, net.last))
+        columns = {"rt_le_m": kept, "last_rt_le_m": last}
+        found += [{**row, "train_seed": seed, **net.costs} for row in rows_of(columns, trial[1])]
     return found
 
 
-def _score(method: Method, recording: Recording, who: Sequence[str], drive: Fleet) -> Floats:
-    """RT-LE (R, E) m, at most LOST."""
-    try:
-        return np.minimum(rt_le(method(recording, who), drive), LOST)
-    except InputError as error:
-        if error.field != "x":  # the estimates of the track, of which one is not finite
-            raise
-        return np.full((recording.runs, len(who)), LOST)
-
-
-def _rows(score: Floats, who: Sequence[str]) -> list[Row]:
-    """RT-LE (R, E) as rows."""
-    runs = range(len(score))
-    return [{"run": r, "ego": ego, "rt_le_m": float(score[r, e])} for e, ego in enumerate(who) for r in runs]
-
-
 def key(p: Params) -> dict[str, str]:
-    """What else changes the numbers: data, code and the library that trains."""
+    """Digests that change the numbers beyond the parameters: data, code and the library that trains."""
     return {**scene.facts(p), "clients": members(p).digest, "torch": version("torch")}
 
 
-def _table(scenario: int, value: str, text: str) -> Any:
-    """View of methods down, conditions across, for one metric."""
+def _table(results: Results, scenario: int, value: str, text: str) -> Table | None:
+    """Methods down, conditions across, for one metric."""
+    at = {"scenario": scenario}
+    ran = [c for c in CONDITIONS if present(results, {**at, "condition": c}, value)]
+    methods = dict.fromkeys((*METHODS, *results.frame["method"]))
 
-    def table(results: Results) -> Table | None:
-        from coopoc.study.style import look
-        from coopoc.study.tables import Table
+    def number(results: Results, where: Where) -> Interval | str | None:
+        found = interval(results, where, value)
+        return "diverged" if found and not found.mean < LOST / 1e3 else found
 
-        at = {"scenario": scenario}
-        ran = [c for c in CONDITIONS if views.present(results, {**at, "condition": c}, value)]
-        body = []
-        for method in dict.fromkeys((*METHODS, *results.frame["method"])):
-            wheres = [{**at, "condition": c, "method": method} for c in ran]
-            row = [_entry(results, value, w) for w in wheres]
-            if any(entry is not None for entry in row):
-                body.append((look(method).label, *row))
-        conditions = scene.conditions({**results.settings, **at})
-        told = "; ".join(f"{c}: {CONDITIONS[c]}" for c in ran)
-        return (
-            Table(
-                ("Rule", *(c.capitalize() for c in ran)),
-                tuple(body),
-                f"{text} {conditions} {told}. {NOTE}",
-                best="min",
-                along="column",
-                decimals=3,
-            )
-            if body
-            else None
-        )
-
-    return table
-
-
-def _entry(results: Results, value: str, where: dict[str, Any]) -> Interval | str | None:
-    if views.present(results, where, value) is None:
-        return None
-    found = results.interval(value, where)
-    return found if found.mean < LOST / 1e3 else "diverged"
-
-
-NOTE = "KF: fitted to the noise that the clients saw; the bound knows the acting noise and no bias."
+    columns = across(number, {c.capitalize(): {**at, "condition": c} for c in ran})
+    conditions = "; ".join(f"{c}: {CONDITIONS[c]}" for c in ran)
+    note = "KF: fitted to the noise that the clients saw; the bound knows the acting noise and no bias."
+    caption = f"{scene.caption(results, text, **at)} {conditions}. {note}"
+    rows = [((look(method).label,), {"method": method}) for method in methods]
+    return crossed(results, ("Rule",), rows, columns, caption, best="min", along="column", decimals=3)
 
 
 def _costs(results: Results) -> Table | None:
-    """Bytes, seconds and what the server refused."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
+    """Bytes, seconds and rejected answers."""
     columns = {
         "sent_kb": "Sent [kB]",
         "received_kb": "Received [kB]",
@@ -155,65 +97,57 @@ def _costs(results: Results) -> Table | None:
         "idle_rounds": "Rounds without change",
         "train_seconds": "Training [s]",
     }
-    body: list[Any] = []
-    for (condition, method), rows in results.groups(["condition", "method"]):
-        if method not in REFERENCES:
-            body.append((condition, look(method).label, *(float(rows[name].mean()) for name in columns)))
+    body = [
+        (condition, look(method).label, *(float(rows[name].mean()) for name in columns))
+        for (condition, method), rows in results.groups(["condition", "method"])
+        if method not in REFERENCES
+    ]
     text = "Of one client over the whole training, payload only, on average; what the server refused; mean over seeds."
     return Table(("Condition", "Rule", *columns.values()), tuple(body), text, decimals=1) if body else None
 
 
-def _findings(results: Results) -> Sequence[str]:
-    return [said for s in (1, 2) for c in CONDITIONS if (said := _finding(results, {"scenario": s, "condition": c}))]
+def _findings(results: Results) -> dict[str, str]:
+    return {
+        f"scenario {s}, {c}": _finding(results, {"scenario": s, "condition": c}) for s in (1, 2) for c in CONDITIONS
+    }
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
     """RT-LE of the mean under a condition, and which rules are better or worse over all training seeds."""
-    plain = _seeds(results, {**at, "method": "mean"})
-    if plain is None:
+    if not present(results, {**at, "method": "mean"}):
         return ""
+    plain = per_seed(results, {**at, "method": "mean"})
     better, worse = list[str](), list[str]()
     for rule in RULES[1:]:
-        other = _seeds(results, {**at, "method": rule})
-        if other is not None and len(plain) > 1:
-            gap = over_seeds(other - plain).interval
-            told = f"{rule} {gap.mean:+.3f} m"
-            (better if gap.high < 0 else worse if gap.low > 0 else []).append(told)
-    beside = {"KF": views.mean(results, {**at, "condition": "iid", "method": "kalman"})}
-    beside["bound"] = views.mean(results, {**at, "condition": "iid", "method": "bound"})
-    text = f"Scenario {at['scenario']}, {at['condition']}: {views.listed({'mean': float(plain.mean()), **beside})}. "
-    return text + f"Better than the mean over training seeds (95 %): {_or_none(better)}; worse: {_or_none(worse)}."
-
-
-def _or_none(told: Sequence[str]) -> str:
-    return ", ".join(told) or "no rule"
-
-
-def _seeds(results: Results, where: dict[str, Any]) -> Floats | None:
-    """(S, E, R) RT-LE of a method by training seed."""
-    if views.present(results, where) is None:
-        return None
-    seeds = sorted(results.select(where)["train_seed"].unique())
-    return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
+        if len(plain) > 1 and present(results, {**at, "method": rule}):
+            gap = over_seeds(per_seed(results, {**at, "method": rule}) - plain).interval
+            (better if gap.high < 0 else worse if gap.low > 0 else []).append(f"{rule} {gap.mean:+.3f} m")
+    beside = {
+        words: mean(results, {**at, "condition": "iid", "method": method})
+        for words, method in (("KF", "kalman"), ("bound", "bound"))
+    }
+    lists = [", ".join(rules) or "no rule" for rules in (better, worse)]
+    return (
+        f"Scenario {at['scenario']}, {at['condition']}: {listed({'mean': float(plain.mean()), **beside})}. "
+        f"Better than the mean over training seeds (95 %): {lists[0]}; worse: {lists[1]}."
+    )
 
 
 STUDY = Study(
-    name="aggregation",
-    question="Which rule should combine the clients' nets when they are alike, differ, lie or stay away?",
+    "aggregation",
+    "Which rule should combine the clients' nets when they are alike, differ, lie or stay away?",
     cell=cell,
     key=key,
     grid={"condition": tuple(CONDITIONS), "method": METHODS, "scenario": (1, 2)},
     where=meaningful,
     shares=("condition", "method"),
     settings={
-        "data": "town10",
+        **scene.DRAWN,
         "clients": "town10-validation",
         "members": 12,
         "velocity_ratio": 0.15,
         "velocity_reading": "axis",
-        "egos": "auto",
         "runs": 15,
-        "seed": 0,
         "train_seeds": 3,
         "rounds": 20,
         "local_epochs": 2,
@@ -226,8 +160,14 @@ STUDY = Study(
         "offset_m": 10.0,
     },
     tables={
-        **{f"scenario{s}": _table(s, "rt_le_m", "RT-LE [m], kept weights.") for s in (1, 2)},
-        **{f"scenario{s}_last": _table(s, "last_rt_le_m", "RT-LE [m], weights of the last round.") for s in (1, 2)},
+        f"scenario{scenario}{end}": partial(_table, scenario=scenario, value=value, text=f"RT-LE [m], {words}.")
+        for end, value, words in (
+            ("", "rt_le_m", "kept weights"),
+            ("_last", "last_rt_le_m", "weights of the last round"),
+        )
+        for scenario in (1, 2)
+    }
+    | {
         "costs": _costs,
     },
     findings=_findings,
@@ -239,5 +179,5 @@ STUDY = Study(
     ),
     minutes=25,
     metrics={"rt_le_m": "lower"},
-    reference=views.reference("aggregation"),
+    reference=lineup.reference("aggregation"),
 )

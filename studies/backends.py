@@ -1,9 +1,10 @@
-"""Whether all backends find the same positions, and what a solve costs with each."""
+"""Agreement of the optimization backends with a referee, and the cost of a solve with each."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,12 +17,17 @@ from coopoc.optimize.initial import initial_guess
 from coopoc.optimize.problem import Problem
 from coopoc.optimize.solution import Status
 from coopoc.optimize.solve import solve
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.numbers import Number, Where, present
+from coopoc.study.pivot import across, crossed
+from coopoc.study.study import Params, Row
+from coopoc.study.style import look
 from coopoc.world.recording import Recording
 
-from . import scene, views
+from . import lineup, scene
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
@@ -33,19 +39,6 @@ SAME_M = 1e-3
 """m, closer than which two answers are one minimum."""
 
 
-def _snapshot(seen: Recording, step: int, ego: str, run: int) -> Problem:
-    return Problem.from_snapshot(seen, step, ego, run)
-
-
-def _window(seen: Recording, step: int, ego: str, run: int) -> Problem:
-    return Problem.from_window(seen, step, ego, WINDOW, run)
-
-
-def _converted(seen: Recording, step: int, ego: str, run: int) -> Problem:
-    """Sightings as vectors of unit covariance: a linear problem."""
-    return Problem.from_snapshot(seen, step, ego, run, NoiseModel.identity())
-
-
 def _ranges(seen: Recording, step: int, ego: str, run: int) -> Problem:
     """The snapshot without its angles."""
     whole = Problem.from_snapshot(seen, step, ego, run)
@@ -53,22 +46,19 @@ def _ranges(seen: Recording, step: int, ego: str, run: int) -> Problem:
 
 
 def _distance(factor: Factor) -> Factor:
+    """A factor of range and angles as one of ranges, std (M, 1) m; any other as it is."""
     if factor.kind != "spherical":
         return factor
-    return Factor("range", factor.nodes, factor.z[..., :1], std=_std(factor))
-
-
-def _std(factor: Factor) -> Floats:
-    """(M, 1) m of the ranges."""
-    return np.asarray(1.0 / factor.root[..., 0, :1])
+    return Factor("range", factor.nodes, factor.z[..., :1], std=np.asarray(1.0 / factor.root[..., 0, :1]))
 
 
 PROBLEMS: Mapping[str, Callable[[Recording, int, str, int], Problem]] = {
-    "snapshot": _snapshot,
-    "window": _window,
+    "snapshot": Problem.from_snapshot,
+    "window": lambda seen, step, ego, run: Problem.from_window(seen, step, ego, WINDOW, run),
     "ranges": _ranges,
-    "converted": _converted,
+    "converted": lambda seen, step, ego, run: Problem.from_snapshot(seen, step, ego, run, NoiseModel.identity()),
 }
+"""Kinds of problems of an ego at a step; converted: relative measurements as vectors of unit covariance, linear."""
 WORDS = {
     "snapshot": "snapshot, range and angles",
     "window": f"window of {WINDOW} steps",
@@ -104,7 +94,7 @@ def cell(p: Params) -> list[Row]:
 
 
 def _solved(problem: Problem, backend: str) -> Row:
-    """What a backend says of one problem, beside the referee; the second call is timed, as imports are once."""
+    """Answer of a backend to one problem, beside the referee; the second call is timed, as imports are once."""
     solve(problem, backend, throw=False)
     began = time.perf_counter()
     mine = solve(problem, backend, throw=False)
@@ -123,108 +113,87 @@ def _solved(problem: Problem, backend: str) -> Row:
     }
 
 
-def _agreement(results: Results) -> Table | None:
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
+ROWS = [
+    ((words, look(backend).label), {"problem": problem, "method": backend})
+    for problem, words in WORDS.items()
+    for backend in BACKENDS
+]
 
-    body: list[tuple[Any, ...]] = []
-    for problem, words in WORDS.items():
-        for backend in BACKENDS:
-            where = views.present(results, {"problem": problem, "method": backend}, "gap_m")
-            if where is None:
-                continue
-            rows = results.select(where)
-            one = rows[rows["same"] == 1.0]
-            worst = f"{1e6 * one['gap_m'].max():.2g}" if len(one) else None
-            body.append(
-                (
-                    words,
-                    look(backend).label,
-                    len(rows),
-                    f"{100 * rows['solved'].mean():.0f} %",
-                    f"{100 * rows['same'].mean():.0f} %",
-                    worst,
-                    f"{one['cost_gap'].abs().max():.0e}" if len(one) else None,
-                    int((rows["cost_gap"] < -1e-6).sum()),
-                    int((rows["cost_gap"] > 1e-6).sum()),
-                )
-            )
-    header = (
-        "Problem",
-        "Backend",
-        "Solves",
-        "At a minimum",
-        "The referee's",
-        "Farthest [µm]",
-        "Cost differs",
-        "Lower",
-        "Higher",
-    )
+
+def _percent(values: pd.Series[float]) -> str:
+    return f"{100 * values.mean():.0f} %"
+
+
+def _agreement(results: Results) -> Table | None:
+    """Numbers of all solves of a backend, and of those that ended where the referee does."""
+
+    def of(number: Callable[[pd.DataFrame], Any], agreed: bool = False) -> Number:
+        def column(results: Results, where: Where) -> Any:
+            kept = present(results, where, "gap_m")
+            rows = None if kept is None else results.select(kept)
+            rows = rows if rows is None or not agreed else rows[rows["same"] == 1.0]
+            return None if rows is None or rows.empty else number(rows)
+
+        return column
+
+    columns = [
+        ("Solves", of(len)),
+        ("At a minimum", of(lambda rows: _percent(rows["solved"]))),
+        ("The referee's", of(lambda rows: _percent(rows["same"]))),
+        ("Farthest [µm]", of(lambda rows: f"{1e6 * rows['gap_m'].max():.2g}", agreed=True)),
+        ("Cost differs", of(lambda rows: f"{rows['cost_gap'].abs().max():.0e}", agreed=True)),
+        ("Lower", of(lambda rows: int((rows["cost_gap"] < -1e-6).sum()))),
+        ("Higher", of(lambda rows: int((rows["cost_gap"] > 1e-6).sum()))),
+    ]
     text = (
         "Answers beside SciPy's trust-region least squares from the same start. The referee's: less than 1 mm away; of "
         "those, the farthest and the largest relative difference of cost. Lower, higher: solves that ended in a better "
-        f"or a worse minimum than the referee. {scene.conditions({**results.settings, 'runs': 1})}"
+        "or a worse minimum than the referee."
     )
-    return Table(header, tuple(body), text) if body else None
+    return crossed(results, ("Problem", "Backend"), ROWS, columns, scene.caption(results, text, runs=1))
 
 
 def _cost(results: Results) -> Table | None:
-    from coopoc.study.style import look
-
-    rows = [
-        ((words, look(backend).label), {"problem": problem, "method": backend})
-        for problem, words in WORDS.items()
-        for backend in BACKENDS
-    ]
     ks = sorted(results.frame["max_neighbours"].unique()) if len(results.frame) else []
     columns = [
-        (f"{label}, K = {k}", {"max_neighbours": k, "value": value})
+        column
         for value, label in (("solve_ms", "Solver"), ("whole_ms", "All"))
-        for k in ks
+        for column in across(partial(_median, value=value), {f"{label}, K = {k}": {"max_neighbours": k} for k in ks})
     ]
     text = (
         "Milliseconds of one solve() from its first guess, median. Solver: the backend alone. All: with structure, "
         "checks, cost and covariance. Batches and streams, which keep the structure, are in docs/performance.md; times "
-        f"depend on the machine. {scene.conditions({**results.settings, 'runs': 1})}"
+        "depend on the machine."
     )
-    return views.crossed(results, ("Problem", "Backend"), rows, columns, _median, text)
+    return crossed(results, ("Problem", "Backend"), ROWS, columns, scene.caption(results, text, runs=1))
 
 
-def _median(results: Results, where: dict[str, Any]) -> float | None:
-    value = where["value"]
-    kept = views.present(results, {name: given for name, given in where.items() if name != "value"}, value)
+def _median(results: Results, where: Where, value: str) -> float | None:
+    kept = present(results, where, value)
     return None if kept is None else float(results.select(kept)[value].median())
 
 
-def _findings(results: Results) -> Sequence[str]:
-    if "same" not in results.frame:
-        return []
+def _findings(results: Results) -> dict[str, str]:
     frame = results.frame
-    apart = frame[(frame["same"] == 0.0) & (frame["cost_gap"] > 1e-6)]
-    said = [
-        f"{len(frame)} solves; {100 * frame['same'].mean():.1f} % end where SciPy's least squares does, and "
-        f"{len(apart)} in a worse minimum."
-    ]
-    wrong = frame[(frame["same"] == 0.0) & (frame["solved"] == 1.0) & (frame["cost_gap"].abs() <= 1e-6)]
-    if len(wrong):
-        said.append(f"{len(wrong)} have the referee's cost at another place.")
-    failed = frame[frame["solved"] == 0.0]
-    if len(failed):
-        counts = failed.groupby("method").size()
-        said.append("Not at a minimum, and said so: " + ", ".join(f"{name} {n}" for name, n in counts.items()) + ".")
-    return said
+    if "same" not in frame:
+        return {}
+    other, failed = frame[frame["same"] == 0.0], frame[frame["solved"] == 0.0]
+    wrong = other[(other["solved"] == 1.0) & (other["cost_gap"].abs() <= 1e-6)]
+    counts = ", ".join(f"{name} {n}" for name, n in failed.groupby("method").size().items())
+    return {
+        "minima": f"{len(frame)} solves; {100 * frame['same'].mean():.1f} % end where SciPy's least squares does, and "
+        f"{(other['cost_gap'] > 1e-6).sum()} in a worse minimum.",
+        "same cost": f"{len(wrong)} have the referee's cost at another place." if len(wrong) else "",
+        "failed": f"Not at a minimum, and said so: {counts}." if counts else "",
+    }
 
 
-def key(p: Params) -> Mapping[str, str]:
-    """What changes the numbers beyond the parameters."""
-    return scene.facts(p)
-
-
-STUDY = Study(
-    name="backends",
-    question="Do all backends find the same positions, and what does a solve cost with each?",
+STUDY = lineup.study(
+    "backends",
+    "Do all backends find the same positions, and what does a solve cost with each?",
     cell=cell,
-    key=key,
+    key=scene.facts,
+    recipe=None,
     grid=[
         {"max_neighbours": k, "problem": problem, "method": backend}
         for k in (2, 6, 10)
@@ -232,17 +201,7 @@ STUDY = Study(
         for backend in BACKENDS
         if backend != "cvxpy" or problem in CONVEX
     ],
-    settings={
-        "data": "town10",
-        "scenario": 2,
-        "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "radius_m": 30.0,
-        "egos": "auto",
-        "samples": 12,
-        "seed": 0,
-        "train_seeds": 0,
-    },
+    settings={**scene.TOWN, "samples": 12, "train_seeds": 0},
     shares=("max_neighbours",),
     tables={"agreement": _agreement, "cost": _cost},
     findings=_findings,
@@ -252,5 +211,4 @@ STUDY = Study(
     ),
     minutes=2,
     metrics={"solved": "higher", "same": "higher"},
-    reference=views.reference("backends"),
 )

@@ -1,14 +1,16 @@
-"""What accuracy costs in bytes: sent once for a training, or in every second of a drive; and when the two are even."""
+"""Accuracy against bytes, sent once for a training or in every second of a drive, and the break-even of the two."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.numbers import listed, mean, ratio, rms
+from coopoc.study.style import look
 
-from . import budget_tables, lineup, scene, views, weights
-from .budget_tables import CAPS, FREE, SCHEDULED, SCHEDULES, SHARED, TRAINED, under
+from . import budget_tables, lineup, scene, weights
+from .budget_tables import AXES, CAPS, SCHEDULED, SCHEDULES, SHARED, TRAINED, under, way
+from .lineup import BOUND, of
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -24,57 +26,49 @@ SOLO = (
 )
 NEIGHBOURS = (1, 2, 4, 10)
 RATES = (1.0, 2.0, 5.0)
-BOUND = ("bound", "bound")
+HOURS = (1, 10, 100)
+PAYLOAD = "payload_bytes_per_second"
+LIMITS = (0.0, 300.0, 1000.0, 5000.0)
+"""B/s, under which the best method is named."""
 
 
 def _grid() -> list[dict[str, Any]]:
     """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; two
     of them under caps with other schedules."""
-    alone = {"channel": "ideal", "max_neighbours": 0, **FREE}
-    grid = [{**alone, "method": m, "noise_model": known} for m, known in (*SOLO, BOUND)]
-    ways = [{"channel": name, "max_neighbours": k, **FREE} for name in scene.CHANNELS for k in NEIGHBOURS]
-    ways += [{"channel": "ideal", "max_neighbours": 10, **FREE, "rate_hz": rate} for rate in RATES]
-    ways += [{"channel": "ideal", "max_neighbours": 10, **FREE, "cap_bytes_per_second": cap} for cap in CAPS]
-    bounded = [way for way in ways if way["channel"] == "ideal" and not way["cap_bytes_per_second"]]
-    grid += [{**way, "method": m, "noise_model": known} for way in ways for m, known in SHARED]
-    grid += [under(cap, each, m, known) for cap in CAPS for each in SCHEDULES[1:] for m, known in SCHEDULED]
-    return grid + [{**way, "method": "bound", "noise_model": "bound"} for way in bounded if not way["rate_hz"]]
-
-
-def cell(p: Params) -> list[Row]:
-    """Rows of one method over one channel; of the bound, one row per ego."""
-    return lineup.bound_rows(p) if p["method"] == "bound" else lineup.rows(p)
+    channels = [way(name, k) for name in scene.CHANNELS for k in NEIGHBOURS]
+    rates = [way("ideal", 10, rate_hz=rate) for rate in RATES]
+    caps = [way("ideal", 10, cap_bytes_per_second=cap) for cap in CAPS]
+    return [
+        *(of(*pair, **way("ideal", 0)) for pair in (*SOLO, BOUND)),
+        *(of(*pair, **each) for each in (*channels, *rates, *caps) for pair in SHARED),
+        *(under(cap, each, *pair) for cap in CAPS for each in SCHEDULES[1:] for pair in SCHEDULED),
+        *(of(*BOUND, **way("ideal", k)) for k in NEIGHBOURS),
+    ]
 
 
 def _pareto(results: Results) -> Plot | None:
     """RT-LE against payload bytes per second; a training's bytes are spread over hours of driving."""
+    from coopoc.study.lines import Line, draw
     from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
 
-    drawn, ran = list[dict[str, Any]](), choices(results)
+    drawn, ran = list[Mapping[str, Any]](), choices(results)
     with canvas(1, 2, width=8.6, height=3.9, sharey=True, gridspec_kw={"width_ratios": [1.0, 1.3]}) as (
         figure,
         (left, right),
     ):
-        for method, known in SOLO:
-            error = views.mean(results, {"method": method, "noise_model": known})
-            if error is None:
-                continue
-            names = {"method": method, "noise_model": known}
-            total = weights.training_bytes(results.settings, [method])[method] if method in TRAINED else None
-            if total is None:
-                for panel in (left, right):
-                    panel.axhline(error, **{**strokes(names), "marker": ""}, alpha=0.75)
+        for pair in SOLO:
+            error = mean(results, of(*pair))
+            if error is not None and pair[0] in TRAINED:
+                total = weights.training_bytes(results.settings, [pair[0]])[pair[0]]
+                drawn += draw(left, [Line(of(*pair), {total / (3600 * hours): error for hours in HOURS})])
             else:
-                left.plot([total / (3600 * hours) for hours in HOURS], [error] * len(HOURS), **strokes(names))
-            drawn.append(names)
-        for method, known in (*SHARED, BOUND):
-            points = [one for one in ran if (one.where["method"], one.where["noise_model"]) == (method, known)]
-            found = sorted((one.size, one.error) for one in points if one.size)
+                level = [Line(of(*pair), error, {"alpha": 0.75})]
+                drawn += draw(left, level) and draw(right, level)
+        for pair in (*SHARED, BOUND):
+            found = sorted((one.size, one.error) for one in ran if _pair(one) == pair and one.size)
             if found:
-                names = {"method": method, "noise_model": known}
-                right.plot(*zip(*found, strict=True), **{**strokes(names, thin=True), "linestyle": "none"})
-                right.plot(*zip(*front(found), strict=True), **{**strokes(names), "marker": ""})
-                drawn.append(names)
+                right.plot(*zip(*found, strict=True), **{**strokes(of(*pair), thin=True), "linestyle": "none"})
+                drawn += draw(right, [Line(of(*pair), dict(front(found)), {"marker": ""})])
         if not drawn:
             return None
         for panel in (left, right):
@@ -89,15 +83,11 @@ def _pareto(results: Results) -> Plot | None:
         "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound forgets "
         "what newcomers did before; estimates and sums tell it."
     )
-    return Plot(figure, f"{text} {scene.conditions(results.settings)}")
-
-
-HOURS = (1, 10, 100)
-PAYLOAD = "payload_bytes_per_second"
+    return Plot(figure, scene.caption(results, text))
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Of points (bytes, error) in order of bytes, those that no cheaper one is as good as.
+    """Of points (bytes, error) in order of bytes, those with a lower error than every cheaper one.
 
     >>> front([(1.0, 3.0), (2.0, 4.0), (3.0, 2.0)])
     [(1.0, 3.0), (3.0, 2.0)]
@@ -117,88 +107,62 @@ class Choice(NamedTuple):
     where: Mapping[str, Any]
 
 
+def _pair(choice: Choice) -> tuple[str, str]:
+    return choice.where["method"], choice.where["noise_model"]
+
+
 def choices(results: Results) -> list[Choice]:
     """All that was run over an ideal channel, and the bound."""
-    names, found = ["channel", "max_neighbours", *FREE, "method", "noise_model"], list[Choice]()
-    known = {*SOLO, *SHARED, BOUND}
+    names, found = [*AXES, "method", "noise_model"], list[Choice]()
     for each, _ in results.frame.groupby(names, sort=False) if set(names) <= set(results.frame) else ():
         where = dict(zip(names, each, strict=True))
-        if where["channel"] == "ideal" and (where["method"], where["noise_model"]) in known:
-            error = views.mean(results, where)
-            if error is not None:
-                found.append(Choice(error, views.mean(results, where, PAYLOAD) or 0.0, where))
-    return found
+        if where["channel"] == "ideal" and (error := mean(results, where)) is not None:
+            found.append(Choice(error, mean(results, where, PAYLOAD) or 0.0, where))
+    return [one for one in found if _pair(one) in (*SOLO, *SHARED, BOUND)]
 
 
 def best_under(found: Sequence[Choice], limit: float) -> Choice | None:
     """The best method of them within `limit` bytes per second."""
-    able = [one for one in found if one.size <= limit and one.where["method"] != BOUND[0]]
+    able = [one for one in found if one.size <= limit and _pair(one) != BOUND]
     return min(able, key=lambda one: one.error, default=None)
 
 
-def _findings(results: Results) -> Sequence[str]:
-    from coopoc.study.style import look
-
-    said, found = [], choices(results)
-    for limit in (0.0, 300.0, 1000.0, 5000.0):
-        best = best_under(found, limit)
+def _findings(results: Results) -> dict[str, str]:
+    found, ran = {}, choices(results)
+    for limit in LIMITS:
+        best = best_under(ran, limit)
         if best is not None:
-            error, size, where = best
-            how = f"{look(where['method']).label} ({where['noise_model']})"
-            at = f", K = {where['max_neighbours']}{_first(where)}, {size:.0f} B/s" if where["max_neighbours"] else ""
+            where, k = best.where, best.where["max_neighbours"]
+            first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
+            at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
-            said.append(f"{words}: best is {how}{at}, {error:.3f} m{gap(results, where)}.")
-    return [*said, *_scheduled(results)]
+            how = f"{look(where['method']).label} ({where['noise_model']}){at}"
+            found[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{gap(results, where)}."
+    return found | {f"schedules, {method}": _scheduled(results, method, known) for method, known in SCHEDULED}
 
 
 def gap(results: Results, where: Mapping[str, Any]) -> str:
-    """How far a selection is from the bound of its K, rms over rms; nothing where the bound was not run."""
-    bound = views.rms(results, {"method": "bound", "max_neighbours": where["max_neighbours"]})
-    rms = views.rms(results, where)
-    return f", {rms / bound:.2f} times the bound" if bound and rms else ""
+    """Ratio of a selection to the bound of its K, rms over rms, in words; empty where the bound was not run."""
+    times = ratio(rms(results, where), rms(results, {"method": "bound", "max_neighbours": where["max_neighbours"]}))
+    return f", {times:.2f} times the bound" if times else ""
 
 
-def _first(where: Mapping[str, Any]) -> str:
-    return "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
+def _scheduled(results: Results, method: str, known: str) -> str:
+    """RT-LE of a method under each cap, by the schedule of its neighbours."""
+    parts = []
+    for cap in CAPS:
+        errors = {each: mean(results, under(cap, each, method, known)) for each in SCHEDULES}
+        if None not in errors.values():
+            parts.append(f"at {cap:g} B/s {listed(errors)}")
+    return f"Heard first under a cap ({look(method).label}, {known}): {'; '.join(parts)}." if parts else ""
 
 
-def _scheduled(results: Results) -> list[str]:
-    """What a method loses or gains under each cap when others than the nearest are heard first."""
-    from coopoc.study.style import look
-
-    said = []
-    for method, known in SCHEDULED:
-        told = []
-        for cap in CAPS:
-            errors = [views.mean(results, under(cap, each, method, known)) for each in SCHEDULES]
-            if all(error is not None for error in errors):
-                told.append(f"at {cap:g} B/s {views.listed(dict(zip(SCHEDULES, errors, strict=True)))}")
-        if told:
-            said.append(f"Heard first under a cap ({look(method).label}, {known}): {'; '.join(told)}.")
-    return said
-
-
-STUDY = Study(
-    name="budget",
-    question="What does accuracy cost in bytes, in a training once or in every second of a drive?",
-    cell=cell,
-    key=lineup.key,
-    prepare=weights.prepare,
+STUDY = lineup.study(
+    "budget",
+    "What does accuracy cost in bytes, in a training once or in every second of a drive?",
     grid=_grid(),
-    settings={
-        "data": "town10",
-        "clients": "town10-clients",
-        "weights": "runs/weights",
-        "scenario": 2,
-        "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "radius_m": 30.0,
-        "egos": "auto",
-        "runs": 30,
-        "seed": 0,
-        "train_seeds": 3,
-    },
-    shares=("channel", "max_neighbours", *FREE),
+    settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 3},
+    shares=AXES,
     tables={
         "channels": budget_tables.channels,
         "load": budget_tables.load,
@@ -208,7 +172,6 @@ STUDY = Study(
     },
     figures={"pareto": _pareto},
     findings=_findings,
-    recipe=weights.described,
     limitations=(
         "A vehicle receives what its K neighbours send; what the others send fills the channel, too.",
         "Under a cap the nearest neighbours are heard first where no other schedule is named.",
@@ -216,5 +179,4 @@ STUDY = Study(
     ),
     minutes=13,
     metrics={"rt_le_m": "lower"},
-    reference=views.reference("budget"),
 )

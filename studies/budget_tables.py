@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coopoc.evaluate.ledger import Kind, Ledger, Way, break_even
-from coopoc.evaluate.statistics import paired_difference
+from coopoc.evaluate.scores import BYTES
+from coopoc.study.numbers import Number, Where, difference, interval, mean, present
+from coopoc.study.pivot import across, crossed
+from coopoc.study.style import look
+from coopoc.study.tables import Table
 from coopoc.world.channel_load import BIT_RATE, CARRIER_SENSE, channel_load
 from coopoc.world.v2x import ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 
-from . import scene, views, weights
-from .scores import BYTES
+from . import scene, weights
+from .lineup import of
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 SHARED = (
     ("lkf-sa", "identity"),
@@ -31,6 +35,8 @@ SCHEDULED = (("joint", "nominal"), ("split-ci", "nominal"))
 CAPS = (100.0, 200.0, 400.0, 800.0)
 SCHEDULES = ("nearest", "round robin", "most informative")
 FREE = {"rate_hz": 0.0, "cap_bytes_per_second": 0.0, "schedule": SCHEDULES[0]}
+AXES = ("channel", "max_neighbours", *FREE)
+"""Parameters of a channel."""
 TRAINED = ("fedokf", "recursive", "fedkalmannet")
 """Trained by federation, in the order of their bytes."""
 WORDS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cpm": "CPM, 5 Hz"}
@@ -41,53 +47,56 @@ COUNTS: tuple[tuple[Kind, Way], ...] = (
     ("on air", "broadcast"),
 )
 CROWD = 300
-"""Vehicles within earshot of each other, as in a jam (methods.md section 9.4)."""
+"""Vehicles within the range of each other, as in a jam (methods.md section 9.4)."""
 
 
-def ways(results: Results) -> list[dict[str, Any]]:
-    """The channels that were run, as selections."""
-    frame = results.frame
-    names = [name for name in ("channel", "max_neighbours", *FREE) if name in frame]
-    return [dict(zip(names, each, strict=True)) for each, _ in frame.groupby(names, sort=False)] if names else []
+def way(channel: str, k: int, **limits: Any) -> dict[str, Any]:
+    """A channel as parameters or as a selection; its own rate, no cap and the nearest first, but for the limits."""
+    return {"channel": channel, "max_neighbours": k, **FREE, **limits}
 
 
-def most(results: Results) -> int:
+def under(cap: float, schedule: str, method: str, known: str) -> dict[str, Any]:
+    """The selection of a method under a cap and a schedule."""
+    return of(method, known, **way("ideal", 10, cap_bytes_per_second=cap, schedule=schedule))
+
+
+def _most(results: Results) -> int:
     """The largest K that was run."""
-    return max((way["max_neighbours"] for way in ways(results)), default=0)
+    return int(max(results.frame["max_neighbours"], default=0)) if set(AXES) <= set(results.frame) else 0
+
+
+def _methods(results: Results) -> list[dict[str, Any]]:
+    """Each method over each channel at the largest K that was run, as selections."""
+    k = _most(results)
+    return [of(*pair, **way(name, k)) for name in scene.CHANNELS for pair in SHARED if k]
+
+
+def _labels(where: Where) -> tuple[str, str]:
+    return WORDS[where["channel"]], look(where["method"]).label
 
 
 def channels(results: Results) -> Table | None:
     """RT-LE, payload and bytes on air of each method over each channel, at the largest K that was run."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
-    body: list[tuple[Any, ...]] = []
-    k = most(results)
-    for name in scene.CHANNELS:
-        for method, known in SHARED:
-            where = {"channel": name, "max_neighbours": k, **FREE, "method": method, "noise_model": known}
-            if k and (error := views.mean(results, where)) is not None:
-                account = _account(results, where)
-                sizes = [round(account.rate(kind)) for kind in ("payload", "on air")] if account else [None, None]
-                body.append((WORDS[name], look(method).label, known, error, *sizes))
-    header = ("Channel", "Method", "NoiseModel", "RT-LE [m]", "Payload [B/s]", "On air [B/s]")
+    rows = [((*_labels(where), where["noise_model"]), where) for where in _methods(results)]
+    columns: list[tuple[str, Number]] = [
+        ("RT-LE [m]", mean),
+        ("Payload [B/s]", _rate),
+        ("On air [B/s]", partial(_rate, kind="on air")),
+    ]
     text = (
-        f"K = {k} over channels as they are in the field: rate, latency, loss in bursts, and what a message carries "
-        f"anyway. Payload is what a method adds. {scene.conditions(results.settings)}"
+        f"K = {_most(results)} over channels as they are in the field: rate, latency, loss in bursts, and what a "
+        "message carries anyway. Payload is what a method adds."
     )
-    return Table(header, tuple(body), text, decimals=3) if body else None
+    head = ("Channel", "Method", "NoiseModel")
+    return crossed(results, head, rows, columns, scene.caption(results, text), decimals=3)
 
 
 def load(results: Results) -> Table | None:
-    """Share of air time that each channel fills: in the drive of the study, and with many vehicles in earshot."""
-    from coopoc.study.tables import Table
-
-    if not most(results):
-        return None
-    drive, body = scene.fleet(results.settings["data"]), list[tuple[Any, ...]]()
+    """Share of air time that each channel fills: in the drive of the study, and with many vehicles in range."""
+    k, drive, body = _most(results), scene.fleet(results.settings["data"]), list[tuple[Any, ...]]()
     carried = {"alone": Message("none", 0), "and a fix": FIX_AND_VELOCITY, "and an estimate": ESTIMATE_AND_COV}
-    for name, words in WORDS.items():
-        v2x = scene.CHANNELS[name](most(results))
+    for name, words in WORDS.items() if k else ():
+        v2x = scene.CHANNELS[name](k)
         for also, message in carried.items():
             size, rate = message.size(v2x.overhead), v2x.rate or 1.0 / drive.dt
             if size:
@@ -100,45 +109,40 @@ def load(results: Results) -> Table | None:
         f"included: the highest of any vehicle and step of the drive ({len(drive.ids)} vehicles), and {CROWD} within "
         f"earshot of each other. Above 100 % the channel is saturated. The ideal channel counts payload only."
     )
-    return Table(header, tuple(body), text, decimals=2)
+    return Table(header, tuple(body), text) if body else None
 
 
 def schedules(results: Results) -> Table | None:
-    """RT-LE under each cap when different neighbours are heard first, and what that changes, paired."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
+    """RT-LE under each cap by the neighbours that come first, and the paired differences."""
+    rows = [
+        ((int(cap), look(pair[0]).label), under(cap, SCHEDULES[0], *pair))
+        for cap in CAPS
+        for pair in SCHEDULED
+        if _other_schedule(results, cap, *pair)
+    ]
 
-    body: list[tuple[Any, ...]] = []
-    for cap in CAPS:
-        for method, known in SCHEDULED:
-            found = [views.present(results, under(cap, each, method, known)) for each in SCHEDULES]
-            if found[0] is None or all(where is None for where in found[1:]):
-                continue
-            base = results.values("rt_le_m", found[0])
-            errors = [None if where is None else results.interval("rt_le_m", where) for where in found]
-            gaps = [
-                None if where is None else paired_difference(results.values("rt_le_m", where), base)
-                for where in found[1:]
-            ]
-            body.append((int(cap), look(method).label, *errors, *gaps))
-    differences = tuple(f"{each} - {SCHEDULES[0]}" for each in SCHEDULES[1:])
-    header = ("Cap [B/s]", "Method", *SCHEDULES, *differences)
+    def less(results: Results, where: Where) -> Any:
+        return difference(results, where, {**where, "schedule": SCHEDULES[0]})
+
+    differences = {f"{each} - {SCHEDULES[0]}": {"schedule": each} for each in SCHEDULES[1:]}
+    columns = across(interval, {each: {"schedule": each} for each in SCHEDULES}) + across(less, differences)
     text = (
-        f"RT-LE [m] when an ego hears no more than the cap, by whom it hears first; differences are paired, with 95 % "
-        f"intervals. K = {most(results)} at 10 Hz. {scene.conditions(results.settings)}"
+        "RT-LE [m] when an ego hears no more than the cap, by whom it hears first; differences are paired, with 95 % "
+        f"intervals. K = {_most(results)} at 10 Hz."
     )
-    return Table(header, tuple(body), text, best="min", unranked=differences, decimals=3) if body else None
+    options: dict[str, Any] = {"best": "min", "unranked": tuple(differences), "decimals": 3}
+    return crossed(results, ("Cap [B/s]", "Method"), rows, columns, scene.caption(results, text), **options)
 
 
-def under(cap: float, schedule: str, method: str, known: str) -> dict[str, Any]:
-    """The selection of a method under a cap and a schedule."""
-    limited = {**FREE, "cap_bytes_per_second": cap, "schedule": schedule}
-    return {"channel": "ideal", "max_neighbours": 10, **limited, "method": method, "noise_model": known}
+def _other_schedule(results: Results, cap: float, *pair: str) -> bool:
+    """True if the nearest first and another schedule were run."""
+    first, *others = (present(results, under(cap, each, *pair)) for each in SCHEDULES)
+    return first is not None and any(others)
 
 
-def _account(results: Results, where: dict[str, Any]) -> Ledger | None:
+def _account(results: Results, where: Where) -> Ledger | None:
     """The ledger of one second of the drive; None where the method was not run."""
-    kept = views.present(results, where)
+    kept = present(results, where)
     if kept is None:
         return None
     egos = sorted(results.select(kept)["ego"].unique())
@@ -149,69 +153,66 @@ def _account(results: Results, where: dict[str, Any]) -> Ledger | None:
     return Ledger(tuple(egos), np.ones(len(egos)), moved[0], moved[1])
 
 
-def even(results: Results) -> Table | None:
-    """Driving time after which deciding together has moved as many bytes as a training, per method and channel."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
+def _rate(results: Results, where: Where, kind: Kind = "payload") -> int | None:
+    account = _account(results, where)
+    return None if account is None else round(account.rate(kind))
 
-    ran, k = _trainings(results), most(results)
-    body: list[tuple[Any, ...]] = []
-    for channel in scene.CHANNELS:
-        for method, known in SHARED:
-            where = {"channel": channel, "max_neighbours": k, **FREE, "method": method, "noise_model": known}
-            account = _account(results, where) if k and ran and known in ("nominal", "trained") else None
-            if account is not None:
-                times = [spoken(break_even(total, account)) for total in ran.values()]
-                body.append((WORDS[channel], look(method).label, round(account.rate()), *times))
-    once = (f"{look(name).label}, {total.per_vehicle('training') / 1e3:,.0f} kB" for name, total in ran.items())
-    header = ("Channel", "Deciding", "Payload [B/s]", *once)
+
+def _trainings(results: Results) -> dict[str, Ledger]:
+    """The ledgers of the trainings that the study has run, by label."""
+    ran = [name for name in TRAINED if present(results, {"method": name})]
+    return {look(name).label: weights.ledger(results.settings, name) for name in ran}
+
+
+def even(results: Results) -> Table | None:
+    """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
+
+    def time(total: Ledger) -> Number:
+        def column(results: Results, where: Where) -> str | None:
+            account = _account(results, where)
+            return None if account is None else duration(break_even(total, account))
+
+        return column
+
+    ran = _trainings(results)
+    once = [(f"{name}, {total.per_vehicle('training') / 1e3:,.0f} kB", time(total)) for name, total in ran.items()]
+    honest = [where for where in _methods(results) if ran and where["noise_model"] in ("nominal", "trained")]
     text = (
-        f"Driving time after which deciding together (K = {k}) has moved as many bytes as each training moved per "
-        f"vehicle, once: payload, per receiver. {scene.conditions(results.settings)}"
+        f"Driving time after which deciding together (K = {_most(results)}) has moved as many bytes as each training "
+        "moved per vehicle, once: payload, per receiver."
     )
-    return Table(header, tuple(body), text) if body else None
+    columns = [("Payload [B/s]", _rate), *once]
+    rows = [(_labels(where), where) for where in honest]
+    return crossed(results, ("Channel", "Deciding"), rows, columns, scene.caption(results, text))
 
 
 def ledger(results: Results) -> Table | None:
     """The same for the joint filter as payload and on air, sent once and per receiver."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
-    ran, k = _trainings(results), most(results)
-    if not ran or not k:
-        return None
-    method, known = SCHEDULED[0]
+    ran, k, (method, known) = _trainings(results), _most(results), SCHEDULED[0]
     body: list[tuple[Any, ...]] = []
-    for channel in scene.CHANNELS:
-        where = {"channel": channel, "max_neighbours": k, **FREE, "method": method, "noise_model": known}
-        account = _account(results, where)
-        for kind, way in COUNTS if account is not None else ():
-            if account is not None and not (kind == "on air" and not scene.CHANNELS[channel](k).overhead):
-                even_ = (spoken(break_even(total, account, kind, way)) for total in ran.values())
-                body.append((WORDS[channel], f"{kind}, {way}", round(account.rate(kind, way)), *even_))
-    for kind, way in COUNTS[:2] if body else ():
-        once = (f"{total.per_vehicle('training', kind, way) / 1e3:,.0f} kB" for total in ran.values())
-        body.append(("a training, once", f"{kind}, {way}", None, *once))
-    header = ("Channel", "Counted", "Deciding [B/s]", *(look(name).label for name in ran))
+    for channel, make in scene.CHANNELS.items() if ran and k else ():
+        account = _account(results, of(method, known, **way(channel, k)))
+        for kind, each in COUNTS if account is not None else ():
+            if account is not None and (kind == "payload" or make(k).overhead):
+                times = (duration(break_even(total, account, kind, each)) for total in ran.values())
+                body.append((WORDS[channel], f"{kind}, {each}", round(account.rate(kind, each)), *times))
+    for kind, each in COUNTS[:2] if body else ():
+        once = (f"{total.per_vehicle('training', kind, each) / 1e3:,.0f} kB" for total in ran.values())
+        body.append(("a training, once", f"{kind}, {each}", None, *once))
     text = (
         f"The ledger per vehicle: {look(method).label.lower()}, {known}, K = {k}, and the driving time after which it "
         f"has moved as many bytes as a training. Broadcast: what is sent, each message once, a server's included; per "
         f"receiver: a copy for each that hears it. Nothing is added to the payload of a training, which goes by "
-        f"another network. {scene.conditions(results.settings)}"
+        f"another network."
     )
-    return Table(header, tuple(body), text) if body else None
+    header = ("Channel", "Counted", "Deciding [B/s]", *ran)
+    return Table(header, tuple(body), scene.caption(results, text)) if body else None
 
 
-def _trainings(results: Results) -> dict[str, Ledger]:
-    """The ledgers of the trainings that the study has run."""
-    ran = [name for name in TRAINED if views.present(results, {"method": name})]
-    return {name: weights.ledger(results.settings, name) for name in ran}
+def duration(seconds: float) -> str:
+    """Seconds in a unit that suits them.
 
-
-def spoken(seconds: float) -> str:
-    """Seconds as one reads them.
-
-    >>> spoken(0.3), spoken(5), spoken(600), spoken(7300), spoken(float("inf"))
+    >>> duration(0.3), duration(5), duration(600), duration(7300), duration(float("inf"))
     ('< 1 s', '5 s', '10 min', '2.0 h', 'never')
     """
     if seconds < 60:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coopoc.methods.catalogue import METHODS
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.numbers import Number, Where, mean
+from coopoc.study.pivot import crossed
+from coopoc.study.style import look
 
-from . import lineup, scene, views, weights
+from . import lineup, scene
+from .lineup import HEAD, labelled, of
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -18,133 +21,82 @@ if TYPE_CHECKING:
     from coopoc.study.tables import Table
 
 SILENT = ("gnss", "mds", "diffusion", "diffusion-anchored", "cooperative-map-gnc")
-"""Without a covariance, or one that only says what a fix is; or, the last, as slow as all others together."""
-CLASSICAL = tuple(name for name in METHODS if name not in SILENT)
+"""Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
 TRAINED = ("okf", "recursive", "cooperative")
 SOLO = ("kalman", "kalman-adaptive", "kalman-variational", "okf", "recursive")
 GATE = 0.95
 USUAL = ("nominal", "trained")
+NOTE = (
+    "NEES of the ego's position (3 is consistent; less is cautious, more is over-confident) and share of the steps "
+    "whose run-averaged NEES is in its 99 % band. Cooperative methods at K = 6."
+)
 
 
 def _grid() -> list[dict[str, Any]]:
-    pairs = [*((name, "nominal") for name in CLASSICAL), *((name, "trained") for name in TRAINED)]
+    pairs = [(name, "nominal") for name in METHODS if name not in SILENT]
+    pairs += [(name, "trained") for name in TRAINED]
     pairs += [("kalman", "fitted"), ("joint", "fitted"), ("kalman", "identity"), ("lkf-sa", "identity")]
-    return [{"max_neighbours": 0 if name in SOLO else 6, "method": name, "noise_model": known} for name, known in pairs]
+    return [of(*pair, max_neighbours=0 if pair[0] in SOLO else 6) for pair in pairs]
 
 
-def cell(p: Params) -> list[Row]:
-    """Rows of one method."""
-    return lineup.rows(p)
+def _inside(results: Results, where: Where) -> float:
+    return mean(results, where, "nees_inside") or 0.0
 
 
-def _ran(results: Results) -> list[tuple[str, str, dict[str, Any]]]:
-    """Methods and knowledge that were run and claim a covariance, the most credible first."""
+def _ran(results: Results) -> list[tuple[str, str]]:
+    """Methods and noise models that were run and claim a covariance, the most credible first."""
     frame = results.frame
-    if "nees" not in frame:
-        return []
-    kept = frame[frame["nees"].notna()]
-    found = [
-        (m, k, {"method": m, "noise_model": k})
-        for m, k in dict.fromkeys(zip(kept["method"], kept["noise_model"], strict=True))
-    ]
-    return sorted(found, key=lambda one: -(views.mean(results, one[2], "nees_inside") or 0.0))
+    kept = frame[frame["nees"].notna()] if "nees" in frame else frame.iloc[:0].assign(method=[], noise_model=[])
+    return sorted(
+        dict.fromkeys(zip(kept["method"], kept["noise_model"], strict=True)),
+        key=lambda pair: -_inside(results, of(*pair)),
+    )
 
 
 def _table(results: Results) -> Table | None:
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
-    body = []
-    for method, known, where in _ran(results):
-        inside = views.mean(results, where, "nees_inside")
-        body.append(
-            (
-                look(method).label,
-                known,
-                views.mean(results, where, "nees"),
-                inside,
-                "yes" if inside is not None and inside >= GATE else "no",
-                views.mean(results, where),
-            )
-        )
-    header = ("Method", "NoiseModel", "NEES", "In band", f"At least {GATE:g}", "RT-LE [m]")
-    return Table(header, tuple(body), _caption(results), decimals=2) if body else None
-
-
-def _caption(results: Results) -> str:
-    return (
-        "NEES of the ego's position (3 is consistent; less is cautious, more is over-confident) and share of the steps "
-        "whose run-averaged NEES is in its 99 % band. Cooperative methods at K = 6. "
-        f"{scene.conditions(results.settings)}"
-    )
+    columns: list[tuple[str, Number]] = [
+        ("NEES", partial(mean, value="nees")),
+        ("In band", partial(mean, value="nees_inside")),
+        (f"At least {GATE:g}", lambda results, where: "yes" if _inside(results, where) >= GATE else "no"),
+        ("RT-LE [m]", mean),
+    ]
+    return crossed(results, HEAD, labelled(_ran(results)), columns, scene.caption(results, NOTE))
 
 
 def _figure(results: Results) -> Plot | None:
     """One row per method: its NEES per ego on a logarithmic axis, and the band of a single ego's mean."""
     from coopoc.study.plot import Plot, canvas, plain_log
-    from coopoc.study.style import look
 
     ran = _ran(results)
     if not ran:
         return None
     with canvas(1, 1, width=6.2, height=0.9 + 0.2 * len(ran)) as (figure, panel):
         panel.axvline(3.0, color="black", linewidth=0.9)
-        for row, (method, _, where) in enumerate(ran):
-            shown = look(method)
-            each = np.nanmean(results.values("nees", where), axis=1)
-            panel.plot(
-                each,
-                np.full(len(each), row),
-                linestyle="none",
-                marker=shown.marker or "o",
-                color=shown.color,
-                alpha=0.8,
-            )
+        for row, pair in enumerate(ran):
+            shown, each = look(pair[0]), np.nanmean(results.values("nees", of(*pair)), axis=1)
+            style = {"linestyle": "none", "marker": shown.marker or "o", "color": shown.color, "alpha": 0.8}
+            panel.plot(each, np.full(len(each), row), **style)
         plain_log(panel.xaxis)
-        labels = [look(method).label + ("" if known in USUAL else f", {known}") for method, known, _ in ran]
+        labels = [look(method).label + ("" if known in USUAL else f", {known}") for method, known in ran]
         panel.set(yticks=range(len(ran)), yticklabels=labels, ylim=(len(ran) - 0.4, -0.6), xlabel="NEES, one per ego")
-    return Plot(figure, _caption(results))
+    return Plot(figure, scene.caption(results, NOTE))
 
 
-def _findings(results: Results) -> Sequence[str]:
-    from coopoc.study.style import look
-
-    good = [
-        look(method).label
-        for method, known, where in _ran(results)
-        if (views.mean(results, where, "nees_inside") or 0.0) >= GATE and known in USUAL
-    ]
-    return [f"At least {GATE:g} of the steps in the band: {', '.join(good)}."] if good else []
+def _findings(results: Results) -> dict[str, str]:
+    good = [look(m).label for m, k in _ran(results) if k in USUAL and _inside(results, of(m, k)) >= GATE]
+    return {"credible": f"At least {GATE:g} of the steps in the band: {', '.join(good)}." if good else ""}
 
 
-STUDY = Study(
-    name="consistency",
-    question="Which method's covariance can be believed?",
-    cell=cell,
-    key=lineup.key,
-    prepare=weights.prepare,
+STUDY = lineup.study(
+    "consistency",
+    "Which method's covariance can be believed?",
     grid=_grid(),
-    settings={
-        "data": "town10",
-        "clients": "town10-clients",
-        "weights": "runs/weights",
-        "scenario": 2,
-        "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "radius_m": 30.0,
-        "backend": "gauss-newton",
-        "egos": "auto",
-        "runs": 20,
-        "seed": 0,
-        "train_seeds": 1,
-    },
+    settings={**scene.TOWN, **scene.WEIGHTS, "backend": "gauss-newton", "runs": 20, "train_seeds": 1},
     shares=("max_neighbours",),
     tables={"nees": _table},
     figures={"nees": _figure},
     findings=_findings,
-    recipe=weights.described,
     limitations=("White noise over an ideal channel: what late messages, biases and lies do is in other studies.",),
     minutes=10,
     metrics={"rt_le_m": "lower", "nees": 3.0},
-    reference=views.reference("consistency"),
 )

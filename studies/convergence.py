@@ -8,17 +8,20 @@ from typing import TYPE_CHECKING
 
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
-from coopoc.study.study import Params, Row, Study
+from coopoc.evaluate.scores import rows_of
+from coopoc.study.numbers import listed, present
+from coopoc.study.pivot import pivot
+from coopoc.study.study import Params, Row
 
-from . import lineup, scene, views, weights
+from . import lineup, scene, weights
 
 if TYPE_CHECKING:
-    from coopoc.learned.checkpoint import Checkpoint
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
+NAMES = {"federated": FEDERATED, "centralised": CENTRALISED}
 NEAR = 0.03
 """Share of the centralised net's RT-LE within which the federated net has reached it."""
 
@@ -30,39 +33,30 @@ def cell(p: Params) -> list[Row]:
     `raw_rt_le_m` of the weights as they are after the round. The centralised net's schedule is cut into as many equal
     parts as there are rounds.
     """
-    checkpoint = weights.checkpoint(p["method"], p, p["train_seed"])
-    rounds, last = (len(c.card["history"]) - 1 for c in (_federated(p), checkpoint))
-    recording, who, drive = scene.recording(p), scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"])
+    made, federated = (weights.checkpoint(name, p, p["train_seed"]) for name in (p["method"], FEDERATED))
+    last, rounds = (len(one.card["history"]) - 1 for one in (made, federated))
+    recording, who, drive = scene.trial(p)
     alone, start = p["method"] in weights.INDIVIDUAL, lineup.start(p)
 
     @lru_cache
     def score(row: int) -> Floats:
-        return rt_le(checkpoint.after(row).method(p["method"], start)(recording, who), drive)
+        return rt_le(made.after(row).method(p["method"], start)(recording, who), drive)
 
     found: list[Row] = []
     for number in (rounds,) if alone else range(rounds + 1):
         at = last if alone else round(number * last / rounds)
-        raw, kept = score(at), score(checkpoint.kept(at))
-        found += [
-            {"round": number, "run": r, "ego": ego, "rt_le_m": float(kept[r, e]), "raw_rt_le_m": float(raw[r, e])}
-            for e, ego in enumerate(who)
-            for r in range(len(raw))
-        ]
+        columns = {"rt_le_m": score(made.kept(at)), "raw_rt_le_m": score(at)}
+        found += [{"round": number, **row} for row in rows_of(columns, who)]
     return found
 
 
-def _federated(p: Params) -> Checkpoint:
-    """The federated net, whose rounds all others are counted in."""
-    return weights.checkpoint(FEDERATED, p, p["train_seed"])
-
-
 def key(p: Params) -> dict[str, str]:
-    """What else changes the numbers: all have the rounds of the federated net."""
+    """Digests that change the numbers beyond the parameters: all have the rounds of the federated net."""
     return {**scene.facts(p), "weights": weights.key(p["method"], p), "rounds": weights.key(FEDERATED, p)}
 
 
 def prepare(cells: Sequence[Params], jobs: int) -> None:
-    """Train what the cells need, and the federated net in any case."""
+    """Train the missing weights of the cells, and the federated net in any case."""
     weights.prepare([{**p, "method": name} for p in cells for name in (p["method"], FEDERATED)], jobs)
 
 
@@ -73,28 +67,31 @@ def meaningful(p: Params) -> bool:
 
 def _curve(results: Results, method: str) -> list[float]:
     """Mean RT-LE after every round; empty if the net was not run."""
-    where = views.present(results, {"method": method})
+    where = present(results, {"method": method})
     rounds = sorted(results.select(where)["round"].unique()) if where else []
     return [results.interval("rt_le_m", method=method, round=number).mean for number in rounds]
 
 
-def _conditions(results: Results) -> str:
-    return scene.conditions({**results.settings, "train_seeds": results.frame["train_seed"].nunique()})
+def _caption(results: Results, text: str) -> str:
+    return scene.caption(results, text, train_seeds=results.frame["train_seed"].nunique())
 
 
 def _figure(results: Results) -> Plot | None:
     from coopoc.study import figures
 
-    where = views.present(results, {"method": [FEDERATED, CENTRALISED]})
+    where = present(results, {"method": [FEDERATED, CENTRALISED]})
     if where is None:
         return None
     ends = {f"individual {c}": _curve(results, name) for c, name in enumerate(weights.INDIVIDUAL, start=1)}
+    text = (
+        "RT-LE after every round with the weights that validated best so far (mean over training seeds, band from the "
+        "lowest to the highest); dashed: individual nets at their end."
+    )
     return figures.convergence(
         results,
         where=where,
         levels={name: curve[-1] for name, curve in ends.items() if curve},
-        caption="RT-LE after every round with the weights that validated best so far (mean over training seeds, band "
-        f"from the lowest to the highest); dashed: individual nets at their end. {_conditions(results)}",
+        caption=_caption(results, text),
     )
 
 
@@ -108,43 +105,30 @@ def _clients(results: Results) -> Plot:
 
 
 def _table(results: Results) -> Table | None:
-    from coopoc.study.pivot import pivot
-
-    where = views.present(results, {"method": [FEDERATED, CENTRALISED]})
+    where = present(results, {"method": [FEDERATED, CENTRALISED]})
     if where is None:
         return None
-    return pivot(
-        results,
-        rows="round",
-        columns="method",
-        value="rt_le_m",
-        where=where,
-        decimals=3,
-        intervals=False,
-        caption=f"RT-LE [m] after every round. {_conditions(results)}",
-    )
+    caption = _caption(results, "RT-LE [m] after every round.")
+    return pivot(results, "round", "method", "rt_le_m", where, caption, decimals=3, intervals=False)
 
 
-def _findings(results: Results) -> Sequence[str]:
+def _findings(results: Results) -> dict[str, str]:
     fed, centralised = _curve(results, FEDERATED), _curve(results, CENTRALISED)
-    found = []
+    found = {}
     if fed and centralised:
         last, end = len(fed) - 1, centralised[-1]
         reached = settled([value / end for value in fed])
-        when = f"not within {100 * NEAR:g} % of it"
-        if reached is not None:
-            when = f"within {100 * NEAR:g} % of it from round {reached} on"
-        gap = f"{100 * (fed[-1] / end - 1):+.1f} %"
-        found.append(
-            f"After {last} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m ({gap}); federated is {when}."
+        within = f"within {100 * NEAR:g} % of it"
+        when = f"not {within}" if reached is None else f"{within} from round {reached} on"
+        found["centralised"] = (
+            f"After {last} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
+            f"({100 * (fed[-1] / end - 1):+.1f} %); federated is {when}."
         )
-    names = {"federated": FEDERATED, "centralised": CENTRALISED}
-    worst = views.listed({words: _worst(results, name) for words, name in names.items()})
+    worst = listed({words: _worst(results, name) for words, name in NAMES.items()})
     if worst:
-        found += [
-            f"Weights as they are after a round, not the best so far, the worst of any round and seed: {worst}.",
-            f"The untrained net: {(fed or centralised)[0]:.2f} m.",
-        ]
+        text = "Weights as they are after a round, not the best so far, the worst of any round and seed"
+        found["worst"] = f"{text}: {worst}."
+        found["untrained"] = f"The untrained net: {(fed or centralised)[0]:.2f} m."
     return found
 
 
@@ -161,42 +145,36 @@ def settled(ratios: Sequence[float]) -> int | None:
 
 def _worst(results: Results, method: str) -> float | None:
     """Largest mean RT-LE of the raw weights over rounds and training seeds; None if the net was not run."""
-    where = views.present(results, {"method": method})
+    where = present(results, {"method": method})
     if where is None:
         return None
     frame = results.select(where)
     return float(frame[frame["round"] > 0].groupby(["round", "train_seed"])["raw_rt_le_m"].mean().max())
 
 
-STUDY = Study(
-    name="convergence",
-    question="Does federated training reach the centralised net, and after how many rounds?",
+STUDY = lineup.study(
+    "convergence",
+    "Does federated training reach the centralised net, and after how many rounds?",
     cell=cell,
     key=key,
     prepare=prepare,
     grid={"method": (FEDERATED, CENTRALISED, *weights.INDIVIDUAL), "train_seed": (0, 1, 2, 3, 4)},
     where=meaningful,
     settings={
-        "data": "town10",
-        "clients": "town10-clients",
-        "weights": "runs/weights",
+        **scene.DRAWN,
+        **scene.WEIGHTS,
+        **scene.SOLO,
         "scenario": 1,
         "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "start": "gnss",
-        "egos": "auto",
         "runs": 30,
-        "seed": 0,
         "train_seeds": 5,
     },
     tables={"rounds": _table},
     figures={"clients": _clients, "rounds": _figure},
     findings=_findings,
-    recipe=weights.described,
     limitations=(
         "The centralised net has no rounds: its schedule is cut into equal parts, as many as the federated net has.",
     ),
     minutes=2,
     metrics={"rt_le_m": "lower"},
-    reference=views.reference("convergence"),
 )

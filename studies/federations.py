@@ -1,8 +1,8 @@
-"""The federations that the aggregation study trains: equal, heterogeneous, poisoned and absent clients."""
+"""Federations of the aggregation study: equal, heterogeneous, poisoned and absent clients."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -49,7 +49,7 @@ GNSS_STD, VELOCITY_RATIO, SHARES = (1.0, 1.5, 2.5, 4.0), (0.05, 0.10, 0.20), (1.
 
 
 def members(p: Params) -> Fleet:
-    """The vehicles that train: so many of the fleet of clients, evenly spaced."""
+    """The vehicles that train: a number of the fleet of clients, evenly spaced."""
     fleet, count = scene.fleet(p["clients"]), int(p["members"])
     if not 2 <= count <= len(fleet.ids):
         raise InputError("members", count, f"must be 2..{len(fleet.ids)}, the vehicles of the fleet", "Take fewer.")
@@ -57,7 +57,7 @@ def members(p: Params) -> Fleet:
 
 
 def noise(p: Params) -> list[Sensors]:
-    """What acts on each client: the paper's training noise, or one pair of sensors after the other."""
+    """Noise of each client: the paper's training noise, or one pair of sensors after the other."""
     paper = replace(Sensors.paper_training(), velocity_reading=p["velocity_reading"])
     count = int(p["members"])
     if p["condition"] != "heterogeneous":
@@ -67,7 +67,7 @@ def noise(p: Params) -> list[Sensors]:
 
 
 def clients(p: Params, seed: int) -> tuple[Client, ...]:
-    """The clients of a condition for one training seed; the one in the middle is the bad one."""
+    """The clients of a condition for one training seed; the one in the middle is the poisoned one."""
     from coopoc.learned.federation.participation import heterogeneous, poisoned
 
     count = int(p["members"])
@@ -88,7 +88,7 @@ def participation(p: Params) -> Participation:
 
 
 def fitted(p: Params) -> NoiseModel:
-    """The noise that all clients together have seen with training seed 0, as the Kalman filter takes it."""
+    """Noise model fitted to the recordings of all clients with training seed 0."""
     fleet, acting = members(p), noise(p)
     seen = {one: observe(fleet, one, V2X(0), seed=0) for one in dict.fromkeys(acting)}
     gnss, velocity = (
@@ -99,16 +99,12 @@ def fitted(p: Params) -> NoiseModel:
 
 
 class Trained(NamedTuple):
-    """A net of one training seed: what was kept and what came last, mean bytes of a client, answers rejected, rounds
-    that changed nothing, seconds."""
+    """A net of one training seed: the kept one, that of the last round, and the columns of its rows: kB of a client,
+    rejected answers, rounds without change, seconds."""
 
     kept: Any
     last: Any
-    sent: float
-    received: float
-    rejected: int
-    idle: int
-    seconds: float
+    costs: Mapping[str, float]
 
 
 @lru_cache(maxsize=2)
@@ -142,15 +138,20 @@ def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]
         compression=wires.get(name),
         topology=graph,
     )
-    found = []
-    for fed in done:
-        sent, received = (
-            sum(getattr(row, way) for row in fed.history) / len(fed.names) for way in ("sent_bytes", "received_bytes")
+    return tuple(
+        Trained(
+            fed.model,
+            fed.after(len(fed.history) - 1),
+            {
+                "sent_kb": sum(row.sent_bytes for row in fed.history) / len(fed.names) / 1e3,
+                "received_kb": sum(row.received_bytes for row in fed.history) / len(fed.names) / 1e3,
+                "rejected": sum(len(row.rejected) for row in fed.history),
+                "idle_rounds": sum(row.note != "" for row in fed.history),
+                "train_seconds": fed.seconds,
+            },
         )
-        rejected, idle = sum(len(row.rejected) for row in fed.history), sum(row.note != "" for row in fed.history)
-        last = fed.after(len(fed.history) - 1)
-        found.append(Trained(fed.model, last, sent, received, rejected, idle, fed.seconds))
-    return tuple(found)
+        for fed in done
+    )
 
 
 def _pooled(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
@@ -167,7 +168,17 @@ def _pooled(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) 
         Task(net, all_(g, "training"), all_(g, "validation"), seed, long=all_(g, "long"))
         for seed, (net, g) in enumerate(zip(nets, groups, strict=True))
     ]
-    sent, received = 4.0 * 6 * float(members(p).present.sum(axis=0).mean()), 4.0 * flatten(nets[:1]).numel()
-    found = fit_many(tasks, Schedule(epochs=int(p["steps"])))
-    last = [unflatten(fit.history[-1].weights[None], fit.model)[0] for fit in found]
-    return tuple(Trained(f.model, net, sent, received, 0, 0, f.seconds) for f, net in zip(found, last, strict=True))
+    costs = {
+        "sent_kb": 4.0 * 6 * float(members(p).present.sum(axis=0).mean()) / 1e3,
+        "received_kb": 4.0 * flatten(nets[:1]).numel() / 1e3,
+        "rejected": 0,
+        "idle_rounds": 0,
+    }
+    return tuple(
+        Trained(
+            fit.model,
+            unflatten(fit.history[-1].weights[None], fit.model)[0],
+            {**costs, "train_seconds": fit.seconds},
+        )
+        for fit in fit_many(tasks, Schedule(epochs=int(p["steps"])))
+    )

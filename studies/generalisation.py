@@ -1,13 +1,18 @@
-"""Whether what was learned on four drives of one town holds in other traffic, another town, other noise, reality."""
+"""Gains that were learned on four drives of one town, in other traffic, another town, other noise and on robots."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.numbers import Number, Where, mean, present, ran, ratio, rms, sentence
+from coopoc.study.pivot import across, crossed
+from coopoc.study.study import Params, Row
+from coopoc.study.style import look
 
-from . import lineup, scene, views, weights
+from . import lineup, scene
+from .error_cdf import case
+from .lineup import HEAD, labelled, of
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -16,30 +21,27 @@ if TYPE_CHECKING:
 
 FLEETS = ("town10", "town10-validation", "town04")
 """Traffic of the town where the clients drove, other traffic there, and a town with motorways."""
-NOISES = {"training": (0, 0.10), "scenario 1": (1, 0.15), "scenario 2": (2, 0.15), "scenario 2, 40 %": (2, 0.40)}
-"""Name -> scenario and velocity noise; the last is beyond what anything was trained at."""
+NOISES = {
+    "training": case(0, 0.10),
+    "scenario 1": case(1, 0.15),
+    "scenario 2": case(2, 0.15),
+    "scenario 2, 40 %": case(2, 0.40),
+}
+"""Cases as selections; the last is beyond the noise of every training."""
 METHODS = (
     ("kalman", "oracle"),
     ("kalman", "nominal"),
     ("kalman", "fitted"),
     ("kalman-adaptive", "nominal"),
-    ("okf", "trained"),
-    ("fedkalmannet", "trained"),
-    ("magnitude", "trained"),
-    ("split", "trained"),
-    ("recursive", "trained"),
-    ("cooperative", "trained"),
+    *((name, "trained") for name in ("okf", "fedkalmannet", "magnitude", "split", "recursive", "cooperative")),
 )
-
-
-REAL = {"data": "real", "scenario": 0, "velocity_ratio": 0.10}
+REAL = {"data": "real", **case(0, 0.10)}
 """Robots that were really driven, whose noise is their own; the setting `real` says where their data are."""
 
 
 def _grid() -> list[dict[str, Any]]:
     places = [at(fleet, noise) for fleet in FLEETS for noise in NOISES]
-    grid = [{**place, "method": m, "noise_model": known} for place in places for m, known in METHODS]
-    return grid + [{**REAL, "method": m, "noise_model": known} for m, known in METHODS if known != "oracle"]
+    return [of(*pair, **place) for place in (*places, REAL) for pair in METHODS if place != REAL or pair[1] != "oracle"]
 
 
 def _meaningful(p: Params) -> bool:
@@ -51,7 +53,7 @@ def _placed(p: Params) -> Params:
 
 
 def key(p: Params) -> dict[str, str]:
-    """What changes the numbers beyond the parameters."""
+    """Digests that change the numbers beyond the parameters."""
     return lineup.key(_placed(p))
 
 
@@ -62,28 +64,23 @@ def cell(p: Params) -> list[Row]:
 
 def at(fleet: str, noise: str) -> dict[str, Any]:
     """A fleet and a noise as a selection."""
-    scenario, ratio = NOISES[noise]
-    return {"data": fleet, "scenario": scenario, "velocity_ratio": ratio}
+    return {"data": fleet, **NOISES[noise]}
 
 
-def multiple(results: Results, where: dict[str, Any]) -> float | None:
+def multiple(results: Results, where: Where) -> float | None:
     """rms over runs of RT-LE over that of the oracle filter in the same place and noise."""
     place = {name: where[name] for name in ("data", "scenario", "velocity_ratio")}
-    oracle = views.rms(results, {**place, "method": "kalman", "noise_model": "oracle"})
-    mine = views.rms(results, where)
-    return None if oracle is None or mine is None else mine / oracle
+    return ratio(rms(results, where), rms(results, of("kalman", "oracle", **place)))
 
 
 def _table(results: Results) -> Table | None:
-    from coopoc.study.style import look
-
     rows = [((noise, fleet), at(fleet, noise)) for noise in NOISES for fleet in FLEETS]
-    ran = [pair for pair in METHODS[1:] if views.present(results, {"method": pair[0]})]
-    columns = [
-        (look(method).label + (f", {known}" if method == "kalman" else ""), {"method": method, "noise_model": known})
-        for method, known in ran
-    ]
-    return views.crossed(results, ("Noise", "Fleet"), rows, columns, multiple, _caption(results), decimals=2)
+    names = {
+        look(method).label + (f", {known}" if method == "kalman" else ""): of(method, known)
+        for method, known in METHODS[1:]
+        if present(results, {"method": method})
+    }
+    return crossed(results, ("Noise", "Fleet"), rows, across(multiple, names), _caption(results))
 
 
 def _caption(results: Results) -> str:
@@ -97,21 +94,16 @@ def _caption(results: Results) -> str:
 
 def _real(results: Results) -> Table | None:
     """RT-LE and NEES on real data; None without them."""
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
-    body: list[tuple[Any, ...]] = []
-    base = views.mean(results, {**REAL, "method": "kalman", "noise_model": "nominal"})
-    for method, known in METHODS:
-        where = {**REAL, "method": method, "noise_model": known}
-        error = views.mean(results, where)
-        if error is not None and base is not None:
-            body.append((look(method).label, known, error, error / base, views.mean(results, where, "nees")))
-    header = ("Method", "NoiseModel", "RT-LE [m]", "Times the nominal KF's", "NEES")
-    if not body:
+    base = mean(results, of("kalman", "nominal", **REAL))
+    if base is None:
         return None
-    text = f"Alone, on real data. {scene.conditions({**results.settings, **_placed({**results.settings, **REAL})})}"
-    return Table(header, tuple(body), text, decimals=3, best=None)
+    columns: list[tuple[str, Number]] = [
+        ("RT-LE [m]", mean),
+        ("Times the nominal KF's", lambda results, where: ratio(mean(results, where), base)),
+        ("NEES", partial(mean, value="nees")),
+    ]
+    text = scene.caption(results, "Alone, on real data.", **_placed({**results.settings, **REAL}))
+    return crossed(results, HEAD, labelled(METHODS, **REAL), columns, text, decimals=3)
 
 
 def _figure(results: Results) -> Plot | None:
@@ -119,58 +111,49 @@ def _figure(results: Results) -> Plot | None:
     from coopoc.study.multiples import multiples
 
     found: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for method, known in METHODS[1:]:
+    for pair in METHODS[1:]:
         for noise in NOISES:
-            each = [multiple(results, {**at(fleet, noise), "method": method, "noise_model": known}) for fleet in FLEETS]
-            ran = [value for value in each if value is not None]
-            if ran:
-                found.setdefault((method, known), {})[noise] = ran
+            each = ran({fleet: multiple(results, of(*pair, **at(fleet, noise))) for fleet in FLEETS})
+            if each:
+                found.setdefault(pair, {})[noise] = list(each.values())
     return multiples(found, f"A mark per fleet. {_caption(results)}") if found else None
 
 
-def _findings(results: Results) -> Sequence[str]:
-    found = []
-    for method in ("fedkalmannet", "recursive"):
-        where = {"method": method, "noise_model": "trained"}
-        home, away = (multiple(results, {**at(fleet, "scenario 2"), **where}) for fleet in ("town10", "town04"))
-        beyond = multiple(results, {**at("town10", "scenario 2, 40 %"), **where})
-        if home is not None and away is not None and beyond is not None:
-            found.append(
-                f"{method} in scenario 2: {home:.2f} times the oracle filter at home, {away:.2f} in the other town, "
-                f"{beyond:.2f} at 40 % velocity noise."
-            )
-    return found
+FINDING = (
+    "{method} in scenario 2: {home:.2f} times the oracle filter at home, {away:.2f} in the other town, {beyond:.2f} at "
+    "40 % velocity noise."
+)
 
 
-STUDY = Study(
-    name="generalisation",
-    question="Does what was learned on four drives hold in other traffic, another town and other noise?",
+def _findings(results: Results) -> dict[str, str]:
+    return {
+        method: sentence(
+            FINDING,
+            method=method,
+            home=multiple(results, of(method, "trained", **at("town10", "scenario 2"))),
+            away=multiple(results, of(method, "trained", **at("town04", "scenario 2"))),
+            beyond=multiple(results, of(method, "trained", **at("town10", "scenario 2, 40 %"))),
+        )
+        for method in ("fedkalmannet", "recursive")
+    }
+
+
+STUDY = lineup.study(
+    "generalisation",
+    "Does what was learned on four drives hold in other traffic, another town and other noise?",
     cell=cell,
     key=key,
-    prepare=weights.prepare,
     grid=_grid(),
     where=_meaningful,
-    settings={
-        "clients": "town10-clients",
-        "weights": "runs/weights",
-        "velocity_reading": "axis",
-        "start": "gnss",
-        "egos": "auto",
-        "runs": 30,
-        "seed": 0,
-        "train_seeds": 3,
-        "real": "",
-    },
+    settings={**scene.WEIGHTS, **scene.SOLO, "egos": "auto", "runs": 30, "seed": 0, "train_seeds": 3, "real": ""},
     shares=("data", "scenario", "velocity_ratio"),
     tables={"multiples": _table, "real": _real},
     figures={"multiples": _figure},
     findings=_findings,
-    recipe=weights.described,
     limitations=(
         "Fleets are SUMO traffic with white noise. Real robots: --set real=FOLDER of MR.CLAM; a real car's odometry is "
         "in docs/streaming.md.",
     ),
     minutes=4,
     metrics={"rt_le_m": "lower"},
-    reference=views.reference("generalisation"),
 )

@@ -1,75 +1,56 @@
-"""What the paper leaves open moves the result more than the learning method does: start and reading of "10 %"."""
+"""Choices that the paper leaves open, which move the result more than the learning method: start and reading."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.numbers import Number, interval, listed, mean, present, ran, seed_std
+from coopoc.study.pivot import across, crossed
 
-from . import lineup, scene, views, weights
-from .error_cdf import CASES, LINEUP, case, meaningful
+from . import lineup, scene
+from .error_cdf import CASES, LINEUP, case, meaningful, worse_than_gnss
+from .lineup import HEAD, labelled, of
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-CHOICES = [(start, reading) for start in ("gnss", "true") for reading in ("axis", "speed")]
+CHOICES = {
+    f"{start}_{reading}": {"start": start, "velocity_reading": reading}
+    for start in ("gnss", "true")
+    for reading in ("axis", "speed")
+}
+"""Pairs of choices, as selections."""
 
 
-def cell(p: Params) -> list[Row]:
-    """Rows of one method in one case under one pair of choices."""
-    return lineup.rows(p)
+def _cases(results: Results, choice: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """The cases that were run under a pair of choices, as selections by their titles."""
+    real = scene.is_real(results.settings["data"])
+    found = {
+        "Real data" if real else f"Sc. {s}, {100 * r:g} %": {**choice, **case(s, r)}
+        for s, r in CASES[: 1 if real else 3]
+    }
+    return {title: at for title, at in found.items() if present(results, at)}
 
 
-def _of(start: str, reading: str) -> dict[str, str]:
-    return {"start": start, "velocity_reading": reading}
+def _table(results: Results, choice: dict[str, str]) -> Table | None:
+    cases = _cases(results, choice)
+    columns: list[tuple[str, Number]] = []
+    for title, at in cases.items():
+        columns += across(interval, {f"{title} [m]": at})
+        columns += across(seed_std, {"Seed std [m]": at}) + across(worse_than_gnss, {"Worse than GNSS [%]": at})
+    caption = " ".join(["RT-LE.", *(scene.caption(results, **at) for at in cases.values())])
+    digits = scene.decimals(results.settings)
+    return crossed(results, HEAD, labelled(LINEUP), columns, caption, decimals=digits)
 
 
-def _cases(results: Results, start: str, reading: str) -> list[dict[str, Any]]:
-    """The cases that were run under a pair of choices, as selections."""
-    found = [{**_of(start, reading), **case(*pair)} for pair in CASES]
-    return [at for at in found if views.present(results, at)]
-
-
-def _table(start: str, reading: str) -> Any:
-    def table(results: Results) -> Table | None:
-        from coopoc.study.style import look
-        from coopoc.study.tables import Table
-
-        cases, body = _cases(results, start, reading), []
-        for method, known in LINEUP:
-            row: list[Any] = []
-            for at in cases:
-                where = {**at, "method": method, "noise_model": known}
-                ran = views.present(results, where)
-                row += _numbers(results, where) if ran else [None] * 3
-            if any(entry is not None for entry in row):
-                body.append((look(method).label, known, *row))
-        header = ["Method", "NoiseModel"]
-        for at in cases:
-            header += [f"{_name(results, at)} [m]", "Seed std [m]", "Worse than GNSS [%]"]
-        digits = scene.decimals(results.settings)
-        text = " ".join(scene.conditions({**results.settings, **at}) for at in cases)
-        return Table(tuple(header), tuple(body), f"RT-LE. {text}", decimals=digits) if body else None
-
-    return table
-
-
-def _numbers(results: Results, where: dict[str, Any]) -> list[Any]:
-    worse = 100 * results.interval("worse_than_gnss", where).mean
-    return [results.interval("rt_le_m", where), views.seed_std(results, where), worse]
-
-
-def _name(results: Results, at: dict[str, Any]) -> str:
-    if scene.is_real(results.settings["data"]):
-        return "Real data"
-    return f"Sc. {at['scenario']}, {100 * at['velocity_ratio']:g} %"
-
-
-def _findings(results: Results) -> Sequence[str]:
-    found = [_finding(results, at) for start, reading in CHOICES for at in _cases(results, start, reading)]
-    return [sentences for sentences in found if sentences]
+def _findings(results: Results) -> dict[str, str]:
+    return {
+        f"{name}, {title}": _finding(results, at)
+        for name, choice in CHOICES.items()
+        for title, at in _cases(results, choice).items()
+    }
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
@@ -80,43 +61,25 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
         "fitted KF": ("kalman", "fitted"),
         "oracle KF": ("kalman", "oracle"),
     }
-    found = {
-        words: views.mean(results, {**at, "method": method, "noise_model": known})
-        for words, (method, known) in names.items()
-    }
-    if not views.listed(found):
+    found = ran({words: mean(results, of(*pair, **at)) for words, pair in names.items()})
+    if not found:
         return ""
-    fed, ratios = found["federated"], ""
-    if fed:
-        ratios = ", ".join(f"{fed / v:.2f} x {words}" for words, v in found.items() if v and words != "federated")
-    shown = f"RT-LE: {views.listed(found)}"
-    return f"{scene.heading({**results.settings, **at})}. {shown}" + (f"; federated is {ratios}." if ratios else ".")
+    fed, text = found.get("federated"), f"{scene.heading({**results.settings, **at})}. RT-LE: {listed(found)}"
+    ratios = [f"{fed / value:.2f} x {words}" for words, value in found.items() if fed and words != "federated"]
+    return text + (f"; federated is {', '.join(ratios)}." if ratios else ".")
 
 
-STUDY = Study(
-    name="open_choices",
-    question="How much do the start and the reading of the velocity noise move the comparison of learned gains?",
-    cell=cell,
-    key=lineup.key,
-    prepare=weights.prepare,
-    grid=[
-        {**_of(start, reading), **case(*pair), "method": method, "noise_model": known}
-        for start, reading in CHOICES
-        for pair in CASES
-        for method, known in LINEUP
-    ],
-    settings={
-        "data": "town10",
-        "clients": "town10-clients",
-        "weights": "runs/weights",
-        "egos": "auto",
-        "runs": 100,
-        "seed": 0,
-        "train_seeds": 5,
-    },
+STUDY = lineup.study(
+    "open_choices",
+    "How much do the start and the reading of the velocity noise move the comparison of learned gains?",
+    cell=lineup.rows,
+    recipe=None,
+    reference=None,
+    grid=[of(*pair, **choice, **case(*at)) for choice in CHOICES.values() for at in CASES for pair in LINEUP],
+    settings={**scene.DRAWN, **scene.WEIGHTS, "runs": 100, "train_seeds": 5},
     where=meaningful,
     shares=("scenario", "velocity_ratio", "velocity_reading"),
-    tables={f"{start}_{reading}": _table(start, reading) for start, reading in CHOICES},
+    tables={name: partial(_table, choice=choice) for name, choice in CHOICES.items()},
     findings=_findings,
     limitations=("The true start is what KalmanNet's published loop assumes; no vehicle has it.",),
     minutes=30,

@@ -39,7 +39,7 @@ TITLE = "Collaborative training against collaborative decision"
 
 
 def lead(data: str) -> tuple[str, str]:
-    """What the page is about, for a test fleet by name or path."""
+    """Sentences under the title of the page, for a test fleet by name or path."""
     from coopoc.data.registry import DATASETS
 
     where = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"

@@ -1,4 +1,4 @@
-"""What does privacy cost, and what does it hide? RT-LE and a membership probe against epsilon."""
+"""Cost and effect of differential privacy: RT-LE and a membership inference against epsilon."""
 
 from __future__ import annotations
 
@@ -12,23 +12,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.errors import InputError
-from coopoc.evaluate.metrics import rt_le
+from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.track import Method
 from coopoc.study.study import Params, Row, Study
 
-from . import lineup, scene, views, weights
+from . import lineup, scene, weights
 from .privacy_views import FIGURES, TABLES, findings
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from coopoc.learned.federation.history import Federation
-    from coopoc.learned.nets.gain import Gain
     from coopoc.learned.privacy.differential import Privacy
     from coopoc.learned.training.clients import Client
-    from coopoc.learned.training.schedule import Schedule
 
 EPSILONS = (1.0, 3.0, 10.0, 30.0, 100.0, math.inf)
 FLEETS = ("town10-clients", "town04")
@@ -36,11 +33,11 @@ FLEETS = ("town10-clients", "town04")
 LOST = 10.0
 """m, at which RT-LE is cut: the fixes alone have 6 m in scenario 2, and a filter may be 1e27 m away."""
 ATTACKS = (("client", "loss"), ("client", "gradient"), ("aggregate", "loss"))
-"""Whose updates are seen, and what of a candidate is scored."""
+"""Updates that are seen, and score of a candidate."""
 
 
 class Plan(NamedTuple):
-    """How a method is federated at every epsilon, chosen on town10-validation: few rounds, as each costs privacy.
+    """Federation of a method at every epsilon, chosen on town10-validation: few rounds, as each costs privacy.
 
     `clip` is the largest; `bearable` is the noise (standard deviation over all rounds) that a weight stands.
     """
@@ -65,8 +62,8 @@ PLANS = {"fedkalmannet": Plan(0.5, 0.008, 5, 5, 3e-3, 0.3), "okf": Plan(0.3, 0.4
 
 
 class Trained(NamedTuple):
-    """The federations of all training seeds, the clients of each, what left them, by (seed, name) and round (P,), and
-    the price: clip, z of the sum, and the epsilon of a server that sees single updates."""
+    """The federations of all training seeds, the clients of each, their updates (P,) by (seed, name) and round, and the
+    price: clip, z of the sum, and the epsilon of a server that sees single updates."""
 
     federations: list[Federation]
     groups: list[tuple[Client, ...]]
@@ -75,7 +72,7 @@ class Trained(NamedTuple):
 
 
 class Tap:
-    """What clients send, kept for the probe; protected before by `inner`, if given."""
+    """Updates of the clients, recorded for the probe; protected before by `inner`, if given."""
 
     def __init__(self, inner: Privacy | None) -> None:
         self.inner = inner
@@ -95,7 +92,7 @@ class Tap:
 
 
 def cell(p: Params) -> list[Row]:
-    """RT-LE per training seed, ego and run, and how well each attack finds what was trained on; of a reference, RT-LE.
+    """RT-LE per training seed, ego and run, and the AUC of each attack on membership; of a reference, RT-LE.
 
     The weights are those of the last round: to choose a round by the clients' validation losses is not private.
     """
@@ -114,12 +111,16 @@ def cell(p: Params) -> list[Row]:
 
 
 def trained(p: Params) -> Trained:
-    """Federations of all training seeds with the cell's epsilon, equal weights and everyone in every round."""
+    """Federations of all training seeds with the cell's epsilon, equal weights and all clients in every round."""
     from coopoc.learned.federation.federated import federate_many
+    from coopoc.learned.nets.gain_net import GainNet
+    from coopoc.learned.nets.okf import NoiseParameters
     from coopoc.learned.privacy.differential import Privacy, auc_bound, epsilon, noise_for
     from coopoc.learned.recipes import Setting, sensors
     from coopoc.learned.training.clients import clients
+    from coopoc.learned.training.schedule import Schedule
 
+    net = GainNet if p["method"] == "fedkalmannet" else NoiseParameters
     plan, drives, delta = PLANS[p["method"]], scene.fleet(p["clients"]), float(p["delta"])
     acting, seeds = sensors(Setting(reading=p["velocity_reading"])), weights.seeds(p)
     groups = [clients(drives, acting, seed=seed, start=scene.start(p)) for seed in seeds]
@@ -128,13 +129,13 @@ def trained(p: Params) -> Trained:
     clip = plan.clipped(z, count) if z else math.inf
     tap = Tap(Privacy(clip, z, delta, count) if z else None)
     made = federate_many(
-        [_net(p["method"], seed) for seed in seeds],
+        [net(seed=seed) for seed in seeds],
         groups,
         seeds,
         plan.rounds,
         "uniform",
         plan.local_epochs,
-        _schedule(plan),
+        Schedule(learning_rate=plan.learning_rate, weight_decay=plan.weight_decay),
         privacy=tap,
     )
     alone = z / math.sqrt(count)
@@ -156,31 +157,19 @@ def probed(made: Trained) -> list[Row]:
     """
     from coopoc.learned.privacy.membership_inference import membership_inference
 
-    rows = []
+    rows: list[Row] = []
     for seen, score in ATTACKS:
         parts = [_standardised(*pair) for pair in _candidates(made, seen, score)]
         members, others = (np.concatenate(side) for side in zip(*parts, strict=True))
         found = membership_inference(members, others)
-        rows.append(
-            {
-                "measure": "probe",
-                "run": 0,
-                "ego": "all",
-                "seen": seen,
-                "score": score,
-                "auc": found.auc,
-                "auc_low": found.low,
-                "auc_high": found.high,
-                "found_at_1_percent": found.found,
-                "members": found.members,
-                "others": found.others,
-            }
-        )
+        row = {"measure": "probe", "run": 0, "ego": "all", "seen": seen, "score": score}
+        numbers = {"auc": found.auc, "auc_low": found.low, "auc_high": found.high, "found_at_1_percent": found.found}
+        rows.append({**row, **numbers, "members": found.members, "others": found.others})
     return rows
 
 
 def _candidates(made: Trained, seen: str, score: str) -> Iterator[list[Floats]]:
-    """Scores of members and others of every client of every federation; zeros where a client never sent anything."""
+    """Scores of members and others of every client and federation; zeros for a client that never sent an update."""
     from coopoc.learned.privacy.membership_inference import gradient_scores, loss_scores
     from coopoc.learned.training.clients import Segments
 
@@ -203,37 +192,14 @@ def _standardised(members: Floats, others: Floats) -> tuple[Floats, Floats]:
     return (members - both.mean()) / spread, (others - both.mean()) / spread
 
 
-def _net(method: str, seed: int) -> Gain:
-    from coopoc.learned.nets.gain_net import GainNet
-    from coopoc.learned.nets.okf import NoiseParameters
-
-    return GainNet(seed=seed) if method == "fedkalmannet" else NoiseParameters(seed=seed)
-
-
-def _schedule(plan: Plan) -> Schedule:
-    from coopoc.learned.training.schedule import Schedule
-
-    return Schedule(learning_rate=plan.learning_rate, weight_decay=plan.weight_decay)
-
-
 def _scored(method: Method, p: Params, measure: str, **more: Any) -> list[Row]:
     """Rows of RT-LE, at most LOST."""
-    recording, who, drive = scene.recording(p), scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"])
-    try:
-        score = np.fmin(rt_le(method(recording, who), drive), LOST)
-    except InputError as error:
-        if error.field != "x":  # the estimates of the track, of which one is not finite
-            raise
-        score = np.full((recording.runs, len(who)), LOST)
-    return [
-        {"measure": measure, "run": r, "ego": ego, "rt_le_m": float(score[r, e]), **more}
-        for e, ego in enumerate(who)
-        for r in range(len(score))
-    ]
+    trial = scene.trial(p)
+    return rows_of({"rt_le_m": bounded_rt_le(method, *trial, LOST)}, trial[1], measure=measure, **more)
 
 
 def key(p: Params) -> dict[str, str]:
-    """What else changes the numbers: data, code, and the libraries that train and count."""
+    """Digests that change the numbers beyond the parameters: data, code, and the library that trains."""
     return {**scene.facts(p), "clients": scene.fleet(p["clients"]).digest, "torch": version("torch")}
 
 
@@ -244,20 +210,17 @@ def _grid() -> list[dict[str, Any]]:
 
 
 STUDY = Study(
-    name="privacy",
-    question="What does a client-level (epsilon, delta) cost in accuracy, and what does it hide from a probe?",
+    "privacy",
+    "What does a client-level (epsilon, delta) cost in accuracy, and what does it hide from a probe?",
     cell=cell,
     key=key,
     grid=_grid(),
     settings={
-        "data": "town10",
+        **scene.DRAWN,
+        **scene.SOLO,
         "scenario": 2,
         "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "start": "gnss",
-        "egos": "auto",
         "runs": 10,
-        "seed": 0,
         "train_seeds": 3,
         "delta": 1e-5,
     },
@@ -277,5 +240,5 @@ STUDY = Study(
     ),
     minutes=15,
     metrics={"rt_le_m": "lower"},
-    reference=views.reference("privacy"),
+    reference=lineup.reference("privacy"),
 )

@@ -8,46 +8,40 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import scene, views
+from coopoc.evaluate.statistics import Interval
+from coopoc.study.numbers import mean, present
+from coopoc.study.pivot import pivot
+from coopoc.study.style import look
+from coopoc.study.tables import Table
+
+from . import scene
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.axes import Axes
 
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 NET, OKF = "fedkalmannet", "okf"
 TRAINED = [NET, OKF]
 NEAR = 0.10
-"""Share of the RT-LE without privacy within which privacy is called affordable."""
-NOTES = {
-    "rt_le": "RT-LE [m] against the client-level epsilon of the sum of the updates, delta {delta:g}; inf: no privacy.",
-    "price": "Clip, noise multiplier z of the sum, the epsilon of a server that sees single updates (no secure "
-    "aggregation), at the epsilon of the sum in the first column, delta {delta:g}, and the areas under the ROC curve "
-    "that no attack on a client's presence can beat.",
-    "probe": "AUC of the membership probe (0.5: a coin) with 95 % bootstrap intervals over pieces, by what is seen, "
-    "one client's updates or the aggregate's, and by what is scored; 0.50 [0.50, 0.50]: the weights diverged.",
-}
+"""Share of the RT-LE without privacy within which epsilon counts as affordable."""
+PROBES = {("client", "gradient"): "single updates", ("aggregate", "loss"): "the aggregate"}
+"""Attacks in the figure and the findings: (updates that are seen, score) -> words."""
+RT_LE = "RT-LE [m] against the client-level epsilon of the sum of the updates, delta {delta:g}; inf: no privacy."
+PRICE = (
+    "Clip, noise multiplier z of the sum, the epsilon of a server that sees single updates (no secure aggregation), at "
+    "the epsilon of the sum in the first column, delta {delta:g}, and the areas under the ROC curve that no attack on "
+    "a client's presence can beat."
+)
+PROBE = (
+    "AUC of the membership probe (0.5: a coin) with 95 % bootstrap intervals over pieces, by what is seen, one "
+    "client's updates or the aggregate's, and by what is scored; 0.50 [0.50, 0.50]: the weights diverged."
+)
 
 
-def _caption(results: Results, name: str) -> str:
-    return f"{NOTES[name].format(**results.settings)} {scene.conditions(results.settings)}"
-
-
-def _each(frame: pd.DataFrame) -> list[Any]:
-    """Rows as named tuples, whose fields pandas does not type."""
-    return list(frame.itertuples())
-
-
-def _names(names: Any) -> Any:
-    """Names of a group, which pandas does not type."""
-    return names
-
-
-def _rows(results: Results, measure: str, **where: Any) -> pd.DataFrame:
-    """Rows of one measure of what was trained; empty if there is none."""
+def _rows(results: Results, measure: str, **where: Any) -> Any:
+    """Frame of one measure of trained methods; empty if there is none."""
     frame = results.frame
     if "measure" not in frame:
         return frame.iloc[:0]
@@ -58,28 +52,14 @@ def _rows(results: Results, measure: str, **where: Any) -> pd.DataFrame:
 
 
 def _rt_le(results: Results) -> Table | None:
-    from coopoc.study.pivot import pivot
-
-    where = views.present(results, {"measure": "rt_le", "method": TRAINED})
+    where = present(results, {"measure": "rt_le", "method": TRAINED})
     if where is None:
         return None
-    return pivot(
-        results,
-        rows="epsilon",
-        columns=["clients", "method"],
-        value="rt_le_m",
-        where=where,
-        best=None,
-        decimals=2,
-        intervals=False,
-        caption=_caption(results, "rt_le"),
-    )
+    options: dict[str, Any] = {"best": None, "intervals": False}
+    return pivot(results, "epsilon", ["clients", "method"], "rt_le_m", where, scene.caption(results, RT_LE), **options)
 
 
 def _price(results: Results) -> Table | None:
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
     frame = _rows(results, "rt_le")
     frame = frame[np.isfinite(frame["epsilon"])] if len(frame) else frame
     if frame.empty:
@@ -96,7 +76,7 @@ def _price(results: Results) -> Table | None:
             f"{row.epsilon_alone:.3g}",
             float(row.ceiling_alone),
         )
-        for row in _each(each)
+        for row in each.itertuples()
     ]
     header = (
         "Epsilon of the sum",
@@ -108,32 +88,27 @@ def _price(results: Results) -> Table | None:
         "Epsilon of single updates",
         "AUC at most, single",
     )
-    return Table(header, tuple(body), _caption(results, "price"))
+    return Table(header, tuple(body), scene.caption(results, PRICE))
 
 
 def _probe(results: Results) -> Table | None:
-    from coopoc.evaluate.statistics import Interval
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
     frame = _rows(results, "probe")
     if frame.empty:
         return None
     body, kinds = [], list(dict.fromkeys(zip(frame["seen"], frame["score"], strict=True)))
-    for names, part in frame.groupby(["clients", "method", "epsilon"], sort=False):
-        clients, method, epsilon = _names(names)
-        known = {(row.seen, row.score): row for row in _each(part)}
+    for (clients, method, epsilon), part in frame.groupby(["clients", "method", "epsilon"], sort=False):
+        known = {(row.seen, row.score): row for row in part.itertuples()}
         entries = [
             Interval(r.auc, r.auc_low, r.auc_high, int(r.members + r.others)) for r in (known[kind] for kind in kinds)
         ]
         body.append((clients, look(method).label, f"{epsilon:g}", *entries, known[kinds[0]].found_at_1_percent))
     titles = [f"{seen}, {score}" for seen, score in kinds]
     header = ("Clients", "Method", "Epsilon", *titles, f"Members found at 1 % false alarms ({titles[0]})")
-    return Table(header, tuple(body), _caption(results, "probe"))
+    return Table(header, tuple(body), scene.caption(results, PROBE))
 
 
 def places(epsilons: Sequence[float]) -> dict[float, float]:
-    """Where each epsilon stands on the axis: its logarithm, and no privacy half a decade beyond the last.
+    """Place of each epsilon on the axis: its logarithm, and no privacy half a decade beyond the last.
 
     >>> places([1.0, 10.0, math.inf])
     {1.0: 0.0, 10.0: 1.0, inf: 1.5}
@@ -143,133 +118,103 @@ def places(epsilons: Sequence[float]) -> dict[float, float]:
     return at | ({math.inf: max(at.values(), default=-0.5) + 0.5} if math.inf in epsilons else {})
 
 
-def _panels(results: Results, measure: str) -> tuple[pd.DataFrame, list[str], dict[float, float]] | None:
+def _panels(results: Results, measure: str) -> tuple[dict[str, pd.DataFrame], dict[float, float], dict[float, str]]:
+    """Rows of a measure by clients, places of each epsilon, and texts of the ticks there."""
     frame = _rows(results, measure)
     if frame.empty:
-        return None
-    return frame, list(dict.fromkeys(frame["clients"])), places(list(frame["epsilon"].unique()))
+        return {}, {}, {}
+    at = places(list(frame["epsilon"].unique()))
+    ticks = {place: f"{e:g}" if math.isfinite(e) else "none" for e, place in at.items()}
+    return {clients: frame[frame["clients"] == clients] for clients in dict.fromkeys(frame["clients"])}, at, ticks
 
 
-def _ticks(axes: Axes, at: Mapping[float, float]) -> None:
-    axes.set_xticks(list(at.values()), [f"{e:g}" if math.isfinite(e) else "none" for e in at])
-    axes.set_xlabel("Epsilon")
+def _title(clients: str) -> str:
+    return f"{len(scene.fleet(clients).ids)} clients ({clients})"
 
 
 def _cost(results: Results) -> Plot | None:
     """RT-LE against epsilon, one panel per set of clients."""
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
-    from coopoc.study.style import words
+    from coopoc.study.lines import Line, Panel, panels
 
-    found = _panels(results, "rt_le")
-    if found is None:
-        return None
-    frame, fleets, at = found
-    drawn: list[Mapping[str, Any]] = []
-    with canvas(1, len(fleets), width=7.6, sharey=True, squeeze=False) as (figure, axes):
-        for panel, clients in zip(axes[0], fleets, strict=True):
-            for method, part in frame[frame["clients"] == clients].groupby("method", sort=False):
-                seeds = part.groupby(["epsilon", "train_seed"])["rt_le_m"].mean().unstack().sort_index()
-                x = [at[e] for e in seeds.index]
-                options = strokes({"method": method})
-                panel.plot(x, seeds.mean(axis=1), **options)
-                panel.fill_between(
-                    x, seeds.min(axis=1), seeds.max(axis=1), color=options["color"], alpha=0.15, linewidth=0
-                )
-                drawn.append({"method": method})
-            drawn += _levels(results, panel, clients, at)
-            _ticks(panel, at)
-            panel.set_title(f"{len(scene.fleet(clients).ids)} clients ({clients})")
-        plain_log(axes[0][0].yaxis)
-        axes[0][0].set_ylabel(words("rt_le_m"))
-        legend(axes[0][-1], list({str(n["method"]): n for n in drawn}.values()), {"kalman": ", fitted"})
+    frames, at, ticks = _panels(results, "rt_le")
+    shown = []
+    for clients, frame in frames.items():
+        lines = []
+        for method, part in frame.groupby("method", sort=False):
+            seeds = part.groupby(["epsilon", "train_seed"])["rt_le_m"].mean().unstack().sort_index()
+            ends = zip(seeds.mean(axis=1), seeds.min(axis=1), seeds.max(axis=1), strict=True)
+            points = {at[e]: Interval(*each, seeds.shape[1]) for e, each in zip(seeds.index, ends, strict=True)}
+            lines.append(Line({"method": method}, points))
+        for method in ("kalman", "bound"):
+            level = mean(results, {"measure": "rt_le", "method": method})
+            lines.append(Line({"method": method}, level, {"linestyle": "--"}))
+        for method in TRAINED:
+            level = mean(results, {"measure": "untrained", "method": method, "clients": clients})
+            lines.append(Line({"method": method}, level, {"linestyle": ":", "linewidth": 0.8}))
+        shown.append(Panel(lines, _title(clients), "Epsilon", ticks))
     text = "Lines: mean over training seeds, egos and runs; bands: lowest to highest seed. Dotted: before training."
-    return Plot(figure, f"{_caption(results, 'rt_le')} {text}")
-
-
-def _levels(results: Results, panel: Axes, clients: str, at: Mapping[float, float]) -> list[dict[str, Any]]:
-    """Horizontal lines: the fitted Kalman filter, the bound, and the methods before training."""
-    from coopoc.study.plot import strokes
-
-    drawn, ends = [], [min(at.values()), max(at.values())]
-    for method in ("kalman", "bound"):
-        level = views.mean(results, {"measure": "rt_le", "method": method})
-        if level is not None:
-            panel.plot(ends, [level, level], **{**strokes({"method": method}), "marker": None, "linestyle": "--"})
-            drawn.append({"method": method})
-    for method in TRAINED:
-        level = views.mean(results, {"measure": "untrained", "method": method, "clients": clients})
-        if level is not None:
-            panel.plot(
-                ends, [level, level], **{**strokes({"method": method}, thin=True), "marker": None, "linestyle": ":"}
-            )
-    return drawn
+    return panels(shown, f"{scene.caption(results, RT_LE)} {text}", 7.6, 3.4, "RT-LE [m]", True, {"kalman": ", fitted"})
 
 
 def _attack(results: Results) -> Plot | None:
     """AUC against epsilon, one panel per set of clients."""
     from coopoc.study.plot import Plot, canvas, legend, strokes
 
-    found = _panels(results, "probe")
-    if found is None:
+    frames, at, ticks = _panels(results, "probe")
+    if not frames:
         return None
-    frame, fleets, at = found
-    styles = {("client", "gradient"): "-", ("aggregate", "loss"): ":"}
-    attacks: Any = list(zip(frame["seen"], frame["score"], strict=True))
-    frame = frame.assign(attack=attacks)
-    frame = frame[frame["attack"].isin(list(styles))]
-    with canvas(1, len(fleets), width=7.6, sharey=True, squeeze=False) as (figure, axes):
-        for panel, clients in zip(axes[0], fleets, strict=True):
+    drawn = list[dict[str, Any]]()
+    with canvas(1, len(frames), width=7.6, sharey=True, squeeze=False) as (figure, (axes,)):
+        for panel, (clients, frame) in zip(axes, frames.items(), strict=True):
             panel.axhline(0.5, color="#555555", linewidth=0.8)
-            here = frame[frame["clients"] == clients]
-            for shift, (names, part) in enumerate(here.groupby(["method", "attack"], sort=False)):
-                method, attack = _names(names)
+            pairs = [(method, attack) for method in dict.fromkeys(frame["method"]) for attack in PROBES]
+            for shift, (method, (seen, score)) in enumerate(pairs):
+                part = frame[(frame["method"] == method) & (frame["seen"] == seen) & (frame["score"] == score)]
                 part = part.sort_values("epsilon")
                 x = [at[e] + 0.04 * (shift - 1.5) for e in part["epsilon"]]
-                spread = np.maximum([part["auc"] - part["auc_low"], part["auc_high"] - part["auc"]], 0.0)
-                options = {**strokes({"method": method}), "linestyle": styles[attack]}
-                panel.errorbar(x, part["auc"], yerr=spread, elinewidth=0.7, **options)
-            _ticks(panel, at)
-            panel.set_title(f"{len(scene.fleet(clients).ids)} clients ({clients})")
-        axes[0][0].set_ylabel("AUC of the probe")
-        legend(axes[0][-1], [{"method": m} for m in dict.fromkeys(frame["method"])])
+                ends = np.maximum([part["auc"] - part["auc_low"], part["auc_high"] - part["auc"]], 0.0)
+                style = {**strokes({"method": method}), "linestyle": "-" if seen == "client" else ":"}
+                panel.errorbar(x, part["auc"], yerr=ends, elinewidth=0.7, **style)
+                drawn.append({"method": method})
+            panel.set_xticks(list(ticks), list(ticks.values()))
+            panel.set(xlabel="Epsilon", title=_title(clients))
+        axes[0].set_ylabel("AUC of the probe")
+        legend(axes[-1], drawn)
     text = "Solid: one client's updates are seen (gradient); dotted: the aggregate's only (loss)."
-    return Plot(figure, f"{_caption(results, 'probe')} {text}")
+    return Plot(figure, f"{scene.caption(results, PROBE)} {text}")
 
 
-def findings(results: Results) -> list[str]:
-    """What each method pays with each set of clients, and what the probe finds."""
-    from coopoc.study.style import look
-
-    found = []
-    for clients in dict.fromkeys(_rows(results, "rt_le").get("clients", ())):
-        for method in TRAINED:
-            line = _paid(results, {"clients": clients, "method": method})
-            if line:
-                count = len(scene.fleet(clients).ids)
-                found.append(f"{look(method).label}, {count} clients: {line}")
-    return found
+def findings(results: Results) -> dict[str, str]:
+    """RT-LE of each method with each set of clients by epsilon, and the AUC of the attacks."""
+    return {
+        f"{clients}, {method}": _paid(results, {"clients": clients, "method": method})
+        for clients in dict.fromkeys(_rows(results, "rt_le").get("clients", ()))
+        for method in TRAINED
+    }
 
 
 def _paid(results: Results, where: dict[str, Any]) -> str:
-    """The least epsilon at which RT-LE is near that without privacy, and the probe with and without it."""
+    """The least epsilon at which RT-LE is near that without privacy, and the attacks with and without it."""
     frame = _rows(results, "rt_le", **where)
     means: dict[float, float] = dict(frame.groupby("epsilon")["rt_le_m"].mean()) if len(frame) else {}
     if math.inf not in means or len(means) < 2:
         return ""
-    free = float(means[math.inf])
     near = affordable({float(e): float(m) for e, m in means.items()})
-    told = "no epsilon that was run" if math.isinf(near) else f"epsilon {near:g}"
+    enough = "no epsilon that was run" if math.isinf(near) else f"epsilon {near:g}"
     listing = ", ".join(f"{m:.2f} m at {e:g}" for e, m in means.items() if math.isfinite(e))
-    text = f"{free:.2f} m without privacy; {listing}. Within {NEAR:.0%} of it: {told}."
-    for seen, score in (("client", "gradient"), ("aggregate", "loss")):
+    text = (
+        f"{look(where['method']).label}, {len(scene.fleet(where['clients']).ids)} clients: {means[math.inf]:.2f} m "
+        f"without privacy; {listing}. Within {NEAR:.0%} of it: {enough}."
+    )
+    for (seen, score), words in PROBES.items():
         probe = _rows(results, "probe", **where, seen=seen, score=score).set_index("epsilon")
         if math.inf in probe.index:
-            row, strict = probe.loc[math.inf], probe.loc[min(probe.index)]
-            text += (
-                f" Probe of {'single updates' if seen == 'client' else 'the aggregate'}: AUC {row.auc:.2f} "
-                f"[{row.auc_low:.2f}, {row.auc_high:.2f}] without, {strict.auc:.2f} [{strict.auc_low:.2f}, "
-                f"{strict.auc_high:.2f}] at epsilon {min(probe.index):g}."
+            least = min(probe.index)
+            free, strict = (
+                f"{row.auc:.2f} [{row.auc_low:.2f}, {row.auc_high:.2f}]"
+                for row in (probe.loc[math.inf], probe.loc[least])
             )
+            text += f" Probe of {words}: AUC {free} without, {strict} at epsilon {least:g}."
     return text
 
 

@@ -1,36 +1,38 @@
-"""What a vehicle costs as the fleet grows: 60 to 1,980 vehicles, the town's traffic beside itself."""
+"""Cost per vehicle as the fleet grows: 60 to 1,980 vehicles, the town's traffic beside itself."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from coopoc.plugins import find
 from coopoc.study.environment import revision
+from coopoc.study.numbers import mean, ran
 from coopoc.study.study import Params, Row, Study
+from coopoc.study.style import look
+from coopoc.study.tables import Table
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensing import observe
 
-from . import scene, views
+from . import scene
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 COPIES = (1, 2, 4, 8, 16, 33)
 APART = 5_000.0
-"""m between copies: nobody sees across."""
+"""m between copies: no vehicle is in the range of another copy."""
 EGOS = 60
 """Vehicles that per-ego methods serve, at every size of the fleet."""
 PER_EGO = ("kalman", "joint", "split-ci", "lkf-sa")
 DISTRIBUTED = ("gbp", "admm", "central-filter")
 """Methods that serve all vehicles at once."""
+METHODS = (*PER_EGO, *DISTRIBUTED)
 
 
 @lru_cache(maxsize=1)
@@ -47,12 +49,8 @@ def copied(data: str, copies: int, steps: int) -> Fleet:
     return Fleet(ids, drive.t, position, np.tile(drive.velocity, (1, copies, 1)))
 
 
-def _grid() -> list[dict[str, Any]]:
-    return [{"copies": copies, "method": m} for copies in COPIES for m in ("observe", *PER_EGO, *DISTRIBUTED)]
-
-
 def key(p: Params) -> dict[str, str]:
-    """What changes the numbers beyond the parameters."""
+    """Digests that change the numbers beyond the parameters."""
     return {"code": revision(*scene.CODE), "fleet": scene.fleet(p["data"]).digest}
 
 
@@ -80,25 +78,28 @@ def _spread(vehicles: int) -> list[int]:
     return (np.arange(EGOS) * vehicles // EGOS).tolist()
 
 
-def _us(results: Results, method: str, copies: int) -> float | None:
-    return views.mean(results, {"method": method, "copies": copies}, "us")
+def costs(results: Results, method: str) -> dict[int, float | None]:
+    """Number of vehicles -> microseconds per vehicle served, step and run."""
+    each = len(scene.fleet(results.settings["data"]).ids)
+    return {each * copies: mean(results, {"method": method, "copies": copies}, "us") for copies in COPIES}
+
+
+def _growth(results: Results, method: str) -> float | None:
+    """Cost in the largest fleet over that in the smallest."""
+    found = list(ran(costs(results, method)).values())
+    return found[-1] / found[0] if found else None
 
 
 def _table(results: Results) -> Table | None:
-    from coopoc.study.style import look
-    from coopoc.study.tables import Table
-
-    sizes = [copies for copies in COPIES if views.present(results, {"copies": copies}, "us")]
-    each = len(scene.fleet(results.settings["data"]).ids)
-    body = []
-    for method in ("observe", *PER_EGO, *DISTRIBUTED):
-        found = [_us(results, method, copies) for copies in sizes]
-        ran = [value for value in found if value is not None]
-        if ran:
-            name = "Observing" if method == "observe" else look(method).label
-            body.append((name, *found, ran[-1] / ran[0]))
-    header = ("Method", *(f"{each * copies:,} vehicles" for copies in sizes), "Largest / smallest")
-    return Table(header, tuple(body), _caption(results), decimals=2) if body else None
+    found = {method: costs(results, method) for method in ("observe", *METHODS)}
+    sizes = sorted({size for each in found.values() for size in ran(each)})
+    body = [
+        ("Observing" if m == "observe" else look(m).label, *(each[size] for size in sizes), _growth(results, m))
+        for m, each in found.items()
+        if ran(each)
+    ]
+    header = ("Method", *(f"{size:,} vehicles" for size in sizes), "Largest / smallest")
+    return Table(header, tuple(body), _caption(results)) if body else None
 
 
 def _caption(results: Results) -> str:
@@ -111,16 +112,11 @@ def _caption(results: Results) -> str:
 
 
 def _figure(results: Results) -> Plot | None:
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
+    from coopoc.study.lines import Line, draw
+    from coopoc.study.plot import Plot, canvas, legend, plain_log
 
-    each, drawn = len(scene.fleet(results.settings["data"]).ids), []
     with canvas(1, 1, width=5.6, height=3.6) as (figure, panel):
-        for method in (*PER_EGO, *DISTRIBUTED):
-            found = {each * copies: _us(results, method, copies) for copies in COPIES}
-            ran = {size: value for size, value in found.items() if value is not None}
-            if ran:
-                panel.plot(list(ran), list(ran.values()), **strokes({"method": method}))
-                drawn.append({"method": method})
+        drawn = draw(panel, [Line({"method": method}, costs(results, method)) for method in METHODS])
         if not drawn:
             return None
         plain_log(panel.xaxis)
@@ -130,42 +126,25 @@ def _figure(results: Results) -> Plot | None:
     return Plot(figure, _caption(results))
 
 
-def _findings(results: Results) -> Sequence[str]:
-    worst = {}
-    for method in (*PER_EGO, *DISTRIBUTED):
-        ran = [value for copies in COPIES if (value := _us(results, method, copies)) is not None]
-        if len(ran) > 1:
-            worst[method] = ran[-1] / ran[0]
-    if not worst:
-        return []
-    name = max(worst, key=lambda method: worst[method])
-    verdict = "grows by less than 1.5 times" if worst[name] <= 1.5 else "grows by MORE than 1.5 times"
-    return [
-        f"Cost per vehicle and step {verdict} from the smallest to the largest fleet: most for {name}, "
-        f"{worst[name]:.2f} times."
-    ]
+def _findings(results: Results) -> dict[str, str]:
+    found = {m: _growth(results, m) for m in METHODS if len(ran(costs(results, m))) > 1}
+    if not (growth := ran(found)):
+        return {}
+    name = max(growth, key=lambda method: growth[method])
+    verdict = "grows by less than 1.5 times" if growth[name] <= 1.5 else "grows by MORE than 1.5 times"
+    return {
+        "growth": f"Cost per vehicle and step {verdict} from the smallest to the largest fleet: most for {name}, "
+        f"{growth[name]:.2f} times."
+    }
 
 
 STUDY = Study(
-    name="scaling",
-    question="What does a vehicle cost as the fleet grows?",
+    "scaling",
+    "What does a vehicle cost as the fleet grows?",
     cell=cell,
     key=key,
-    grid=_grid(),
-    settings={
-        "data": "town10",
-        "scenario": 2,
-        "velocity_ratio": 0.15,
-        "velocity_reading": "axis",
-        "radius_m": 30.0,
-        "max_neighbours": 6,
-        "steps": 60,
-        "repeats": 3,
-        "runs": 4,
-        "seed": 0,
-        "egos": "auto",
-        "train_seeds": 0,
-    },
+    grid={"copies": COPIES, "method": ("observe", *METHODS)},
+    settings={**scene.TOWN, "max_neighbours": 6, "steps": 60, "repeats": 3, "runs": 4, "train_seeds": 0},
     shares=("copies",),
     tables={"cost": _table},
     figures={"cost": _figure},

@@ -1,4 +1,4 @@
-"""The scene of a cell: which fleet drives, under which sensors and channel, and who is looked at."""
+"""The scene of a cell: which fleet drives, under which sensors and channel, and which vehicles are scored."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -23,9 +23,17 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import spoofed
 from coopoc.world.v2x import V2X
 
+if TYPE_CHECKING:
+    from coopoc.study.results import Results
+
 Start = Literal["gnss", "true"]
 CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "optimize", "evaluate", "learned", "data", "studies"))
 """The packages whose code makes the numbers of a cell."""
+DRAWN: Mapping[str, Any] = {"data": "town10", "egos": "auto", "seed": 0}
+WEIGHTS: Mapping[str, Any] = {"clients": "town10-clients", "weights": "runs/weights"}
+SOLO: Mapping[str, Any] = {"velocity_reading": "axis", "start": "gnss"}
+TOWN: Mapping[str, Any] = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0}
+"""Settings that studies share: draws; training; filters without neighbours; draws of scenario 2 with neighbours."""
 
 
 @lru_cache(maxsize=4)
@@ -35,7 +43,7 @@ def fleet(data: str) -> Fleet:
 
 
 def is_real(data: str) -> bool:
-    """True for data that holds real measurements between vehicles, which nobody needs to simulate."""
+    """True for data that holds real measurements between vehicles, which are not simulated."""
     return _recorder(data) is not None
 
 
@@ -68,18 +76,20 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
         return tuple(drive.ids[drive.index(i)] for i in wanted.split("+"))
     count = int(wanted)
     if not 1 <= count <= len(throughout):
-        raise InputError("egos", wanted, f"must be 1..{len(throughout)}, who is there throughout", "Take fewer.")
+        raise InputError(
+            "egos", wanted, f"must be 1..{len(throughout)}, vehicles that are present throughout", "Take fewer."
+        )
     return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
 
 
 CHANNELS = {"ideal": V2X.ideal, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
 """Channels by name; "ideal" counts payload only."""
 LASTING = ("own_share", "common_share")
-"""Parameters: shares of a fix's variance that last for a while, of each receiver and of all alike."""
+"""Parameters: shares of a fix's variance that are time-correlated, of each receiver and common to all."""
 
 
 def sensors(p: Params) -> Sensors:
-    """What acts in scenario 1 or 2 of the paper, or in its training (0), with the velocity noise of the cell."""
+    """Noise of scenario 1 or 2 of the paper, or of its training (0), with the velocity noise of the cell."""
     ratio, reading = float(p["velocity_ratio"]), p["velocity_reading"]
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
@@ -96,7 +106,7 @@ def sensors(p: Params) -> Sensors:
 
 
 def lasting(noise: Sensors, own: float, common: float) -> Sensors:
-    """The same variance of a fix, of which the shares `own` and `common` last for a while (`Sensors.gnss_drift_std`).
+    """The same variance of a fix, with its shares `own` and `common` time-correlated (`Sensors.gnss_drift_std`).
 
     >>> lasting(Sensors(), 0.36, 0.0).gnss_drift_std.__round__(3)
     0.9
@@ -116,13 +126,13 @@ def lasting(noise: Sensors, own: float, common: float) -> Sensors:
 
 
 def acting(p: Params) -> Sensors:
-    """The noise of the cell's measurements: what is simulated, or what was measured of real data."""
+    """Noise of the cell's measurements: the simulated one, or that measured of real data."""
     real = measured(p["data"])
     return sensors(p) if real is None else real.sensors
 
 
 def start(p: Params) -> Start:
-    """Where the filters of a cell start: "gnss", the first fix, unless it names "true", the true position."""
+    """Start of the filters of a cell: "gnss", the first fix, unless it names "true", the true position."""
     found: Start = p.get("start", "gnss")
     if found not in get_args(Start):
         raise InputError("start", repr(found), "must be gnss or true", "The first fix, or the true position.")
@@ -155,7 +165,7 @@ def relative(noise: Sensors) -> str:
 
 
 def conditions(p: Params) -> str:
-    """Heading and size of a cell, for captions; of real data also what is simulated in it and what uses truth."""
+    """Heading and size of a cell, for captions; of real data also its simulated parts and uses of the truth."""
     real = measured(p["data"])
     labels = "" if real is None else f" ({'; '.join(real.notes)})"
     who = egos(p["data"], str(p["egos"]))
@@ -164,36 +174,43 @@ def conditions(p: Params) -> str:
     return f"{heading(p)}{labels}; {size}{trained}."
 
 
+def caption(results: Results, *texts: str, **at: Any) -> str:
+    """The texts, which may name settings in braces, and the conditions of the study, or of the selection `at` of it."""
+    p = {**results.settings, **at}
+    return " ".join([*(text.format(**p) for text in texts), conditions(p)])
+
+
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def channel(p: Params) -> V2X:
-    """Neighbourhood and budget of the cell; what it does not name is ideal; a cap of 0 is none, a rate of 0 the
-    channel's own."""
+    """Neighbourhood and budget of the cell, ideal where it names nothing else.
+
+    A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
+    """
     name, cap = p.get("channel", "ideal"), float(p.get("cap_bytes_per_second", 0.0))
     if name not in CHANNELS:
         raise InputError("channel", repr(name), f"must be one of {sorted(CHANNELS)}", "Pick one.")
     found: V2X = CHANNELS[name](int(p.get("max_neighbours", 0)))
+    losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
+    given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(
         found,
         radius=float(p.get("radius_m", 30.0)),
         rate=p.get("rate_hz") or found.rate,
-        loss=_given(p, "loss", found.loss),
-        burst=_given(p, "burst", found.burst),
-        latency=_given(p, "latency_s", found.latency),
         bytes_per_second=cap or float("inf"),
         schedule=p.get("schedule", found.schedule),
+        **given,
     )
 
 
-def _given(p: Params, name: str, default: float) -> float:
-    value = p.get(name)
-    return default if value is None else float(value)
-
-
 def facts(p: Params) -> Mapping[str, str]:
-    """What changes the numbers beyond a cell's parameters: its data and all code; InputError for what cannot be."""
+    """Digests that change the numbers beyond a cell's parameters: of its data and of all code.
+
+    Raises:
+        InputError: parameters that no cell can be computed with.
+    """
     sensors(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
     if int(p.get("runs", 1)) < 1:
         raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
@@ -212,12 +229,17 @@ def _digests(data: str) -> Mapping[str, str]:
 
 
 def recording(p: Params) -> Recording:
-    """What the vehicles of the cell see; the real measurements where there are any."""
+    """Recording of the cell's vehicles; the real measurements where there are any."""
     who = egos(p["data"], str(p["egos"]))
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
     seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
     share = float(p.get("spoofed_share", 0.0))
     return spoofed(seen, share, seed=int(p["seed"]), honest=who) if share else seen
+
+
+def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
+    """Recording, egos and fleet of a cell."""
+    return recording(p), egos(p["data"], str(p["egos"])), fleet(p["data"])
 
 
 @lru_cache(maxsize=2)

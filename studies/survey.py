@@ -1,4 +1,4 @@
-"""What collaboration gives and what it costs: six studies, and one report whose first lines answer the questions."""
+"""Gain and cost of collaboration: six studies, and one report whose first lines answer the questions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from coopoc.study.study import Finding
+from coopoc.study.style import look
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -21,7 +21,7 @@ PRIOR = {
     "with the noise known": ("nominal", "trained", "none"),
     "with the noise fitted elsewhere": ("fitted", "trained"),
 }
-"""What a method may know: the sensors' true figures, or what vehicles learned while they drove alone."""
+"""Noise models that are compared: the sensors' true figures, or figures fitted and trained without neighbours."""
 
 
 def survey(
@@ -30,7 +30,7 @@ def survey(
     data: Annotated[str, tyro.conf.arg(metavar="NAME_OR_PATH")] = "town10",
     runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
 ) -> int:
-    """Run the studies of bytes, lasting errors, late messages, headings, lies and consistency, and write one report.
+    """Run the studies of bytes, correlated errors, latency, headings, spoofing and consistency, and write one report.
 
     Example: coopoc survey --out runs/survey --jobs 2
 
@@ -67,52 +67,43 @@ def stages(names: Sequence[str], out: Path, jobs: int, changes: Mapping[str, Any
 
 
 def ended(began: float, found: Mapping[str, Results], page: Path) -> int:
-    """Say what it took and where the report is; 1 if cells have failed."""
+    """Print the time and where the report is; 1 if cells have failed."""
     failed, took = sum(results.failed for results in found.values()), (time.perf_counter() - began) / 60
     print(f"coopoc: done in {took:.1f} min, {failed} failed cells. The report is {page}", file=sys.stderr)
     return int(failed > 0)
 
 
+LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
+QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "correlated_gnss": ("If errors of GNSS last?", ("own", "common")),
+    "latency_loss": ("If messages are late or lost?", ("late", "lost one by one")),
+    "heading_error": ("If the heading is wrong?", ("heading_bias_deg, K = 2", "heading_bias_deg, K = 10")),
+    "robustness": ("If neighbours lie?", ("K = 4", "K = 10")),
+    "consistency": ("Whose covariance can be believed?", ("credible",)),
+}
+"""Study -> question, and the keys of the findings that answer it."""
+
+
 def answers(found: Mapping[str, Results]) -> dict[str, str]:
-    """Question -> answer, from what was run."""
-    said = {}
-    for limit, words in LIMITS.items():
-        if "budget" in found and (answer := _under(found["budget"], limit)):
-            said[f"Which method with {words}?"] = answer
+    """Question -> answer, from the results of the studies that were run."""
+    from coopoc.plugins import find
+
+    given = {}
+    for limit, words in LIMITS.items() if "budget" in found else ():
+        given[f"Which method with {words}?"] = _under(found["budget"], limit)
     for name, (question, keys) in QUESTIONS.items():
-        given = _findings(name, found[name]) if name in found else []
-        texts = [str(f) for f in given if not keys or (isinstance(f, Finding) and f.key in keys)]
-        if texts:
-            said[question] = " ".join(map(_sentence, texts[:2]))
-    return said
+        if name in found:
+            texts = find("coopoc.studies", name).found(found[name])
+            given[question] = " ".join(_sentence(texts[key]) for key in keys if key in texts)
+    return {question: answer for question, answer in given.items() if answer}
 
 
 def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
-QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "correlated_gnss": ("If errors of GNSS last?", ("own", "common")),
-    "latency_loss": ("If messages are late or lost?", ()),
-    "heading_error": ("If the heading is wrong?", ("heading_bias_deg",)),
-    "robustness": ("If neighbours lie?", ()),
-    "consistency": ("Whose covariance can be believed?", ()),
-}
-"""Study -> question, and the keys of the findings that answer it; none for all of them."""
-
-
-def _findings(name: str, results: Results) -> Sequence[Finding | str]:
-    from coopoc.plugins import find
-
-    study = find("coopoc.studies", name)
-    return list(study.findings(results)) if study.findings else []
-
-
 def _under(results: Results, limit: float) -> str:
-    """The best on an ideal channel within a limit of bytes per second, for each kind of knowledge, beside the bound."""
-    from coopoc.study.style import look
-
+    """The best on an ideal channel within a limit of bytes per second, for each noise model, beside the bound."""
     from . import budget
 
     parts, ran = [], budget.choices(results)

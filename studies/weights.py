@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
-"""Nets of single clients, of as many as there are, at most six."""
+"""Nets of single clients, one per client, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
-"""What the paper trains, and the fair floor."""
+"""Methods that the paper trains, and the optimised Kalman filter."""
 LEARNED = (*PAPER, "fedokf", "magnitude", "split", "recursive", "cooperative")
 """Methods that are trained."""
 
@@ -51,7 +51,7 @@ def trainable(p: Params) -> bool:
 
 
 def is_trained(name: str) -> bool:
-    """Whether a method is trained first: by its name, or as a recipe or a net in a file, mine.py:NAME."""
+    """True for a method that is trained: by its name, or as a recipe or a net in a file, mine.py:NAME."""
     return name in LEARNED or (in_file(name) and getattr(from_file(name, "method"), "trainable", False))
 
 
@@ -85,14 +85,14 @@ def _jobs(recipe: str, digest: str, clients: str, setting: Setting) -> list[tupl
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
-    """Train what the cells need and is not there yet, with progress: `jobs` recipes at a time."""
-    from coopoc.learned.train import train_all
-
+    """Train the missing weights of the cells, with progress: `jobs` recipes at a time."""
     wanted: dict[tuple[str, str, int], list[Params]] = {}
     for p in cells:
         if is_trained(p["method"]):
             wanted.setdefault((p["clients"], p["weights"], len(seeds(p))), []).append(p)
     for (clients, folder, count), asking in wanted.items():
+        from coopoc.learned.train import train_all
+
         train_all(
             fleet(clients),
             folder,
@@ -173,7 +173,7 @@ def described(results: Results) -> Mapping[str, str]:
 
 
 def _own(card: Mapping[str, Any]) -> str:
-    """How a net that the paper does not have was trained otherwise than the paper's."""
+    """Training of a net that the paper does not have."""
     plan, how = card["settings"], card["settings"]["schedule"]
     pieces = "mirrored" if how["mirror"] else "as they are"
     return (
@@ -183,7 +183,7 @@ def _own(card: Mapping[str, Any]) -> str:
 
 
 def _nets(card: Mapping[str, Any], count: int) -> str:
-    """What the paper's nets have in common, from the card of one."""
+    """Training that the paper's nets have in common, from the card of one."""
     plan, how = card["settings"], card["settings"]["schedule"]
     pieces = "mirrored at random" if how["mirror"] else "as they are"
     which = f"seeds 0 to {count - 1}" if count > 1 else "seed 0"

@@ -11,7 +11,7 @@ import pytest
 from coopoc import V2X, Fleet, Sensors, observe, run_study
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies import heading_error as study
-from coopoc.studies import views
+from coopoc.study import numbers
 from coopoc.world.spherical import wrap
 
 NOISE = Sensors(heading_std=0.05)
@@ -54,7 +54,7 @@ def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path, short_town: str)
     results = run_study("heading_error", tmp_path, settings=wanted, progress=False)
     for kind in study.KINDS:
         none, told, ignored = (
-            views.mean(results, study.at(kind, size, "joint", known, 10), "nees")
+            numbers.mean(results, study.at(kind, size, "joint", known, 10), "nees")
             for size, known in ((0.0, "nominal"), (8.0, "nominal"), (8.0, study.EXACT))
         )
         assert none is not None

@@ -78,9 +78,7 @@ def circles(package: str) -> list[list[str]]:
     return sorted(list(group) for group in found if group[0] in reached[group[-1]] and len(group) > 1)
 
 
-@pytest.mark.parametrize(
-    "package", ["coopoc.study", "coopoc.data", "coopoc.world", "coopoc.formats", "coopoc.evaluate"]
-)
+@pytest.mark.parametrize("package", ["coopoc", *FOLDERS])
 def test_no_file_imports_in_a_circle(package: str) -> None:
     assert circles(package) == []
 

@@ -66,7 +66,7 @@ STUDY = Study(
     cell=cell,
     grid={"x": (1, 2), "method": ("kalman", SCRIPT)},
     tables={"rt_le": table},
-    findings=lambda results: [f"Finding {SCRIPT}"],
+    findings=lambda results: {"script": f"Finding {SCRIPT}"},
     limitations=(SCRIPT,),
 )
 

@@ -23,7 +23,7 @@ from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import Setting, jobs_of, load_method
 from coopoc.plugins import find
-from coopoc.studies import claims, convergence, error_cdf, neighbours, paper, scene, weights
+from coopoc.studies import convergence, error_cdf, lineup, neighbours_findings, paper, scene, weights
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
@@ -62,7 +62,7 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     assert bound == sorted(bound, reverse=True)
     assert np.array(joint) == pytest.approx(np.array(bound), rel=0.15)
     shown = published(tmp_path / "neighbours")
-    said = "\n".join(shown["findings"])
+    said = "\n".join(shown["findings"].values())
     assert "LKF-SA falls from K = 2 to 6" in said
     assert "order" not in said  # there is no net to order
     rms = np.sqrt(
@@ -90,7 +90,7 @@ def test_neighbours_of_solo_filters_alone_ends_well(tmp_path: Path) -> None:
         "nees",
         "nees_inside",
     ]
-    assert shown["findings"] == []
+    assert shown["findings"] == {}
 
 
 @pytest.mark.parametrize("rate", [10.0, 2.0])
@@ -102,8 +102,8 @@ def test_the_bound_receives_what_the_channel_sends(rate: float) -> None:
         "rate_hz": rate,
         "cap_bytes_per_second": 0.0,
     }
-    (bound,) = neighbours.cell({**p, "method": "bound", "noise_model": "bound"})
-    (joint,) = neighbours.cell({**p, "method": "joint", "noise_model": "nominal"})
+    (bound,) = lineup.cell({**p, "method": "bound", "noise_model": "bound"})
+    (joint,) = lineup.cell({**p, "method": "joint", "noise_model": "nominal"})
     assert bound["bytes_per_second"] == pytest.approx(joint["bytes_per_second"], rel=0.1)
 
 
@@ -139,8 +139,8 @@ def lkf(*levels: float) -> pd.DataFrame:
     ],
 )
 def test_a_fall_with_k_is_claimed_only_if_it_was_seen(levels: tuple[float, ...], words: str | None) -> None:
-    said = claims.findings(drawn("neighbours", lkf(*levels), "method", "max_neighbours"))
-    assert [words in said[0]] == [True] if words else said == []
+    said = neighbours_findings.findings(drawn("neighbours", lkf(*levels), "method", "max_neighbours"))
+    assert words in said["identity"] if words else not any(said.values())
 
 
 def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
@@ -175,15 +175,16 @@ def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
     ],
 )
 def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: int, words: str) -> None:
-    (said,) = error_cdf.STUDY.findings(cdf(net, runs))  # type: ignore[misc]
-    assert words in said
+    found = error_cdf.STUDY.found(cdf(net, runs))
+    assert list(found) == ["scenario 1"]
+    assert words in found["scenario 1"]
 
 
 def test_nothing_is_claimed_where_the_interval_is_not_finite() -> None:
     results = cdf((0.1, 0.1))
     one = replace(results, frame=results.frame[(results.frame["ego"] == 0) & (results.frame["run"] == 0)])
-    (said,) = error_cdf.STUDY.findings(one)  # type: ignore[misc]
-    assert "cannot be judged against the fitted KF: too few seeds, egos or runs" in said
+    found = error_cdf.STUDY.found(one)
+    assert "cannot be judged against the fitted KF: too few seeds, egos or runs" in found["scenario 1"]
 
 
 def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:
@@ -344,7 +345,9 @@ def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path:
     assert joint.mean < kalman.mean < 0.12
     shown = published(tmp_path / "neighbours")
     assert all("GNSS is simulated" in view["caption"] for view in shown["tables"])
-    assert "range 1 m, angles 4°, nobody nearer than 2 m; in this data it is range 0.09" in shown["findings"][-1]
+    assert (
+        "range 1 m, angles 4°, nobody nearer than 2 m; in this data it is range 0.09" in shown["findings"]["transfer"]
+    )
 
 
 def test_real_measurements_are_one_case_without_an_oracle(shared: Path, tmp_path: Path) -> None:
@@ -357,7 +360,7 @@ def test_real_measurements_are_one_case_without_an_oracle(shared: Path, tmp_path
     shown = published(tmp_path / "error_cdf")
     assert [view["name"] for view in shown["tables"]] == ["scenario1_15"]
     assert [view["name"] for view in shown["figures"]] == ["cdf_scenario1_15"]
-    (said,) = shown["findings"]
+    (said,) = shown["findings"].values()
     assert said.startswith("Real data, trained with velocity noise per axis, start at the first fix. RT-LE: fitted KF")
     assert "2 runs, 1 ego of MRCLAM_Dataset6, 1 training seed." in shown["tables"][0]["caption"]
     p = {**study("error_cdf", data=data, egos="1").settings, "scenario": 1, "velocity_ratio": 0.15, "method": "kalman"}

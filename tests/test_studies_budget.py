@@ -14,7 +14,8 @@ from coopoc.learned import load as load_weights
 from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of
 from coopoc.studies import budget as study
 from coopoc.studies import budget_tables as tables
-from coopoc.studies import scene, views
+from coopoc.studies import scene
+from coopoc.study import numbers
 from coopoc.study.tables import Table
 from coopoc.world.sensing import find_links
 
@@ -54,7 +55,7 @@ def rows(table: Table | None) -> list[tuple[object, ...]]:
 
 
 def at(**where: object) -> dict[str, object]:
-    return {"max_neighbours": 2, **study.FREE, "method": "joint", "noise_model": "nominal", **where}
+    return {"max_neighbours": 2, **tables.FREE, "method": "joint", "noise_model": "nominal", **where}
 
 
 def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: str) -> None:
@@ -62,18 +63,18 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
     drive = load_fleet(short_town)
     egos = [drive.index(ego) for ego in scene.egos(short_town, "2")]
     near = len(find_links(drive, egos, 2, 30.0, 2.0)) / len(egos) / len(drive.t)
-    ideal = [views.mean(results, at(channel="ideal"), kind) for kind in SIZES]
+    ideal = [numbers.mean(results, at(channel="ideal"), kind) for kind in SIZES]
     assert ideal == pytest.approx([near * 320, near * 320])
-    payload, air = (views.mean(results, at(channel="cam"), kind) for kind in SIZES)
+    payload, air = (numbers.mean(results, at(channel="cam"), kind) for kind in SIZES)
     assert payload is not None
     assert air == pytest.approx(payload * 382 / 32)
     assert payload < 0.3 * near * 320  # 2.2 Hz and 2 % lost
 
 
 def test_channels_keep_their_order(results: Results) -> None:
-    error = {name: views.mean(results, at(channel=name)) for name in scene.CHANNELS}
+    error = {name: numbers.mean(results, at(channel=name)) for name in scene.CHANNELS}
     assert error["ideal"] == min(error.values())  # type: ignore[type-var]
-    assert views.mean(results, at(method="bound", noise_model="bound", channel="ideal")) is not None
+    assert numbers.mean(results, at(method="bound", noise_model="bound", channel="ideal")) is not None
 
 
 def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None:
@@ -111,7 +112,7 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
     for gap, wanted in zip(found[3:], gaps, strict=True):
         assert [gap.mean, gap.low, gap.high] == pytest.approx([wanted.mean, wanted.low, wanted.high])
         assert gap.mean != 0.0
-    (said,) = [sentence for sentence in study._findings(tight) if sentence.startswith("Heard first")]
+    said = study.STUDY.found(tight)["schedules, joint"]
     for schedule, error in zip(tables.SCHEDULES, errors, strict=True):
         assert f"{schedule} {error.mean():.3g} m" in said
 
@@ -125,7 +126,7 @@ def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short
     card = load_weights(WEIGHTS / "fedokf.safetensors").card
     once = (len(card["history"]) - 1) * 4 * (2 * card["parameters"] + 1)
     (row,) = [row for row in rows(tables.even(tight)) if row[0] == tables.WORDS["cam"]]
-    assert row[2:] == (round(account.rate()), tables.spoken(once / account.rate()))
+    assert row[2:] == (round(account.rate()), tables.duration(once / account.rate()))
     body = {row[:2]: row[2:] for row in rows(tables.ledger(tight))}
     assert body["a training, once", "payload, per receiver"] == (None, f"{once / 1e3:,.0f} kB")
     for kind, way in tables.COUNTS:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from coopoc import run_study
-from coopoc.studies import latency_loss, robustness, views
+from coopoc.studies import latency_loss, robustness
+from coopoc.study import numbers
 
 
 def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
@@ -21,7 +22,7 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short
     }
     results = run_study("latency_loss", tmp_path, settings=wanted, progress=False)
     perfect, late, lossy = (
-        views.mean(results, {**latency_loss.PERFECT, "method": "joint", **change})
+        numbers.mean(results, {**latency_loss.PERFECT, "method": "joint", **change})
         for change in ({}, {"latency_s": 0.3}, {"loss": 0.6})
     )
     assert perfect is not None
@@ -44,7 +45,7 @@ def test_who_trusts_everybody_is_led_astray_and_who_is_careful_is_not(tmp_path: 
     }
     results = run_study("robustness", tmp_path, settings=wanted, progress=False)
     alone, trusting, careful, unharmed = (
-        views.mean(results, robustness.at(method, 4, share))
+        numbers.mean(results, robustness.at(method, 4, share))
         for method, share in (("kalman", 0.4), ("joint", 0.4), *(("cooperative-map-gnc", s) for s in (0.4, 0.0)))
     )
     assert alone is not None

@@ -47,8 +47,9 @@ def test_backends_are_held_against_scipy(tmp_path: Path, short_town: str) -> Non
     assert set(results.frame["method"]) == set(backends.BACKENDS)
     assert (results.frame["same"] == 1.0).all()
     assert (results.frame["gap_m"] > 0).any()  # the referee is somebody else
-    (said,) = backends._findings(results)
-    assert "100.0 % end where SciPy's least squares does, and 0 in a worse minimum." in said
+    found = backends.STUDY.found(results)
+    assert list(found) == ["minima"]
+    assert "100.0 % end where SciPy's least squares does, and 0 in a worse minimum." in found["minima"]
 
 
 def test_the_referee_solves_a_linear_problem_as_lstsq_does(short_town: str) -> None:

@@ -10,12 +10,12 @@ from conftest import crossing_fleet, formation_fleet
 
 import coopoc as co
 from coopoc.data.table import write_table
-from coopoc.evaluate.bounds import posterior_bound
+from coopoc.evaluate.bounds import past_bound, posterior_bound
 from coopoc.learned.checkpoint import Checkpoint, save
 from coopoc.learned.nets.noise_net import NoiseNet
 from coopoc.learned.recipes import Setting, jobs_of
 from coopoc.studies import cooperative_gain
-from coopoc.studies.cooperative_gain import STUDY, past_bound
+from coopoc.studies.cooperative_gain import STUDY
 from coopoc.study.publish import views as published
 from coopoc.study.run import run_study
 
@@ -52,8 +52,9 @@ def test_views_say_what_was_run(tmp_path: Path, weights: str) -> None:
     shown = published(tmp_path / "cooperative_gain")
     assert [view["name"] for view in shown["tables"]] == ["rt_le", "bytes", "nees", "nees_inside", "receivers"]
     assert [view["name"] for view in shown["figures"]] == ["rt_le"]
-    assert [said.split(":")[0] for said in shown["findings"]] == [f"{loss} % loss, K = 6" for loss in (0, 70)]
-    assert f"the cooperative gain has {clear:.3f} m" in shown["findings"][0]
+    assert list(shown["findings"]) == ["0 % loss", "70 % loss"]
+    assert all(said.startswith(f"{key}, K = 6: ") for key, said in shown["findings"].items())
+    assert f"the cooperative gain has {clear:.3f} m" in shown["findings"]["0 % loss"]
 
 
 def test_nothing_is_shown_of_what_was_not_run(tmp_path: Path) -> None:
@@ -64,7 +65,7 @@ def test_nothing_is_shown_of_what_was_not_run(tmp_path: Path) -> None:
     assert results.failed == 0
     shown = published(tmp_path / "cooperative_gain")
     assert [view["name"] for view in shown["tables"]] == ["rt_le", "bytes", "nees", "nees_inside"]
-    assert shown["findings"] == []
+    assert shown["findings"] == {}
 
 
 def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes() -> None:

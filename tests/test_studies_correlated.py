@@ -9,7 +9,8 @@ import pytest
 
 from coopoc import InputError, Sensors, run_study
 from coopoc.studies import correlated_gnss as study
-from coopoc.studies import scene, views
+from coopoc.studies import scene
+from coopoc.study import numbers
 
 QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
 
@@ -18,7 +19,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
     results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
     value = {
-        name: [views.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
+        name: [numbers.rms(results, {**study.case(name), "method": "drift", "max_neighbours": k}) for k in (0, 6)]
         for name in ("white", "own", "common")
     }
     own, common = value["own"], value["common"]
@@ -28,8 +29,9 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     assert common[0] is not None
     assert common[1] is not None
     assert common[1] > 0.8 * common[0]
-    told = study._findings(results)
-    assert [str(finding).split(":")[0] for finding in told] == ["white", "own", "common"]
+    found = study.STUDY.found(results)
+    assert list(found) == ["white", "own", "common"]
+    assert all(text.startswith(f"{name}: ") for name, text in found.items())
     folder = tmp_path / "correlated_gnss"
     assert "Cramér-Rao bound" in (folder / "tables" / "rms.md").read_text()
     assert (folder / "figures" / "rms.pdf").stat().st_size > 5_000

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from coopoc import load_fleet, run_study
-from coopoc.studies import generalisation, scaling, views
+from coopoc.studies import generalisation, scaling
+from coopoc.study import numbers
 from coopoc.world.sensing import find_links
 
 
@@ -21,8 +22,8 @@ def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path, short_
     }
     results = run_study("consistency", tmp_path, settings=wanted, progress=False)
     table = (tmp_path / "consistency" / "tables" / "nees.md").read_text()
-    good = views.mean(results, {"method": "joint", "noise_model": "nominal"}, "nees_inside")
-    bad = views.mean(results, {"method": "lkf-sa", "noise_model": "identity"}, "nees_inside")
+    good = numbers.mean(results, {"method": "joint", "noise_model": "nominal"}, "nees_inside")
+    bad = numbers.mean(results, {"method": "lkf-sa", "noise_model": "identity"}, "nees_inside")
     assert good is not None
     assert bad is not None
     assert good > 0.9 > 0.1 > bad
@@ -37,7 +38,7 @@ def test_copies_do_not_see_each_other_and_cost_is_counted_per_vehicle(tmp_path: 
     assert len(links) == 2 * len(find_links(load_fleet("town10").between(0, 10), range(60), 6, 30.0))
     wanted = {"steps": 10, "runs": 1, "repeats": 1, "copies": "1,2", "method": "observe,kalman,gbp"}
     results = run_study("scaling", tmp_path, settings=wanted, progress=False)
-    each = [scaling._us(results, "gbp", copies) for copies in (1, 2)]
+    each = [scaling.costs(results, "gbp")[vehicles] for vehicles in (60, 120)]
     assert all(value is not None and np.isfinite(value) and value > 0 for value in each)
     assert "Largest / smallest" in (tmp_path / "scaling" / "tables" / "cost.md").read_text()
 

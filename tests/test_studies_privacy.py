@@ -107,7 +107,7 @@ def test_views(ran: tuple[Path, Results]) -> None:
     assert [view["name"] for view in shown["figures"]] == ["rt_le", "probe"]
     assert all((folder / "figures" / f"{name}.png").stat().st_size > 10_000 for name in ("rt_le", "probe"))
     assert all("1 ego of town10, 2 training seeds" in view["caption"] for view in shown["tables"] + shown["figures"])
-    net, okf = shown["findings"]
+    net, okf = shown["findings"].values()
     assert net.startswith("FedKalmanNet, 3 clients: ")
     assert f"{mean(results, method='okf', epsilon=math.inf):.2f} m without privacy" in okf
 
@@ -117,7 +117,7 @@ def test_views_of_references_alone(few: str, tmp_path: Path) -> None:
     study = replace(privacy.STUDY, grid=grid).override({"runs": 2, "egos": "1"})
     assert run_study(study, tmp_path, progress=False).failed == 0
     shown = published(tmp_path / "privacy")
-    assert [shown[kind] for kind in ("tables", "figures", "findings")] == [[], [], []]
+    assert [shown[kind] for kind in ("tables", "figures", "findings")] == [[], [], {}]
 
 
 def test_the_grid_has_few_and_many_clients() -> None:

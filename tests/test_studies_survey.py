@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from coopoc.studies import survey, views
+from coopoc.studies import survey
+from coopoc.study import numbers
 from coopoc.study.report import report
 
 
@@ -25,7 +26,7 @@ def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: 
     assert "stage 1 of 2: heading_error" in capsys.readouterr().err
     said = survey.answers(found)
     alone, together, bound = (
-        views.rms(found["budget"], {"method": method, "noise_model": known, "max_neighbours": k, "rate_hz": 0.0})
+        numbers.rms(found["budget"], {"method": method, "noise_model": known, "max_neighbours": k, "rate_hz": 0.0})
         for method, known, k in (("kalman", "nominal", 0), ("joint", "nominal", 4), ("bound", "bound", 4))
     )
     assert alone is not None

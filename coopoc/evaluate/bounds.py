@@ -65,6 +65,28 @@ def posterior_bound(
     return out
 
 
+def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
+    """`posterior_bound` (T, 3, 3) m^2, filtering, of an ego that knows all fixes and velocities of all vehicles, too.
+
+    Messages that carry sums since departure bring a new neighbour's past, which a star that forgets absent vehicles
+    does not count. It is never above the star's bound, and equal to it while the same neighbours stay.
+
+    Args:
+        fleet: truth.
+        sensors: the noise that acts, stds positive.
+        ego: column.
+        v2x: K and radius, not loss.
+
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> float(past_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0, V2X(0))[1, 0, 0])  # standing still: 4 / 2
+    2.0
+    """
+    links = find_links(fleet, [ego], v2x.max_neighbours, v2x.radius, sensors.min_range)
+    own = slice(3 * ego, 3 * ego + 3)
+    stages = stages_of(fleet, sensors, links, [np.arange(len(fleet.ids))] * len(fleet.t))
+    return np.stack([cov[own, own] for _, cov in covariances(stages, smoothing=False)])
+
+
 def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoothing: bool = False) -> Floats:
     """Bound covariances (T, N, 3, 3) m^2 of all vehicles from all that any of them measures; NaN where absent.
 

@@ -1,14 +1,17 @@
-"""pivot: one metric of a study's results as a table, such as methods across and neighbours down."""
+"""Tables of a study: `pivot` puts one metric's columns across and down, `crossed` any numbers beside any selections."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..evaluate.statistics import Interval
-from .results import Results
+from .numbers import Number, Where
 from .style import label, title, words
-from .tables import Best, Table
+from .tables import Best, Entry, Table
+
+if TYPE_CHECKING:
+    from .results import Results
 
 
 def pivot(
@@ -63,3 +66,43 @@ def pivot(
         intervals=intervals,
         notes=(f"{missing} egos are left out because a run of theirs failed.",) if missing else (),
     )
+
+
+def crossed(
+    results: Results,
+    head: Sequence[str],
+    rows: Iterable[tuple[Sequence[Entry], Where]],
+    columns: Sequence[tuple[str, Number]],
+    caption: str,
+    **options: Any,
+) -> Table | None:
+    """Table with a row per selection and a column per number; rows that were not run are left out.
+
+    Args:
+        results: of the study.
+        head: titles over the labels of a row.
+        rows: labels and selection of each.
+        columns: title and number of a selection, such as `coopoc.study.numbers.mean`.
+        caption: under the table.
+        options: of `Table`.
+
+    Returns:
+        The table, or None if no row was run.
+    """
+    found = [(labels, [number(results, where) for _, number in columns]) for labels, where in rows]
+    body = [(*labels, *entries) for labels, entries in found if any(entry is not None for entry in entries)]
+    return Table((*head, *(title for title, _ in columns)), tuple(body), caption, **options) if body else None
+
+
+def across(number: Number, selections: Mapping[str, Where]) -> list[tuple[str, Number]]:
+    """Columns of `crossed` that show one number.
+
+    Args:
+        number: of a selection.
+        selections: title -> what the column adds to the selection of a row.
+    """
+
+    def column(also: Where) -> Number:
+        return lambda results, where: number(results, {**where, **also})
+
+    return [(title, column(also)) for title, also in selections.items()]

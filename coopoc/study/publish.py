@@ -22,7 +22,7 @@ VIEWS = "views.json"
 _FIELDS = {
     "tables": list,
     "figures": list,
-    "findings": list,
+    "findings": dict,
     "recipe": dict,
     "missing": dict,
     "limitations": list,
@@ -54,11 +54,11 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
                 if shown is not None:
                     made[kind].append({"name": name, **save(shown, folder / kind / name)})
                 bar.update()
-    findings = _made(study.findings, results, missing, "findings") if study.findings else None
+    findings = _made(study.found, results, missing, "findings") or {}
     recipe = _made(study.recipe, results, missing, "recipe") if study.recipe else None
     content = {
         **made,
-        "findings": [*map(str, findings or ()), *_reference(study, results)],
+        "findings": {**findings, **_reference(study, results)},
         "recipe": dict(recipe or {}),
         "missing": missing,
         "limitations": list(study.limitations),
@@ -69,7 +69,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
 
 
 def views(folder: str | Path) -> Mapping[str, Any]:
-    """Read the views of a study: tables and figures by name, findings, recipe, views that are missing, limitations.
+    """Read the views of a study: tables and figures by name, findings by key, recipe, missing views, limitations.
 
     Raises:
         InputError: the study was not run to its end, the file is damaged, or a view's name is no file name.
@@ -110,15 +110,15 @@ def _made(view: Callable[[Results], Any], results: Results, missing: dict[str, s
         return None
 
 
-def _reference(study: Study, results: Results) -> list[str]:
+def _reference(study: Study, results: Results) -> dict[str, str]:
     """How many reference values hold; nothing for a run of other settings."""
     if study.reference is None or not Path(study.reference).is_file():
-        return []
+        return {}
     known = reference.Reference.load(study.reference)
     if reference.differing(results, known):
-        return []
+        return {}
     found = reference.check(results, known)
-    return [f"{reference.summary(found)[:-1]} (coopoc reference)."] if found else []
+    return {"reference": f"{reference.summary(found)[:-1]} (coopoc reference)."} if found else {}
 
 
 def _remove_others(folder: Path, made: Mapping[str, list[dict[str, Any]]]) -> None:

@@ -23,26 +23,7 @@ if TYPE_CHECKING:
     from .tables import Table
 
 
-__all__ = ["Cell", "Finding", "Params", "Row", "Scalar", "Study"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A sentence for the top of the report.
-
-    Args:
-        text: the sentence.
-        key: name by which a survey finds it among the findings of a study.
-
-    >>> print(Finding("The heading bias doubles the error.", key="heading_bias_deg"))
-    The heading bias doubles the error.
-    """
-
-    text: str
-    key: str = ""
-
-    def __str__(self) -> str:
-        return self.text
+__all__ = ["Cell", "Params", "Row", "Scalar", "Study"]
 
 
 def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:
@@ -75,7 +56,8 @@ class Study:
             each other in one worker, so that functools.lru_cache finds the recording.
         tables: name -> function of Results; None where the results lack what the table shows.
         figures: name -> function of Results, likewise.
-        findings: Results -> sentences for the top of the report.
+        findings: Results -> key -> sentence for the top of the report, empty where the results lack its numbers. The
+            key stays the same when the sentence changes: other code finds it by that.
         recipe: Results -> field -> value of the training, for the report.
         limitations: sentences.
         minutes: expected on one core.
@@ -101,7 +83,7 @@ class Study:
     shares: tuple[str, ...] = ()
     tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)
     figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
-    findings: Callable[[Results], Sequence[Finding | str]] | None = None
+    findings: Callable[[Results], Mapping[str, str]] | None = None
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
     limitations: tuple[str, ...] = ()
     minutes: float | None = None
@@ -130,6 +112,15 @@ class Study:
         if twice := [dict(cell.params) for cell in found if count[cell.name] > 1]:
             raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
         return found
+
+    def found(self, results: Results) -> dict[str, str]:
+        """Findings by key: those whose numbers were run.
+
+        >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).found(None)
+        {'a': 'It does.'}
+        """
+        given = self.findings(results) if self.findings else {}
+        return {key: text for key, text in given.items() if text}
 
     def override(self, changes: Mapping[str, Any]) -> Study:
         """The same study with other settings, or other values on an axis (a list, or words split at commas).

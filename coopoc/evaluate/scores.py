@@ -1,0 +1,128 @@
+"""Scores of a method in each run and for each ego of a recording, as columns and as rows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..arrays import AnyArray, Floats
+from ..errors import InputError
+from ..methods.track import Method, Track
+from ..world.fleet import Fleet
+from ..world.recording import Recording
+from .ledger import Kind, Way, of_track
+from .metrics import distance, errors, nees, neighbour_rt_le, rt_le, share_of_average
+
+BYTES: Mapping[str, tuple[Kind, Way]] = {
+    "bytes_per_second": ("on air", "per receiver"),
+    "sent_bytes_per_second": ("on air", "broadcast"),
+    "payload_bytes_per_second": ("payload", "per receiver"),
+    "sent_payload_bytes_per_second": ("payload", "broadcast"),
+}
+"""Columns of rows with the bytes of online cooperation, as a ledger counts them."""
+SLAB = 2**25
+"""Bytes of a Track, about: runs are scored while the cache still holds them, and memory does not grow with the number
+of runs."""
+LANES = 4
+"""Runs that kernels follow beside each other."""
+
+
+def rows_of(columns: Mapping[str, AnyArray], who: Sequence[str], **more: Any) -> list[dict[str, Any]]:
+    """Rows of columns (R, E), or (R, E, q) for lists: one per ego and run, all with the same `more`.
+
+    >>> rows_of({"rt_le_m": np.array([[1.0, 2.0]])}, ("a", "b"), round=3)[1]
+    {'run': 0, 'ego': 'b', 'round': 3, 'rt_le_m': 2.0}
+    """
+    runs = len(next(iter(columns.values())))
+    return [
+        {"run": r, "ego": ego, **more, **{name: values[r, e].tolist() for name, values in columns.items()}}
+        for e, ego in enumerate(who)
+        for r in range(runs)
+    ]
+
+
+def bounded_rt_le(method: Method, recording: Recording, egos: Sequence[str], drive: Fleet, most: float) -> Floats:
+    """RT-LE (R, E) m, cut at `most`, which is also that of a method whose estimates are not finite.
+
+    Args:
+        method: that follows the egos.
+        recording: its measurements and messages.
+        egos: ids.
+        drive: the truth.
+        most: m.
+    """
+    try:
+        return np.fmin(rt_le(method(recording, egos), drive), most)
+    except InputError as error:
+        if error.field != "x":  # the estimates of the track, of which one is not finite
+            raise
+        return np.full((recording.runs, len(egos)), most)
+
+
+def scored(
+    method: Method, recording: Recording, egos: Sequence[str], drive: Fleet, quantiles: int = 0
+) -> dict[str, AnyArray]:
+    """Errors, consistency and bytes of a method for E egos in R runs, some runs at a time.
+
+    Args:
+        method: that follows the egos.
+        recording: its measurements and messages.
+        egos: ids.
+        drive: the truth.
+        quantiles: number of quantiles of the distances.
+
+    Returns:
+        Columns (R, E): `neighbours_mean`; RT-LE, largest error and neighbours' error in m; the rates of BYTES;
+        `worse_than_gnss`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of wall time per
+        run and vehicle served; and `error_quantiles_m` (R, E, q) if some are wanted.
+
+    >>> from coopoc import GNSS, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> scored(GNSS(), observe(fleet, Sensors(), runs=3), ["a"], fleet)["rt_le_m"].shape
+    (3, 1)
+    """
+    seconds, parts, squares = 0.0, list[dict[str, AnyArray]](), list[Floats]()
+    for part in slabs(recording, len(egos)):
+        track = method(part, egos)
+        seconds += track.seconds
+        parts.append(_columns(track, part, method, drive, quantiles))
+        if track.covariance is not None:
+            each = nees(track, drive)
+            parts[-1]["nees"] = np.nanmean(each, axis=1)
+            squares.append(each.sum(axis=0))
+    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    near = [len(recording.links.of(recording.ids.index(ego))) / len(recording.t) for ego in egos]
+    served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
+    more: dict[str, Any] = {"neighbours_mean": near, "seconds": seconds / recording.runs / served}
+    if squares:
+        more["nees_inside"] = share_of_average(np.sum(squares, axis=0) / recording.runs, recording.runs)
+    return {**{name: np.broadcast_to(value, found["rt_le_m"].shape) for name, value in more.items()}, **found}
+
+
+def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
+    """The recording in parts of some runs each, as many as the cache holds."""
+    per_run = 8 * (12 * len(recording.t) * egos + 3 * len(recording.links))
+    runs = max(1, SLAB // (LANES * per_run)) * LANES
+    for first in range(0, recording.runs, runs):
+        yield recording.of_runs(slice(first, first + runs)) if runs < recording.runs else recording
+
+
+def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, quantiles: int) -> dict[str, AnyArray]:
+    """Columns that need no average over runs."""
+    error, mine = errors(track, drive), list(track.egos)
+    level = np.sqrt((error**2).mean(axis=1))
+    fixes = np.sqrt((distance(recording.gnss.take(mine, axis=2), drive.position[:, mine]) ** 2).mean(axis=1))
+    account = of_track(track, recording, method.message)
+    found = {
+        "rt_le_m": level,
+        "max_error_m": error.max(axis=1),
+        "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
+        **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
+        "worse_than_gnss": (level > 1.001 * fixes).astype(float),
+    }
+    if quantiles:
+        spaced = np.quantile(error, np.linspace(0, 1, quantiles), axis=1)
+        found["error_quantiles_m"] = np.moveaxis(spaced, 0, -1)
+    return found

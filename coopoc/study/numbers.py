@@ -1,0 +1,153 @@
+"""numbers: one number of a selection of a study's rows, for tables, figures and findings; None where it was not run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from ..arrays import Floats
+from ..evaluate.statistics import Interval, over_seeds, paired_difference
+
+if TYPE_CHECKING:
+    from .results import Results
+
+Where: TypeAlias = Mapping[str, Any]
+"""Column -> value, or a list of values."""
+Number: TypeAlias = Callable[["Results", Where], Any]
+"""An entry of a table for a selection; None where it was not run."""
+
+
+def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str, Any] | None:
+    """`where` without the values for which nothing was run; None if that leaves no row with a number.
+
+    Args:
+        results: of the study.
+        where: the selection.
+        value: the metric that is wanted.
+    """
+    rows = results.frame
+    if not {*where, value} <= set(rows):
+        return None
+    lists = {name: wanted if isinstance(wanted, list) else [wanted] for name, wanted in where.items()}
+    kept = rows[value].notna().to_numpy()
+    for name, wanted in lists.items():
+        kept = kept & rows[name].isin(wanted).to_numpy()
+    if not kept.any():
+        return None
+    ran = {name: set(rows[name][kept].unique()) for name in lists}
+    return {name: [v for v in wanted if v in ran[name]] for name, wanted in lists.items()}
+
+
+def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
+    """Mean of a metric over egos, runs and training seeds."""
+    kept = present(results, where, value)
+    return None if kept is None else float(results.values(value, kept).mean())
+
+
+def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval | None:
+    """Mean of a metric over egos, runs and training seeds, with its interval over egos, then runs."""
+    kept = present(results, where, value)
+    return None if kept is None else results.interval(value, kept)
+
+
+def rms(results: Results, where: Where) -> float | None:
+    """sqrt(mean over runs of RT-LE^2), m, averaged over egos and training seeds: the quantity that the bound bounds."""
+    kept = present(results, where)
+    if kept is None:
+        return None
+    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
+    seeded = "train_seed" in frame and frame["train_seed"].notna().any()
+    return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
+
+
+def difference(results: Results, one: Where, other: Where) -> Interval | None:
+    """RT-LE of `one` less that of `other` in metres, paired by ego and run; None where either was not run."""
+    first, second = present(results, one), present(results, other)
+    if first is None or second is None:
+        return None
+    return paired_difference(results.values("rt_le_m", first), results.values("rt_le_m", second))
+
+
+def ran(numbers: Mapping[Any, float | None]) -> dict[Any, float]:
+    """Those of the numbers that were run, in their order.
+
+    >>> ran({"OKF": 0.8, "KF": None})
+    {'OKF': 0.8}
+    """
+    return {name: value for name, value in numbers.items() if value is not None}
+
+
+def listed(numbers: Mapping[str, float | None]) -> str:
+    """Lengths in metres as words: those that were run, in their order.
+
+    >>> listed({"OKF": 0.8, "KF": None, "GNSS": 3.0})
+    'OKF 0.8 m, GNSS 3 m'
+    """
+    return ", ".join(f"{name} {value:.3g} m" for name, value in ran(numbers).items())
+
+
+def sentence(template: str, **numbers: Any) -> str:
+    """The template with its numbers; nothing if one of them was not run.
+
+    >>> sentence("{one:.1f} m", one=2.0), sentence("{one:.1f} m", one=None)
+    ('2.0 m', '')
+    """
+    return "" if None in numbers.values() else template.format(**numbers)
+
+
+def ratio(one: float | None, other: float | None) -> float | None:
+    """one / other; None if either was not run.
+
+    >>> ratio(3.0, 2.0), ratio(None, 2.0)
+    (1.5, None)
+    """
+    return one / other if one is not None and other else None
+
+
+def per_seed(results: Results, where: Where) -> Floats:
+    """(S, E, R) m, RT-LE for each training seed; S = 0 for a method that is not trained."""
+    frame = results.select(where)
+    seeds = sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
+    return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
+
+
+def seed_std(results: Results, where: Where) -> float | None:
+    """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
+    each = per_seed(results, where) if present(results, where) else np.empty(0)
+    return float(over_seeds(each).means.std(ddof=1)) if len(each) > 1 else None
+
+
+def verdict(results: Results, one: Where, other: Where, name: str) -> str:
+    """Sentence on the RT-LE of `one`, which is trained, against `other`, which is not, with the evidence.
+
+    A difference is claimed if its 95 % intervals over egos and runs, and over training seeds, all exclude zero.
+
+    Args:
+        results: of the study.
+        one: selection of one method.
+        other: selection of another method, over the same egos and runs.
+        name: of the other, for the sentence.
+    """
+    base, each = results.values("rt_le_m", other), per_seed(results, one)
+    gaps = [paired_difference(each.mean(axis=0), base)]
+    text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
+    if len(each) > 1:
+        gaps.append(over_seeds(each - base).interval)
+        text += f"{_ends(gaps[1])} over {len(each)} training seeds"
+    else:
+        text += "of one training seed, whose spread is unknown"
+    return f"{_claim(gaps, name)} ({text})"
+
+
+def _claim(gaps: list[Interval], name: str) -> str:
+    if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
+        return f"cannot be judged against {name}: too few seeds, egos or runs"
+    if all(gap.high < 0 for gap in gaps):
+        return f"beats {name}"
+    return f"is worse than {name}" if all(gap.low > 0 for gap in gaps) else f"cannot be told from {name}"
+
+
+def _ends(gap: Interval) -> str:
+    return f"[{gap.low:+.3f}, {gap.high:+.3f}]"
