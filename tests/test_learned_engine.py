@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numba import njit
 from torch import Tensor
 
 from coopoc import InputError
 from coopoc.learned import Gain, GainNet
-from coopoc.learned.engine.arithmetic import part, sigmoid, tanh
+from coopoc.learned.engine.arithmetic import sigmoid, tanh
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
@@ -63,7 +64,7 @@ def grad(leaf: Tensor) -> Tensor:
 
 
 def test_tanh_and_sigmoid_against_numpy() -> None:
-    @part
+    @njit(error_model="numpy")
     def both(x: np.ndarray, out: np.ndarray) -> None:
         for i in range(len(x)):
             out[0, i], out[1, i] = tanh(x[i], x.dtype.type), sigmoid(x[i], x.dtype.type)

@@ -9,7 +9,7 @@ import numpy as np
 from llvmlite import ir
 from numba import njit
 from numba.core import cgutils, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 from coopoc.arrays import AnyArray
 from coopoc.kernels.compile import Function
@@ -23,18 +23,31 @@ Index: TypeAlias = int | np.integer[Any]
 
 
 def part(function: Function) -> Function:
-    """Compiled with the first kernel that calls it, and kept in that one's machine code; it may return views."""
-    return cast(Function, njit(nogil=True, error_model="numpy", fastmath={"contract"})(function))
+    """Compiled with the first kernel that calls it, for compiled callers only; it may return views."""
+    return _within(function)
 
 
 def inside(function: Function) -> Function:
     """As `part`, and always copied into its caller: to hand arrays to a small function takes as long as it does."""
-    return cast(Function, njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=True)(function))
+    return _within(function, forceinline=True)
 
 
 def apart(function: Function) -> Function:
     """As `part`, and also so where an `inside` calls it, whose callees are otherwise copied like itself."""
-    return cast(Function, njit(nogil=True, error_model="numpy", fastmath={"contract"}, forceinline=False)(function))
+    return _within(function, forceinline=False)
+
+
+def _within(function: Function, **options: bool) -> Function:
+    """Without wrappers for callers from Python, which would be machine code of its own."""
+    made = njit(
+        nogil=True,
+        error_model="numpy",
+        fastmath={"contract"},
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        **options,
+    )
+    return cast(Function, made(function))
 
 
 instructions = cast(Callable[[Callable[..., Any]], Callable[..., Any]], intrinsic)
@@ -69,7 +82,7 @@ def sigmoid(v: Any, real: Any) -> Any:
     return real(0.5) + real(0.5) * tanh(real(0.5) * v, real)
 
 
-@part
+@register_jitable
 def whole(columns: Index) -> Index:
     """Columns rounded up to whole vectors."""
     return (columns + PAD - 1) // PAD * PAD

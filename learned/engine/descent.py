@@ -9,7 +9,7 @@ from coopoc.kernels.compile import compiled
 from coopoc.learned.engine.arguments import Drives, Found, Matrices, Memory, Moments, Update
 
 from . import backward, forward
-from .arithmetic import ZERO, Index, aligned, borrowed, part
+from .arithmetic import ONE, ZERO, Index, aligned, borrowed, part
 from .optimiser import advance_row
 from .tape import Tape, net_of
 
@@ -48,15 +48,24 @@ def descend(
         net = net_of(theta[update.rows[r]], padded, matrices, ZERO)
         tape = Tape(borrowed(passing), borrowed(kept), borrowed(memory.fields), borrowed(now), lanes)
         deltas = Tape(borrowed(waiting), borrowed(waiting), borrowed(memory.delta_fields), borrowed(now), lanes)
-        forward.follow(net, tape, drives, x, r, 1, ahead)
+        forward.follow(net, tape, drives, x, r, ONE, ahead)
         if update.step < 0:
-            x[:, r] = target[:, r]
+            _copy(x, target, r)
         else:
             found.losses[r] = _score(x, target, r)
         nets = backward.nets(net, matrices, behind, found.gradient[r])
         backward.back(nets, tape, deltas, drives.gnss, x, r, memory.slots, behind)
         if update.step > 0:
             advance_row(moments, found, update, r)
+
+
+@part
+def _copy(x: Floats, target: Floats, r: Index) -> None:
+    """x[:, r] = target[:, r]; an assignment of slices would compile the text of its errors."""
+    for t in range(x.shape[0]):
+        for b in range(x.shape[2]):
+            for i in range(3):
+                x[t, r, b, i] = target[t, r, b, i]
 
 
 @part

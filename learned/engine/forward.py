@@ -55,7 +55,7 @@ def forward(
     for s in range(span[0], span[1]):
         net = net_of(theta[s], padded, matrices, ZERO)
         tape = Tape(borrowed(passing), borrowed(kept), borrowed(memory.fields), borrowed(now), lanes)
-        follow(net, tape, drives, x, s, 0, room)
+        follow(net, tape, drives, x, s, ZERO, room)
 
 
 @part

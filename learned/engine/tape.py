@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from numba.extending import register_jitable
+
 from coopoc.arrays import AnyArray, Bools, Ints
 from coopoc.learned.engine.arguments import Matrices
 
@@ -56,7 +58,7 @@ def net_of(theta: AnyArray, padded: AnyArray, matrices: Matrices, which: Index) 
     return Net(borrowed(theta), borrowed(padded), borrowed(matrices.layers), borrowed(turned), borrowed(places))
 
 
-@inside
+@register_jitable
 def room(outputs: Index, inputs: Index) -> Index:
     """Padded memory of a layer: its weight, turned or not, and its bias."""
     return max(inputs * whole(outputs), outputs * whole(inputs + PAD - 9)) + whole(outputs)
