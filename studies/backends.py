@@ -202,6 +202,7 @@ STUDY = lineup.study(
         if backend != "cvxpy" or problem in CONVEX
     ],
     settings={**scene.TOWN, "samples": 12, "train_seeds": 0},
+    scored=False,
     shares=("max_neighbours",),
     tables={"agreement": _agreement, "cost": _cost},
     findings=_findings,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopoc.study.numbers import listed, mean, ratio, rms
 from coopoc.study.style import look
+from coopoc.world.channels import CHANNELS
 
 from . import budget_tables, lineup, scene, weights
 from .budget_tables import AXES, CAPS, SCHEDULED, SCHEDULES, SHARED, TRAINED, under, way
@@ -35,7 +36,7 @@ LIMITS = (0.0, 300.0, 1000.0, 5000.0)
 def _grid() -> list[dict[str, Any]]:
     """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; two
     of them under caps with other schedules."""
-    channels = [way(name, k) for name in scene.CHANNELS for k in NEIGHBOURS]
+    channels = [way(name, k) for name in CHANNELS for k in NEIGHBOURS]
     rates = [way("ideal", 10, rate_hz=rate) for rate in RATES]
     caps = [way("ideal", 10, cap_bytes_per_second=cap) for cap in CAPS]
     return [

@@ -14,6 +14,7 @@ from coopoc.study.pivot import across, crossed
 from coopoc.study.style import look
 from coopoc.study.tables import Table
 from coopoc.world.channel_load import BIT_RATE, CARRIER_SENSE, channel_load
+from coopoc.world.channels import CHANNELS
 from coopoc.world.v2x import ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 
 from . import scene, weights
@@ -68,7 +69,7 @@ def _most(results: Results) -> int:
 def _methods(results: Results) -> list[dict[str, Any]]:
     """Each method over each channel at the largest K that was run, as selections."""
     k = _most(results)
-    return [of(*pair, **way(name, k)) for name in scene.CHANNELS for pair in SHARED if k]
+    return [of(*pair, **way(name, k)) for name in CHANNELS for pair in SHARED if k]
 
 
 def _labels(where: Where) -> tuple[str, str]:
@@ -96,7 +97,7 @@ def load(results: Results) -> Table | None:
     k, drive, body = _most(results), scene.fleet(results.settings["data"]), list[tuple[Any, ...]]()
     carried = {"alone": Message("none", 0), "and a fix": FIX_AND_VELOCITY, "and an estimate": ESTIMATE_AND_COV}
     for name, words in WORDS.items() if k else ():
-        v2x = scene.CHANNELS[name](k)
+        v2x = CHANNELS[name](k)
         for also, message in carried.items():
             size, rate = message.size(v2x.overhead), v2x.rate or 1.0 / drive.dt
             if size:
@@ -190,7 +191,7 @@ def ledger(results: Results) -> Table | None:
     """The same for the joint filter as payload and on air, sent once and per receiver."""
     ran, k, (method, known) = _trainings(results), _most(results), SCHEDULED[0]
     body: list[tuple[Any, ...]] = []
-    for channel, make in scene.CHANNELS.items() if ran and k else ():
+    for channel, make in CHANNELS.items() if ran and k else ():
         account = _account(results, of(method, known, **way(channel, k)))
         for kind, each in COUNTS if account is not None else ():
             if account is not None and (kind == "payload" or make(k).overhead):

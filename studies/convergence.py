@@ -160,6 +160,7 @@ STUDY = lineup.study(
     prepare=prepare,
     grid={"method": (FEDERATED, CENTRALISED, *weights.INDIVIDUAL), "train_seed": (0, 1, 2, 3, 4)},
     where=meaningful,
+    scored=False,
     settings={
         **scene.DRAWN,
         **scene.WEIGHTS,

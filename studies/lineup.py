@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,18 @@ BOUND = ("bound", "bound")
 """The bound as (method, noise model)."""
 
 
-def study(name: str, question: str, **options: Any) -> Study:
-    """A study of methods: cells, keys, training and reference values as most studies have them, but for the options."""
-    usual = {"cell": cell, "key": key, "prepare": weights.prepare, "recipe": weights.described}
+def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = True, **options: Any) -> Study:
+    """A study of methods: cells, keys, training and reference values as most studies have them, but for the options.
+
+    Args:
+        name: of the study.
+        question: that it answers.
+        settings: of its cells.
+        scored: whether its rows come from `rows`, to which the setting `metric` adds a column.
+        options: other fields of Study.
+    """
+    settings = {**settings, "metric": ""} if scored else settings
+    usual = {"settings": settings, "cell": cell, "key": key, "prepare": weights.prepare, "recipe": weights.described}
     return Study(name, question, **{**usual, "reference": reference(name), **options})
 
 
@@ -67,13 +76,15 @@ def key(p: Params) -> dict[str, str]:
     """Digests that change the numbers of a cell beyond its parameters: of data, code, and trained or fitted noise.
 
     Raises:
-        InputError: an unknown method, or other settings that no cell can be computed with.
+        InputError: an unknown method or metric, or other settings that no cell can be computed with.
     """
     found = dict(scene.facts(p))
     if weights.is_trained(p["method"]):
         found["weights"] = weights.key(p["method"], p)
     elif p["method"] not in (*METHODS, "bound"):
         find("coopoc.methods", p["method"])
+    if p.get("metric"):
+        find("coopoc.metrics", p["metric"])
     if p.get("noise_model") == "fitted":
         found["clients"] = scene.fleet(p["clients"]).digest
     return found
@@ -143,10 +154,10 @@ def rows(
         seen: recording, instead of that of the cell.
     """
     recording = scene.recording(p) if seen is None else seen
-    who, drive = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"])
+    who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
     found: list[Row] = []
     for seed, method in made or methods(p, recording):
-        columns = scored(method, recording, who, drive, quantiles)
+        columns = scored(method, recording, who, drive, quantiles, metric)
         found += rows_of(columns, who, **({} if seed is None else {"train_seed": seed}))
     return found
 

@@ -16,6 +16,7 @@ from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.environment import revision
 from coopoc.study.study import Params
+from coopoc.world import channels
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
@@ -82,8 +83,6 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
     return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
 
 
-CHANNELS = {"ideal": V2X.ideal, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
-"""Channels by name; "ideal" counts payload only."""
 LASTING = ("own_share", "common_share")
 """Parameters: shares of a fix's variance that are time-correlated, of each receiver and common to all."""
 
@@ -189,10 +188,8 @@ def channel(p: Params) -> V2X:
 
     A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
     """
-    name, cap = p.get("channel", "ideal"), float(p.get("cap_bytes_per_second", 0.0))
-    if name not in CHANNELS:
-        raise InputError("channel", repr(name), f"must be one of {sorted(CHANNELS)}", "Pick one.")
-    found: V2X = CHANNELS[name](int(p.get("max_neighbours", 0)))
+    cap = float(p.get("cap_bytes_per_second", 0.0))
+    found = channels.channel(str(p.get("channel", "ideal")), int(p.get("max_neighbours", 0)))
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
     given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
@@ -146,6 +147,15 @@ def test_a_channel_and_a_metric_go_by_their_file(folder: Path, word: str, names:
     rows = [line.split() for line in done.stdout.splitlines()]
     assert [row[0] for row in rows] == names, done.stderr
     assert all(float(row[1]) > 0 for row in rows)
+
+
+@pytest.mark.parametrize(("word", "column"), [("rain.py:rain", "rt_le_m"), ("late.py:final_error_m", "final_error_m")])
+def test_a_study_takes_a_channel_and_a_metric_by_their_file(folder: Path, word: str, column: str) -> None:
+    command = commands(f"={word}")[0]
+    shell(command, folder)
+    frame = pd.read_parquet(folder / command.split("--out ")[1] / "side_by_side" / "results.parquet")
+    assert np.isfinite(frame[column]).all()
+    assert set(frame["method"]) == {"joint", "kalman"}
 
 
 def test_a_channel_and_a_metric_keep_their_promise(tmp_path: Path, crossing: Fleet) -> None:

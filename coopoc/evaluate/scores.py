@@ -12,6 +12,7 @@ from ..errors import InputError
 from ..methods.track import Method, Track
 from ..world.fleet import Fleet
 from ..world.recording import Recording
+from .catalogue import measure
 from .ledger import Kind, Way, of_track
 from .metrics import distance, errors, nees, neighbour_rt_le, rt_le, share_of_average
 
@@ -62,7 +63,7 @@ def bounded_rt_le(method: Method, recording: Recording, egos: Sequence[str], dri
 
 
 def scored(
-    method: Method, recording: Recording, egos: Sequence[str], drive: Fleet, quantiles: int = 0
+    method: Method, recording: Recording, egos: Sequence[str], drive: Fleet, quantiles: int = 0, metric: str = ""
 ) -> dict[str, AnyArray]:
     """Errors, consistency and bytes of a method for E egos in R runs, some runs at a time.
 
@@ -72,11 +73,12 @@ def scored(
         egos: ids.
         drive: the truth.
         quantiles: number of quantiles of the distances.
+        metric: one more, by its name or "mine.py:NAME"; "" for none.
 
     Returns:
         Columns (R, E): `neighbours_mean`; RT-LE, largest error and neighbours' error in m; the rates of BYTES;
         `worse_than_gnss`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of wall time per
-        run and vehicle served; and `error_quantiles_m` (R, E, q) if some are wanted.
+        run and vehicle served; and `error_quantiles_m` (R, E, q) and the column NAME of a metric if some are wanted.
 
     >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -88,6 +90,8 @@ def scored(
         track = method(part, egos)
         seconds += track.seconds
         parts.append(_columns(track, part, method, drive, quantiles))
+        if metric:
+            parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
             each = nees(track, drive)
             parts[-1]["nees"] = np.nanmean(each, axis=1)

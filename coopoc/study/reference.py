@@ -22,7 +22,7 @@ TOLERANCE, TRAINED = 0.01, 0.05
 trained by them."""
 SIGMA = 2.0
 """Standard errors by which means over other numbers of runs may differ in addition."""
-FREE = ("runs", "weights", "backend")
+FREE = ("runs", "weights", "backend", "metric")
 """Settings that may differ from those of the reference."""
 
 
