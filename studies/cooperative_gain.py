@@ -95,7 +95,7 @@ def cell(p: Params) -> list[Row]:
 
 
 def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
-    from coopoc.learned.nets.cooperative import CooperativeGain, ToldNoise
+    from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
 
     if p["method"] in TRAINED:
         models: list[tuple[int, Any]] = [
@@ -105,7 +105,7 @@ def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
     if p["noise_model"] == "told":
         drive = scene.fleet(p["data"])
         process = NoiseModel.nominal(seen.sensors).process_variance(seen)
-        truth = ToldNoise("told", seen.sensors, fix=np.square(gnss_std(p, drive))[None], process=process)
+        truth = NetNoise("told", seen.sensors, fix=np.square(gnss_std(p, drive))[None], process=process)
         return [(None, find("coopoc.methods", p["method"])(truth))]
     return [(None, find("coopoc.methods", p["method"])(lineup.noise_model(p)))]
 

@@ -88,7 +88,7 @@ def _of(track: Track, recording: Recording, method: Method, drive: Fleet, quanti
         "rt_le_m": level,
         "max_error_m": error.max(axis=1),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
+        **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
         "worse_than_gnss": (level > 1.001 * fixes).astype(float),
     }
     found = None if track.covariance is None else nees(track, drive)
