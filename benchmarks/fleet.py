@@ -339,7 +339,7 @@ def growth(sizes: Sequence[tuple[int, int]]) -> str:
                 each * timed(lambda f=fleet, e=everyone, a=args: sensing.find_links(f, e, *a)),
                 1e6 / (vehicles * len(few.t)) * timed(lambda f=few, a=args: by_pairs(f, *a)),
                 each * timed(lambda f=fleet: sensing._normals(f, "gnss", 0, 0)),
-                each * timed(lambda f=fleet, n=links: sensing._sightings(f, n, SENSORS, 1, 0)),
+                each * timed(lambda f=fleet, n=links: sensing._relative_measurements(f, n, SENSORS, 1, 0)),
                 each * timed(lambda f=fleet: co.observe(f, SENSORS, CHANNEL)),
                 each * timed(lambda r=recording: exchange.exchange(r, NO_MESSAGE)),
                 "yes" if same else "NO",

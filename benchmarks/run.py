@@ -53,7 +53,8 @@ def slower(rows: Rows, baseline: Mapping[str, Mapping[str, float]], measured: Se
     """What to say of the baseline's rows that were not measured or whose ratio exceeds theirs times their tolerance.
 
     Args:
-        baseline: ratio and tolerance by name. measured: benchmarks that have run, the first word of their rows' names.
+        baseline: ratio and tolerance by name.
+        measured: benchmarks that have run, the first word of their rows' names.
     """
     ratios, said = {row["name"]: row["ratio"] for row in rows}, []
     for name, wanted in baseline.items():

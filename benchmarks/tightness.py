@@ -35,7 +35,8 @@ def ranged(
     """Fixes of all vehicles, and the ranges of a star around the first or of all pairs.
 
     Args:
-        stretch: of the fixes' std along the last axis. shape: "volume", "street" (a tenth as high as wide), "line".
+        stretch: of the fixes' std along the last axis.
+        shape: "volume", "street" (a tenth as high as wide), "line".
     """
     rng = np.random.default_rng(seed)
     spread = {"volume": np.ones(d), "street": np.array([*np.ones(d - 1), 0.1]), "line": np.eye(d)[0]}[shape]

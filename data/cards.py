@@ -23,11 +23,20 @@ class Card:
     """Provenance and statistics of a fleet; `sha256` is Fleet.digest.
 
     Args:
-        name, map, map_licence, command, sumo, sha256: provenance. recipe: all fields of the Recipe.
-        vehicles, steps, dt: size, steps being one number per vehicle if they differ.
+        name: provenance.
+        map: provenance.
+        map_licence: provenance.
+        command: provenance.
+        sumo: provenance.
+        sha256: provenance.
+        recipe: all fields of the Recipe.
+        vehicles: their number.
+        steps: their number, one per vehicle if they differ.
+        dt: s.
         speed: m/s, over all vehicles: min, p05, mean, p95, max, standing (share below 0.1); [min, max] of each if few.
         neighbours: within 30 m, at most 10: mean, share of steps with one or more, per vehicle lowest and highest mean.
-        height: [min, max] m. acceleration: largest, m/s^2.
+        height: [min, max] m.
+        acceleration: largest, m/s^2.
     """
 
     name: str

@@ -45,7 +45,7 @@ def read_carla(
     order: str | None = None,
     handedness: str | None = None,
 ) -> Fleet:
-    """Fleet of a CARLA table in a right-handed frame; Fleet.source says what was detected.
+    """Fleet of a CARLA table in a right-handed frame; Fleet.source records what was detected.
 
     Args:
         path: .csv or .xlsx with a header row; m, m/s.
@@ -58,7 +58,7 @@ def read_carla(
 
     Raises:
         InputError: missing columns, cells that are no numbers, or a convention that the numbers leave open: the message
-            says which option to pass.
+            names the option to pass.
     """
     _check_options(order, handedness, dt)
     table = _xlsx(path) if path.suffix == ".xlsx" else read_csv(path)
@@ -82,7 +82,7 @@ def read_carla(
         notes = [f"stamps given, |dx/dt - v| is {size:.1%} of |v|"]
     else:
         fleet, notes = _without_stamps(rows, ids, vehicles, order, dt, path.name)
-    side, why = (handedness, "as told") if handedness else frame(rows.get("yaw"), _xyz(rows, "v{}"), fleet)
+    side, why = (handedness, "as given") if handedness else frame(rows.get("yaw"), _xyz(rows, "v{}"), fleet)
     flip = np.array([1.0, -1.0, 1.0]) if side == "left" else np.ones(3)
     notes.append(f"{side}-handed ({why})" + (", y flipped" if side == "left" else ""))
     return replace(
@@ -107,10 +107,10 @@ def _without_stamps(
             f"must divide the {len(rows['x'])} rows into two or more steps",
             "Pass vehicles= (their number), or columns= with id and t.",
         )
-    told = row_order(ids) if ids is not None else None
-    if order and told and count > 1 and order != told:
-        raise InputError("order", repr(order), f"must be {told!r} by the ids", "Leave it out, or pass vehicles=.")
-    found = order or told
+    by_ids = row_order(ids) if ids is not None else None
+    if order and by_ids and count > 1 and order != by_ids:
+        raise InputError("order", repr(order), f"must be {by_ids!r} by the ids", "Leave it out, or pass vehicles=.")
+    found = order or by_ids
     if ids is not None and found is None:
         raise InputError(
             f"{file}: column id",

@@ -1,4 +1,4 @@
-"""What a table does not say, found from its numbers: row order, sampling interval, frame and unit of yaw."""
+"""Conventions of a table, found from its numbers: row order, sampling interval, frame and unit of yaw."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def disagreement(position: Floats, velocity: Floats, dt: float) -> float:
     >>> disagreement(np.arange(3.0).reshape(3, 1, 1), np.full((3, 1, 1), 10.0), 0.1)
     0.0
     """
-    slope = np.diff(position, axis=0) / dt
+    quotient = np.diff(position, axis=0) / dt
     middle = (velocity[1:] + velocity[:-1]) / 2
     size = np.sqrt(np.nanmean(middle**2))
-    return float(np.sqrt(np.nanmean((slope - middle) ** 2)) / size) if size > 0 else float("inf")
+    return float(np.sqrt(np.nanmean((quotient - middle) ** 2)) / size) if size > 0 else float("inf")
 
 
 def interval(position: Floats, velocity: Floats, dt: float | None = None) -> tuple[float, float]:
@@ -55,7 +55,8 @@ def yaw_reading(yaw: Floats, velocity: Floats) -> tuple[str, int] | None:
     """(unit, sign) with yaw = sign atan2(vy, vx), from the moving rows; None if no reading stands out.
 
     Args:
-        yaw: (...,) in an unknown unit. velocity: (..., 3) m/s.
+        yaw: (...,) in an unknown unit.
+        velocity: (..., 3) m/s.
 
     >>> course = np.linspace(-3.0, 3.0, 9)
     >>> yaw_reading(np.degrees(course), 5 * np.column_stack([np.cos(course), np.sin(course), 0 * course]))
@@ -100,13 +101,16 @@ def frame(yaw: Floats | None, velocity: Floats, fleet: Fleet) -> tuple[str, str]
     """("left" or "right", why): handedness of the frame of positions and velocities.
 
     CARLA's yaw turns clockwise seen from above. If yaw = -atan2(vy, vx), the positions have been flipped to a
-    right-handed frame and the yaw has not. If yaw = atan2(vy, vx), both are in one frame: traffic tells which.
+    right-handed frame and the yaw has not. If yaw = atan2(vy, vx), both are in one frame, which the traffic's side
+    gives.
 
     Args:
-        yaw: (L,) in degrees or radians, or None. velocity: (L, 3) m/s of the same rows. fleet: the rows in their frame.
+        yaw: (L,) in degrees or radians, or None.
+        velocity: (L, 3) m/s of the same rows.
+        fleet: the rows in their frame.
 
     Raises:
-        InputError: neither yaw nor traffic tells.
+        InputError: neither yaw nor traffic determines it.
     """
     reading = None if yaw is None else yaw_reading(yaw, velocity)
     if reading is not None and reading[1] < 0:

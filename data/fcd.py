@@ -24,7 +24,7 @@ def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0
     Args:
         path: XML with id, x, y, angle, speed, and z and slope if the network has elevation.
         dt: s, resample; None keeps SUMO's steps.
-        vehicle_length: m, of every vehicle (5.0 is SUMO's default; the file does not tell).
+        vehicle_length: m, of every vehicle (5.0 is SUMO's default; the file does not hold it).
 
     Raises:
         InputError: no XML, an attribute missing or no finite number, or what Fleet refuses.

@@ -26,13 +26,19 @@ class MrclamLog:
     Args:
         fleet: Vicon truth on the steps, z = 0, NaN in gaps of Vicon.
         heading: (T, N) rad, Vicon, unwrapped, NaN in gaps.
-        speed, turn_rate: (T, N) m/s and rad/s, wheel odometry averaged over the step that ends at t.
+        speed: (T, N) m/s, wheel odometry averaged over the step that ends at t.
+        turn_rate: (T, N) rad/s, as `speed`.
         time: (M,) s on the fleet's clock, of every robot-to-robot measurement.
-        step: (M,) nearest step, -1 outside the fleet's interval. observer, subject: (M,) columns of the fleet.
-        range: (M,) m. bearing: (M,) rad in the observer's body frame.
-        true_range, true_bearing: (M,) m and rad, from Vicon at `time`; NaN in gaps.
+        step: (M,) nearest step, -1 outside the fleet's interval.
+        observer: (M,) columns of the fleet.
+        subject: (M,) columns of the fleet.
+        range: (M,) m.
+        bearing: (M,) rad in the observer's body frame.
+        true_range: (M,) m, from Vicon at `time`; NaN in gaps.
+        true_bearing: (M,) rad, from Vicon at `time`; NaN in gaps.
         observer_heading: (M,) rad, Vicon at `time`.
-        landmarks, unknown: number of measurements of landmarks and of barcodes in no list, which are not among the M.
+        landmarks: number of measurements of landmarks, which are not among the M.
+        unknown: number of measurements of barcodes in no list, which are not among the M.
     """
 
     fleet: Fleet
@@ -108,7 +114,8 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1) -> MrclamLog:
     file is a barcode although its header says subject: Barcodes.dat translates.
 
     Args:
-        folder: with the .dat files. dt: s, step of the fleet.
+        folder: with the .dat files.
+        dt: s, step of the fleet.
 
     Raises:
         InputError: a missing file, a line that is not numbers, dt <= 0.

@@ -32,8 +32,11 @@ def recording(
     measured range.
 
     Args:
-        log: of read_mrclam. v2x: K, radius and channel.
-        runs: R. seed: of GNSS and channel. gnss_std: m, simulated on x and y.
+        log: of read_mrclam.
+        v2x: K, radius and channel.
+        runs: R.
+        seed: of GNSS and channel.
+        gnss_std: m, simulated on x and y.
         assumed: what methods may know; default: gnss_std, and the noise measured against Vicon (a calibration).
     """
     acting = Sensors(gnss_std=(gnss_std, gnss_std, 0.0), velocity_std_ratio=0.0)

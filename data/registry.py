@@ -70,7 +70,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
         name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
             CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder.
-        format: table, tum, fcd, carla or mrclam, instead of what the name and the contents tell.
+        format: table, tum, fcd, carla or mrclam, instead of the one found from name and contents.
         options: of the reader, for example dt (s), columns, vehicle_length, handedness.
 
     Raises:

@@ -26,10 +26,15 @@ def assemble(
     """Fleet of L rows; vehicles keep the order of their first row, absence is a missing row.
 
     Args:
-        vehicle: (L,) ids. t: (L,) s. position: (L, 3) m.
+        vehicle: (L,) ids.
+        t: (L,) s.
+        position: (L, 3) m.
         velocity: (L, 3) m/s; None: the backward difference u_t = (x_t - x_{t-1})/dt, with u_0 := u_1.
         dt: s; None keeps the stamps, a number resamples every vehicle linearly (gaps above 5 dt and 0.5 s stay absent).
-        file: named in errors. name, source, licence: of the Fleet.
+        file: named in errors.
+        name: of the Fleet.
+        source: of the Fleet.
+        licence: of the Fleet.
 
     Raises:
         InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, a
@@ -119,7 +124,7 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
 
 
 def _regular(instants: Floats, file: str) -> tuple[Floats, Ints]:
-    """Equally spaced grid and the place of every instant on it: instants at which nobody was present are filled in."""
+    """Equally spaced grid and the place of every instant on it: instants without any vehicle are filled in."""
     gaps = np.diff(instants)
     if not len(gaps):
         return instants, np.zeros(1, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Smoothing of simulated paths, so that velocity and position tell the same story."""
+"""Smoothing of simulated paths, so that velocity is the derivative of position."""
 
 from __future__ import annotations
 
@@ -15,7 +15,9 @@ def smooth(position: Floats, dt: float, cutoff: float) -> Floats:
     lines and constant accelerations pass unchanged, and so do both ends of the drive.
 
     Args:
-        position: (T, ...) m, no NaN. dt: s. cutoff: Hz.
+        position: (T, ...) m, no NaN.
+        dt: s.
+        cutoff: Hz.
 
     Source: Whittaker, Proc. Edinburgh Math. Soc. 41, 1923; Eilers, Analytical Chemistry 75(14), 2003.
 

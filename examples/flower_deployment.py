@@ -162,7 +162,8 @@ def join(site: Site, drives: Mapping[str, Fleet], port: int | None = None) -> li
     """A SuperNode for each vehicle, with a file of its own drive, and its key registered under its name.
 
     Args:
-        drives: by vehicle, each a fleet of one. port: where the nodes find the SuperLink, if not at its own.
+        drives: by vehicle, each a fleet of one.
+        port: where the nodes find the SuperLink, if not at its own.
     """
     homes = {vehicle: site.folder / f"node-{number}" for number, vehicle in enumerate(drives, 1)}
     for vehicle, home in homes.items():

@@ -59,7 +59,7 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     """Write weights, history and card to one safetensors file; a reader sees the old file or the new one whole.
 
     Raises:
-        InputError: a net of a class that is no entry point in `coopoc.nets`: nobody could read it again.
+        InputError: a net of a class that is no entry point in `coopoc.nets`: the file could not be read again.
     """
     path, model = Path(path), checkpoint.model
     card = dict(checkpoint.card) | {

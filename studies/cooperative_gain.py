@@ -91,7 +91,7 @@ def cell(p: Params) -> list[Row]:
 
 
 def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
-    from coopoc.learned.nets.cooperative import CooperativeGain, ToldNoise
+    from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
 
     if p["method"] in TRAINED:
         nets: list[tuple[int, Any]] = [(s, weights.checkpoint("cooperative", p, s).model) for s in weights.seeds(p)]
@@ -100,7 +100,7 @@ def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
         return lineup.methods(p, seen)
     process = NoiseModel.nominal(seen.sensors).process_variance(seen)
     fix = np.square(gnss_std(p, scene.fleet(p["data"])))[None]
-    known = ToldNoise("told", seen.sensors, fix=fix, process=process)
+    known = NetNoise("told", seen.sensors, fix=fix, process=process)
     return [(None, find("coopoc.methods", p["method"])(known))]
 
 

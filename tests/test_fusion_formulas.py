@@ -202,17 +202,17 @@ def test_majorisation_falls_to_the_minimum_of_least_squares() -> None:
     anchor = truth + rng.normal(0, 2.0, truth.shape)
     distance = cdist(truth, truth) + np.triu(rng.normal(0, 0.5, (5, 5)), 1)
     distance = np.triu(distance, 1) + np.triu(distance, 1).T
-    weight, pull = np.full((5, 5), 4.0) - 4.0 * np.eye(5), np.full((5, 3), 0.25) * [1, 1, 0.5]
+    weight, anchor_weight = np.full((5, 5), 4.0) - 4.0 * np.eye(5), np.full((5, 3), 0.25) * [1, 1, 0.5]
     pair = np.triu_indices(5, 1)
 
     def residual(flat: np.ndarray) -> np.ndarray:
         x = flat.reshape(5, 3)
         ranges = np.linalg.norm(x[pair[0]] - x[pair[1]], axis=1) - distance[pair]
-        return np.concatenate([2.0 * ranges, (np.sqrt(pull) * (x - anchor)).ravel()])
+        return np.concatenate([2.0 * ranges, (np.sqrt(anchor_weight) * (x - anchor)).ravel()])
 
     x, costs = anchor[None], []
     for _ in range(1500):
-        x = majorise(x, distance[None], weight[None], anchor[None], pull[None], 1)
+        x = majorise(x, distance[None], weight[None], anchor[None], anchor_weight[None], 1)
         costs.append((residual(x.ravel()) ** 2).sum())
     assert (np.diff(costs) <= 1e-9).all()
     best = least_squares(residual, anchor.ravel())

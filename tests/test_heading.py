@@ -53,12 +53,12 @@ def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path, short_town: str)
     }
     results = run_study("heading_error", tmp_path, settings=wanted, progress=False)
     for kind in study.KINDS:
-        none, told, ignored = (
+        none, modelled, ignored = (
             numbers.mean(results, study.at(kind, size, "joint", known, 10), "nees")
             for size, known in ((0.0, "nominal"), (8.0, "nominal"), (8.0, study.EXACT))
         )
         assert none is not None
-        assert told is not None
+        assert modelled is not None
         assert ignored is not None
-        assert none < told < ignored
+        assert none < modelled < ignored
     assert "Joint filter" in (tmp_path / "heading_error" / "tables" / "rt_le.md").read_text()

@@ -16,7 +16,7 @@ from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Sensors, observe
 from coopoc.evaluate.metrics import nees_inside
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.federation.federated import federate
-from coopoc.learned.nets.cooperative import CooperativeGain, ToldNoise
+from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
 from coopoc.learned.nets.noise_net import NoiseFilter, NoiseNet, Variances, filtered, guess, lanes
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch, clients
@@ -63,8 +63,10 @@ def test_filter_is_filterpys_while_the_noise_of_fixes_stays(formation: Fleet) ->
     gnss, velocity = rng.normal(0, 3, (20, 3)), rng.normal(0, 8, (20, 3))
     gnss[[4, 5]] = np.nan
     process, r = rng.uniform(0.01, 1, (20, 3)), np.array([4.0, 9.0, 1.0])
-    told = Variances(*(torch.from_numpy(np.broadcast_to(a, (20, 1, 1, 3)).copy()) for a in (r, process[:, None, None])))
-    x, p = filtered(lanes(gnss[None, :, None]), lanes(velocity[None, :, None]), told, 0.1)
+    given = Variances(
+        *(torch.from_numpy(np.broadcast_to(a, (20, 1, 1, 3)).copy()) for a in (r, process[:, None, None]))
+    )
+    x, p = filtered(lanes(gnss[None, :, None]), lanes(velocity[None, :, None]), given, 0.1)
     theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     theirs.x, theirs.P, theirs.R = gnss[0].copy(), 1e6 * np.eye(3), np.diag(r)
     theirs.H, theirs.B = np.eye(3), 0.1 * np.eye(3)
@@ -76,8 +78,8 @@ def test_filter_is_filterpys_while_the_noise_of_fixes_stays(formation: Fleet) ->
         np.testing.assert_allclose(p[t, 0, 0], np.diag(theirs.P), rtol=1e-9)
 
 
-def test_a_standing_vehicle_is_at_the_mean_of_its_fixes_whatever_is_told_of_them() -> None:
-    """Without motion noise the estimate is the mean, and its variance the one that is told last over their number."""
+def test_a_standing_vehicle_is_at_the_mean_of_its_fixes_whatever_their_variance() -> None:
+    """Without motion noise the estimate is the mean, and its variance the last one given over their number."""
     rng = np.random.default_rng(1)
     fixes, r = torch.from_numpy(rng.normal(0, 3, (9, 1, 1, 3))), torch.from_numpy(rng.uniform(1, 16, (9, 1, 1, 3)))
     x, p = filtered(fixes, 0 * fixes, Variances(r, 0 * r), 0.1)
@@ -116,14 +118,14 @@ def test_a_known_start_is_certain() -> None:
     given = batch()
     known = given._replace(known=torch.ones(2, 2, dtype=torch.bool))
     gnss, velocity = torch.cat([known.x0[None], known.gnss]), torch.cat([known.velocity[:1], known.velocity])
-    told = Variances(torch.ones_like(gnss), torch.full_like(gnss, 0.25))
-    x, p = filtered(gnss, velocity, told, 0.1, known.known)
+    given = Variances(torch.ones_like(gnss), torch.full_like(gnss, 0.25))
+    x, p = filtered(gnss, velocity, given, 0.1, known.known)
     assert p[0].abs().max() == 0
     np.testing.assert_allclose(p[1], 0.25 / 1.25, rtol=1e-9)
     np.testing.assert_allclose(x[1], x[0] + 0.1 * velocity[1] + 0.2 * (gnss[1] - x[0] - 0.1 * velocity[1]), rtol=1e-9)
 
 
-def test_training_alone_gives_the_noise_of_a_fleet_that_is_never_told(tmp_path: Path) -> None:
+def test_training_alone_gives_the_unknown_noise_of_a_fleet(tmp_path: Path) -> None:
     """Federated on one second-long pieces: the loss falls, the covariance holds, and a checkpoint reads the same."""
     fleet = around(1300)
     fed = federate(
@@ -196,18 +198,18 @@ def test_with_few_messages_sums_do_better() -> None:
 
 
 @pytest.mark.parametrize("v2x", [V2X(5), V2X(5, loss=0.5, burst=4.0), V2X(5, rate=2.0, latency=0.2)])
-def test_told_noise_serves_other_filters_of_a_star(v2x: V2X) -> None:
-    """Constants told fix by fix are constants, with messages of any age."""
+def test_net_noise_serves_other_filters_of_a_star(v2x: V2X) -> None:
+    """Constants given fix by fix are constants, with messages of any age."""
     seen = drive(crossing_fleet(), v2x)
     known = NoiseModel.nominal(NOISE)
     shape = seen.gnss.shape
-    told = ToldNoise(
+    given = NetNoise(
         "told",
         NOISE,
         fix=np.broadcast_to(known.gnss_variance, shape).copy(),
         process=np.broadcast_to(known.process_variance(seen), shape).copy(),
     )
-    np.testing.assert_allclose(JointFilter(told)(seen).x, JointFilter(known)(seen).x, atol=1e-12)
+    np.testing.assert_allclose(JointFilter(given)(seen).x, JointFilter(known)(seen).x, atol=1e-12)
 
 
 def test_sums_say_what_lost_messages_said() -> None:
@@ -269,6 +271,6 @@ def test_what_it_cannot_do_is_said(crossing: Fleet) -> None:
         CooperativeGain(net())(late)
     assert np.isfinite(CooperativeGain(net(), sums=False)(late).x).all()
     with pytest.raises(InputError, match="changes from fix to fix"):
-        CovarianceIntersection(ToldNoise.by(net(), late))(late)
+        CovarianceIntersection(NetNoise.by(net(), late))(late)
     with pytest.raises(InputError, match=r"x0 = shape \(3,\): must be"):
         NoiseFilter(net(), x0=np.zeros(3))(late)

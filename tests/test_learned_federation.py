@@ -329,17 +329,17 @@ def test_participation_refuses_what_cannot_be(field: str, options: dict[str, flo
 def test_the_ledger_counts_every_byte(four: tuple[Client, ...], compression: Compression | None, size: int) -> None:
     """Three weights and one loss up, three weights down, per round; who drops out has received and not sent."""
     fed = trained(four, 3, compression=compression, participation=Participation(dropout=0.4), seed=1)
-    told, air = ledger(fed), ledger(fed, overhead=100)
-    assert told.names == (*fed.names, SERVER)
-    assert told.servers == (SERVER,)
-    sent, received = (told.of("training", way=way)[0] for way in ("broadcast", "per receiver"))
+    account, air = ledger(fed), ledger(fed, overhead=100)
+    assert account.names == (*fed.names, SERVER)
+    assert account.servers == (SERVER,)
+    sent, received = (account.of("training", way=way)[0] for way in ("broadcast", "per receiver"))
     rounds = np.array([sum(name not in row.absent for row in fed.history[1:]) for name in fed.names])
     np.testing.assert_array_equal(sent, [*rounds * (size + 4), 3 * 12])  # the server tells all at once
     np.testing.assert_array_equal(received, [3 * 12] * 4 + [rounds.sum() * (size + 4)])
     np.testing.assert_array_equal(air.of("training", "on air", "broadcast")[0] - sent, [*100 * rounds, 300])
     np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [300] * 4 + [100 * rounds.sum()])
     moved = sum(row.sent_bytes + row.received_bytes for row in fed.history)
-    assert told.per_vehicle("training") == moved / 4
+    assert account.per_vehicle("training") == moved / 4
     assert 0 < min(sent[:4]) < max(sent[:4])
 
 
@@ -430,10 +430,10 @@ def test_bytes_of_a_mesh_are_counted_per_link_and_direction(four: tuple[Client, 
     fed = trained(four, 2, topology=Ring())
     pairs = [("c0", "c1"), ("c1", "c2"), ("c2", "c3"), ("c3", "c0")]
     assert fed.history[1].traffic == dict.fromkeys([*pairs, *((b, a) for a, b in pairs)], 12)
-    told = ledger(fed)
-    assert told.servers == ()
-    assert told.of("training").tolist() == [[48] * 4]
-    assert told.of("training", way="broadcast").tolist() == [[24] * 4]  # both neighbours hear one message
+    account = ledger(fed)
+    assert account.servers == ()
+    assert account.of("training").tolist() == [[48] * 4]
+    assert account.of("training", way="broadcast").tolist() == [[24] * 4]  # one message reaches both neighbours
 
 
 def test_a_neighbour_that_sends_nonsense_is_not_mixed_in(four: tuple[Client, ...]) -> None:

@@ -1,5 +1,5 @@
 """RecursiveGain: equals filterpy's filter before training, its compiled rollout equals plain torch, and its covariance
-is calibrated where nobody told it the noise."""
+is calibrated where the noise is not given."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def test_untrained_net_is_filterpys_filter() -> None:
     assert track.covariance is not None
     for t in range(1, 60):
         levels = after(levels, fixes[t], speeds[t], 0.1)
-        told = noise(levels, 0.1)
-        r = told.gnss.numpy()
+        levelled = noise(levels, 0.1)
+        r = levelled.gnss.numpy()
         theirs.P, theirs.R = theirs.P * (r / before), np.diag(r)
-        theirs.predict(u=speeds[t].numpy(), Q=np.diag((told.ratio * told.gnss).numpy()))
+        theirs.predict(u=speeds[t].numpy(), Q=np.diag((levelled.ratio * levelled.gnss).numpy()))
         theirs.update(fixes[t].numpy())
         before = r
         np.testing.assert_allclose(track.x[0, t, 0], theirs.x, atol=1e-9)

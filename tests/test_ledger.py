@@ -1,4 +1,4 @@
-"""The ledger: training and deciding on one axis, as payload and on air, sent once and per receiver."""
+"""The ledger: training and online cooperation on one axis, as payload and on air, sent once and per receiver."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ def test_a_star_and_a_clique_in_closed_form() -> None:
     one by one, and 20 s T arrive."""
     seen = observe(ring(5), S2, V2X(4, overhead=68), runs=2)
     one = star(seen, 0, FIX_AND_VELOCITY)
-    assert one.of("deciding", "on air", "broadcast").tolist() == [[0] + [1000] * 4] * 2
-    assert one.of("deciding", "on air").tolist() == [[4000, 0, 0, 0, 0]] * 2
+    assert one.of("online", "on air", "broadcast").tolist() == [[0] + [1000] * 4] * 2
+    assert one.of("online", "on air").tolist() == [[4000, 0, 0, 0, 0]] * 2
     assert one.rate("payload") == one.rate("payload", "broadcast") == pytest.approx(4 * 320)
     assert one.rate("on air") == pytest.approx(4 * 1000)
-    told = clique(seen, "v0", FIX_AND_VELOCITY)
-    assert told.of("deciding", "on air", "broadcast").tolist() == [[1000] * 5]
-    assert told.of("deciding", "on air").tolist() == [[4000] * 5]
+    account = clique(seen, "v0", FIX_AND_VELOCITY)
+    assert account.of("online", "on air", "broadcast").tolist() == [[1000] * 5]
+    assert account.of("online", "on air").tolist() == [[4000] * 5]
     each = clique(seen, "v0", replace(FIX_AND_VELOCITY, unicast=True))
-    assert each.of("deciding", "on air", "broadcast").tolist() == [[4000] * 5]
-    assert each.of("deciding").tolist() == [[1280] * 5]
+    assert each.of("online", "on air", "broadcast").tolist() == [[4000] * 5]
+    assert each.of("online").tolist() == [[1280] * 5]
 
 
 def test_a_clique_is_what_an_exchange_counts() -> None:
     for message in (Message("belief", 9, rounds=2), Message("belief", 9, rounds=2, unicast=True)):
         seen = observe(ring(4), S2, V2X(3, overhead=10))
-        met, told = exchange(seen, message), clique(seen, 2, message)
-        np.testing.assert_array_equal(told.of("deciding", "on air"), met.received_bytes)
-        np.testing.assert_array_equal(told.of("deciding", "on air", "broadcast"), met.sent_bytes)
+        met, account = exchange(seen, message), clique(seen, 2, message)
+        np.testing.assert_array_equal(account.of("online", "on air"), met.received_bytes)
+        np.testing.assert_array_equal(account.of("online", "on air", "broadcast"), met.sent_bytes)
 
 
 def test_a_star_loses_what_the_channel_loses(crossing: Fleet) -> None:
@@ -62,10 +62,10 @@ def test_a_star_loses_what_the_channel_loses(crossing: Fleet) -> None:
     lossy = observe(crossing, S2, V2X(3, loss=0.4, bytes_per_second=900.0), runs=3)
     free, method = observe(crossing, S2, V2X(3), runs=1), JointFilter()
     one, track = star(lossy, 2, method.message), method(lossy, [2])
-    np.testing.assert_array_equal(one.of("deciding")[:, 2], track.received_bytes[:, 0])
+    np.testing.assert_array_equal(one.of("online")[:, 2], track.received_bytes[:, 0])
     whole = star(free, 2, method.message)
-    assert one.of("deciding", way="broadcast").sum() == 3 * whole.of("deciding").sum()
-    assert 0.5 < one.per_vehicle("deciding") / whole.per_vehicle("deciding") < 0.7
+    assert one.of("online", way="broadcast").sum() == 3 * whole.of("online").sum()
+    assert 0.5 < one.per_vehicle("online") / whole.per_vehicle("online") < 0.7
 
 
 def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
@@ -75,10 +75,10 @@ def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
         track, bare = method(seen, [1, 4]), method(plain, [1, 4])
         account = of_track(track, seen, method.message)
         assert account.names == ("c1", "c4")
-        np.testing.assert_array_equal(account.of("deciding", "on air"), track.received_bytes)
-        np.testing.assert_array_equal(account.of("deciding", "on air", "broadcast"), track.sent_bytes)
-        np.testing.assert_allclose(account.of("deciding"), bare.received_bytes, rtol=1e-12)
-        np.testing.assert_allclose(account.of("deciding", way="broadcast"), bare.sent_bytes, rtol=1e-12)
+        np.testing.assert_array_equal(account.of("online", "on air"), track.received_bytes)
+        np.testing.assert_array_equal(account.of("online", "on air", "broadcast"), track.sent_bytes)
+        np.testing.assert_allclose(account.of("online"), bare.received_bytes, rtol=1e-12)
+        np.testing.assert_allclose(account.of("online", way="broadcast"), bare.sent_bytes, rtol=1e-12)
         assert account.rate("on air") == pytest.approx(track.received_bytes.mean() / 6.0)
         assert account.per_vehicle("training") == 0.0
     alone = of_track(Kalman()(seen, [1]), seen, NO_MESSAGE)
@@ -109,10 +109,10 @@ def test_cards_tell_what_their_trainings_moved() -> None:
     """By hand: 20 rounds of 12 numbers down, 12 and a loss up; drives of six numbers a step, and weights back once."""
     drives = load_fleet("town10-clients")
     fed, pooled = (load_weights(WEIGHTS / f"{name}.safetensors").card for name in ("fedkalmannet", "okf"))
-    told, count = card_ledger(fed, drives), len(fed["clients"])
+    account, count = card_ledger(fed, drives), len(fed["clients"])
     rounds, size = len(fed["history"]) - 1, 4 * fed["parameters"]
-    assert told.of("training")[0].tolist() == [rounds * size] * count + [rounds * (size + 4) * count]
-    assert told.of("training", way="broadcast")[0].tolist() == [rounds * (size + 4)] * count + [rounds * size]
+    assert account.of("training")[0].tolist() == [rounds * size] * count + [rounds * (size + 4) * count]
+    assert account.of("training", way="broadcast")[0].tolist() == [rounds * (size + 4)] * count + [rounds * size]
     raw = card_ledger(pooled, drives)
     up = 24 * drives.present.sum(axis=0)
     assert raw.of("training", way="broadcast")[0].tolist() == [*up, 4 * pooled["parameters"]]
@@ -121,10 +121,10 @@ def test_cards_tell_what_their_trainings_moved() -> None:
 
 def test_the_page_of_the_budget_runs() -> None:
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "budget.md").read_text(), flags=re.DOTALL)
-    told: dict[str, Any] = {}
-    exec(block.replace("drive.rate(", "found = drive.rate("), told)
-    rate, once, seconds = told["found"]
-    assert (once, seconds) == (told["training"].per_vehicle("training"), once / told["drive"].rate())
+    account: dict[str, Any] = {}
+    exec(block.replace("drive.rate(", "found = drive.rate("), account)
+    rate, once, seconds = account["found"]
+    assert (once, seconds) == (account["training"].per_vehicle("training"), once / account["drive"].rate())
     assert rate == pytest.approx(2.2 * 382, rel=0.02)  # what the ego itself broadcasts
 
 
@@ -139,9 +139,9 @@ def test_ledgers_add_up_by_name() -> None:
     assert both.seconds.tolist() == [5.0, 10.0, 5.0]
     assert both.of("training").tolist() == [[30.0, 40.0, 0.0]] * 3
     for kind in ("payload", "on air"):
-        first, second = (drive.of("deciding", kind) for drive in drives)  # type: ignore[arg-type]
+        first, second = (drive.of("online", kind) for drive in drives)  # type: ignore[arg-type]
         wanted = np.column_stack([first[:, 0], first[:, 1] + second[:, 0], second[:, 1]])
-        np.testing.assert_array_equal(both.of("deciding", kind), wanted)  # type: ignore[arg-type]
+        np.testing.assert_array_equal(both.of("online", kind), wanted)  # type: ignore[arg-type]
     assert break_even(both, both) == pytest.approx(both.per_vehicle("training") / both.rate())
     with pytest.raises(InputError, match="runs"):
         drives[0] + Ledger.empty(["a"], runs=2)

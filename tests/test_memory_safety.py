@@ -154,7 +154,7 @@ def test_checks_of_single_arrays_and_numbers() -> None:
 
 CODE = """
 import numpy as np
-from coopoc.kernels.abreast import put, take
+from coopoc.kernels.batched import put, take
 from coopoc.kernels.compile import as_written, part
 from coopoc.kernels.lanes import subtract
 

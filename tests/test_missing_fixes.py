@@ -23,7 +23,7 @@ from coopoc import (
     rt_le,
 )
 from coopoc.learned import CooperativeGain, GainNet, LearnedGain, NoiseNet, RecursiveFilter, RecursiveGain
-from coopoc.learned.nets.cooperative import ToldNoise
+from coopoc.learned.nets.cooperative import NetNoise
 from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.noise_model import NoiseModel
 
@@ -78,13 +78,13 @@ def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  
 
 
 def test_a_missing_fix_is_one_of_boundless_variance(crossing: Fleet) -> None:
-    """And not one at the origin: the joint filter that is told 10^12 m^2 of those fixes gives the same answer."""
+    """And not one at the origin: the joint filter that assumes 10^12 m^2 of those fixes gives the same answer."""
     whole = observe(crossing, Sensors(), V2X(4, 80.0), runs=2)
     some, known = holed(whole, 0.5), NoiseModel.nominal(whole.sensors)
     r = np.where(np.isnan(some.gnss), 1e12, 1.5**2)
     process = np.broadcast_to(known.process_variance(whole), whole.gnss.shape)
-    told = ToldNoise("told", whole.sensors, fix=r, process=process)
-    np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(told)(whole, [0]).x, atol=1e-5)
+    given = NetNoise("net", whole.sensors, fix=r, process=process)
+    np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(given)(whole, [0]).x, atol=1e-5)
 
 
 def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:

@@ -15,7 +15,9 @@ class Alignment:
     """x -> scale R x + t.
 
     Args:
-        rotation: (..., d, d). translation: (..., d) m. scale: (...,), 1 where it was not estimated.
+        rotation: (..., d, d).
+        translation: (..., d) m.
+        scale: (...,), 1 where it was not estimated.
     """
 
     rotation: Floats
@@ -35,7 +37,8 @@ def align(estimate: Floats, truth: Floats, *, scale: bool = False) -> Alignment:
     (Umeyama, IEEE PAMI 13(4), 1991, equations 39 to 43).
 
     Args:
-        estimate, truth: (..., T, d) m, d = 2 or 3; leading axes, such as runs, are aligned one by one.
+        estimate: (..., T, d) m, d = 2 or 3; leading axes, such as runs, are aligned one by one.
+        truth: as `estimate`.
         scale: estimate s as well, for a monocular estimate; else s = 1.
 
     Raises:
@@ -87,7 +90,8 @@ def absolute_error(estimate: Floats, truth: Floats, *, aligned: bool = True, sca
     """e_t = |truth_t - (s R x_t + t)|, after the best alignment unless the frame is known.
 
     Args:
-        estimate, truth: (..., T, d) m at the same instants, d = 2 or 3.
+        estimate: (..., T, d) m at the same instants, d = 2 or 3.
+        truth: (..., T, d) m at the same instants, d = 2 or 3.
         aligned: align first; False compares in the frame given.
         scale: estimate the scale as well.
 

@@ -30,15 +30,19 @@ def posterior_bound(
     """Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
 
     Filtering: J_t = (Q_t + J_{t-1}^-1)^-1 + F_t (Tichavsky, Muravchik, Nehorai 1998), F_t the Fisher information of the
-    fixes and relative measurements at the true positions, Q_t the true motion noise. Smoothing adds what the future
-    says. The information set is the ego's own measurements (solo, `v2x` None or K = 0), also the fixes and velocities
-    of the linked neighbours over an ideal channel (star), or all that any vehicle measures (fleet); a vehicle that
-    leaves the star is forgotten, as nothing is heard of its motion. The bias is left out: it is unobservable from a
-    GNSS start. Drift and common errors of the fixes are unknowns beside the positions (filtering only).
+    fixes and relative measurements at the true positions, Q_t the true motion noise. Smoothing adds the information of
+    the future. The information set is the ego's own measurements (solo, `v2x` None or K = 0), also the fixes and
+    velocities of the linked neighbours over an ideal channel (star), or all that any vehicle measures (fleet); a
+    vehicle that leaves the star is forgotten, as its motion is not received. The bias is left out: it is unobservable
+    from a GNSS start. Drift and common errors of the fixes are unknowns beside the positions (filtering only).
 
     Args:
-        fleet: truth. sensors: the noise that acts, stds positive. ego: column or id. v2x: K and radius, not loss.
-        smoothing: use measurements after t, too. information: "fleet" costs O(T (3N)^3); for several egos use
+        fleet: truth.
+        sensors: the noise that acts, stds positive.
+        ego: column or id.
+        v2x: K and radius, not loss.
+        smoothing: use measurements after t, too.
+        information: "fleet" costs O(T (3N)^3); for several egos use
             `fleet_bound`, which gives all at once.
 
     Raises:
@@ -93,8 +97,8 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
     Args and errors: as in `posterior_bound`.
 
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
-    >>> stiff = Sensors(gnss_std=(2, 2, 2), range_std=1e-3)
-    >>> float(fleet_bound(fleet, stiff, V2X())[0, 1, 0, 0].round(3))  # two fixes for one body: 4 / 2
+    >>> rigid = Sensors(gnss_std=(2, 2, 2), range_std=1e-3)
+    >>> float(fleet_bound(fleet, rigid, V2X())[0, 1, 0, 0].round(3))  # two fixes for one body: 4 / 2
     2.0
     """
     v2x = _checked(sensors, v2x)
@@ -128,5 +132,5 @@ def _checked(sensors: Sensors, v2x: V2X | None) -> V2X:
     if min(sensors.gnss_std) <= 0:
         raise InputError("gnss_std", sensors.gnss_std, "must be > 0", "With exact fixes the bound is zero.")
     if v2x.max_neighbours and min(sensors.relative_std) <= 0:
-        raise InputError("relative_std", sensors.relative_std, "must be > 0", "Exact sightings merge two vehicles.")
+        raise InputError("relative_std", sensors.relative_std, "must be > 0", "An exact one merges two vehicles.")
     return v2x

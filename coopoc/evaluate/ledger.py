@@ -1,4 +1,5 @@
-"""Ledger: the bytes of training and of deciding on one axis, as payload and on air, sent once or per receiver."""
+"""Ledger: the bytes of training and of online cooperation on one axis, as payload and on air, sent once or per
+receiver."""
 
 from __future__ import annotations
 
@@ -16,21 +17,22 @@ from ..plugins import unknown
 from ..world.recording import Recording
 from ..world.v2x import Message
 
-Purpose = Literal["training", "deciding"]
+Purpose = Literal["training", "online"]
 Kind = Literal["payload", "on air"]
 Way = Literal["broadcast", "per receiver"]
-"""What goes out, each message once; or what comes in, one copy for each receiver, as unicast would carry it."""
+"""Bytes sent, each message once; or bytes received, one copy for each receiver, as unicast would carry it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Bytes of V participants in R runs, by purpose ("training", "deciding") and kind ("payload", "on air").
+    """Bytes of V participants in R runs, by purpose ("training", "online") and kind ("payload", "on air").
 
     Args:
-        names: (V,) of the participants. servers: those among them that are no vehicles.
-        seconds: (V,) of driving that the bytes of deciding are for; 0 for who has only trained, and for servers.
-        sent: (2, 2, R, V) bytes, purposes x kinds: a message once, whoever hears it.
+        names: (V,) of the participants.
+        seconds: (V,) of driving that the online bytes are for; 0 for participants that only train, and for servers.
+        sent: (2, 2, R, V) bytes, purposes x kinds: a message once, whatever the number of its receivers.
         received: (2, 2, R, V) bytes: a message in the account of each receiver.
+        servers: the participants that are no vehicles.
 
     Raises:
         InputError: shapes that do not fit together, a name twice, a server that does not take part.
@@ -77,10 +79,10 @@ class Ledger:
         return float(self.of(purpose, kind, way).sum(axis=1).mean()) / max(vehicles, 1)
 
     def rate(self, kind: Kind = "payload", way: Way = "per receiver") -> float:
-        """Bytes of deciding per second of driving and vehicle; InputError if nobody has driven."""
+        """Online bytes per second of driving and vehicle; InputError without any driving."""
         if not self.seconds.sum() > 0:
             raise InputError("seconds", self.seconds.tolist(), "must be > 0 for some vehicle", "Add a drive.")
-        return float(self.of("deciding", kind, way).sum(axis=1).mean() / self.seconds.sum())
+        return float(self.of("online", kind, way).sum(axis=1).mean() / self.seconds.sum())
 
     def __add__(self, other: Ledger) -> Ledger:
         """All that both hold, by name: drives of one vehicle come one after the other; one run stands for all."""
@@ -109,10 +111,14 @@ def of_training(
     """The ledger of a training from payload bytes (V,) sent once and received.
 
     Args:
-        names: of the participants. servers: those that are no vehicles. messages: (2, V) that each sent and received.
+        names: of the participants.
+        sent: (V,) bytes.
+        received: (V,) bytes.
+        servers: those that are no vehicles.
+        messages: (2, V) that each sent and received.
         overhead: bytes per message on air.
 
-    >>> ledger = of_training(["a", "hub"], [80.0, 40.0], [40.0, 80.0], ["hub"], messages=np.ones((2, 2)), overhead=10)
+    >>> ledger = of_training(["a", "s"], [80.0, 40.0], [40.0, 80.0], ["s"], messages=np.ones((2, 2)), overhead=10)
     >>> ledger.per_vehicle("training"), ledger.per_vehicle("training", "on air")
     (120.0, 140.0)
     """
@@ -127,7 +133,9 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     """The ledger of a drive: what the egos of a track broadcast and received.
 
     Args:
-        track: with its bytes on air. recording: that the track is of. message: of the method.
+        track: with its bytes on air.
+        recording: that the track is of.
+        message: of the method.
 
     Raises:
         InputError: a message as long as the neighbourhood under an overhead: its payload has no one share of the air.
@@ -142,12 +150,15 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     return of_drive(names, len(track.t) * recording.dt, track.sent_bytes, track.received_bytes, message, overhead)
 
 
-def break_even(training: Ledger, deciding: Ledger, kind: Kind = "payload", way: Way = "per receiver") -> float:
-    """Seconds of driving after which deciding has moved as many bytes per vehicle as the training did; inf for never.
+def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Way = "per receiver") -> float:
+    """Seconds of driving after which online cooperation has moved as many bytes per vehicle as the training; inf:
+    never.
 
     Args:
-        training, deciding: ledgers; the bytes of the one and the rate of the other are taken. kind, way: counted so in
-            both.
+        training: its bytes are taken.
+        online: its rate is taken.
+        kind: of the bytes in both.
+        way: of counting in both.
 
     Raises:
         InputError: a training without bytes, or a drive of no time.
@@ -159,7 +170,7 @@ def break_even(training: Ledger, deciding: Ledger, kind: Kind = "payload", way: 
     bytes_ = training.per_vehicle("training", kind, way)
     if not bytes_ > 0:
         raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
-    rate = deciding.rate(kind, way)
+    rate = online.rate(kind, way)
     return bytes_ / rate if rate else float("inf")
 
 
@@ -181,11 +192,15 @@ def payload(on_air: Floats, message: Message, overhead: int) -> Floats:
 def of_drive(
     names: Sequence[str], seconds: npt.ArrayLike, sent: Floats, received: Floats, message: Message, overhead: int
 ) -> Ledger:
-    """The ledger of deciding from bytes on air.
+    """The ledger of online cooperation from bytes on air.
 
     Args:
-        names: of V vehicles. seconds: of driving, one number or (V,). sent, received: (1 or R, V) and (R, V) bytes.
-        message, overhead: what they carry.
+        names: of V vehicles.
+        seconds: of driving, one number or (V,).
+        sent: (1 or R, V) bytes.
+        received: (R, V) bytes.
+        message: that they carry.
+        overhead: bytes per message on air.
 
     Raises:
         InputError: as in `of_track`.

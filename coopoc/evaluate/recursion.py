@@ -1,4 +1,4 @@
-"""The recursion of the posterior Cramer-Rao bound over the steps of a drive, whoever takes part in them."""
+"""The recursion of the posterior Cramer-Rao bound over the steps of a drive, with members that come and go."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from ..world.spherical import spherical, vector_cov
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """One step: the members' columns, who stayed, the variance of their motion, and the information that it brings."""
+    """One step: the members' columns, their places before, the variance of their motion, the information gained."""
 
     members: Ints
-    kept: Ints
+    previous: Ints
     process: Floats
     gained: Floats
 
 
 def stages_of(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], *, fixes: bool = True) -> list[Stage]:
-    """Every step of the vehicles (columns) that are members of it, with what fixes say or without."""
+    """Every step of the vehicles (columns) that are members of it, with fixes or without."""
     start = np.searchsorted(links.step, np.arange(len(fleet.t) + 1))
     stages, before = [], np.full(len(fleet.ids), -1)
     for t, now in enumerate(members):
@@ -62,13 +62,13 @@ def _fisher(position: Floats, observer: Ints, neighbour: Ints, sensors: Sensors)
 def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Floats]]:
     """Steps and the bound (3n, 3n) of their members: forward, or for smoothing from the last step to the first.
 
-    Smoothing is the two-filter form: information from the past with the present, plus what the future says.
+    Smoothing is the two-filter form: information from the past with the present, plus that of the future.
     """
     filtered: list[Floats] = []
     cov: Floats = np.zeros((0, 0))
     with tqdm(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0) as bar:
         for t, stage in enumerate(stages):
-            information = _carry(cov, stage.kept, stage.process) + stage.gained
+            information = _carry(cov, stage.previous, stage.process) + stage.gained
             cov = np.linalg.inv(information)
             bar.update()
             if smoothing:
@@ -92,29 +92,31 @@ def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> It
     cov: Floats = np.zeros((0, 0))
     for t, stage in enumerate(tqdm(stages, desc="bound", unit="step", delay=2.0)):
         n = len(stage.members)
-        sees, weight = drift.sees(n), np.tile(1.0 / np.square(sensors.gnss_std), n)
-        information = np.linalg.inv(drift.carry(cov, stage.kept, stage.process)) + (sees.T * weight) @ sees
+        fix_matrix, weight = drift.fix_matrix(n), np.tile(1.0 / np.square(sensors.gnss_std), n)
+        information = (
+            np.linalg.inv(drift.carry(cov, stage.previous, stage.process)) + (fix_matrix.T * weight) @ fix_matrix
+        )
         information[: 3 * n, : 3 * n] += stage.gained
         cov = np.linalg.inv(information)
         yield t, cov[: 3 * n, : 3 * n]
 
 
-def _carry(cov: Floats, kept: Ints, process: Floats) -> Floats:
-    """Information about the members of a step from the covariance one step before: who joins brings none."""
-    n = len(kept)
+def _carry(cov: Floats, previous: Ints, process: Floats) -> Floats:
+    """Information about the members of a step from the covariance one step before: none of new members."""
+    n = len(previous)
     out = np.zeros((3 * n, 3 * n))
-    stays = np.flatnonzero(kept >= 0)
+    stays = np.flatnonzero(previous >= 0)
     if len(stays):
-        here, there = rows(stays), rows(kept[stays])
+        here, there = rows(stays), rows(previous[stays])
         out[np.ix_(here, here)] = np.linalg.inv(cov[np.ix_(there, there)] + np.diag(process[stays].ravel()))
     return out
 
 
 def _from_ahead(future: Floats, ahead: Stage, n: int) -> Floats:
-    """What a step and its future say of the n members one step before."""
-    stays = np.flatnonzero(ahead.kept >= 0)
+    """Information of a step and its future about the n members one step before."""
+    stays = np.flatnonzero(ahead.previous >= 0)
     back = np.full(n, -1, dtype=np.int64)
-    back[ahead.kept[stays]] = stays
+    back[ahead.previous[stays]] = stays
     process = np.zeros((n, 3))
-    process[ahead.kept[stays]] = ahead.process[stays]
+    process[ahead.previous[stays]] = ahead.process[stays]
     return _carry(np.linalg.inv(future + ahead.gained), back, process)

@@ -123,7 +123,7 @@ def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, q
         "rt_le_m": level,
         "max_error_m": error.max(axis=1),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        **{name: account.of("deciding", *counted) / account.seconds for name, counted in BYTES.items()},
+        **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
         "worse_than_gnss": (level > 1.001 * fixes).astype(float),
     }
     if quantiles:

@@ -37,10 +37,13 @@ def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, 
 
     The percentiles are widened to Phi(sqrt(n/(n-1)) t_{n-1}), n = E (or R for one ego): the plain percentile interval
     is too narrow for few egos (Hesterberg, The American Statistician 69, 2015, section 4.3.2). With normal egos and
-    runs of equal spread, 95 % intervals hold the mean in 87, 93 and 93 % of trials for 3, 5 and 8 egos, 94 % for one.
+    runs of equal variance, 95 % intervals hold the mean in 87, 93 and 93 % of trials for 3, 5 and 8 egos, 94 % for one.
 
     Args:
-        values: (E, R) or (R,) of one metric. level: of the interval. resamples: of the bootstrap. seed: of its draws.
+        values: (E, R) or (R,) of one metric.
+        level: of the interval.
+        resamples: of the bootstrap.
+        seed: of its draws.
 
     Raises:
         InputError: a value that is not finite, another shape, or no value.
@@ -56,7 +59,8 @@ def paired_difference(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: 
     """Mean of a - b on the same egos and runs, with its interval: what the two share cancels.
 
     Args:
-        a, b: (E, R) or (R,) of one metric, the same draws in the same places.
+        a: (E, R) or (R,) of one metric, the same draws in the same places.
+        b: as `a`.
 
     Raises:
         InputError: shapes that differ, or as in `mean_interval`.

@@ -69,7 +69,10 @@ class PointEdges(Edges):
     """M measured points: of the second vertex in the frame of the first, or of a single vertex in the world (priors).
 
     Args:
-        nodes: (M, 2), or (M, 1) for priors. position: (M, d) m. covariance: (M, d, d) m^2. stamps: (M,) s.
+        nodes: (M, 2), or (M, 1) for priors.
+        position: (M, d) m.
+        covariance: (M, d, d) m^2.
+        stamps: (M,) s.
 
     >>> len(PointEdges([[0, 1]], [[1, 0]], [np.eye(2)]))
     1
@@ -86,7 +89,10 @@ class RangeEdges(Edges):
     """M measured distances between any two vertices.
 
     Args:
-        nodes: (M, 2). distance: (M,) m. variance: (M,) m^2. stamps: (M,) s.
+        nodes: (M, 2).
+        distance: (M,) m.
+        variance: (M,) m^2.
+        stamps: (M,) s.
 
     >>> len(RangeEdges([[0, 1]], [5.0], [0.01]))
     1

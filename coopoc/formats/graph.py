@@ -33,7 +33,11 @@ class Graph(Vertices):
         position: (n, d) m, what the vertex lines hold: the truth in PyFG, an initial guess in g2o; NaN where unknown.
         orientation: (n, 1) rad in 2-D, (n, 4) qx qy qz qw in 3-D, the identity for points; NaN where unknown.
         stamps: (n,) s; NaN for points and where the file has none.
-        relative_pose, relative_point, ranges, pose_prior, point_prior: what was measured.
+        relative_pose: measurements of pose pairs.
+        relative_point: measurements of points from poses.
+        ranges: measured distances.
+        pose_prior: measured poses.
+        point_prior: measured points.
         fixed: (F,) places in names of the vertices that stay where they are (g2o's FIX).
         place: (field, row) -> where it came from, for messages; readers pass the line of the file.
 

@@ -33,7 +33,8 @@ def to_numbers(file: str, lines: Sequence[int], words: Sequence[Sequence[str]], 
     """(M, columns) finite numbers of M lines.
 
     Args:
-        file, lines: name and (M,) line numbers, for messages.
+        file: name and (M,) line numbers, for messages.
+        lines: name and (M,) line numbers, for messages.
         words: (M, columns).
         form: what a line must look like, for messages.
 

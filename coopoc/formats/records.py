@@ -14,7 +14,7 @@ VALUES = {"pose2": "x y theta", "pose3": "x y z qx qy qz qw", "point2": "x y", "
 
 @dataclass(frozen=True)
 class Record:
-    """What a line with one tag says.
+    """Content of a line with one tag.
 
     Args:
         kind: pose or point (a vertex), or an edge as in `ENDS`.

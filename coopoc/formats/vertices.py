@@ -11,7 +11,7 @@ from .rotations import to_rotation
 
 @dataclass(frozen=True, eq=False)
 class Vertices:
-    """The first fields of a Graph, which says what they hold."""
+    """The first fields of a Graph, which documents them."""
 
     dimension: int
     names: tuple[str, ...]

@@ -68,24 +68,24 @@ def bring_forward(
         measured: what these vehicles measured; they are present throughout.
         assumed: the noise model.
     """
-    now, spread = np.empty_like(x), np.zeros_like(cov)
+    now, covariance = np.empty_like(x), np.zeros_like(cov)
     for run in range(x.shape[0]):
         for t in range(x.shape[1]):
             for n in range(held.shape[2]):
                 step, last = held[run, t, n], t - 1
                 if step < 0 and t == 0:
-                    begin_at_fix(now[run, 0], spread[run, 0], run, 0, n, measured, assumed)
+                    begin_at_fix(now[run, 0], covariance[run, 0], run, 0, n, measured, assumed)
                     continue
                 if step >= 0 and (t == 0 or step > held[run, t - 1, n]):
                     last = step
                     store(now[run, t], n, load(x[run, step], n, VECTOR))
-                    store(spread[run, t], n, load(cov[run, step], n, MATRIX))
+                    store(covariance[run, t], n, load(cov[run, step], n, MATRIX))
                 else:
                     store(now[run, t], n, load(now[run, t - 1], n, VECTOR))
-                    store(spread[run, t], n, load(spread[run, t - 1], n, MATRIX))
+                    store(covariance[run, t], n, load(covariance[run, t - 1], n, MATRIX))
                 for u in range(last + 1, t + 1):
-                    correct(now[run, t], spread[run, t], run, u, n, measured, assumed)
-    return now, spread
+                    correct(now[run, t], covariance[run, t], run, u, n, measured, assumed)
+    return now, covariance
 
 
 @compiled

@@ -30,12 +30,15 @@ from .small import (
 
 
 class Past(NamedTuple):
-    """What the steps before a window say of its first step, and what it takes to go back through the window.
+    """Information of the steps before a window about its first step, and what it takes to go back through the window.
 
-    Args:
-        information, eta: (9 most^2, LANES), (3 most, LANES), arrival cost around `at`.
-        at, base: (3 places, LANES) m, where the past expects each point; vector at which its measurement is linear.
-        kept, kept_eta: (9 most (most + 2) slots, LANES), (3 places, LANES), of `predict` step by step.
+    Attributes:
+        information: (9 most^2, LANES), arrival cost around `at`.
+        eta: (3 most, LANES), its information vector.
+        at: (3 places, LANES) m, where the past expects each point.
+        base: (3 places, LANES) m, vector at which its measurement is linear.
+        kept: (9 most (most + 2) slots, LANES), of `predict` step by step.
+        kept_eta: (3 places, LANES), of `predict` step by step.
     """
 
     information: Floats
@@ -70,15 +73,15 @@ def kept_of(window: Window, past: Past, step: int) -> Floats:
 
 
 @inner
-def stiffness(window: Window, joint: Joint, step: int) -> None:
+def process_information(window: Window, joint: Joint, step: int) -> None:
     """Inverse process noise of the members that stay for the next step, zero of the others."""
     ego, after, m = place_of(window.layout, step, 0), place_of(window.layout, step + 1, 0), count_of(window.sizes, step)
     for k in range(m):
         later = window.later[ego + k]
-        stiff = zeros(load(window.point, ego, ROW)[0], ROW)
+        process = zeros(load(window.point, ego, ROW)[0], ROW)
         if later >= 0:
-            stiff, _ = motion(window, ego + k, after + later)
-        store(joint.process, block_of(k, m), stiff)
+            process, _ = motion(window, ego + k, after + later)
+        store(joint.process, block_of(k, m), process)
 
 
 @inner
@@ -99,7 +102,7 @@ def go_back(window: Window, past: Past, joint: Joint, step: int) -> None:
         count_of(window.sizes, step),
     )
     kept = kept_of(window, past, step)
-    stiffness(window, joint, step)
+    process_information(window, joint, step)
     for k in range(m):
         later, ahead = window.later[here + k], zeros(load(window.point, here, ROW)[0], ROW)
         if later >= 0:
@@ -148,7 +151,7 @@ def ego_covariance(window: Window, past: Past, joint: Joint, span: Any) -> Any:
             for j in range(k + 1, m):
                 own = less_transposed_product(own, transpose(load(kept, at + j, ONE)), load(joint.scratch, j, ONE))
             store(joint.scratch, k, minus_product(load(kept, at + m, ONE), own))
-        stiffness(window, joint, step)
+        process_information(window, joint, step)
         here, n = place_of(window.layout, step, 0), count_of(window.sizes, step + 1)
         for k in range(n):
             store(joint.scratch, window.layout[1] + block_of(k, n), nothing)

@@ -13,7 +13,11 @@ def nearest_first(arrival: AnyArray, size: AnyArray, start: AnyArray, fill: floa
     """Arrivals (R, M), -1 for rejected messages. One that does not fit never will in this step: tokens only go.
 
     Args:
-        arrival, size, start: as in `within_cap`. fill: bytes a step. depth: bytes, also at first.
+        arrival: as in `within_cap`.
+        size: as in `within_cap`.
+        start: as in `within_cap`.
+        fill: bytes a step.
+        depth: bytes, also at first.
     """
     accepted, tokens, last = np.full(arrival.shape, -1, np.int64), np.full(len(arrival), depth), 0
     for t in range(len(start) - 1):

@@ -21,7 +21,7 @@ FORGOTTEN = 1e6
 class State(NamedTuple):
     """The filter between two steps, twice: before and after vehicles join, leave or meet.
 
-    Args:
+    Attributes:
         label: (N,) component of each vehicle, -1 where absent.
         plans: (2, 6, N+1) of the components.
         cov: (2, .) m^2, their covariances.
@@ -37,7 +37,7 @@ class State(NamedTuple):
 class Step(NamedTuple):
     """What one step brings to R runs that share their covariance.
 
-    Args:
+    Attributes:
         weight: (9 P) 1/m^2, information of the pairs.
         eta: (R, P, 3) 1/m.
         total: (R, N, 3) 1/m, information vectors of the vehicles.
@@ -108,24 +108,24 @@ def follow(
             old, new = state.now[0], 1 - state.now[0]
             state.now[0], state.now[1] = new, arrange(state.label, state.plans[new])
             move(state.plans[old], state.plans[new], before, state.cov[old], state.cov[new], state.now[1])
-        plan, spread = state.plans[state.now[0]], state.cov[state.now[0]]
-        predict(measured, assumed, runs, t, before, plan, (x, spread))
+        plan, covariance = state.plans[state.now[0]], state.cov[state.now[0]]
+        predict(measured, assumed, runs, t, before, plan, (x, covariance))
         for run in range(first, first + runs[1]):
             for k in range(pairs.start[t], pairs.start[t + 1]):
                 if pairs.alive[first, k]:
                     i, j, p = pairs.first[k], pairs.second[k], k - pairs.start[t]
                     vector = subtract(load(x[run, t, j], 0, VECTOR), load(x[run, t, i], 0, VECTOR))
-                    between = difference(plan, spread, i, j)
+                    between = difference(plan, covariance, i, j)
                     one = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)
                     store(step.weight, p, one[0])
                     store(step.eta[run - first, p], 0, one[1])
-        gather(measured, pairs, assumed, runs, t, (before, plan, state.now[1], spread), step)
+        gather(measured, pairs, assumed, runs, t, (before, plan, state.now[1], covariance), step)
         for run in range(first, first + runs[1]):
             sum_vectors(measured, pairs, assumed, run, first, x[run, t], t, step)
         for component in range(state.now[1]):
-            update(plan, component, spread, step.information, step.near, step.scratch, step.total, step.moved)
+            update(plan, component, covariance, step.information, step.near, step.scratch, step.total, step.moved)
             for run in range(runs[1]):
-                write(plan, component, spread, step.moved[run], x[first + run, t], cov[first + run, t])
+                write(plan, component, covariance, step.moved[run], x[first + run, t], cov[first + run, t])
 
 
 @part
@@ -133,7 +133,7 @@ def predict(
     measured: Measured, assumed: Assumed, runs: Any, t: int, before: AnyArray, plan: AnyArray, belief: Any
 ) -> None:
     """x += dt u and P += Q; a vehicle that joins stands at its fix, and nothing is known of it."""
-    x, spread = belief
+    x, covariance = belief
     for c in range(x.shape[2]):
         if plan[HOME, c] >= 0:
             process, diagonal = at(assumed.process, runs[0], t, c), plan[STRIDE, plan[HOME, c]] + 1
@@ -142,21 +142,21 @@ def predict(
                     moved = x[run, t - 1, c, a] + measured.dt * measured.velocity[run, t, c, a]
                     x[run, t, c, a] = moved if before[c] else measured.gnss[run, t, c, a]
                 k = place(plan, c, c) + a * diagonal
-                spread[k] = spread[k] + process[a] if before[c] else FORGOTTEN
+                covariance[k] = covariance[k] + process[a] if before[c] else FORGOTTEN
 
 
 @part
-def difference(plan: AnyArray, spread: AnyArray, i: int, j: int) -> Any:
+def difference(plan: AnyArray, covariance: AnyArray, i: int, j: int) -> Any:
     """Covariance of x_j - x_i; i before j."""
     a, b, c, step = place(plan, i, i), place(plan, j, j), place(plan, i, j), plan[STRIDE, plan[HOME, i]]
-    xx = spread[a] + spread[b] - 2.0 * spread[c]
-    xy = spread[a + 1] + spread[b + 1] - spread[c + 1] - spread[c + step]
-    xz = spread[a + 2] + spread[b + 2] - spread[c + 2] - spread[c + 2 * step]
+    xx = covariance[a] + covariance[b] - 2.0 * covariance[c]
+    xy = covariance[a + 1] + covariance[b + 1] - covariance[c + 1] - covariance[c + step]
+    xz = covariance[a + 2] + covariance[b + 2] - covariance[c + 2] - covariance[c + 2 * step]
     a, b, c = a + step + 1, b + step + 1, c + step + 1
-    yy = spread[a] + spread[b] - 2.0 * spread[c]
-    yz = spread[a + 1] + spread[b + 1] - spread[c + 1] - spread[c + step]
+    yy = covariance[a] + covariance[b] - 2.0 * covariance[c]
+    yz = covariance[a + 1] + covariance[b + 1] - covariance[c + 1] - covariance[c + step]
     a, b, c = a + step + 1, b + step + 1, c + step + 1
-    return from_upper((xx, xy, xz, yy, yz, spread[a] + spread[b] - 2.0 * spread[c]))
+    return from_upper((xx, xy, xz, yy, yz, covariance[a] + covariance[b] - 2.0 * covariance[c]))
 
 
 @part
@@ -165,7 +165,7 @@ def gather(measured: Measured, pairs: Pairs, assumed: Assumed, runs: Any, t: int
 
     A vehicle that joins begins with half of the information of its fix, and learns the other half.
     """
-    before, plan, components, spread = belief
+    before, plan, components, covariance = belief
     info, near, first = step.information, step.near, runs[0]
     last = components - 1
     info[: plan[BASE, last] + plan[STRIDE, last] ** 2 if components > 0 else 0] = 0.0
@@ -178,7 +178,7 @@ def gather(measured: Measured, pairs: Pairs, assumed: Assumed, runs: Any, t: int
             k = place(plan, c, c) + a * (plan[STRIDE, plan[HOME, c]] + 1)
             info[k] = 0.0 if math.isnan(fix[a]) else (1.0 if before[c] else 0.5) / noise[a]
             if not before[c]:
-                spread[k] = 2.0 * noise[a]
+                covariance[k] = 2.0 * noise[a]
     for k in range(pairs.start[t], pairs.start[t + 1]):
         if pairs.alive[first, k]:
             i, j, w = pairs.first[k], pairs.second[k], 9 * (k - pairs.start[t])
@@ -208,7 +208,7 @@ def sum_vectors(
 
 
 @part
-def write(plan: AnyArray, component: int, spread: AnyArray, moved: AnyArray, x: AnyArray, cov: AnyArray) -> None:
+def write(plan: AnyArray, component: int, covariance: AnyArray, moved: AnyArray, x: AnyArray, cov: AnyArray) -> None:
     """Positions of the members of a component and their own covariances."""
     members, stride = plan[MEMBER, plan[BEGIN, component] : plan[BEGIN, component + 1]], plan[STRIDE, component]
     for i in range(len(members)):
@@ -216,4 +216,4 @@ def write(plan: AnyArray, component: int, spread: AnyArray, moved: AnyArray, x: 
         for c in range(3):
             x[members[i], c] += moved[3 * i + c]
             for d in range(3):
-                cov[members[i], c, d] = spread[k + min(c, d) * stride + max(c, d)]
+                cov[members[i], c, d] = covariance[k + min(c, d) * stride + max(c, d)]

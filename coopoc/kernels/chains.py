@@ -13,7 +13,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import Floats
-from .abreast import take
+from .batched import take
 from .compile import inner, storage
 from .elimination import eliminate, substitute
 from .lanes import LANES
@@ -118,12 +118,12 @@ def assemble_ego(window: Window, span: Any, memory: Memory) -> None:
         for j in range(s + 1, h):
             store(memory.a, s * h + j, nothing)
         if s > 0:
-            stiff, off = motion(window, place_of(window.layout, first + s - 1, 0), ego)
-            stiff, off = scale(stiff, trust), scale(off, trust)
-            block, eta = add_diagonal(block, stiff), add(eta, off)
+            process, off = motion(window, place_of(window.layout, first + s - 1, 0), ego)
+            process, off = scale(process, trust), scale(off, trust)
+            block, eta = add_diagonal(block, process), add(eta, off)
             before = s - 1
-            store(memory.a, before * (h + 1), add_diagonal(load(memory.a, before * (h + 1), ONE), stiff))
-            store(memory.a, before * (h + 1) + 1, add_diagonal(nothing, negate(stiff)))
+            store(memory.a, before * (h + 1), add_diagonal(load(memory.a, before * (h + 1), ONE), process))
+            store(memory.a, before * (h + 1) + 1, add_diagonal(nothing, negate(process)))
             store(memory.b, before, subtract(load(memory.b, before, ROW), off))
         for place in range(ego + 1, ego + count_of(window.sizes, first + s)):
             block, eta = add(block, load(window.edge, place, ONE)), subtract(eta, load(window.eta, place, ROW))
@@ -148,12 +148,12 @@ def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> No
         own = add_diagonal(add(own, information), fix)
         eta = add(add(eta, load(window.eta, place, ROW)), times(fix, fix_gap(window, place)))
         after = window.later[place] if step < last else -1
-        stiff, off = nothing, nothing
+        process, off = nothing, nothing
         if after >= 0:
             after = place_of(window.layout, step + 1, after)
-            stiff, off = motion(window, place, after)
+            process, off = motion(window, place, after)
         eta = subtract(eta, off)
-        pivot = negate(inverse(add_diagonal(own, stiff)))
+        pivot = negate(inverse(add_diagonal(own, process)))
         solved = minus_apply(pivot, eta)
         store(memory.eta, place, eta)
         store(memory.pivot, place, pivot)
@@ -168,10 +168,10 @@ def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> No
             store(memory.b, i, less_transposed_applied(load(memory.b, i, ROW), left, solved))
         if after < 0:
             return
-        own = mirrored(scale_rows(stiff, minus_product(pivot, own)))
-        eta = add(times(stiff, solved), off)
+        own = mirrored(scale_rows(process, minus_product(pivot, own)))
+        eta = add(times(process, solved), off)
         for i in range(begin, end + 1):
-            store(memory.arm, after * h + i, scale_rows(stiff, load(memory.row, i, ONE)))
+            store(memory.arm, after * h + i, scale_rows(process, load(memory.row, i, ONE)))
         step, place = step + 1, after
 
 
@@ -189,8 +189,8 @@ def unfold(window: Window, span: Any, step: int, place: int, memory: Memory) -> 
     after = window.later[place] if step < last else -1
     if after >= 0:
         after = place_of(window.layout, step + 1, after)
-        stiff, _ = motion(window, place, after)
-        eta = add(eta, times(stiff, load(memory.move, after, ROW)))
+        process, _ = motion(window, place, after)
+        eta = add(eta, times(process, load(memory.move, after, ROW)))
     moved = minus_apply(load(memory.pivot, place, ONE), eta)
     store(memory.move, place, moved)
     return moved

@@ -29,7 +29,7 @@ def as_written(function: Function) -> Function:
 def part(function: Function) -> Function:
     """Compiled as `compiled` is, for compiled callers only, and kept in their machine code.
 
-    References to arrays are not counted within: whoever calls it holds them. So it allocates nothing and returns no
+    References to arrays are not counted within: the caller holds them. So it allocates nothing and returns no
     array; counting every array of every NamedTuple would take longer than the sums, and to compile.
     """
     return _within(function, {"contract"})
@@ -46,7 +46,7 @@ def inner(function: Function) -> Function:
 
 
 def inside(function: Function) -> Function:
-    """As `inner`, and copied into whoever calls it: a call would hand over every number that describes an array, which
+    """As `inner`, and copied into the caller: a call would hand over every number that describes an array, which
     takes longer than to read three of its elements."""
     return _within(function, set(), forceinline=True)
 

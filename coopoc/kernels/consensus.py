@@ -20,7 +20,7 @@ from .small import add, add_diagonal, apply, inverse, load, minus_apply, minus_p
 class Consensus(NamedTuple):
     """Variables of one step, flat: of N vehicles, or of up to 2 P copies.
 
-    Args:
+    Attributes:
         z: (3 N) m, agreed positions less the beliefs.
         own: (3 N) m, each vehicle's copy of itself.
         own_dual: (3 N) m.

@@ -23,7 +23,7 @@ LARGEST_STEP = 0.1
 class Estimates(NamedTuple):
     """What the vehicles keep at one step.
 
-    Args:
+    Attributes:
         begin: (N+1,) first entry of each vehicle.
         member: (M,) the vehicle that an entry estimates.
         w: (M, 3) m.
@@ -113,8 +113,8 @@ def meet(run: int, t: int, pairs: Pairs, now: Estimates, fill: AnyArray) -> None
 def start(
     run: int, t: int, measured: Measured, old: Estimates, now: Estimates, place: AnyArray, anchored: bool
 ) -> None:
-    """Estimates of members kept move with their velocities; a new one starts at its fix, or with an anchor at its own
-    estimate."""
+    """Estimates of members that stay move with their velocities; a new one starts at its fix, or with an anchor at its
+    own estimate."""
     for own in (True, False):
         for n in range(len(place)):
             for entry in range(old.begin[n], old.begin[n + 1]):

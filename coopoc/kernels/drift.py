@@ -1,4 +1,4 @@
-"""Receivers whose fixes err for a while, in the blocks of `coopoc.kernels.joint`: z = x + drift + common + white noise.
+"""Fixes with time-correlated errors, in the blocks of `coopoc.kernels.joint`: z = x + drift + common + white noise.
 
 A state is (position, drift), six numbers. The error that all fixes have in common is the position of one more block
 behind the members'; its drift is zero. Both errors are Gauss-Markov: e_t = keep e_{t-1} + w, in steady state.
@@ -87,11 +87,11 @@ def drift_noise(star: Star, joint: Joint, drift: Drift, members: int, n: int, ol
     """Inverse process noise of the drifts of the members that stay; the common error has none."""
     least = NOTHING * NOTHING
     for k in range(n):
-        stiff = 1.0 / max(drift.own * (1.0 - drift.keep**2), least) if k < members else 1.0 / least
+        process = 1.0 / max(drift.own * (1.0 - drift.keep**2), least) if k < members else 1.0 / least
         if star.previous[k] >= 0:
             at = block_of(star.previous[k], old)
             position = first3(load(joint.process, at, (0.0,) * 6))
-            store(joint.process, at, joined(position, three(0.0 * position[0] + stiff)))
+            store(joint.process, at, joined(position, three(0.0 * position[0] + process)))
 
 
 @inside

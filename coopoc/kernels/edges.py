@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from .abreast import choose, plus
+from .batched import choose, plus
 from .compile import inner
 from .relative import completed, converted, exact, vector
 from .small import apply, choose_each, from_upper, scale, subtract

@@ -22,7 +22,7 @@ UNIT = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class Measured(NamedTuple):
     """What a fleet of N vehicles measured in R runs.
 
-    Args:
+    Attributes:
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s.
         relative: (R, L, 5) of `coopoc.kernels.relative.components`.
@@ -40,7 +40,7 @@ class Measured(NamedTuple):
 class Pairs(NamedTuple):
     """Vehicles in contact, sorted by step.
 
-    Args:
+    Attributes:
         first: (P,) column, less than `second`.
         second: (P,) column.
         link: (P,) the measurement of `second` by `first`, -1 for none.
@@ -60,7 +60,7 @@ class Pairs(NamedTuple):
 class Assumed(NamedTuple):
     """The noise model.
 
-    Args:
+    Attributes:
         process: broadcastable to (R, T, N, 3) m^2, variance of the motion.
         fix: broadcastable to (R, T, N, 3) m^2, variance of a fix.
         std: (3,) m, rad, rad of a relative measurement; of no length for vectors of unit covariance.

@@ -21,14 +21,14 @@ from .compile import compiled
 from .fleet_graph import VECTOR, Assumed, Measured, Pairs, advance, pair
 from .small import load, store, subtract
 
-STIFF = 1e7
+HARD = 1e7
 """Weight of the motion over that of a fix beyond which D - D S^-1 D loses its digits."""
 
 
 class Drive(NamedTuple):
     """One run.
 
-    Args:
+    Attributes:
         place: (T, N) the vehicle's number among those of its step, -1 where inactive.
         pairs: those that count; `alive` is (1, P).
         relative: (L, 5).
@@ -113,7 +113,7 @@ def _vectors(eta: Floats, place: Ints) -> list[Floats]:
 
 
 def _stays(place: Ints) -> list[tuple[Ints, Ints, Ints]]:
-    """Columns of those who are at each step and the next, and their rows here and there."""
+    """Columns of the vehicles present at each step and the next, and their rows here and there."""
     found = []
     for here, there in pairwise(place):
         columns = np.flatnonzero((here >= 0) & (there >= 0))
@@ -142,14 +142,14 @@ def _eliminate(
     tick: Callable[[], object],
 ) -> list[Floats]:
     """S^-1 of each step given the next one; `vectors` (n,) take in the past."""
-    stiff = STIFF * drive.fix_weight[drive.fix_weight > 0].min()
+    limit = HARD * drive.fix_weight[drive.fix_weight > 0].min()
     ahead = memory.matrix(0, len(vectors[0]))
     ahead[:] = 0.0
     inverses = []
     for t, (motion, eta) in enumerate(zip(motions, vectors, strict=True)):
         total = ahead
         gather(t, drive, weight, total)
-        hard = motion.weight.max(initial=0.0) > stiff
+        hard = motion.weight.max(initial=0.0) > limit
         known = _whole(total) if hard else total
         total[motion.old, motion.old] += motion.weight
         inverse = _inverse(total)

@@ -31,9 +31,11 @@ NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 class Fusion(NamedTuple):
     """What is fused at a step.
 
-    Args:
-        source: (most, 22) coefficients of each source, the ego's first. gap: (most, 3) m, from the ego to their
-            pseudo-fixes. fixed: (9,) information and information vector that do not depend on w. sums: (18,) scratch.
+    Attributes:
+        source: (most, 22) coefficients of each source, the ego's first.
+        gap: (most, 3) m, from the ego to their pseudo-fixes.
+        fixed: (9,) information and information vector that do not depend on w.
+        sums: (18,) scratch.
         at: (3,) m, position of the ego.
     """
 
@@ -126,9 +128,9 @@ def best_weight(fusion: Fusion, count: int, least_det: bool, alone: bool, start:
 def derivatives(fusion: Fusion, count: int, w: float, least_det: bool) -> Any:
     """First and second derivative of tr P or of log det P by w, from those of the information."""
     add_up(fusion, count, w)
-    p, rise, bend = inverse3(six(fusion.sums, 0)), six(fusion.sums, 6), six(fusion.sums, 12)
+    p, derivative, second = inverse3(six(fusion.sums, 0)), six(fusion.sums, 6), six(fusion.sums, 12)
     outer, twice = (p, 1.0) if least_det else (between(p, UNIT), 2.0)
-    return -inner(outer, rise), twice * inner(outer, between(rise, p)) - inner(outer, bend)
+    return -inner(outer, derivative), twice * inner(outer, between(derivative, p)) - inner(outer, second)
 
 
 @part
@@ -150,17 +152,17 @@ def add_up(fusion: Fusion, count: int, w: float) -> None:
 
 @part
 def add(source: AnyArray, j: int, s: float, sign: float, sums: AnyArray) -> None:
-    """Add what one source says at its s, which is `sign` times w and a constant."""
+    """Add the information of one source at its s, which is `sign` times w and a constant."""
     p, q, r = source[j, DET + 1], source[j, DET + 2], source[j, DET + 3]
     scale = 1.0 / (source[j, DET] + s * (p + s * (q + s * r)))
     first, second = p + s * (2.0 * q + 3.0 * s * r), 2.0 * q + 6.0 * s * r
     for c in range(6):
         p, q, r = source[j, c], source[j, 6 + c], source[j, 12 + c]
         value = s * (p + s * (q + s * r)) * scale
-        rise = (p + s * (2.0 * q + 3.0 * s * r) - value * first) * scale
+        derivative = (p + s * (2.0 * q + 3.0 * s * r) - value * first) * scale
         sums[c] += value
-        sums[6 + c] += sign * rise
-        sums[12 + c] += (2.0 * q + 6.0 * s * r - 2.0 * rise * first - value * second) * scale
+        sums[6 + c] += sign * derivative
+        sums[12 + c] += (2.0 * q + 6.0 * s * r - 2.0 * derivative * first - value * second) * scale
 
 
 @part

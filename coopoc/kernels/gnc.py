@@ -13,8 +13,8 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import Bools, Floats
-from .abreast import choose, put, take
-from .abreast import lane as lane_of
+from .batched import choose, put, take
+from .batched import lane as lane_of
 from .compile import inner, storage
 from .lanes import LANES
 from .slots import ROW, Window, count_of, fix_gap, motion, place_of
@@ -26,10 +26,14 @@ TINY = 1e-30
 class GNC(NamedTuple):
     """The robust loss.
 
-    Args:
-        bound: (length + 1,) c^2 by the number of fixes of a group. truncated: or Geman and McClure's. ego: whether the
-            ego's fixes and its odometry are groups, too. rate: of mu. least: mu that is inverted. settled: largest
-            change of a weight that counts as none. rounds: 0 for no robust loss.
+    Attributes:
+        bound: (length + 1,) c^2 by the number of fixes of a group.
+        truncated: whether the loss is truncated least squares, or Geman and McClure's.
+        ego: whether the ego's fixes and its odometry are groups, too.
+        rate: of mu.
+        least: mu that is inverted.
+        settled: largest change of a weight that counts as none.
+        rounds: 0 for no robust loss.
     """
 
     bound: Floats
@@ -44,10 +48,14 @@ class GNC(NamedTuple):
 class Weights(NamedTuple):
     """The state of the schedule; a group is a vehicle or, the last, the ego's odometry.
 
-    Args:
-        weight, square, fixes: (N + 1, LANES), GNC weight, r^2 and number of fixes. member: (N + 1,) whether the group
-            is in the window. mu, going, blind: (LANES,), whether the weights still change, and whether they had
-            rejected every fix, so that all count.
+    Attributes:
+        weight: (N + 1, LANES) of GNC.
+        square: (N + 1, LANES) r^2.
+        fixes: (N + 1, LANES) number of fixes.
+        member: (N + 1,) whether the group is in the window.
+        mu: (LANES,).
+        going: (LANES,) whether the weights still change.
+        blind: (LANES,) whether they had rejected every fix, so that all count.
     """
 
     weight: Floats
@@ -161,7 +169,7 @@ def ratio_of(weights: Weights, gnc: GNC, group: int, lane: int) -> float:
 
 @inner
 def restore(window: Window, span: Any, weights: Weights, active: Floats) -> None:
-    """Where no fix has any weight nothing says where the window is: there all groups get weight one for good."""
+    """Where no fix has any weight the window's position is unobservable: there all groups get weight one for good."""
     total = 0.0 * take(window.odometry, uint64(0))
     for step in range(span[0], span[1] + 1):
         for place in range(

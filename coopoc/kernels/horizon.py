@@ -14,8 +14,8 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray, Bools, Floats
-from .abreast import put, take
 from .back import Past, ego_covariance, new_past
+from .batched import put, take
 from .compile import as_written, inner
 from .joint import Joint, new_joint
 from .lanes import LANES
@@ -115,8 +115,8 @@ def advance(
     """Take in the steps from steps[0] up to steps[1], and solve the window that ends at each, in runs first to last.
 
     Args:
-        seen: `newest` and `fresh` are overwritten where messages count when they were sent. arrival: (R, M) step at
-            which the message of each link arrives, -1 for never.
+        seen: `newest` and `fresh` are overwritten where messages count when they were sent.
+        arrival: (R, M) step at which the message of each link arrives, -1 for never.
     """
     window, past, joint, star, mask = horizon
     end = len(seen.start) - 2
@@ -125,7 +125,7 @@ def advance(
         enter(window, star, seen, known, runs, t)
         if settings.age >= 0.0:
             for step in range(span[0], t + 1):
-                listen(window, seen, known, arrival, settings.age, runs, step, t)
+                gather_arrived(window, seen, known, arrival, settings.age, runs, step, t)
         use_fixes(window, t if settings.age < 0.0 else span[0], t)
         start_points(window, past, known, t)
         mask[:] = 1.0
@@ -157,7 +157,7 @@ def find_moving(window: Window, past: Past, span: Any, settings: Settings, mask:
 
 
 @inner
-def listen(
+def gather_arrived(
     window: Window,
     seen: Measurements,
     known: Assumptions,

@@ -34,7 +34,8 @@ def follow(seen: Measurements, known: Assumptions, split: bool, least_det: bool)
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
-        seen: `broadcast` holds every vehicle's own estimate. known: `broadcast` its variance m^2.
+        seen: `broadcast` holds every vehicle's own estimate.
+        known: `broadcast` its variance m^2.
         least_det: choose w for the least determinant of the fused covariance, instead of its trace.
     """
     runs, steps = seen.gnss.shape[:2]
@@ -67,7 +68,7 @@ def write(out: Any, star: Star, believed: AnyArray, at: Any, n: int, lane: int) 
 
 @part
 def message(star: Star, k: int, row: int, lane: int) -> Any:
-    """Three numbers of what member k's last message says."""
+    """Three numbers of member k's last message."""
     at = 12 * k + 3 * row
     return star.motion[at, lane], star.motion[at + 1, lane], star.motion[at + 2, lane]
 

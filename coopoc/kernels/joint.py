@@ -44,9 +44,15 @@ LEAST_PROCESS = 1e-90
 class Joint(NamedTuple):
     """A Gaussian of the members' states in information form, and scratch memory; arrays are (., LANES).
 
-    Args:
-        state: (d most,). information, factor: (d^2 most^2,). eta, move, process: (d most,): information vector, step of
-            the state, inverse process noise. scratch: (2 d^2 most,). stride: blocks in a row.
+    Attributes:
+        state: (d most,).
+        information: (d^2 most^2,).
+        factor: (d^2 most^2,).
+        eta: (d most,) information vector.
+        move: (d most,) step of the state.
+        process: (d most,) process information, the inverse of the process noise.
+        scratch: (2 d^2 most,).
+        stride: blocks in a row.
     """
 
     state: Floats
@@ -111,9 +117,9 @@ def predict_state(star: Star, joint: Joint, n: int, old: int, row: Any) -> None:
             at = add(first3(before), load(star.motion, row_of + MOVED, ROW))
             store(joint.state, k, with_first3(before, at))
             p, q, r = load(star.motion, row_of + PROCESS, ROW)
-            stiff = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
+            process = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
             at_block = block_of(place, old)
-            store(joint.process, at_block, with_first3(load(joint.process, at_block, row), stiff))
+            store(joint.process, at_block, with_first3(load(joint.process, at_block, row), process))
         elif k == 0:
             first = load(star.motion, row_of + POSITION, ROW)
             store(joint.state, k, with_first3(zeros(first[0], row), first))

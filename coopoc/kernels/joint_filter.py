@@ -53,7 +53,8 @@ def follow(
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m.
 
     Args:
-        refine: one Gauss-Newton step on range and angles. row: as many zeros as a state has numbers.
+        refine: one Gauss-Newton step on range and angles.
+        row: as many zeros as a state has numbers.
     """
     runs, steps = seen.gnss.shape[:2]
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))

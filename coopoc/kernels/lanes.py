@@ -1,7 +1,7 @@
 """The inner loops of dense 3x3-block algebra, written as vector instructions: three rows -= (3, 3) x three rows.
 
 A loop over a short row costs more to enter than to run when the compiler must first prove that arrays do not overlap;
-here it is told so. Matrices are flat arrays whose rows are `stride` numbers apart, a multiple of `LANES`.
+here it is stated. Matrices are flat arrays whose rows are `stride` numbers apart, a multiple of `LANES`.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray, Floats
-from .abreast import pack
+from .batched import pack
 from .compile import as_written, inner, inside
 from .elimination import predict
 from .joint import LEAST_PROCESS, Joint, block_of, joint_in, joint_size, move, rearrange, solve, stayed
@@ -42,7 +42,8 @@ def follow(seen: Measurements, known: Assumptions, ones: bool, reset: bool) -> t
     """x (R, T, 3) m, its variance (R, T, 3) m^2, neighbours (R, M, 3) m.
 
     Args:
-        ones: propagate the covariance with blocks of ones. reset: restart all states when a member joins or leaves.
+        ones: propagate the covariance with blocks of ones.
+        reset: restart all states when a member joins or leaves.
     """
     runs, steps = seen.gnss.shape[:2]
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3)), np.empty((runs, seen.relative.shape[1], 3))
@@ -80,7 +81,7 @@ def axes(memory: AnyArray, at: int, lane: int) -> Any:
 
 @inside
 def message(star: Star, k: int, row: int, lane: int) -> Any:
-    """A row of what member k's last message says."""
+    """A row of member k's last message."""
     return axes(star.motion, 12 * k + 3 * row, lane)
 
 
@@ -202,10 +203,10 @@ def add_laplacian(star: Star, joint: Joint, known: Assumptions, unit: bool, n: i
     """Add L W L and L W (delta - L x), L the Laplacian of the star of complete measurements: W is 1, or the edges'
     information over the degree."""
     unit = unit or len(known.relative_std) == 0
-    count, rim = edge_information(star, known, n, unit, lane)
+    count, outer = edge_information(star, known, n, unit, lane)
     if count == 0.0:
         return
-    hub, stride, e = rim if unit else rim / count, joint.stride, n - 1
+    central, stride, e = outer if unit else outer / count, joint.stride, n - 1
     total, ego = 0.0 * load(joint.state, 0, ONE)[0], load(joint.state, 0, ONE)[0]
     for k in range(1, n):
         there, ahead = edge(star, k, lane)
@@ -213,13 +214,13 @@ def add_laplacian(star: Star, joint: Joint, known: Assumptions, unit: bool, n: i
     for k in range(1, n):
         there, ahead = edge(star, k, lane)
         gap = there * (ahead - load(joint.state, k, ONE)[0] + ego)
-        add_to(joint.eta, k - 1, rim * gap + there * hub * total)
-        add_to(joint.information, (k - 1) * stride + k - 1, rim * there)
-        add_to(joint.information, (k - 1) * stride + e, -there * (count * hub + rim))
+        add_to(joint.eta, k - 1, outer * gap + there * central * total)
+        add_to(joint.information, (k - 1) * stride + k - 1, outer * there)
+        add_to(joint.information, (k - 1) * stride + e, -there * (count * central + outer))
         for j in range(k, n):
-            add_to(joint.information, (k - 1) * stride + j - 1, hub * there * edge(star, j, lane)[0])
-    add_to(joint.eta, e, -(count * hub + rim) * total)
-    add_to(joint.information, e * stride + e, count * count * hub + count * rim)
+            add_to(joint.information, (k - 1) * stride + j - 1, central * there * edge(star, j, lane)[0])
+    add_to(joint.eta, e, -(count * central + outer) * total)
+    add_to(joint.information, e * stride + e, count * count * central + count * outer)
 
 
 @inside

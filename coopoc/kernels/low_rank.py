@@ -16,7 +16,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray
-from .abreast import less, pack, put, take
+from .batched import less, pack, put, take
 from .compile import part, storage
 from .components import BASE, BEGIN, MEMBER, STRIDE, TILE
 from .lanes import LANES, subtract
@@ -33,7 +33,7 @@ NO_PIVOT = 1e-12
 class Scratch(NamedTuple):
     """Memory of the update.
 
-    Args:
+    Attributes:
         rows: flat, `COPIED` + 3N rows as wide as the widest component.
         left: (N,) members that are not eliminated yet.
         degree: (N,) neighbours of each among these.
@@ -67,7 +67,7 @@ def scratch(vehicles: int, wide: int) -> Scratch:
 def update(
     plan: AnyArray,
     component: int,
-    spread: AnyArray,
+    covariance: AnyArray,
     info: AnyArray,
     near: AnyArray,
     memory: Scratch,
@@ -79,7 +79,7 @@ def update(
     Args:
         plan: of the components.
         component: which of them.
-        spread: covariances m^2, of which the upper triangle counts.
+        covariance: m^2, of which the upper triangle counts.
         info: informations 1/m^2, the lower triangle, zeros above; used up.
         near: (N, N) by the members' slots, True for two that share a block of `info`; False on the diagonal.
         memory: scratch.
@@ -88,7 +88,7 @@ def update(
     """
     begin, stride, base = plan[BEGIN, component], plan[STRIDE, component], plan[BASE, component]
     n = plan[BEGIN, component + 1] - begin
-    p, f, members = spread[base : base + stride**2], info[base : base + stride**2], plan[MEMBER, begin : begin + n]
+    p, f, members = covariance[base : base + stride**2], info[base : base + stride**2], plan[MEMBER, begin : begin + n]
     close = near[begin:, begin:]
     for i in range(n):
         memory.left[i], memory.degree[i], memory.copied[i] = i, 0, 0
@@ -238,7 +238,7 @@ def follow_up(
     eta: AnyArray,
     moved: AnyArray,
 ) -> None:
-    """Move by V^T C^-1 (y - L_k^T moved), y what the measurement says: L y is the information vector."""
+    """Move by V^T C^-1 (y - L_k^T moved), y the measurement: L y is the information vector."""
     step = uint64(len(v) // 3)
     stride, own = len(v) // 3, members[k]
     at = 3 * k * (stride + 1)

@@ -1,4 +1,4 @@
-"""What the last message of each member of a star says at a step, for LANES runs side by side.
+"""What the last message of each member of a star holds at a step, for LANES runs side by side.
 
 The one place that says what a message means: who is in the star, where each member stood in the last one, its motion
 since then, and its position as broadcast, brought forward to now. A message that is missing or lost has held = 0, one
@@ -14,7 +14,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray, Bools, Floats, Ints
-from .abreast import choose, put, take
+from .batched import choose, put, take
 from .compile import inner, inside, storage
 from .lanes import LANES
 from .small import add, load, scale, store, times
@@ -35,10 +35,15 @@ NONE = np.int64(0)
 class Measurements(NamedTuple):
     """What one ego has measured and received in R runs of T steps; M links, neighbours of a step nearest first.
 
-    Args:
-        gnss, velocity: (R, T, N, 3) m, m/s. broadcast: (R, T, N, 3) m, position in the neighbours' messages.
-        relative: (R, M, 5) of `components`. neighbour: (M,) columns. start: (T+1,) first link of each step.
-        newest: (R, M) step of the newest message held, -1 for none. fresh: (R, M) whether it is new.
+    Attributes:
+        gnss: (R, T, N, 3) m.
+        velocity: (R, T, N, 3) m/s.
+        broadcast: (R, T, N, 3) m, position in the neighbours' messages.
+        relative: (R, M, 5) of `components`.
+        neighbour: (M,) columns.
+        start: (T+1,) first link of each step.
+        newest: (R, M) step of the newest message held, -1 for none.
+        fresh: (R, M) whether it is new.
     """
 
     gnss: Floats
@@ -56,11 +61,15 @@ class Measurements(NamedTuple):
 class Assumptions(NamedTuple):
     """What a filter assumes of them; arrays are broadcastable to (R, T, N, 3) m^2.
 
-    Args:
-        process: of one step. fixes, broadcast: of the ego's fixes, of positions in messages.
+    Attributes:
+        process: of one step.
+        fixes: of the ego's fixes.
+        broadcast: of positions in messages.
         growth: variance of a position of age a: that of one step times a (growth[0] a + growth[1]).
-        relative_std: (3,) m, rad, rad; of no length for unit covariances. min_range: m.
-        flat: m^2, prior of a member that joins. acceleration: m/s^2, change of a velocity since it was sent.
+        relative_std: (3,) m, rad, rad; of no length for unit covariances.
+        min_range: m.
+        flat: m^2, prior of a member that joins.
+        acceleration: m/s^2, change of a velocity since it was sent.
         velocity_noise: `NoiseModel.velocity_noise`, from which `process` is made; of no length: it is given.
     """
 
@@ -78,11 +87,15 @@ class Assumptions(NamedTuple):
 class Star(NamedTuple):
     """The members of a star at a step, the ego first, in LANES runs.
 
-    Args:
-        member, previous: (most,) column, and index in the last star, -1 for a member that joins.
-        status: (5 most, LANES). motion: (12 most, LANES). relative: (8 most, LANES): range m, sine and cosine of
-            azimuth and of inclination, and three standard deviations, infinite where nothing was measured.
-        last_member, last_status: of the last star.
+    Attributes:
+        member: (most,) column.
+        previous: (most,) index in the last star, -1 for a member that joins.
+        status: (5 most, LANES).
+        motion: (12 most, LANES).
+        relative: (8 most, LANES): range m, sine and cosine of azimuth and of inclination, and three standard
+            deviations, infinite where nothing was measured.
+        last_member: of the last star.
+        last_status: of the last star.
     """
 
     member: Ints

@@ -17,9 +17,12 @@ class MotionNoise(NamedTuple):
 
     s is the measured speed on the axis, or of the whole velocity. So a step of 0.2 s is as uncertain as two of 0.1 s.
 
-    Args:
-        base: (3,) m per step of `interval`. ratio: (3,) share of the speed. floor: m/s. of_speed: 1.0 for a share of
-            the whole speed, 0.0 for one of each axis. interval: s.
+    Attributes:
+        base: (3,) m per step of `interval`.
+        ratio: (3,) share of the speed.
+        floor: m/s.
+        of_speed: 1.0 for a share of the whole speed, 0.0 for one of each axis.
+        interval: s.
     """
 
     base: Floats
@@ -81,8 +84,11 @@ def bridge(x: AnyArray, variance: AnyArray, new: AnyArray, velocity: AnyArray, p
     """Write dead reckoning where no fix is new: x + dt u m and its variance + q m^2, from the step before.
 
     Args:
-        x: (R, T, N, 3) m, changed in place. variance: (R, T, N, 3) m^2, changed in place. new: (R, T, N).
-        velocity: (R, T, N, 3) m/s. process: (R, T, N, 3) m^2.
+        x: (R, T, N, 3) m, changed in place.
+        variance: (R, T, N, 3) m^2, changed in place.
+        new: (R, T, N).
+        velocity: (R, T, N, 3) m/s.
+        process: (R, T, N, 3) m^2.
     """
     for run in range(x.shape[0]):
         for t in range(1, x.shape[1]):

@@ -35,7 +35,8 @@ def follow(seen: Measurements, known: Assumptions) -> tuple[Floats, Floats, Floa
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
-        seen: `broadcast` holds every vehicle's own estimate. known: `broadcast` its variance m^2.
+        seen: `broadcast` holds every vehicle's own estimate.
+        known: `broadcast` its variance m^2.
     """
     runs, steps = seen.gnss.shape[:2]
     x, cov, theirs = (

@@ -17,7 +17,7 @@ def add_squares(
     which: int,
     opposed: bool,
     residual: AnyArray,
-    slope: AnyArray,
+    jacobian: AnyArray,
     blocks: AnyArray,
     gradient: AnyArray,
     sizes: Any,
@@ -25,21 +25,24 @@ def add_squares(
     """Add S^T S to blocks (B, P, d, d) and S^T r to the gradient (B, n, d), S the derivative by one of the nodes.
 
     Args:
-        nodes: (M, arity). place: (M, 1) the block of the node, or (M, 3) those of the first, the second and the two.
-        which: of the nodes. opposed: the other node's derivative is -S, and adds too.
-        residual: (B, M, k) r. slope: (B or 1, M or 1, k, d) S.
+        nodes: (M, arity).
+        place: (M, 1) the block of the node, or (M, 3) those of the first, the second and the two.
+        which: of the nodes.
+        opposed: the other node's derivative is -S, and adds too.
+        residual: (B, M, k) r.
+        jacobian: (B or 1, M or 1, k, d) S.
         sizes: tuples of length k and d, so that the compiler knows both.
     """
     square = np.empty((len(sizes[1]), len(sizes[1])))
     for b in range(len(residual)):
-        each = slope[b % len(slope)]
+        each = jacobian[b % len(jacobian)]
         for m in range(len(nodes)):
-            S, r, pull = each[m % len(each)], residual[b, m], gradient[b, nodes[m, which]]
+            S, r, node_gradient = each[m % len(each)], residual[b, m], gradient[b, nodes[m, which]]
             for i in range(len(sizes[1])):
                 total = 0.0
                 for k in range(len(sizes[0])):
                     total += S[k, i] * r[k]
-                pull[i] += total
+                node_gradient[i] += total
                 if opposed:
                     gradient[b, nodes[m, 1 - which], i] -= total
                 for j in range(len(sizes[1])):
@@ -68,7 +71,9 @@ def add_products(
     """Add S_i^T S_j, i the smaller of a pair's nodes (M, 2), to the blocks `place[:, 2]` of (B, P, d, d).
 
     Args:
-        first, second: (B or 1, M or 1, k, d) derivatives by the first and the second node. sizes: as `add_squares`.
+        first: (B or 1, M or 1, k, d) derivative by the first node.
+        second: (B or 1, M or 1, k, d) derivative by the second node.
+        sizes: as `add_squares`.
     """
     for b in range(len(blocks)):
         one, two = first[b % len(first)], second[b % len(second)]

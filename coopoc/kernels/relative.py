@@ -13,7 +13,7 @@ from numba.extending import overload
 from numpy import uint64
 
 from ..arrays import AnyArray, Floats, Ints
-from .abreast import Abreast, choose, lane, less, pack, plus, put
+from .batched import Batched, choose, lane, less, pack, plus, put
 from .compile import as_written, inner, inside
 from .lanes import LANES
 
@@ -106,7 +106,7 @@ def one_angle(sine: Any, cosine: Any, which: int) -> float:
 @overload(math.atan2)
 def _of_several_runs(sine: Any, cosine: Any) -> Any:
     """Where not all are small, one by one."""
-    if not isinstance(sine, Abreast):
+    if not isinstance(sine, Batched):
         return None
 
     def each(sine: Any, cosine: Any) -> Any:
@@ -131,13 +131,13 @@ def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
     turn, raise_ = std[1] * d, std[2] * d
     side = r2 / (flat2 * flat2 * turn * turn)
     up = 1.0 / (r2 * flat2 * raise_ * raise_)
-    level, slope = plus(along, up * z, z), less(along, up, flat2)
+    level, tilt = plus(along, up * z, z), less(along, up, flat2)
     return (
         plus(level * x * x, side * y, y),
         (level - side) * x * y,
-        slope * x * z,
+        tilt * x * z,
         plus(level * y * y, side * x, x),
-        slope * y * z,
+        tilt * y * z,
         plus(along * z * z, up * flat2, flat2),
     )
 
@@ -228,8 +228,8 @@ def converted_cov(seen: Any, std: Any, least: float) -> Any:
     """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
 
     Args:
-        seen: range m, sine and cosine of azimuth and of inclination. std: 1e3 at most, so that a missing component
-            has a variance beyond any other.
+        seen: range m, sine and cosine of azimuth and of inclination.
+        std: 1e3 at most, so that a missing component has a variance beyond any other.
     """
     d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
     d = max(d, least)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray, Floats, Ints
-from .abreast import put, take
+from .batched import put, take
 from .compile import inner, storage
 from .edges import edge
 from .lanes import LANES
@@ -25,14 +25,22 @@ class Window(NamedTuple):
     """The last steps of one ego's star in LANES runs; step t stands in slot t modulo h + 1, member k of slot s in place
     s most + k.
 
-    Args:
-        sizes: (h + 1,) members. member, previous, later, joined: (places,) column, index in the star before and after,
-            or -1, and the step since which it has been in the star.
-        status, motion, relative: of `coopoc.kernels.messages.Star`, place by place. fix, used: (3 places, LANES) 1/m^2,
-            information of the positions that count, and the same times their GNC weights.
-        edge, eta: (9 places, LANES), (3 places, LANES), information of the relative measurements around the points.
-        point: (3 places, LANES) m. odometry: (1, LANES) GNC weight of the ego's odometry. layout: slots
-            h + 1, and most members, places of a slot.
+    Attributes:
+        sizes: (h + 1,) members.
+        member: (places,) column.
+        previous: (places,) index in the star before, or -1.
+        later: (places,) index in the star after, or -1.
+        joined: (places,) step since which it has been in the star.
+        status: of `coopoc.kernels.messages.Star`, place by place.
+        motion: of `coopoc.kernels.messages.Star`, place by place.
+        relative: of `coopoc.kernels.messages.Star`, place by place.
+        fix: (3 places, LANES) 1/m^2, information of the positions that count.
+        used: (3 places, LANES) 1/m^2, the same times their GNC weights.
+        edge: (9 places, LANES), information of the relative measurements around the points.
+        eta: (3 places, LANES), their information vectors.
+        point: (3 places, LANES) m.
+        odometry: (1, LANES) GNC weight of the ego's odometry.
+        layout: slots h + 1, and most members, places of a slot.
     """
 
     sizes: Ints
@@ -145,9 +153,9 @@ def fix_gap(window: Window, place: int) -> Any:
 def motion(window: Window, here: int, there: int) -> Any:
     """Information 1/m^2 of the motion from a place to the one after, and its eta on the latter's point."""
     p, q, r = load(window.motion, 4 * there + PROCESS, ROW)
-    stiff = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
+    process = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
     moved = subtract(load(window.point, there, ROW), load(window.point, here, ROW))
-    return stiff, times(stiff, subtract(load(window.motion, 4 * there + MOVED, ROW), moved))
+    return process, times(process, subtract(load(window.motion, 4 * there + MOVED, ROW), moved))
 
 
 @inner

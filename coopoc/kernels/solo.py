@@ -27,9 +27,12 @@ GNSS, VELOCITY, DT, FIX_AGE = slice(0, 3), slice(3, 6), 6, 7
 class FixNoise(NamedTuple):
     """The noise of fixes: known, or revised at each of them.
 
-    Args:
-        variance: (3,) m^2 at the start. weight: fixes that the start counts for; infinite: known. window: most fixes in
-            the running mean. rho: forgetting per fix. iterations: of the variational fixed point; 0: running mean.
+    Attributes:
+        variance: (3,) m^2 at the start.
+        weight: fixes that the start counts for; infinite: known.
+        window: most fixes in the running mean.
+        rho: forgetting per fix.
+        iterations: of the variational fixed point; 0: running mean.
     """
 
     variance: Floats
@@ -111,7 +114,9 @@ def drive(
     A vehicle that was absent starts at its first fix.
 
     Args:
-        gnss, velocity, process: (R, T, N, 3) m, m/s, m^2; NaN for no fix and for an absent vehicle.
+        gnss: (R, T, N, 3) m, NaN for no fix and for an absent vehicle.
+        velocity: (R, T, N, 3) m/s, NaN for an absent vehicle.
+        process: (R, T, N, 3) m^2, NaN for an absent vehicle.
         known: whether x[:, 0] is exact; if not, it is a fix.
     """
     if math.isinf(rule.weight):
@@ -159,14 +164,14 @@ def _drive_known(
             for n in range(vehicles):
                 for c in range(3):
                     fix, r = gnss[run, t, n, c], rule.variance[c]
-                    prior, spread = x[run, t - 1, n, c] + dt * velocity[run, t, n, c], p[run, t - 1, n, c]
+                    prior, variance = x[run, t - 1, n, c] + dt * velocity[run, t, n, c], p[run, t - 1, n, c]
                     if math.isnan(prior):
-                        prior, spread = fix, r
+                        prior, variance = fix, r
                     else:
-                        spread += process[run, t, n, c]
+                        variance += process[run, t, n, c]
                         if not math.isnan(fix):
-                            prior, spread = corrected(prior, spread, fix, r)
-                    x[run, t, n, c], p[run, t, n, c] = prior, spread
+                            prior, variance = corrected(prior, variance, fix, r)
+                    x[run, t, n, c], p[run, t, n, c] = prior, variance
 
 
 def packed(motion: MotionNoise, rule: FixNoise) -> Floats:
@@ -211,7 +216,9 @@ def stream_step(given: AnyArray, state: AnyArray, history: AnyArray, noise: AnyA
     Nothing is changed where the input is bad or the history full. A state of NaN has not started yet.
 
     Args:
-        given: (8,) fix m, velocity m/s, dt s, age of the fix s. state: (3, 5). noise: of `packed`.
+        given: (8,) fix m, velocity m/s, dt s, age of the fix s.
+        state: (3, 5).
+        noise: of `packed`.
         answer: (12,) position m, covariance m^2.
     """
     motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])

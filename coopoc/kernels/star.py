@@ -1,4 +1,4 @@
-"""Marginals of stars, whose nodes only meet at a hub: the compiled twin of `coopoc.optimize.arrowhead` for them."""
+"""Marginals of stars, whose nodes only meet at a separator: the compiled twin of `coopoc.optimize.arrowhead`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .compile import compiled
 
 @compiled
 def star_marginals(
-    hub: int,
+    separator: int,
     others: AnyArray,
     corner: int,
     head: AnyArray,
     arm: AnyArray,
-    turned: AnyArray,
+    transposed: AnyArray,
     blocks: AnyArray,
     gradient: AnyArray,
     cov: AnyArray,
@@ -27,57 +27,65 @@ def star_marginals(
 ) -> Bools:
     """Diagonal blocks of (J^T J)^-1 into cov (B, n, d, d), and -(J^T J)^-1 gradient into dx (B, n, d).
 
-    With a node's own block H and its arm A to the hub: T = H^-1 A, S = corner - sum A^T T; the hub's covariance is
-    S^-1, the node's H^-1 + T S^-1 T^T.
+    With a node's own block H and its arm A to the separator: T = H^-1 A, S = corner - sum A^T T. The separator's
+    covariance is S^-1, the node's H^-1 + T S^-1 T^T.
 
     Args:
-        hub: its node. others: (G,) nodes around it. corner, head (G,), arm (G,): their blocks among (B, P, d, d), -1
-            for an arm that is none. turned: (G,) whether an arm's block is that of (hub, node). gradient: (B, n, d).
-        size: a tuple of length d, so that the compiler knows it.
+        separator: its node.
+        others: (G,) nodes around it.
+        corner: block of the separator among `blocks`.
+        head: (G,) block of each node.
+        arm: (G,) block of each node and the separator, -1 for none.
+        transposed: (G,) whether an arm's block is that of (separator, node).
+        blocks: (B, P, d, d) of J^T J.
+        gradient: (B, n, d).
+        cov: (B, n, d, d), filled.
+        dx: (B, n, d), filled.
+        size: a tuple of length d, which the compiler unrolls.
 
     Returns:
         (B,) False where a block is not positive definite; cov and dx are not filled there.
     """
     d, sound = len(size), np.empty(len(blocks), np.bool_)
-    inner, taken = np.empty((len(others), d, d)), np.empty((len(others), d, d))
-    schur, inverse, wide, step = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d)
+    inner, solved = np.empty((len(others), d, d)), np.empty((len(others), d, d))
+    schur, inverse, product, step = np.empty((d, d)), np.empty((d, d)), np.empty((d, d)), np.empty(d)
     for b in range(len(blocks)):
         sound[b] = True
         for i in range(len(size)):
-            step[i] = -gradient[b, hub, i]
+            step[i] = -gradient[b, separator, i]
             for j in range(len(size)):
                 schur[i, j] = blocks[b, corner, i, j]
         for g in range(len(others)):
             sound[b] &= invert(blocks[b, head[g]], inner[g], size)
             if arm[g] < 0:
                 continue
-            A = blocks[b, arm[g]].T if turned[g] else blocks[b, arm[g]]
+            A = blocks[b, arm[g]].T if transposed[g] else blocks[b, arm[g]]
             eta = gradient[b, others[g]]
             for i in range(len(size)):
                 for j in range(len(size)):
                     total = 0.0
                     for k in range(len(size)):
                         total += inner[g, i, k] * A[k, j]
-                    taken[g, i, j] = total
+                    solved[g, i, j] = total
             for i in range(len(size)):
                 for k in range(len(size)):
-                    step[i] += taken[g, k, i] * eta[k]
+                    step[i] += solved[g, k, i] * eta[k]
                     for j in range(len(size)):
-                        schur[i, j] -= A[k, i] * taken[g, k, j]
+                        schur[i, j] -= A[k, i] * solved[g, k, j]
         sound[b] &= invert(schur, inverse, size)
         if sound[b]:
-            cov[b, hub], dx[b, hub] = inverse, 0.0
+            cov[b, separator], dx[b, separator] = inverse, 0.0
             for i in range(len(size)):
                 for k in range(len(size)):
-                    dx[b, hub, i] += inverse[i, k] * step[k]
+                    dx[b, separator, i] += inverse[i, k] * step[k]
             for g in range(len(others)):
-                spread(
+                back_substitute(
                     gradient[b, others[g]],
                     inner[g],
-                    taken[g],
+                    solved[g],
                     inverse,
                     step,
-                    wide,
+                    product,
                     cov[b, others[g]],
                     dx[b, others[g]],
                     arm[g] >= 0,
@@ -87,19 +95,19 @@ def star_marginals(
 
 
 @compiled
-def spread(
+def back_substitute(
     eta: AnyArray,
     inner: AnyArray,
-    taken: AnyArray,
-    hub: AnyArray,
+    solved: AnyArray,
+    separator: AnyArray,
     step: AnyArray,
-    wide: AnyArray,
+    product: AnyArray,
     cov: AnyArray,
     dx: AnyArray,
     linked: bool,
     size: Any,
 ) -> None:
-    """Covariance and step of one node from those of the hub."""
+    """Covariance and step of one node from those of the separator."""
     for i in range(len(size)):
         total = 0.0
         for k in range(len(size)):
@@ -107,14 +115,14 @@ def spread(
             cov[i, k] = inner[i, k]
         if linked:
             for j in range(len(size)):
-                wide[i, j] = 0.0
+                product[i, j] = 0.0
                 for k in range(len(size)):
-                    wide[i, j] += taken[i, k] * hub[k, j]
+                    product[i, j] += solved[i, k] * separator[k, j]
             for k in range(len(size)):
-                total += wide[i, k] * step[k]
+                total += product[i, k] * step[k]
             for j in range(len(size)):
                 for k in range(len(size)):
-                    cov[i, j] += wide[i, k] * taken[j, k]
+                    cov[i, j] += product[i, k] * solved[j, k]
         dx[i] = -total
 
 

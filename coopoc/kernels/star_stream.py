@@ -46,8 +46,11 @@ LAST_AGE, LAST_USED = 3, 4
 class Memory(NamedTuple):
     """What a stream keeps from step to step; M vehicles known, up to `most` in the star.
 
-    Args:
-        numbers, columns: of the star and its Gaussian. last: (M, 5). place: (M,) index in the last star, -1 for none.
+    Attributes:
+        numbers: of the star and its Gaussian.
+        columns: of the star and its Gaussian.
+        last: (M, 5).
+        place: (M,) index in the last star, -1 for none.
         size: (2,) members of the last star, `most`.
     """
 
@@ -120,7 +123,10 @@ def stream_step(
     Args:
         given: (12,) fix m, velocity m/s, dt s, age of the fix s; then x0 m if it is known before the first step, 1.
         inbox: (k, 12) of the neighbours measured now, behind each its row in `last`.
-        numbers, last: of Memory. index: its size, columns and place, one behind the other. assumed: of `packed`.
+        numbers: of Memory.
+        last: of Memory.
+        index: its size, columns and place, one behind the other.
+        assumed: of `packed`.
     """
     n, old, most, slots = 1 + len(inbox), index[0], index[1], inbox[:, 11]
     memory = Memory(numbers, index[2 : 2 + 3 * most], last, index[2 + 3 * most :], index[:2])

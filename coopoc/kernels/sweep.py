@@ -12,8 +12,8 @@ from typing import Any
 from numpy import uint64
 
 from ..arrays import AnyArray
-from .abreast import take
-from .back import Past, advance_points, go_back, kept_of, stiffness
+from .back import Past, advance_points, go_back, kept_of, process_information
+from .batched import take
 from .compile import inner
 from .edges import AT_GAP, EXACT, edge
 from .elimination import predict
@@ -106,7 +106,7 @@ def distance(window: Window, past: Past, span: Any) -> Any:
 
 @inner
 def assemble(window: Window, past: Past, joint: Joint, step: int) -> None:
-    """From what the past says around `at` to what it and the fixes of a step say around its points."""
+    """Move the information of the past from `at` to a step's points, and add the step's fixes."""
     ego, n, stride = place_of(window.layout, step, 0), count_of(window.sizes, step), joint.stride
     for k in range(n):
         place = ego + k
@@ -142,7 +142,7 @@ def go_on(window: Window, past: Past, joint: Joint, known: Assumptions, step: in
     """A step becomes the past of the next one; what it takes to go back is kept."""
     m, n, stride = count_of(window.sizes, step), count_of(window.sizes, step + 1), joint.stride
     here, after = place_of(window.layout, step, 0), place_of(window.layout, step + 1, 0)
-    stiffness(window, joint, step)
+    process_information(window, joint, step)
     kept = kept_of(window, past, step)
     predict(joint.information, m, stride, joint.process, kept, ONE, ROW, m + 1)
     for k in range(m):
@@ -189,8 +189,9 @@ def sweep(
     """One Gauss-Newton step of the window in the runs of the mask; the ego's newest covariance is then in `scratch`.
 
     Args:
-        exact: measurements in range and angles. entered: the newest step has just come; it is solved converted, and
-            made exact where that leads, and the oldest becomes the arrival cost.
+        exact: measurements in range and angles.
+        entered: the newest step has just come; it is solved converted, and made exact where that leads, and the oldest
+            becomes the arrival cost.
     """
     first, last = span
     moves, leaving = take(mask, uint64(0)), first - 1

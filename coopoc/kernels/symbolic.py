@@ -15,7 +15,7 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .abreast import VECTOR, Abreast, abreast, wide
+from .batched import BATCHED, VECTOR, Batched, wide
 from .lanes import LANES, check_index, fused
 
 
@@ -145,7 +145,7 @@ def _kind(made: Any) -> Any:
     if made is None:
         return types.void
     if isinstance(made, Number):
-        return abreast if made.batched else types.float64
+        return BATCHED if made.batched else types.float64
     return types.Tuple([_kind(n) for n in made])
 
 
@@ -157,6 +157,6 @@ def _symbol(context: Any, build: Any, kind: Any, value: Any) -> Any:
         return [_symbol(context, build, k, v) for k, v in zip(kinds, values, strict=True)]
     if isinstance(kind, types.Array):
         return _Memory(kind, context, build, value)
-    if isinstance(kind, Abreast | types.Float):
-        return Number(isinstance(kind, Abreast), build, value)
+    if isinstance(kind, Batched | types.Float):
+        return Number(isinstance(kind, Batched), build, value)
     return value

@@ -13,7 +13,7 @@ import numpy as np
 from numpy import uint64
 
 from ..arrays import AnyArray, Bools, Floats, Ints
-from .abreast import put, take
+from .batched import put, take
 from .chains import Memory, move, new_memory
 from .compile import as_written, inner
 from .edges import AT_MEASUREMENT, EXACT
@@ -67,7 +67,8 @@ def windows(seen: Measurements, known: Assumptions, fresh: Fresh, settings: Sett
     """All windows of a drive.
 
     Args:
-        seen: `fresh` is where any message is held. gnc: without rounds for no robust loss.
+        seen: `fresh` is where any message is held.
+        gnc: without rounds for no robust loss.
     """
     runs, steps, most = seen.gnss.shape[0], seen.gnss.shape[1], largest(seen.start)
     found = Found(

@@ -78,7 +78,7 @@ class NoiseAdaptive(ABC):
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveKalman(NoiseAdaptive):
-    """Kalman filter whose GNSS variance r is the mean of what innovations say of it, per axis.
+    """Kalman filter whose GNSS variance r is estimated from its innovations, per axis.
 
     With innovation v of variance p + r, p that of the prediction: r <- r + (v^2 - p - r) / n, n <- min(n + 1, window).
     So r is the mean of v^2 - p over all fixes and `prior_weight` fixes of the assumed variance, and once there are

@@ -67,7 +67,7 @@ WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "cent
 
 
 def needs_whole_fleet(name: str) -> bool:
-    """Whether a method needs what every vehicle measured; one from elsewhere says so by `whole_fleet = True`.
+    """Whether a method needs what every vehicle measured; one from elsewhere declares it by `whole_fleet = True`.
 
     >>> needs_whole_fleet("gbp"), needs_whole_fleet("joint")
     (True, False)

@@ -62,7 +62,7 @@ class CooperativeMAP:
         robust: "truncated" or "geman-mcclure"; None for no robust loss.
         threshold: probability that the fixes of an honest neighbour in a window pass (of a robust loss).
         suspect_ego: the ego's own fixes and its odometry may be outliers, too, each as one group. Where every fix is
-            rejected nothing says where the window is: it is solved with all of them, and the notes count it.
+            rejected the window's position is unobservable: it is solved with all of them, and the notes count it.
 
     References:
         Yang, Antonante, Tzoumas, Carlone, Graduated non-convexity for robust spatial perception, RA-L 2020.
@@ -220,7 +220,7 @@ class Windows:
                     yield first + lane, t, Problem.from_steps(steps, self.known.sensors), vehicles_of(window, span)
 
     def put(self, found: Any, run: int, step: int, x: Floats, cov: Floats) -> None:
-        """Fill in what a problem's solution says of its newest step."""
+        """Fill in the solution of a problem's newest step."""
         links = slice(self.box.start[step], self.box.start[step + 1])
         found.x[run, step], found.covariance[run, step] = x[0], cov
         found.neighbours[run, links] = np.where(self.box.newest[run, links, None] >= 0, x[1:], np.nan)

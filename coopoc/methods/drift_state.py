@@ -1,4 +1,4 @@
-"""The state of a star whose receivers err for a while: positions, each one's drift, and what all have in common."""
+"""The state of a star whose fixes have time-correlated errors: positions, each receiver's drift, the common drift."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ class Drift:
     e_t = keep e_{t-1} + w_t with var e = own or common m^2 per axis. What has no variance is not in the state.
 
     Args:
-        own, common: m^2 per axis. keep: correlation of two errors one step apart.
+        own: m^2 per axis, of each receiver.
+        common: m^2 per axis, of all receivers.
+        keep: correlation of two errors one step apart.
 
     >>> Drift.of(Sensors(gnss_drift_std=1.0), 0.1).size(4)
     24
@@ -39,41 +41,42 @@ class Drift:
         """Length of the state of n members."""
         return 3 * n * (1 + (self.own > 0)) + 3 * (self.common > 0)
 
-    def sees(self, n: int) -> Floats:
+    def fix_matrix(self, n: int) -> Floats:
         """(3n, size) of the fixes: z = x + drift + common + white noise."""
         unit = np.eye(3 * n)
         parts = [unit, *([unit] if self.own else []), *([np.tile(np.eye(3), (n, 1))] if self.common else [])]
         return np.concatenate(parts, axis=1)
 
-    def carry(self, spread: Floats, kept: Ints, process: Floats) -> Floats:
-        """Covariance one step later, (..., size, size) m^2: nothing is known of the position of who joins.
+    def carry(self, covariance: Floats, previous: Ints, process: Floats) -> Floats:
+        """Covariance one step later, (..., size, size) m^2: nothing is known of the position of a new member.
 
         Args:
-            spread: (..., size, size) of the members before. kept: (n,) their places there, -1 for who joins.
+            covariance: (..., size, size) of the members before.
+            previous: (n,) their places there, -1 for a new member.
             process: (..., n, 3) m^2 of the motion.
         """
-        n, before = len(kept), self._members(spread.shape[-1])
-        stays = np.flatnonzero(kept >= 0)
-        here, there = rows(stays), rows(kept[stays])
+        n, before = len(previous), self._members(covariance.shape[-1])
+        stays = np.flatnonzero(previous >= 0)
+        here, there = rows(stays), rows(previous[stays])
         if self.own:
             here, there = (np.concatenate([at, at + 3 * m]) for at, m in ((here, n), (there, before)))
         if self.common:
             here, there = (np.append(at, self.size(m) - 3 + np.arange(3)) for at, m in ((here, n), (there, before)))
-        new, diagonal = self._fresh(n, stays, process, spread.shape[:-2]), np.arange(self.size(n))
+        new, diagonal = self._fresh(n, stays, process, covariance.shape[:-2]), np.arange(self.size(n))
         shrink = np.where(here < 3 * n, 1.0, self.keep)
         out = np.zeros((*new.shape, new.shape[-1]))
         out[..., diagonal, diagonal] = new
         if before:
-            out[..., here[:, None], here] += shrink[:, None] * shrink * spread[..., there[:, None], there]
+            out[..., here[:, None], here] += shrink[:, None] * shrink * covariance[..., there[:, None], there]
         return out
 
-    def moved(self, state: Floats, kept: Ints) -> Floats:
-        """(..., size) of the drifts one step later and zeros for the positions; who joins is expected to have none."""
-        n, before = len(kept), self._members(state.shape[-1])
+    def moved(self, state: Floats, previous: Ints) -> Floats:
+        """(..., size) of the drifts one step later and zeros for the positions and new members."""
+        n, before = len(previous), self._members(state.shape[-1])
         out = np.zeros((*state.shape[:-1], self.size(n)))
-        stays = np.flatnonzero(kept >= 0)
+        stays = np.flatnonzero(previous >= 0)
         if self.own and before:
-            out[..., 3 * n + rows(stays)] = self.keep * state[..., 3 * before + rows(kept[stays])]
+            out[..., 3 * n + rows(stays)] = self.keep * state[..., 3 * before + rows(previous[stays])]
         if self.common and before:
             out[..., -3:] = self.keep * state[..., -3:]
         return out
@@ -96,12 +99,12 @@ class Drift:
 
 
 def drifting(sensors: Sensors) -> bool:
-    """Whether fixes err for a while."""
+    """Whether fixes have time-correlated errors."""
     return sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0
 
 
 def require_white(sensors: Sensors, what: str) -> None:
-    """InputError where fixes err for a while and `what` takes their errors as white."""
+    """InputError where fixes have time-correlated errors and `what` takes them as white."""
     if drifting(sensors):
         found = (sensors.gnss_drift_std, sensors.gnss_common_std)
         hint = "Set them to 0, or take the filtering one."

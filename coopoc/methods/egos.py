@@ -17,7 +17,7 @@ from .track import Method, Track
 
 class Estimate(NamedTuple):
     """One ego at one step: position (R, 3) m, covariance (R or 1, 3, 3) m^2, its links there, and its neighbours
-    (R, k, 3) m, NaN where it says nothing of them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3)."""
+    (R, k, 3) m, NaN where it does not estimate them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3)."""
 
     step: int | slice
     x: Floats

@@ -37,10 +37,12 @@ class FixedLagSmoother:
     Messages are brought forward as there; MovingHorizon puts them at their true time.
 
     Args:
-        lag: steps. backend: "gauss-newton", batched over the runs, or "gtsam", its incremental fixed-lag smoother,
-            which loops over the runs and makes each helding linear once, when it comes.
+        lag: steps.
+        backend: "gauss-newton", batched over the runs, or "gtsam", its incremental fixed-lag smoother, which loops over
+            the runs and makes each helding linear once, when it comes.
         smoothed: answer each step when it leaves the window, `lag` steps late; the last ones at the end of the drive.
-        noise_model: "identity", "nominal" or a NoiseModel. exact: False keeps heldings as converted vectors.
+        noise_model: "identity", "nominal" or a NoiseModel.
+        exact: False keeps heldings as converted vectors.
 
     Raises:
         InputError: a lag < 0, another backend. MissingLibraryError: no gtsam.
@@ -116,7 +118,7 @@ class FixedLagSmoother:
 
 
 def read(found: Any, box: Inbox, run: int, t: int, estimate: Any) -> None:
-    """Put what gtsam's smoother says of a step into the arrays of the kernels."""
+    """Put the estimates of gtsam's smoother at a step into the arrays of the kernels."""
     found.x[run, t], found.covariance[run, t] = estimate.x[0], estimate.covariance[0]
     found.neighbours[run, box.start[t] : box.start[t + 1]] = estimate.x[1:]
 
@@ -126,15 +128,15 @@ def _piece(
 ) -> Problem:
     """What a step adds in a run: its members' fixes, motions from the step before, and relative measurements."""
     (run, t, exact), (before, here) = which, names
-    held = steps_of(horizon.window, recording, box, run, (t, t))[0]
-    problem = window_problem(horizon, [held], known, exact, run, (t, t))
-    stays, joins = np.flatnonzero(held.previous >= 0), np.flatnonzero(held.previous < 0)
+    newest = steps_of(horizon.window, recording, box, run, (t, t))[0]
+    problem = window_problem(horizon, [newest], known, exact, run, (t, t))
+    stays, joins = np.flatnonzero(newest.previous >= 0), np.flatnonzero(newest.previous < 0)
     top = len(stays)
     factors = [replace(factor, nodes=factor.nodes + top) for factor in problem.factors]
     if top:
         pairs = np.stack([np.arange(top), top + stays], axis=1)
-        factors.append(Factor("displacement", pairs, held.moved[stays], held.moved_std[stays]))
+        factors.append(Factor("displacement", pairs, newest.moved[stays], newest.moved_std[stays]))
     if len(joins):
         start = horizon.past.at[:, run % horizon.mask.size].reshape(-1, 3)[places(horizon.window, t)]
         factors.append(Factor("position", top + joins[:, None], start[joins], np.array(np.sqrt(FORGOTTEN))))
-    return Problem((*(before[k] for k in held.previous[stays]), *here), tuple(factors))
+    return Problem((*(before[k] for k in newest.previous[stays]), *here), tuple(factors))

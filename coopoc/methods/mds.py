@@ -27,7 +27,7 @@ class MDS:
     Multidimensional Scaling", 2005, chapters 12 and 20).
 
     No step knows of another. The ego measures its own ranges; those among its neighbours come in their messages, where
-    the recording has their links (`observe` with all vehicles as observers): the notes say how many did. Shortest paths
+    the recording has their links (`observe` with all vehicles as observers): the notes give their share. Shortest paths
     complete the rest. If all lead through the ego it seems to stand in the middle of its neighbours, and is worse off
     than with its fix alone (`town10`, K <= 10: 8.9 m against 6.1 m); `missing="angles"` takes those distances from the
     ego's azimuths and inclinations instead (3.6 m), which MDS as such does not use. With `iterations`, majorisation of
@@ -72,8 +72,8 @@ class MDS:
         recording, known, notes = bridge(recording, resolve(self.noise_model, recording))
         links = recording.links
         columns = recording.columns(egos)
-        heard = np.unique(links.neighbour[np.isin(links.observer, columns)])
-        listed = min(self.ranges, recording.v2x.max_neighbours) if np.isin(heard, recording.observers).any() else 0
+        neighbours = np.unique(links.neighbour[np.isin(links.observer, columns)])
+        listed = min(self.ranges, recording.v2x.max_neighbours) if np.isin(neighbours, recording.observers).any() else 0
         method = replace(self, ranges=listed)
         find, count = _finder(recording, listed), np.zeros(2, dtype=np.int64)
 
@@ -101,20 +101,22 @@ class MDS:
             yield Estimate(star.step, points[:, 0], unclaimed, star.links, theirs)
 
     def _locate(self, measured: Floats, star: StarStep, held: Bools, known: NoiseModel) -> Floats:
-        """Positions (R, n, 3) of the star from its ranges (R, n, n), and the fixes of those who are held (R, n)."""
-        pull = np.where(held[..., None], 1.0 / star.fix_variance, 0.0)
+        """Positions (R, n, 3) of the star from its ranges (R, n, n), and the fixes held (R, n)."""
+        anchor_weight = np.where(held[..., None], 1.0 / star.fix_variance, 0.0)
         seen = np.concatenate([np.zeros((len(held), 1, 3)), star.vector], axis=1)
         apart = np.linalg.norm(seen[:, :, None] - seen[:, None], axis=-1) if self.missing == "angles" else None
         guess = np.linalg.norm(star.fix[:, :, None] - star.fix[:, None], axis=-1)
         apart = None if apart is None else np.where(np.isfinite(apart), apart, guess)
         distance = complete(measured, apart)
         distance = np.where(np.isfinite(distance), distance, guess)
-        points = fit(shape(distance), star.fix, pull.mean(axis=2))
+        points = fit(shape(distance), star.fix, anchor_weight.mean(axis=2))
         if not self.iterations:
             return points
         ends = np.isfinite(measured) * 1.0
         variance = 1.0 if known.sensors is None else known.sensors.range_std**2
-        return majorise(points, distance, (ends + np.swapaxes(ends, 1, 2)) / variance, star.fix, pull, self.iterations)
+        return majorise(
+            points, distance, (ends + np.swapaxes(ends, 1, 2)) / variance, star.fix, anchor_weight, self.iterations
+        )
 
 
 Finder = Callable[[Ints, Ints, Ints], Ints]
@@ -141,7 +143,7 @@ def _finder(recording: Recording, most: int) -> Finder:
 
 
 def _ranges(recording: Recording, members: Ints, sent: Ints, find: Finder) -> Floats:
-    """(R, n, n) m what the members' newest messages say of each other, NaN where nothing."""
+    """(R, n, n) m, ranges in the members' newest messages, NaN where none."""
     if len(members) == 1:
         return np.full((recording.runs, 1, 1), np.nan)
     link = find(sent[:, :, None], members[None, :, None], members[None, None, :])

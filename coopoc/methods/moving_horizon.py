@@ -37,19 +37,22 @@ class MovingHorizon:
     what the steps before the horizon leave when they are eliminated one by one, as a filter does. A message that comes
     late is put where it belongs: its fix at the step at which it was sent, its velocity in the place of the older one
     that stood in for it. A velocity that stands in n times makes the same error n times (see star_steps). A fix that is
-    late by more than the horizon is dropped, and the notes count it. With linear sightings and no constraint the newest
-    point is that of the Kalman filter.
+    late by more than the horizon is dropped, and the notes count it. With linear relative measurements and no
+    constraint the newest point is that of the Kalman filter.
 
     Constraints hold for every vehicle at every step of the horizon. They bound the answer and not the arrival cost,
     which stays that of the filter (Rao, Rawlings, Mayne, IEEE TAC 48, 2003); a window that keeps them as it is needs no
     other solution. The covariance knows of equalities only: under an exact height it is singular.
 
     Args:
-        horizon: N, steps. backend: "gauss-newton" solves all runs at once by block elimination, and no constraints;
-            others of `coopoc.optimize.backends()` loop over the runs: osqp can hold heights, casadi all.
+        horizon: N, steps.
+        backend: "gauss-newton" solves all runs at once by block elimination, and no constraints; others of
+            `coopoc.optimize.backends()` loop over the runs: osqp can hold heights, casadi all.
         road: the height m of all vehicles, (lowest, highest), or a surface z = f(x, y, m) with m a namespace that has
-            sqrt, atan2 and where. top_speed: m/s from step to step.
-        noise_model: "identity", "nominal" or a NoiseModel. exact: False keeps sightings as converted vectors.
+            sqrt, atan2 and where.
+        top_speed: m/s from step to step.
+        noise_model: "identity", "nominal" or a NoiseModel.
+        exact: False keeps relative measurements as converted vectors.
 
     Raises:
         InputError: a horizon < 1, a road or top speed that the backend cannot hold or no vehicle can keep.

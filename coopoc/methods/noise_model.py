@@ -59,7 +59,7 @@ class NoiseModel:
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:
-        """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is held against."""
+        """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is compared with."""
         return replace(cls.nominal(sensors), name="oracle", velocity=fleet.velocity)
 
     @classmethod
@@ -70,7 +70,8 @@ class NoiseModel:
         measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them.
 
         Args:
-            recording: what the training vehicles measured. fleet: where they were.
+            recording: what the training vehicles measured.
+            fleet: their true motion.
         """
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
         floor = recording.dt * recording.sensors.velocity_floor
@@ -92,9 +93,9 @@ class NoiseModel:
         return variance
 
     @property
-    def pace(self) -> Floats:
-        """(3,) what makes the process noise from a measured velocity: ratio, floor m/s, 1 for a ratio of the speed; of
-        no length where it comes from elsewhere."""
+    def velocity_noise(self) -> Floats:
+        """(3,) parameters of a measured velocity's noise, the process noise: ratio, floor m/s, 1 for a ratio of the
+        speed; of no length where the process noise comes from elsewhere."""
         another = type(self).process_variance is not NoiseModel.process_variance
         if another or self.sensors is None or self.process_std is not None or self.velocity is not None:
             return np.empty(0)
@@ -123,7 +124,7 @@ class NoiseModel:
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
-    """A NoiseModel itself, or `identity` / `nominal` by name from what the recording says its sensors are.
+    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors.
 
     >>> resolve("identity", None).gnss_std
     (1.0, 1.0, 1.0)

@@ -57,11 +57,11 @@ class QCQPRelaxation:
             for star in star_steps(recording, ego, box, known):
                 held = box.newest[:, box.start[star.step] : box.start[star.step + 1]] >= 0
                 held &= np.isfinite(star.relative[..., 0])
-                points, spread = np.full_like(star.fix, np.nan), np.empty((recording.runs, 3, 3))
+                points, covariance = np.full_like(star.fix, np.nan), np.empty((recording.runs, 3, 3))
                 for run in range(recording.runs):
                     members = np.concatenate([[0], 1 + np.flatnonzero(held[run])])
-                    points[run, members], spread[run] = _locate(range_star(star, run, members, known), tight)
-                yield Estimate(star.step, points[:, 0], spread, star.links, points[:, 1:])
+                    points[run, members], covariance[run] = _locate(range_star(star, run, members, known), tight)
+                yield Estimate(star.step, points[:, 0], covariance, star.links, points[:, 1:])
 
         track = follow_egos(self, recording, egos, follow, missing=True)
         return replace(track, notes=(f"{sum(tight)} of {len(tight)} relaxations were tight", *notes))

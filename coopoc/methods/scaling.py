@@ -57,10 +57,12 @@ def fit(points: Floats, target: Floats, weight: Floats) -> Floats:
     """The points moved to the target: min over R in O(3) and t of sum_i w_i |R x_i + t - z_i|^2 (weighted Procrustes).
 
     R = V U^T of the singular vectors U S V^T of sum w (x - xm)(z - zm)^T: it is a reflection where that fits better,
-    because distances do not tell a shape from its mirror image.
+    because distances do not distinguish a shape from its mirror image.
 
     Args:
-        points, target: (B, n, 3) m. weight: (B, n) >= 0, not all zero.
+        points: (B, n, 3) m.
+        target: (B, n, 3) m.
+        weight: (B, n) >= 0, not all zero.
     """
     share = (weight / weight.sum(axis=1, keepdims=True))[..., None]
     middle, there = (share * points).sum(axis=1, keepdims=True), (share * target).sum(axis=1, keepdims=True)
@@ -69,23 +71,29 @@ def fit(points: Floats, target: Floats, weight: Floats) -> Floats:
     return moved
 
 
-def majorise(points: Floats, distance: Floats, weight: Floats, anchor: Floats, pull: Floats, iterations: int) -> Floats:
+def majorise(
+    points: Floats, distance: Floats, weight: Floats, anchor: Floats, anchor_weight: Floats, iterations: int
+) -> Floats:
     """SMACOF with anchors: each step lowers sum_{i<j} w_ij (d_ij - |x_i - x_j|)^2 + sum_i a_i |x_i - z_i|^2.
 
     X <- (V + diag a)^-1 (B(X) X + diag(a) Z), V the Laplacian of w and B(X) that of w d / |x_i - x_j| (de Leeuw's
     majorisation): no step length, and slow where the anchors are weak.
 
     Args:
-        points: (B, n, 3) m, the start. distance: (B, n, n) m. weight: (B, n, n) 1/m^2, symmetric, 0 if not measured.
-        anchor: (B, n, 3) m. pull: (B, n, 3) 1/m^2 per axis, 0 for none; each connected part needs one.
+        points: (B, n, 3) m, the start.
+        distance: (B, n, n) m.
+        weight: (B, n, n) 1/m^2, symmetric, 0 if not measured.
+        anchor: (B, n, 3) m.
+        anchor_weight: (B, n, 3) 1/m^2 per axis, 0 for none; each connected component needs one.
+        iterations: of the majorisation.
     """
     own = np.arange(points.shape[1])
-    fixed = _laplacian(weight)[:, None] + np.swapaxes(pull, 1, 2)[..., None] * np.eye(len(own))
+    fixed = _laplacian(weight)[:, None] + np.swapaxes(anchor_weight, 1, 2)[..., None] * np.eye(len(own))
     inverse = np.linalg.inv(fixed)
     for _ in range(iterations):
         gap = np.linalg.norm(points[:, :, None] - points[:, None], axis=-1)
         ratio = np.where(gap > 0, weight * distance / np.where(gap > 0, gap, 1.0), 0.0)
-        target = _laplacian(ratio) @ points + pull * anchor
+        target = _laplacian(ratio) @ points + anchor_weight * anchor
         points = np.swapaxes((inverse @ np.swapaxes(target, 1, 2)[..., None])[..., 0], 1, 2)
     return points
 

@@ -1,4 +1,4 @@
-"""The star around one ego, step by step: who is in it, who stayed, and what arrived from whom."""
+"""The star around one ego, step by step: its members, their places before, and their newest messages."""
 
 from __future__ import annotations
 
@@ -31,16 +31,20 @@ class StarStep:
     """What one ego knows at one step of the n members of its star, itself first.
 
     Args:
-        step: t. kept: (n,) index of each member in the previous star, -1 if it has just joined.
+        step: t.
+        previous: (n,) index of each member in the previous star, -1 if it has just joined.
         links: (n-1,) indices into the Recording's links.
-        relative: (R, n-1, 3) m, rad, rad. vector: (R, n-1, 3) m, converted.
-        moved: (R, n, 3) m, dt times the latest velocity held. process: (R or 1, n, 3) m^2 of that motion.
-        fix: (R, n, 3) m, GNSS brought forward to this step. fix_variance: (R or 1, n, 3) m^2.
-        heard: (R, n) True where that fix is new.
+        relative: (R, n-1, 3) m, rad, rad.
+        vector: (R, n-1, 3) m, converted.
+        moved: (R, n, 3) m, dt times the latest velocity held.
+        process: (R or 1, n, 3) m^2 of that motion.
+        fix: (R, n, 3) m, GNSS brought forward to this step.
+        fix_variance: (R or 1, n, 3) m^2.
+        new_fix: (R, n) True where that fix is new.
     """
 
     step: int
-    kept: Ints
+    previous: Ints
     links: Ints
     relative: Floats
     vector: Floats
@@ -48,18 +52,18 @@ class StarStep:
     process: Floats
     fix: Floats
     fix_variance: Floats
-    heard: Bools
+    new_fix: Bools
 
 
 def star_steps(
     recording: Recording, ego: int, box: Inbox, noise_model: NoiseModel, steps: range | None = None
 ) -> Iterator[StarStep]:
-    """The ego's star at every step, or as if only `steps` in a row had been, with what the newest message of each
-    member says.
+    """The ego's star at every step, or as if only `steps` in a row had been, with the newest message of each
+    member.
 
     A fix sent `age` steps ago is brought forward with the velocity that came with it. A velocity that is used for the
     n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this
-    step adds (2n - 1) times the variance of one. Nothing is assumed of who is seen but not heard.
+    step adds (2n - 1) times the variance of one. Nothing is assumed of a member without messages.
     """
     variance, fixes = noise_model.process_variance(recording), noise_model.fix_variance(recording)
     before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)
@@ -68,20 +72,20 @@ def star_steps(
         span = slice(box.start[t], box.start[t + 1])
         links = box.link[span]
         members = np.concatenate([[ego], recording.links.neighbour[links]])
-        kept = np.array([_place(before, m) for m in members])
+        previous = np.array([_place(before, m) for m in members])
         own = np.full((recording.runs, 1), t)
         sent = np.concatenate([own, box.newest[:, span]], axis=1)
-        again = (kept >= 0) & (np.append(before_sent, own * 0 - 2, axis=1)[:, kept] == sent)
-        uses = np.where(again, np.append(uses, own, axis=1)[:, kept] + 1, 1)
+        again = (previous >= 0) & (np.append(before_sent, own * 0 - 2, axis=1)[:, previous] == sent)
+        uses = np.where(again, np.append(uses, own, axis=1)[:, previous] + 1, 1)
         motion = _prompt if (sent == t).all() else held_motion
         moved, process, fix, fix_variance = motion(recording, variance, members, sent, uses, t)
         relative = recording.relative[:, links]
         there: Bools = np.asarray(np.isfinite(fix).all(axis=-1))
-        heard = np.concatenate([own >= 0, box.fresh[:, span]], axis=1) & there
+        new_fix = np.concatenate([own >= 0, box.fresh[:, span]], axis=1) & there
         fix = np.where(there[..., None], fix, 0.0)
         yield StarStep(
             t,
-            kept,
+            previous,
             links,
             relative,
             to_vector(relative),
@@ -89,15 +93,18 @@ def star_steps(
             process,
             fix,
             _when_sent(fixes, members, sent, t) + fix_variance,
-            heard,
+            new_fix,
         )
         before, before_sent = members, sent
 
 
 def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
-    """What one ego has measured and received, as `coopoc.kernels.messages.Measurements`.
+    """Measurements and messages of one ego, as `coopoc.kernels.messages.Measurements`.
 
     Args:
+        recording: of all vehicles.
+        ego: column.
+        box: its messages.
         broadcast: (R, T, N, 3) m, position in a message; None for the fix.
     """
     neighbour, start, newest = (
@@ -122,9 +129,9 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
     """What a filter assumes of them, as `coopoc.kernels.messages.Assumptions`: a message holds a fix and a velocity,
     whose error the fix of `age` steps ago has made age times."""
-    velocity_noise, fixes = known.pace, np.ascontiguousarray(known.fix_variance(recording))
+    velocity_noise, fixes = known.velocity_noise, np.ascontiguousarray(known.fix_variance(recording))
     process = np.zeros((1, 1, 1, 3)) if len(velocity_noise) else np.ascontiguousarray(known.process_variance(recording))
-    noise = sighting_noise(known)
+    noise = relative_noise(known)
     return Assumptions(process, fixes, fixes, (1.0, 0.0), *noise, FORGOTTEN, ACCELERATION_STD, velocity_noise)
 
 
@@ -135,19 +142,23 @@ def estimates(
     in the stars of some egos.
 
     Args:
-        growth: as in `Assumptions`. acceleration: m/s^2.
+        recording: of all vehicles.
+        known: the noise model.
+        egos: columns.
+        growth: as in `Assumptions`.
+        acceleration: m/s^2.
     """
     links, x, p = recording.links, np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)
-    who = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    process = known.process_variance(recording, who.tolist())
-    gnss, velocity = recording.gnss[:, :, who], recording.velocity[:, :, who]
-    x[:, :, who], p[:, :, who] = solo_filter(gnss, velocity, process, known.gnss_variance, recording.dt)
+    members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+    process = known.process_variance(recording, members.tolist())
+    gnss, velocity = recording.gnss[:, :, members], recording.velocity[:, :, members]
+    x[:, :, members], p[:, :, members] = solo_filter(gnss, velocity, process, known.gnss_variance, recording.dt)
     grown = assumptions(recording, known)._replace(broadcast=p, growth=growth, acceleration=acceleration)
     return grown, x
 
 
-def sighting_noise(known: NoiseModel) -> tuple[Floats, float]:
-    """(3,) m, rad, rad and the least range m of sightings, or nothing for unit matrices."""
+def relative_noise(known: NoiseModel) -> tuple[Floats, float]:
+    """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
     return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
 
 

@@ -16,7 +16,7 @@ from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
 from ..kernels.star_stream import FIX, MESSAGE, MESSAGE_AGE, RELATIVE, VELOCITY, Noise, packed, resized, stream_step
 from .motion_history import MotionHistory, check_step, fix_or_none, seconds, three
 from .noise_model import NoiseModel
-from .star import ACCELERATION_STD, FORGOTTEN, sighting_noise
+from .star import ACCELERATION_STD, FORGOTTEN, relative_noise
 from .stream import motion_noise
 
 
@@ -78,7 +78,7 @@ class StarStream:
     ) -> None:
         motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
         assumed = Assumptions(
-            fixes, fixes, fixes, (1.0, 0.0), *sighting_noise(known), FORGOTTEN, ACCELERATION_STD, np.empty(0)
+            fixes, fixes, fixes, (1.0, 0.0), *relative_noise(known), FORGOTTEN, ACCELERATION_STD, np.empty(0)
         )
         self.max_age = seconds("max_age", max_age)
         self._noise = packed(Noise(motion, assumed, float(max_age), refine))

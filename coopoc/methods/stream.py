@@ -83,7 +83,8 @@ class FilterStream:
     """A compiled solo filter, fed step by step: `step` takes what is new and returns the estimate.
 
     Args:
-        motion: noise of the motion. fixes: noise of the fixes.
+        motion: noise of the motion.
+        fixes: noise of the fixes.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
         history: s, how old a delayed fix may be.
     """
@@ -108,7 +109,7 @@ class FilterStream:
 
         A fix that was true `fix_age` seconds ago is moved by the dead-reckoned motion since, and its covariance grows
         by the noise of that motion. The filter's own prediction has made the same error of motion, and so have other
-        delayed fixes: that correlation is ignored (docs/streaming.md says what it costs).
+        delayed fixes: that correlation is ignored (docs/streaming.md gives its cost).
 
         Args:
             gnss: (3,) m; None or NaN for no fix.

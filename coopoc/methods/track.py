@@ -1,4 +1,4 @@
-"""Track: what a method says about its egos, and what saying it cost. Method: the protocol that all methods follow."""
+"""Track: a method's estimates of its egos, and their bytes. Method: the protocol that all methods follow."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ class Track:
     """Estimates of E egos over T steps in R runs.
 
     Args:
-        t: (T,) s. egos: (E,) columns of the Recording.
+        t: (T,) s.
+        egos: (E,) columns of the Recording.
         x: (R, T, E, 3) m.
         covariance: (R, T, E, 3, 3) m^2, or None if the method claims none.
-        received_bytes, sent_bytes: (R, E) bytes over the drive, payload and overhead.
+        received_bytes: (R, E) bytes over the drive, payload and overhead.
+        sent_bytes: (R, E) bytes over the drive, payload and overhead.
         seconds: wall time of the method.
         neighbours: (R, L, 3) m estimate of each link's neighbour at the link's step, NaN where there is none; or None.
             The links are those of the egos, `recording.links.of(ego)` ego by ego, and no others of the fleet.

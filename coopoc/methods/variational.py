@@ -24,8 +24,9 @@ class VariationalKalman(NoiseAdaptive):
     is reread with the noise believed now (`Belief`); without that the start decides NEES for half a minute.
 
     Args:
-        prior_weight: 2 alpha at the start. rho: forgetting per fix, in (0, 1]. iterations: of the fixed point.
-            The others as in `NoiseAdaptive`.
+        prior_weight: 2 alpha at the start.
+        rho: forgetting per fix, in (0, 1].
+        iterations: of the fixed point. The others as in `NoiseAdaptive`.
 
     Source: Sarkka and Nummenmaa, IEEE TAC 54(3) 2009, section III. Defaults were chosen on `town10-validation`
     (docs/methods.md).

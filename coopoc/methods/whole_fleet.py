@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Answer(NamedTuple):
     """What the fleet finds out at each step.
 
-    Args:
+    Attributes:
         x: (R, T, N, 3) m of all vehicles, of any shape.
         covariance: (R, T, N, 3, 3) m^2, of any shape, or None.
         rounds: of messages a step, None if an answer needs all vehicles that pairs connect, 0 if it is never late.

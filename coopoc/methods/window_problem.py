@@ -38,7 +38,9 @@ class Arrival:
     """The cost 1/2 d^T information d - eta^T d of the past, d = x - at.
 
     Args:
-        at: (n, 3) m. information: (3n, 3n) 1/m^2. eta: (3n,) 1/m.
+        at: (n, 3) m.
+        information: (3n, 3n) 1/m^2.
+        eta: (3n,) 1/m.
     """
 
     at: Floats
@@ -47,7 +49,7 @@ class Arrival:
 
 
 def arrival_of(horizon: Any, run: int, step: int) -> Arrival:
-    """What the steps before the first one of a compiled horizon say of it, in one run."""
+    """Information of the past about the first step of a compiled horizon, in one run."""
     window, past = horizon.window, horizon.past
     lane, here = run % window.motion.shape[1], places(window, step)
     n = here.stop - here.start
@@ -76,9 +78,9 @@ def window_problem(
     start = past.at[:, lane].reshape(-1, 3)
     tops = np.cumsum([0, *(part.stop - part.start for part in here)])
     joins = [np.flatnonzero((window.previous[part] < 0) & (k > 0)) for k, part in enumerate(here)]
-    nodes = np.concatenate([top + who for top, who in zip(tops, joins, strict=False)])
+    nodes = np.concatenate([top + joining for top, joining in zip(tops, joins, strict=False)])
     if len(nodes):
-        at = np.concatenate([start[part][who] for part, who in zip(here, joins, strict=True)])
+        at = np.concatenate([start[part][joining] for part, joining in zip(here, joins, strict=True)])
         factors.append(Factor("position", nodes[:, None], at, np.array(np.sqrt(FORGOTTEN))))
     return replace(problem, factors=tuple(factors))
 

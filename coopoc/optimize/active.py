@@ -16,7 +16,7 @@ from .problem import Problem
 NEAR = 5e-7
 """m or rad, a step this long reaches the bound: the constraint is active."""
 DEPENDENT = 1e-9
-"""Singular value, of rows of length 1, below which they say the same."""
+"""Singular value, of rows of length 1, below which they are dependent."""
 
 
 @dataclass(frozen=True, eq=False)

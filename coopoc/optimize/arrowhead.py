@@ -28,7 +28,7 @@ class Star(NamedTuple):
     corner: int
     head: Ints
     arm: Ints
-    turned: Bools
+    transposed: Bools
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Arrow:
         separator: (h,) points.
         group: (G, s) points, -1 where a group is smaller.
         corner: source block and destination (group, row, column) of the three parts, first of the blocks (i, j) that
-            are taken as they are, then of those (j, i) that are turned over.
+            are taken as they are, then of those (j, i) that are transposed.
         arm: as `corner`.
         head: as `corner`.
     """
@@ -57,11 +57,11 @@ class Arrow:
         if len(self.separator) != 1 or self.group.shape[1] != 1 or own != (1, len(self.group)):
             return None
         head, arm = np.empty(len(self.group), np.int64), np.full(len(self.group), -1)
-        turned = np.zeros(len(self.group), bool)
+        transposed = np.zeros(len(self.group), bool)
         head[self.head[0][1]] = self.head[0][0]
         for over, (source, group, *_) in enumerate(self.arm):
-            arm[group], turned[group] = source, bool(over)
-        return Star(int(self.separator[0]), self.group[:, 0].copy(), int(self.corner[0][0][0]), head, arm, turned)
+            arm[group], transposed[group] = source, bool(over)
+        return Star(int(self.separator[0]), self.group[:, 0].copy(), int(self.corner[0][0][0]), head, arm, transposed)
 
 
 def structure(problem: Problem) -> tuple[Pattern, Arrow]:
@@ -96,19 +96,19 @@ def _arrow(separator: Ints, scheme: Pattern) -> Arrow:
     i, j = scheme.pairs.T
     row, col = np.concatenate([scheme.pairs, scheme.pairs[i != j][:, ::-1]]).T
     source = np.concatenate([np.arange(len(i)), np.flatnonzero(i != j)])
-    turned, in_hub = np.arange(len(source)) >= len(i), label < 0
+    transposed, in_separator = np.arange(len(source)) >= len(i), label < 0
 
     def part(chosen: Bools) -> Part:
-        kept = [np.flatnonzero(chosen & over) for over in (~turned, turned)]
+        kept = [np.flatnonzero(chosen & over) for over in (~transposed, transposed)]
         straight, over = ((source[k], np.maximum(label[row[k]], 0), place[row[k]], place[col[k]]) for k in kept)
         return straight, over
 
     return Arrow(
         separator,
         group,
-        part(in_hub[row] & in_hub[col]),
-        part(~in_hub[row] & in_hub[col]),
-        part(~in_hub[row] & ~in_hub[col]),
+        part(in_separator[row] & in_separator[col]),
+        part(~in_separator[row] & in_separator[col]),
+        part(~in_separator[row] & ~in_separator[col]),
     )
 
 
@@ -133,11 +133,11 @@ def _parts(frame: Arrow, blocks: Floats, damping: Floats) -> tuple[Floats, Float
 
     def fill(part: Part, groups: int, rows: int, cols: int) -> Floats:
         out = np.zeros((batch, groups, rows, d, cols, d))
-        (source, group, row, col), (turned, *over) = part
+        (source, group, row, col), (transposed, *over) = part
         inside = out.swapaxes(3, 4)
         inside[:, group, row, col] = blocks[:, source]
-        if len(turned):
-            inside[:, over[0], over[1], over[2]] = blocks[:, turned].swapaxes(-1, -2)
+        if len(transposed):
+            inside[:, over[0], over[1], over[2]] = blocks[:, transposed].swapaxes(-1, -2)
         return out.reshape(batch, groups, d * rows, d * cols)
 
     corner = fill(frame.corner, 1, h, h)[:, 0]
@@ -199,12 +199,12 @@ def marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool = False
     inverse = _inverse(head, many)
     reduced = inverse @ arm
     separator = _inverse(corner - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1), many)
-    turned = reduced.swapaxes(-1, -2)
-    step = separator @ ((turned @ side).sum(axis=1) - eta)
+    transposed = reduced.swapaxes(-1, -2)
+    step = separator @ ((transposed @ side).sum(axis=1) - eta)
     cov[:, frame.separator], dx[:, frame.separator] = _own(separator, d), step.reshape(batch, -1, d)
     rest = inverse @ side + reduced @ step[:, None]
     dx[:, frame.group[there]] = -rest.reshape(batch, *frame.group.shape, d)[:, there]
-    rest = _own(inverse + reduced @ separator[:, None] @ turned, d)
+    rest = _own(inverse + reduced @ separator[:, None] @ transposed, d)
     cov[:, frame.group[there]] = rest[:, there]
     return cov, dx
 

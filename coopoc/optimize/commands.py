@@ -74,12 +74,12 @@ def described(solution: Solution) -> dict[str, Any]:
 def nodes(solution: Solution) -> dict[str, Any]:
     """Positions m, rotation matrices and covariances (position m, then rotation rad) by name; NaN becomes null."""
     at = zip(solution.names, solution.position, solution.rotation, solution.covariance, strict=True)
-    turning = solution.space.has_rotation
+    has_rotation = solution.space.has_rotation
     return {
         "nodes": {
             name: {
                 "position": position.tolist(),
-                **({"rotation": rotation.tolist()} if turning else {}),
+                **({"rotation": rotation.tolist()} if has_rotation else {}),
                 "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
             }
             for name, position, rotation, covariance in at

@@ -83,7 +83,7 @@ def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequ
     half = [0.5 * (error[2][1] - error[1][2]), 0.5 * (error[0][2] - error[2][0]), 0.5 * (error[1][0] - error[0][1])]
     sine = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     cosine = 0.5 * (error[0][0] + error[1][1] + error[2][2] - 1.0)
-    if isinstance(R[2][2], float):  # in the plane, where one angle says all
+    if isinstance(R[2][2], float):  # in the plane one angle suffices
         return *moved, 0.0, 0.0, m.atan2(half[2], cosine)
     turning = sine > 1e-12
     root = m.sqrt(m.where(turning, sine, 1.0))

@@ -88,10 +88,10 @@ class Solution:
     def __str__(self) -> str:
         at = ", ".join(f"{v:.2f}" for v in self.position[self.shown])
         variance = np.diag(self.covariance[self.shown])[: self.space.dimension]
-        spread = ", ".join(f"{v:.2f}" for v in np.sqrt(variance))
+        std = ", ".join(f"{v:.2f}" for v in np.sqrt(variance))
         return (
             f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; "
-            f"cost {self.cost:.4g}, gradient {self.gradient_norm:.0e}; {self.names[self.shown]} ({at}) +- ({spread}) m"
+            f"cost {self.cost:.4g}, gradient {self.gradient_norm:.0e}; {self.names[self.shown]} ({at}) +- ({std}) m"
         )
 
 

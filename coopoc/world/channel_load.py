@@ -22,14 +22,18 @@ def channel_load(
     carrier_sense: float = CARRIER_SENSE,
     bit_rate: float = BIT_RATE,
 ) -> Floats:
-    """Share of air time that the messages within earshot of each vehicle ask for: the channel busy ratio if all go out.
+    """Share of air time that the messages within carrier-sense range of each vehicle need: the channel busy ratio if
+    all go out.
 
     load_i = sum over j with |p_j - p_i| <= carrier_sense, i itself included, of 8 size_j rate_j / bit_rate. Above 1 the
     channel is saturated, and some are not sent or collide; preambles and waiting times come on top.
 
     Args:
-        position: (..., N, 3) m, NaN for who is absent. size: bytes on air of a message, a number or (N,).
-        rate: Hz, a number or (N,). carrier_sense: m. bit_rate: bit/s.
+        position: (..., N, 3) m, NaN for absent vehicles.
+        size: bytes on air of a message, a number or (N,).
+        rate: Hz, a number or (N,).
+        carrier_sense: m.
+        bit_rate: bit/s.
 
     Returns:
         (..., N), NaN where absent.
@@ -54,12 +58,12 @@ def channel_load(
             raise InputError(name, value.tolist(), f"must be a number >= 0, or {vehicles} of them", "One per vehicle.")
     busy = np.broadcast_to(8.0 * given["size"] * given["rate"] / bit_rate, vehicles)
     flat = places.reshape(places.size // max(3 * vehicles, 1), vehicles, 3)
-    loads = [_heard(step, busy, carrier_sense) for step in flat]
+    loads = [_load_within(step, busy, carrier_sense) for step in flat]
     return np.array(loads, dtype=float).reshape(places.shape[:-1])
 
 
-def _heard(position: Floats, busy: Floats, reach: float) -> Floats:
-    """(N,) sum of what those within reach fill."""
+def _load_within(position: Floats, busy: Floats, reach: float) -> Floats:
+    """(N,) sum over the vehicles within reach."""
     here = np.flatnonzero(np.isfinite(position[:, 0]))
     near = here[KDTree(position[here]).query_pairs(reach, output_type="ndarray")]
     load = np.full(len(position), np.nan)

@@ -1,4 +1,4 @@
-"""Exchange: which vehicles of the whole fleet are in contact at each step, whose messages get through, at what cost."""
+"""Exchange: which vehicles of the whole fleet are in contact at each step, which messages arrive, and their bytes."""
 
 from __future__ import annotations
 
@@ -142,8 +142,8 @@ def _receive(recording: Recording, pairs: tuple[Ints, ...], arrivals: tuple[Ints
         order = np.lexsort((rank, both, receiver))
         for mine in np.split(order, np.searchsorted(receiver[order], np.arange(1, vehicles))):
             start = np.searchsorted(both[mine], np.arange(len(recording.t) + 1))
-            heard_by = _order(recording, sender[mine])
-            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], start, recording, heard_by)
+            schedule = _order(recording, sender[mine])
+            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], start, recording, schedule)
         arrivals[0][:], arrivals[1][:] = arrival[:, :count], arrival[:, count:]
     there = (arrival >= 0) & (arrival < len(recording.t))
     return np.stack([np.bincount(receiver, row * sizes, minlength=vehicles) for row in there]).astype(float)

@@ -25,7 +25,9 @@ class Fleet:
         t: (T,) seconds, equally spaced.
         position: (T, N, 3) metres.
         velocity: (T, N, 3) metres per second.
-        name, source, licence: where it comes from, for cards and reports.
+        name: where it comes from, for cards and reports.
+        source: where it comes from, for cards and reports.
+        licence: where it comes from, for cards and reports.
 
     Raises:
         InputError: shapes, time steps, ids or NaN patterns that no filter could use.

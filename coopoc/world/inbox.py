@@ -20,11 +20,12 @@ class Inbox:
     Args:
         link: (M,) indices of its links in the Recording, in time order.
         start: (T+1,) link[start[t]:start[t+1]] are the links of step t.
-        arrival: (R, M) step at which the message sent at the link's step arrives, -1 if it is lost, turned away by the
+        arrival: (R, M) step at which the message sent at the link's step arrives, -1 if it is lost, rejected by the
             cap, or still on its way at the end.
         newest: (R, M) step at which the newest message held was sent, -1 for none.
         fresh: (R, M) True where that message is new since the pair was last linked: a fix may be used once only.
-        received_bytes: (R,) over the drive. sent_bytes: bytes that this vehicle broadcasts over the drive.
+        received_bytes: (R,) over the drive.
+        sent_bytes: bytes that this vehicle broadcasts over the drive.
     """
 
     link: Ints
@@ -40,7 +41,8 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     """What `ego` has received when each neighbour broadcasts `message`.
 
     Args:
-        recording: the links, the sending schedule and the arrivals. ego: column.
+        recording: the links, the sending schedule and the arrivals.
+        ego: column.
         message: what its rounds take on air counts against `v2x.bytes_per_second`.
 
     Raises:
@@ -58,11 +60,11 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     link = recording.links.of(ego)
     at = recording.links.step[link]
     start, size = np.searchsorted(at, np.arange(steps + 1)), message.size(recording.v2x.overhead)
-    heard_by = order(recording, ego, link, message)
+    schedule = order(recording, ego, link, message)
     sent = np.full(len(link), size)
-    arrival = within_cap(recording.arrival.take(link, axis=1), sent, start, recording, heard_by)
+    arrival = within_cap(recording.arrival.take(link, axis=1), sent, start, recording, schedule)
     arrival = np.where(arrival < steps, arrival, -1)
-    newest, fresh = _held(arrival, at, recording.links.neighbour[link], steps)
+    newest, fresh = _newest(arrival, at, recording.links.neighbour[link], steps)
     too_old = at - newest > recording.v2x.max_age / recording.dt + 1e-9
     newest[too_old] = -1
     broadcasts = recording.broadcasts[:, ego].sum() if recording.v2x.max_neighbours else 0
@@ -77,20 +79,20 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     )
 
 
-def _held(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Ints, Bools]:
+def _newest(arrival: Ints, sent: Ints, neighbour: Ints, steps: int) -> tuple[Ints, Bools]:
     """Newest sending step held and whether that is new, (R, M) both, of messages of several neighbours."""
     if (arrival == sent).all():
         return np.broadcast_to(sent, arrival.shape).copy(), np.ones(arrival.shape, dtype=bool)
     newest, fresh = np.empty(arrival.shape, dtype=np.int64), np.empty(arrival.shape, dtype=bool)
     for one in np.unique(neighbour):
         pair = np.flatnonzero(neighbour == one)
-        held = _newest_held(arrival[:, pair], sent[pair], steps)[:, sent[pair]]
+        held = _newest_of_pair(arrival[:, pair], sent[pair], steps)[:, sent[pair]]
         newest[:, pair] = held
         fresh[:, pair] = np.diff(held, axis=1, prepend=-1) > 0
     return newest, fresh
 
 
-def _newest_held(arrival: Ints, sent: Ints, steps: int) -> Ints:
+def _newest_of_pair(arrival: Ints, sent: Ints, steps: int) -> Ints:
     """(R, T) newest sending step among the messages of one pair that have arrived by each step."""
     held = np.full((len(arrival), steps), -1, dtype=np.int64)
     run, k = np.nonzero(arrival >= 0)

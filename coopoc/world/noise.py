@@ -10,11 +10,15 @@ import numpy as np
 def stream(seed: int, sensor: str, run: int, vehicle: str, partner: str = "") -> np.random.Generator:
     """Random stream of one sensor of one vehicle in one run; step t takes the t-th draw.
 
-    30 runs are a prefix of 100, and adding a vehicle, a neighbour or a method changes nobody's draws, because the key
+    30 runs are a prefix of 100, and adding a vehicle, a neighbour or a method changes no other draws, because the key
     names everything that the draw belongs to (ids, not columns). Philox is counter-based: streams do not overlap.
 
     Args:
-        seed: the study's seed. run: 0..R-1. sensor, vehicle, partner: names.
+        seed: the study's seed.
+        run: 0..R-1.
+        sensor: names.
+        vehicle: names.
+        partner: names.
 
     >>> bool(stream(0, "gnss", 3, "a").normal() == stream(0, "gnss", 3, "a").normal())
     True

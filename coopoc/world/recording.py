@@ -22,14 +22,16 @@ class Recording:
     """Measurements of N vehicles over T steps in R runs, in the local east-north-up frame.
 
     Args:
-        ids: (N,) names. t: (T,) s.
-        gnss: (R, T, N, 3) m. velocity: (R, T, N, 3) m/s, with x_t ~ x_{t-1} + dt u_t; both NaN where absent, a fix
-            alone where it is missing.
+        ids: (N,) names.
+        t: (T,) s.
+        gnss: (R, T, N, 3) m.
+        velocity: (R, T, N, 3) m/s, with x_t ~ x_{t-1} + dt u_t; both NaN where absent, a fix alone where it is missing.
         links: L directed links; `observers` are the columns whose links were recorded.
         relative: (R, L, 3) range m, world azimuth rad, inclination rad of the neighbour as the observer sees it.
         broadcasts: (T, N) True where a vehicle broadcasts.
         arrival: (R, L) step at which the neighbour's broadcast of the link's step arrives, -1 if lost or not sent.
-        sensors, v2x: what a method may know (the bias is not among it).
+        sensors: what a method may know (the bias is not among it).
+        v2x: what a method may know (the bias is not among it).
         notes: labels that every table and figure carries (what is simulated, what uses truth).
 
     Raises:

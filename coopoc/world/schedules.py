@@ -1,4 +1,4 @@
-"""Schedules: whom a receiver hears first when its token bucket does not hold enough for all that arrives."""
+"""Schedules: which message a receiver takes first when its token bucket does not hold enough for all that arrive."""
 
 from __future__ import annotations
 
@@ -15,62 +15,65 @@ from .v2x import Message
 
 
 class Order(Protocol):
-    """What one receiver thinks of the messages (R, M) that are sent to it, as it hears one after the other."""
+    """The order in which one receiver takes the messages (R, M) that are sent to it."""
 
-    def see(self, step: int, span: slice) -> None:
-        """Take note of a step, before any message of it; `span` are the messages sent at it."""
+    def measure(self, step: int, span: slice) -> None:
+        """Use the relative measurements of a step, before any message of it; `span` are the messages sent at it."""
 
-    def worth(self, step: int, span: slice) -> Floats:
-        """(R, n) of the messages of a step: the largest is heard next, of equals the first."""
+    def utility(self, step: int, span: slice) -> Floats:
+        """(R, n) of the messages of a step: the largest is received next, of equals the first."""
 
-    def hear(self, step: int, run: Ints, message: Ints) -> None:
-        """Take note that `message[i]` of this step is heard in `run[i]`."""
+    def receive(self, step: int, run: Ints, message: Ints) -> None:
+        """Use `message[i]` of this step, received in `run[i]`."""
 
 
 @dataclass(frozen=True)
 class Nearest:
     """In the order in which messages are given: nearest first."""
 
-    def see(self, step: int, span: slice) -> None:
+    def measure(self, step: int, span: slice) -> None:
         """Nothing changes."""
 
-    def worth(self, step: int, span: slice) -> Floats:
-        """The first is worth most."""
+    def utility(self, step: int, span: slice) -> Floats:
+        """The first has the largest utility."""
         return -np.arange(span.stop - span.start, dtype=float)[None]
 
-    def hear(self, step: int, run: Ints, message: Ints) -> None:
+    def receive(self, step: int, run: Ints, message: Ints) -> None:
         """Nothing changes."""
 
 
 @dataclass(frozen=True, eq=False)
 class RoundRobin:
-    """In turns: who has waited longest for this receiver is next; who was never heard comes first.
+    """In turns: the sender that has waited longest is next; one that was never received comes first.
 
     Args:
-        sender: (M,) columns. last: (R, N) step at which each was heard last, -1 for never.
+        sender: (M,) columns.
+        last: (R, N) step at which a message of each was last received, -1 for never.
     """
 
     sender: Ints
     last: Ints
 
-    def see(self, step: int, span: slice) -> None:
+    def measure(self, step: int, span: slice) -> None:
         """Nothing changes."""
 
-    def worth(self, step: int, span: slice) -> Floats:
-        """Steps since each was heard."""
+    def utility(self, step: int, span: slice) -> Floats:
+        """Steps since the last message of each."""
         return (step - self.last[:, self.sender[span]]).astype(float)
 
-    def hear(self, step: int, run: Ints, message: Ints) -> None:
-        """Those that are heard go to the end of the queue."""
+    def receive(self, step: int, run: Ints, message: Ints) -> None:
+        """Move the senders to the end of the queue."""
         self.last[run, self.sender[message]] = step
 
 
 def order(recording: Recording, ego: int, link: Ints, message: Message) -> Order:
-    """The schedule of one receiver before it has heard anything.
+    """The schedule of one receiver before any message.
 
     Args:
-        ego: its column. link: (M,) links of the recording over which messages come, by step, nearest first.
-        message: what they are.
+        recording: the links, and the schedule by name.
+        ego: column of the receiver.
+        link: (M,) links of the recording over which messages come, by step, nearest first.
+        message: their kind.
     """
     if recording.v2x.schedule == "nearest":
         return Nearest()
@@ -81,29 +84,32 @@ def order(recording: Recording, ego: int, link: Ints, message: Message) -> Order
     return MostInformative.at_first(recording, ego, link, message.cumulative)
 
 
-def within_cap(arrival: Ints, size: Ints, start: Ints, recording: Recording, heard_by: Order) -> Ints:
-    """Arrivals (R, M) with -1 for what a token bucket turns away.
+def within_cap(arrival: Ints, size: Ints, start: Ints, recording: Recording, schedule: Order) -> Ints:
+    """Arrivals (R, M) with -1 for messages that a token bucket rejects.
 
     The bucket holds what one second brings, or the largest message if that is more; it is full at the first step, as in
-    RFC 2697 (section 3), and it fills by `bytes_per_second` times dt a step. A message that arrives is heard if there
-    are tokens for all of it; of those that arrive together the schedule takes one after the other.
+    RFC 2697 (section 3), and it fills by `bytes_per_second` times dt a step. A message that arrives is accepted if
+    there are tokens for all of it; of those that arrive together the schedule takes one after the other.
 
     Args:
         arrival: (R, M) steps at one receiver, by sending step and then nearest first; those of one sending step arrive
-            together. size: (M,) bytes on air. start: (T+1,) start[t]:start[t+1] are sent at step t.
-        heard_by: the schedule of this receiver.
+            together.
+        size: (M,) bytes on air.
+        start: (T+1,) start[t]:start[t+1] are sent at step t.
+        recording: its V2X has the cap.
+        schedule: of this receiver.
     """
     cap = recording.v2x.bytes_per_second
     if not np.isfinite(cap) or not size.any():
         return arrival
     depth = float(max(cap, int(size.max()))) if cap else 0.0
-    if isinstance(heard_by, Nearest):
+    if isinstance(schedule, Nearest):
         there, bytes_, first = (np.ascontiguousarray(values, dtype=np.int64) for values in (arrival, size, start))
         return nearest_first(there, bytes_, first, cap * recording.dt, depth)
-    kept = np.full_like(arrival, -1)
+    accepted = np.full_like(arrival, -1)
     tokens, last = np.full(len(arrival), depth), 0
     for t, span in enumerate(map(slice, start[:-1].tolist(), start[1:].tolist())):
-        heard_by.see(t, span)
+        schedule.measure(t, span)
         left = arrival[:, span] >= 0
         if not left.any():
             continue
@@ -111,9 +117,9 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, recording: Recording, hea
         tokens, last = np.minimum(tokens + cap * recording.dt * (now - last), depth), now
         while (fits := left & (size[span] <= tokens[:, None] + 1e-9)).any():
             run = np.flatnonzero(fits.any(axis=1))
-            best = np.where(fits, heard_by.worth(t, span), -np.inf)[run].argmax(axis=1)
-            heard_by.hear(t, run, span.start + best)
+            best = np.where(fits, schedule.utility(t, span), -np.inf)[run].argmax(axis=1)
+            schedule.receive(t, run, span.start + best)
             left[run, best] = False
-            kept[run, span.start + best] = arrival[run, span.start + best]
+            accepted[run, span.start + best] = arrival[run, span.start + best]
             tokens[run] -= size[span.start + best]
-    return kept
+    return accepted

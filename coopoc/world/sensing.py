@@ -46,9 +46,12 @@ def observe(
     A noisy range that would be negative is reflected, as in the authors' public code.
 
     Args:
-        fleet: the truth. sensors: the noise that acts. v2x: neighbourhood and channel, default V2X.ideal().
-        runs: R. seed: of all draws.
-        observers: vehicles whose links are recorded (default all); fewer is faster and changes nobody's draws.
+        fleet: the truth.
+        sensors: the noise that acts.
+        v2x: neighbourhood and channel, default V2X.ideal().
+        runs: R.
+        seed: of all draws.
+        observers: vehicles whose links are recorded (default all); fewer is faster and changes no other draws.
         assumed: what methods may know, default `sensors` without its bias.
 
     Raises:
@@ -111,7 +114,9 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
     """Places (step x vehicles + column) of observers and of all vehicles in their cell or the eight around it.
 
     Args:
-        position: (T, N, 3) m, NaN where absent. columns: of the observers. radius: m, cells are no smaller.
+        position: (T, N, 3) m, NaN where absent.
+        columns: of the observers.
+        radius: m, cells are no smaller.
     """
     vehicles = position.shape[1]
     here = np.flatnonzero(np.isfinite(position[..., 0]))
@@ -162,7 +167,7 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
             bias = [stream(seed, "gnss_bias", r, name).uniform(low, high, (steps, 3)) for name in fleet.ids]
             fixes[r] += np.stack(bias, axis=1)
         for std, names in ((sensors.gnss_drift_std, fleet.ids), (sensors.gnss_common_std, ("",))):
-            if std > 0:  # the common error is that of nobody in particular
+            if std > 0:  # the common error belongs to no vehicle
                 draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
                 fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
     return fixes
@@ -208,7 +213,7 @@ def _relative(
             if key[:-1] == drawn and key[-1] > most:
                 whole = find_links(fleet, columns, key[-1], v2x.radius, sensors.min_range)
                 return wider.take(np.flatnonzero(np.isin(_code(fleet, whole), _code(fleet, links))), axis=1)
-        return _sightings(fleet, links, sensors, runs, seed)
+        return _relative_measurements(fleet, links, sensors, runs, seed)
 
     return _once((*drawn, most), draw)
 
@@ -219,7 +224,7 @@ def _code(fleet: Fleet, links: Links) -> Ints:
     return np.asarray((links.step * size + links.observer) * size + links.neighbour)
 
 
-def _sightings(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
+def _relative_measurements(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
@@ -252,7 +257,8 @@ def _heading(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int)
 
 
 def schedule(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
-    """Who broadcasts when (T, N), and the arrival step (R, L) of the neighbour's broadcast over each link."""
+    """Steps at which each vehicle broadcasts (T, N), and the arrival step (R, L) of the neighbour's broadcast over each
+    link."""
     per_step = 1.0 if v2x.rate is None else v2x.rate * fleet.dt
     if per_step > 1 + 1e-9:
         limit = f"must be <= 1/dt = {1 / fleet.dt:g} Hz"

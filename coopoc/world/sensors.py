@@ -19,8 +19,8 @@ VelocityReading = Literal["axis", "speed"]
 class Sensors:
     """Standard deviations of GNSS, velocity and relative measurements.
 
-    The same class says what *acts* (zero is allowed) and what a method *assumes* (zero is an error: it would be a
-    singular covariance). Where the paper leaves a choice open, the field says what the default is and why.
+    The same class holds the noise that *acts* (zero is allowed) and that a method *assumes* (zero is an error: a
+    singular covariance). Where the paper leaves a choice open, the field gives the default and the reason.
     """
 
     gnss_std: tuple[float, float, float] = (1.5, 1.5, 1.5)

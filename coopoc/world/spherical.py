@@ -15,7 +15,9 @@ def spherical(dx: Any, dy: Any, dz: Any, m: Any = np) -> tuple[Any, Any, Any]:
     d = |v|, az = atan2(dy, dx) anticlockwise from +x, inc = atan2(hypot(dx, dy), dz) from +z.
 
     Args:
-        dx, dy, dz: metres, of any one shape.
+        dx: metres, of any one shape.
+        dy: metres, of any one shape.
+        dz: metres, of any one shape.
         m: numpy, torch, casadi, or anything with `sqrt` and `atan2`.
 
     Returns:

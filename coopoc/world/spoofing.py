@@ -27,12 +27,16 @@ def spoofed(
     """The recording with the fixes of spoofed vehicles moved: gnss' = gnss + o, o ~ U(low, high) on each axis.
 
     In each run every vehicle that is not `honest` is spoofed with probability `share`, and keeps its offset for the
-    whole drive. Both draws are keyed by (seed, run, id): who is spoofed at 20 % is spoofed, by the same offset, at
+    whole drive. Both draws are keyed by (seed, run, id): a vehicle spoofed at 20 % is spoofed, by the same offset, at
     30 %, and no other noise changes. Velocities and relative measurements stay true. A spoofed vehicle reads
     its own false fix, too: name the egos among the honest ones.
 
     Args:
-        recording: what was measured. share: in [0, 1]. low, high: m. seed: of the attack.
+        recording: what was measured.
+        share: in [0, 1].
+        low: m, least offset.
+        high: m, largest offset.
+        seed: of the attack.
         honest: columns or ids of egos that are never spoofed.
 
     Raises:

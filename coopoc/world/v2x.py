@@ -30,15 +30,15 @@ class V2X:
     burst: float = 1.0
     """Mean length of a run of losses, in messages (Gilbert-Elliott); 1/(1 - loss) or less means independent losses."""
     max_age: float = 1.0
-    """s, older messages are forgotten: their sender is seen, but nothing is assumed of it."""
+    """s, older messages are forgotten: their sender is measured, but nothing is assumed of it."""
     bytes_per_second: float = float("inf")
     """Cap on what one vehicle receives: a token bucket, full at first, that holds one second's worth; messages beyond
     it are dropped."""
     overhead: int = 0
     """Bytes per message on air beyond the payload (headers, signature)."""
     schedule: Schedule = "nearest"
-    """Whom a receiver hears first under the cap: "nearest"; "round robin", who waited longest for it; "most
-    informative", whose message lowers the bound of its position most (`coopoc.world.informative`)."""
+    """Which message a receiver takes first under the cap: "nearest"; "round robin", of the sender that waited longest;
+    "most informative", which lowers the bound of its position most (`coopoc.world.informative`)."""
 
     def __post_init__(self) -> None:
         if self.schedule not in get_args(Schedule):
@@ -97,7 +97,8 @@ class Message:
     """What a vehicle sends in one step: `rounds` messages of `numbers` float32, 4 bytes each.
 
     Args:
-        numbers: in each round. rounds: messages a step; they share the fate of the step's message. 0 sends nothing.
+        numbers: in each round.
+        rounds: messages a step; they share the fate of the step's message. 0 sends nothing.
         opening: numbers that ride with the first round only, such as the measurements that all rounds work on.
         per_neighbour: numbers more in each round for each neighbour of the sender: a list as long as its neighbourhood.
         unicast: True for a message of its own to each neighbour; False for one broadcast that all neighbours receive.
@@ -131,7 +132,8 @@ class Message:
         """Bytes that one receiver takes from one sender in a step: rounds x (payload + overhead), and the opening.
 
         Args:
-            overhead: bytes per message on air. neighbours: of the sender, a number or an array.
+            overhead: bytes per message on air.
+            neighbours: of the sender, a number or an array.
         """
         return 4 * self.opening + self.rounds * (self.payload + 4 * self.per_neighbour * neighbours + overhead)
 

@@ -13,14 +13,14 @@ from coopoc.arrays import AnyArray, Bools, Floats, Ints
 class Matrices(NamedTuple):
     """Layers of nets of one shape, and whether the matrix of each is transposed: of all, of none, of the tall ones.
 
-    Args:
+    Attributes:
         layers: (layers, 11) as in `tape.Net`.
-        turned: (3, layers) whether the matrix is transposed.
+        transposed: (3, layers) whether the matrix is transposed.
         places: (3, P) index in the padded matrices of each number of theta.
     """
 
     layers: Ints
-    turned: Bools
+    transposed: Bools
     places: AnyArray
 
 

@@ -147,14 +147,14 @@ def _again(net: Net, tape: Tape) -> None:
 def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
     """Add what `count` steps from the present one on contribute to the gradient of every weight and bias.
 
-    The matrix of a layer with more outputs than inputs is turned: the longer axis runs along the vectors.
+    The matrix of a layer with more outputs than inputs is transposed: the longer axis runs along the vectors.
     """
     one = np.ones((count * tape.lanes, 1), gradient.padded.dtype)
     for name in range(len(gradient.layers)):
         outputs, inputs = gradient.layers[name, 2], gradient.layers[name, 3]
         given, at = span(tape, gradient.layers[name, 7], count), gradient.layers[name, 8]
         delta, column = span(deltas, gradient.layers[name, 9], count), gradient.layers[name, 10]
-        if gradient.turned[name]:
+        if gradient.transposed[name]:
             add_outer(given, at, inputs, delta, column, matrix(gradient, name))
         else:
             add_outer(delta, column, outputs, given, at, matrix(gradient, name))

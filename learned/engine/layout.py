@@ -100,14 +100,14 @@ def plan_of(shapes: Shapes) -> Plan:
         size += room(outputs, inputs)
     layers = np.array(found)
     tall = layers[:, 2] > layers[:, 3]
-    turned = np.stack([tall | True, tall & False, tall])
-    return Plan(Matrices(layers, turned, np.stack([_places(layers, at, rows) for rows in turned])), at, size)
+    transposed = np.stack([tall | True, tall & False, tall])
+    return Plan(Matrices(layers, transposed, np.stack([_places(layers, at, rows) for rows in transposed])), at, size)
 
 
-def _places(layers: Ints, parameters: int, turned: Bools) -> AnyArray:
+def _places(layers: Ints, parameters: int, transposed: Bools) -> AnyArray:
     """(P,) a row of `Matrices.places`."""
     places = np.empty(parameters, np.uint32)  # numba asks of every signed index whether it counts from the end
-    for (weight, bias, outputs, inputs, at, last, *_), across in zip(layers, turned, strict=True):
+    for (weight, bias, outputs, inputs, at, last, *_), across in zip(layers, transposed, strict=True):
         o, i = np.arange(outputs)[:, None], (np.arange(inputs) - last) % inputs
         padded = i * whole(outputs) + o if across else o * whole(inputs + PAD - 9) + i
         places[weight : weight + outputs * inputs] = (at + padded).ravel()

@@ -15,17 +15,17 @@ from .arithmetic import ONE, PAD, Index, borrowed, inside, part, whole, window
 class Net(NamedTuple):
     """Flat weights (P,) of one model, or their gradient, and memory for the same as matrices with padded columns.
 
-    `layers` (layers, 11) says of each where its weight and its bias begin in theta, its outputs, its inputs, where it
+    `layers` (layers, 11) holds of each where its weight and its bias begin in theta, its outputs, its inputs, where it
     begins in `padded`; how many of its inputs, the first ones, come last on the tape; whether it ends in a ReLU; the
     field of the tape with its inputs and their first column; the field of the deltas with the gradient of its outputs
-    and their first column. `turned` (layers,) says whose matrix is turned, (inputs, outputs), and `places` (P,) where
+    and their first column. `transposed` (layers,): whether the matrix is (inputs, outputs). `places` (P,): where
     each number of theta is in `padded`.
     """
 
     theta: AnyArray
     padded: AnyArray
     layers: Ints
-    turned: Bools
+    transposed: Bools
     places: AnyArray
 
 
@@ -40,7 +40,7 @@ class Nets(NamedTuple):
 class Tape(NamedTuple):
     """What the steps of one model leave behind, in memory that is kept for backward and in memory that is not.
 
-    `fields` (fields, 3) says of each where it begins, its width, and whether it is kept (1, else 0). `now` (2,) holds
+    `fields` (fields, 3) holds of each where it begins, its width, and whether it is kept (1, else 0). `now` (2,) holds
     the slot of the present step in the memory that is not kept, which has few and uses them in turn, and in the other.
     """
 
@@ -54,24 +54,24 @@ class Tape(NamedTuple):
 @inside
 def net_of(theta: AnyArray, padded: AnyArray, matrices: Matrices, which: Index) -> Net:
     """The net of flat weights with its matrices transposed as row `which` of `Matrices` has it."""
-    places, turned = matrices.places[which], matrices.turned[which]
-    return Net(borrowed(theta), borrowed(padded), borrowed(matrices.layers), borrowed(turned), borrowed(places))
+    places, transposed = matrices.places[which], matrices.transposed[which]
+    return Net(borrowed(theta), borrowed(padded), borrowed(matrices.layers), borrowed(transposed), borrowed(places))
 
 
 @register_jitable
 def room(outputs: Index, inputs: Index) -> Index:
-    """Padded memory of a layer: its weight, turned or not, and its bias."""
+    """Padded memory of a layer: its weight, transposed or not, and its bias."""
     return max(inputs * whole(outputs), outputs * whole(inputs + PAD - 9)) + whole(outputs)
 
 
 @inside
 def matrix(net: Net, layer: Index) -> AnyArray:
-    """Weight (outputs, inputs) of a layer, or turned (inputs, outputs), a view; inputs stand as on the tape.
+    """Weight (outputs, inputs) of a layer, or transposed (inputs, outputs), a view; inputs stand as on the tape.
 
-    Unturned rows are so long that PAD columns may be read from the last nine inputs on.
+    Untransposed rows are so long that PAD columns may be read from the last nine inputs on.
     """
     outputs, inputs, at = net.layers[layer, 2], net.layers[layer, 3], net.layers[layer, 4]
-    rows, columns = (inputs, whole(outputs)) if net.turned[layer] else (outputs, whole(inputs + PAD - 9))
+    rows, columns = (inputs, whole(outputs)) if net.transposed[layer] else (outputs, whole(inputs + PAD - 9))
     return window(net.padded, at, rows, columns)
 
 

@@ -1,4 +1,4 @@
-"""CooperativeGain: the joint filter of a star whose vehicles send each other how large their noise is."""
+"""CooperativeGain: the joint filter of a star whose vehicles broadcast the variance of their noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from coopoc.world.inbox import Inbox
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import Message
 
-from .noise_net import NoiseNet, tell
+from .noise_net import NoiseNet, estimate_noise
 from .star_gain import follow
 
 NEWEST = Message("fix, velocity and noise", 14)
@@ -27,22 +27,24 @@ SUMS = Message("sums since departure", 14, cumulative=True)
 
 
 @dataclass(frozen=True, eq=False)
-class ToldNoise(NoiseModel):
-    """What the nets of all vehicles tell in one recording, for any filter of a star.
+class NetNoise(NoiseModel):
+    """Noise of all vehicles in one recording, estimated by the net on board of each, for any filter of a star.
+
+    Relative noise is the data sheet's: vehicles that drive alone in training show nothing of it.
 
     Args:
-        fix, process: (R, T, N, 3) m^2. sensors: relative noise, from the data sheet: vehicles that drive alone in
-            training show nothing of it.
+        fix: (R, T, N, 3) m^2.
+        process: (R, T, N, 3) m^2.
     """
 
     fix: Floats | None = None
     process: Floats | None = None
 
     @classmethod
-    def by(cls, model: NoiseNet, recording: Recording) -> ToldNoise:
+    def by(cls, model: NoiseNet, recording: Recording) -> NetNoise:
         """By the same net on board of every vehicle."""
-        fix, process = tell(model, recording)
-        return cls("told", recording.sensors, fix=fix, process=process)
+        fix, process = estimate_noise(model, recording)
+        return cls("net", recording.sensors, fix=fix, process=process)
 
     def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
         """(R, T, N, 3) m^2, or the columns of it."""
@@ -59,25 +61,27 @@ class ToldNoise(NoiseModel):
         """There is no constant one: InputError."""
         raise InputError(
             "noise_model",
-            "told noise",
+            "the noise of nets",
             "changes from fix to fix, and this method takes constants",
-            "Use a filter of a star, such as JointFilter, or another knowledge.",
+            "Use a filter of a star, such as JointFilter, or another noise model.",
         )
 
 
 @dataclass(frozen=True, eq=False)
 class CooperativeGain:
-    """Ego and neighbours in one state as in JointFilter, each with the noise that the net on board of it tells.
+    """Ego and neighbours in one state as in JointFilter, each with the noise that its net estimates.
 
-    Nobody is told the noise of GNSS and velocity; that of range and angles is the data sheet's. A neighbour is used
-    when a message of it comes, so without any the ego is filtered exactly as by `NoiseFilter`.
+    The noise of GNSS and velocity is not given; that of range and angles is the data sheet's. A neighbour is used
+    when its message arrives, so without any the ego is filtered exactly as by `NoiseFilter`.
 
-    A message holds sums since departure. The receiver takes the difference to the last sums it has heard of that
-    vehicle, so that a message also says what lost ones said: the whole motion in between with its noise, and all fixes
-    in between, averaged along that motion. With `sums=False` it holds the newest fix and velocity, as JointFilter's.
+    A message holds sums since departure. The receiver takes the difference to the last sums received from that vehicle,
+    so that a message also holds the content of lost ones: the whole motion in between with its noise, and all fixes in
+    between, averaged along that motion. With `sums=False` it holds the newest fix and velocity, as JointFilter's.
 
     Args:
-        noise: the net; or a NoiseModel, which all vehicles then assume. sums: what messages hold. name: in tables.
+        noise: the net; or a NoiseModel, which all vehicles then assume.
+        sums: whether messages hold sums.
+        name: in tables.
 
     >>> CooperativeGain(NoiseNet()).message.payload
     56
@@ -106,9 +110,9 @@ class CooperativeGain:
                 "must be 0 s with sums",
                 "Use CooperativeGain(noise, sums=False).",
             )
-        told = ToldNoise.by(self.noise, recording) if isinstance(self.noise, NoiseNet) else self.noise
-        process = np.ascontiguousarray(told.process_variance(recording))
-        known = assumptions(recording, told)._replace(process=process, velocity_noise=np.empty(0))
+        model = NetNoise.by(self.noise, recording) if isinstance(self.noise, NoiseNet) else self.noise
+        process = np.ascontiguousarray(model.process_variance(recording))
+        known = assumptions(recording, model)._replace(process=process, velocity_noise=np.empty(0))
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
             x, cov, neighbours = follow(measurements(recording, ego, box), known, self.sums)

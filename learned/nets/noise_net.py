@@ -45,7 +45,7 @@ class Variances(NamedTuple):
 class Guess(NamedTuple):
     """Closed-form estimate that the net corrects, and the net's inputs.
 
-    Args:
+    Attributes:
         gnss: (T, S, B, 3) log of the GNSS std r m.
         axis: (T, S, B, 3) log of a, the velocity noise's share of the axis's velocity.
         speed: (T, S, B, 3) log of b, its share of the speed.
@@ -244,7 +244,7 @@ class NoiseFilter:
         return torch.from_numpy(np.broadcast_to(given, shape).reshape(1, -1, 3).copy())
 
 
-def tell(model: NoiseNet, recording: Recording) -> tuple[Floats, Floats]:
+def estimate_noise(model: NoiseNet, recording: Recording) -> tuple[Floats, Floats]:
     """Variances of fixes and of motion (R, T, N, 3) m^2 by the net on board of every vehicle; run by run."""
     theta, found = flatten([model]).double(), []
     with one_core(), torch.inference_mode():

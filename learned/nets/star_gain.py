@@ -37,9 +37,9 @@ from coopoc.kernels.messages import (
 from coopoc.kernels.relative import vector
 from coopoc.kernels.small import add, load, square, store
 
-SUMS, LAST, STEP, JOINED, GUESSED, PACE, WORTH, SIZE = 0, 12, 24, 25, 26, 29, 32, 35
+SUMS, LAST, STEP, JOINED, GUESSED, VELOCITY, WORTH, SIZE = 0, 12, 24, 25, 26, 29, 32, 35
 """Of a vehicle: motion m, its variance m^2, 1/r and (fix - motion)/r, each summed since departure, three axes each; the
-same as its last message said; the step of that, -1 for none; 1 if it came since the vehicle joined; m that it has been
+same as in its last message; the step of that, -1 for none; 1 if it came since the vehicle joined; m that it has been
 moved by guess since, m that it moves per step, and 1/r of its fixes as sent last."""
 
 
@@ -125,16 +125,16 @@ def settle(star: Star, account: AnyArray, t: int, member: Any) -> None:
     star.status[5 * k + NEW, lane] = 1.0 if news and account[6] > account[18] else 0.0
     for c in range(3):
         moved, q, w = account[c] - account[LAST + c], account[3 + c] - account[15 + c], account[6 + c] - account[18 + c]
-        star.motion[row + 3 * MOVED + c, lane] = moved - account[GUESSED + c] if again else account[PACE + c]
+        star.motion[row + 3 * MOVED + c, lane] = moved - account[GUESSED + c] if again else account[VELOCITY + c]
         star.motion[row + 3 * PROCESS + c, lane] = q if again else 0.0
         w = w if news and w > 0.0 else 1.0
         mean = (account[9 + c] - account[21 + c]) / w
         star.motion[row + 3 * POSITION + c, lane] = mean + account[c]
         star.motion[row + 3 * VARIANCE + c, lane] = 1.0 / w + late * q
         if news:
-            account[GUESSED + c], account[PACE + c] = 0.0, moved / steps if again else 0.0
+            account[GUESSED + c], account[VELOCITY + c] = 0.0, moved / steps if again else 0.0
         else:
-            account[GUESSED + c] += account[PACE + c]
+            account[GUESSED + c] += account[VELOCITY + c]
     if news:
         account[STEP], account[JOINED] = t, 1.0
         for i in range(LAST):

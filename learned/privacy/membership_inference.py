@@ -129,7 +129,7 @@ def gradient_scores(model: Gain, updates: Updates, pieces: Segments, mirrors: bo
         before, after = (torch.stack(weights) for weights in zip(*updates[at : at + many], strict=True))
         theta = before.repeat_interleave(len(pieces), 0)
         batch = _batch(pieces, torch.arange(len(pieces)).repeat(len(before))[:, None])
-        gradient = torch.stack([model.loss_and_gradient(theta, _turned(batch, form))[1] for form in forms]).mean(0)
+        gradient = torch.stack([model.loss_and_gradient(theta, _rotated(batch, form))[1] for form in forms]).mean(0)
         step = (after - before).double().repeat_interleave(len(pieces), 0)
         scores.append(torch.cosine_similarity(-gradient.double(), step).view(len(before), -1))
     return _means(torch.cat(scores))
@@ -148,7 +148,7 @@ def _batch(pieces: Segments, index: Tensor) -> Batch:
     return replace(pieces, noise="static").batch(index)
 
 
-def _turned(batch: Batch, form: tuple[bool, float, float, float]) -> Batch:
+def _rotated(batch: Batch, form: tuple[bool, float, float, float]) -> Batch:
     """The batch with x and y exchanged, if so, and its axes signed."""
     order, signs = [1, 0, 2] if form[0] else [0, 1, 2], torch.tensor(form[1:])
     gnss, velocity, truth, x0 = (array[..., order] * signs for array in batch[:4])

@@ -41,7 +41,8 @@ class Schedule:
     mirror: bool = True
     """Mirror each piece at random at each use (`clients.mirrored`). Not in the paper; docs/learned.md has the gain."""
     checks: int = 20
-    """Validations spread over the training, as many as the paper has rounds; the best weights seen are kept."""
+    """Validations at equal distances over the training, as many as the paper has rounds; the best weights seen are
+    kept."""
 
     def __post_init__(self) -> None:
         for field in ("epochs", "batch", "learning_rate", "clip", "checks"):

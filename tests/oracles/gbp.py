@@ -20,22 +20,22 @@ def gbp(drive, rounds, damping=0.0, carry="own"):  # type: ignore[no-untyped-def
         factors = [
             (i, j, *drive.factor_at_agreement(k, x[t, j] - x[t, i], own[i] + own[j])) for k, i, j in drive.pairs(t)
         ]
-        told = {(a, b): (np.zeros((3, 3)), np.zeros(3)) for i, j, _, _ in factors for a, b in ((i, j), (j, i))}
+        messages = {(a, b): (np.zeros((3, 3)), np.zeros(3)) for i, j, _, _ in factors for a, b in ((i, j), (j, i))}
 
-        def belief(n, told=told, own=own):  # type: ignore[no-untyped-def]
-            mine = [message for (_, to), message in told.items() if to == n]
+        def belief(n, messages=messages, own=own):  # type: ignore[no-untyped-def]
+            mine = [message for (_, to), message in messages.items() if to == n]
             return np.linalg.inv(own[n]) + sum(m[0] for m in mine), sum((m[1] for m in mine), np.zeros(3))
 
         for _ in range(rounds):
             new = {}
             for i, j, W, w in factors:
                 for sender, receiver, sign in ((i, j, 1.0), (j, i, -1.0)):
-                    L, eta = (a - b for a, b in zip(belief(sender), told[receiver, sender], strict=True))
+                    L, eta = (a - b for a, b in zip(belief(sender), messages[receiver, sender], strict=True))
                     gain = W @ np.linalg.inv(L + W)
                     message = W - gain @ W, sign * w + gain @ (eta - sign * w)
-                    both = zip(told[sender, receiver], message, strict=True)
+                    both = zip(messages[sender, receiver], message, strict=True)
                     new[sender, receiver] = tuple(damping * a + (1 - damping) * b for a, b in both)
-            told.update(new)
+            messages.update(new)
         for n in drive.here(t):
             L, eta = belief(n)
             P[t, n] = np.linalg.inv(L)

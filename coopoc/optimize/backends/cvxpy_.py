@@ -2,7 +2,7 @@
 
 Every programme has parameters (CVXPY's DPP rules) and is built once per shape. The semidefinite one is the primal of
 the one that `shor` solves, so that the two check each other. The refinement is ours: the trust region of manifold.py,
-then Gauss-Newton; the extras say what the relaxation had found before it.
+then Gauss-Newton; the extras hold the point of the relaxation before it.
 """
 
 from __future__ import annotations

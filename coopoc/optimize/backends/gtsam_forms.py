@@ -31,7 +31,7 @@ Given: TypeAlias = Callable[[Any], list[tuple[Any, ...]]]
 class Part(NamedTuple):
     """A GTSAM class that states a factor, or those of its residuals that `root` keeps.
 
-    Args:
+    Attributes:
         root: (M or 1, k, k) S, square root of the information of its k errors.
     """
 

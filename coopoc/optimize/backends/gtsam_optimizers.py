@@ -47,15 +47,15 @@ def all_native(problem: Problem, forms_: Sequence[Form], optimizer: str) -> None
 def gnc(problem: Problem, forms_: Sequence[Form]) -> Callable[[Any, int], tuple[Any, int, list[Floats]]]:
     """gtsam.GncLMOptimizer: (values, limit) -> rough values, iterations and (M,) weights of each factor's measurements.
 
-    GTSAM cannot copy the chord of a relative pose, as its graduation does; until it has told the outliers, the
-    logarithm of the whole pose stands in for it, which has the same minimum where all residuals vanish.
+    GTSAM's GNC copies factors and cannot copy the chord of a relative pose; until the outliers are found, the
+    logarithm of the whole pose replaces it, which has the same minimum where all residuals vanish.
 
     Raises:
         InputError: factors whose losses are not one of GNC_LOSSES with one scale, or that cannot be copied.
     """
     import gtsam
 
-    name, scale = _doubted(problem)
+    name, scale = _robust_loss(problem)
     parts = [copied(*pair, problem.dimension) for pair in zip(problem.factors, forms_, strict=True)]
     native = native_graph(problem, parts)
     inliers = [k for k, (f, _) in enumerate(native.place) if problem.factors[f].loss is None]
@@ -81,7 +81,7 @@ def gnc(problem: Problem, forms_: Sequence[Form]) -> Callable[[Any, int], tuple[
     return solve_gnc
 
 
-def _doubted(problem: Problem) -> tuple[str, float]:
+def _robust_loss(problem: Problem) -> tuple[str, float]:
     """The one loss and scale of a problem's factors."""
     losses = {(f.loss.name, f.loss.scale) for f in problem.factors if f.loss is not None}
     if len(losses) != 1 or next(iter(losses))[0] not in GNC_LOSSES:

@@ -155,7 +155,7 @@ class Programme:
         return workspace.solver.solution
 
     def _polish(self, workspace: Workspace, wanted: bool) -> None:
-        """Without an active set OSQP would say so on stdout."""
+        """Without an active set OSQP would print a message."""
         if wanted != self._polishing:
             self._polishing = wanted
             workspace.polish(wanted)

@@ -62,7 +62,7 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
         solution: of it.
         tolerance: largest gap, as a share of max(cost, 1).
         surrogate: replace what is not quadratic (`surrogate`), solve that from the solution and certify its minimum;
-            the sentence says what was replaced and how far the two points are apart.
+            the sentence names the replaced factors and the distance of the two points.
 
     Raises:
         InputError: as `quadratic`, or as `surrogate`.
@@ -101,8 +101,8 @@ def _by_surrogate(problem: Problem, solution: Solution, tolerance: float) -> Cer
     verdict = certify(other.problem, found, tolerance)
     space = problem.space
     apart = np.linalg.norm(space.position(found.x) - space.position(solution.x), axis=1).max(initial=0.0)
-    said = f"; surrogate: {'; '.join(other.replaced) or 'nothing replaced'}; at most {apart:.3g} m from the solution"
-    return replace(verdict, sentence=verdict.sentence + said, surrogate=other.replaced)
+    note = f"; surrogate: {'; '.join(other.replaced) or 'nothing replaced'}; at most {apart:.3g} m from the solution"
+    return replace(verdict, sentence=verdict.sentence + note, surrogate=other.replaced)
 
 
 def lower_bound(reduced: Reduced, L: Multipliers) -> tuple[float, float, Floats]:

@@ -75,7 +75,8 @@ def quadratic(problem: Problem) -> Quadratic:
 
 
 def _hold(rows: Any, place: _Place, fixed: Ints, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
-    """A with what fixed nodes say moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to keep."""
+    """A with the terms of fixed nodes moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to
+    keep."""
     if not len(fixed):
         return rows, np.arange(place.size)
     from scipy.sparse import csr_array
@@ -142,14 +143,14 @@ def _pose(place: _Place, factor: Factor, origin: Floats) -> Terms:
     """w (t_i - z), and w (R_i^T - R_z^T H)."""
     d = place.dimension
     (i,) = factor.nodes.T
-    w, turning = (weight[:, None, None] for weight in _weights(factor, d))
+    w, angular = (weight[:, None, None] for weight in _weights(factor, d))
     frame = np.tile(place.frame, (len(i), 1))
     seen = factor.z[:, None, :d] - origin
     turn = np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
     ahead = np.broadcast_to(np.eye(d), turn.shape)
     return [
         (np.concatenate([w, -w * seen], axis=2), np.concatenate([place.position(i), frame], axis=1)),
-        (turning * np.concatenate([ahead, -turn], axis=2), np.concatenate([place.rotation(i), frame], axis=1)),
+        (angular * np.concatenate([ahead, -turn], axis=2), np.concatenate([place.rotation(i), frame], axis=1)),
     ]
 
 

@@ -1,4 +1,4 @@
-"""Runs abreast: the same digits as alone, and the algebra of numpy.linalg in every lane."""
+"""Runs side by side: the same digits as alone, and the algebra of numpy.linalg in every lane."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def test_the_same_with_process_noise_of_every_size(crossing: Fleet) -> None:
         np.testing.assert_array_equal(alone.covariance[0], whole.covariance[1])
 
 
-def test_angles_abreast_are_those_of_atan2() -> None:
+def test_angles_side_by_side_are_those_of_atan2() -> None:
     """Where all are small, where some are, and where one is missing."""
     import numba
 
-    from coopoc.kernels.abreast import pack, put, take
+    from coopoc.kernels.batched import pack, put, take
     from coopoc.kernels.relative import angle
 
     @numba.njit

@@ -1,4 +1,4 @@
-"""Numbers of four runs abreast: a vector that adds, multiplies and divides as a float does, for compiled code.
+"""Numbers of four runs side by side: a vector that adds, multiplies and divides as a float does, for compiled code.
 
 What is written for floats serves four runs at the price of one, and each as if it were alone: every lane is rounded as
 a float is. A product and a sum are rounded once, and are one instruction, in `plus` and `less` and nowhere else.
@@ -20,25 +20,25 @@ from .lanes import LANES, check_index, fused
 VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 
 
-class Abreast(types.Type):
+class Batched(types.Type):
     """The type of LANES numbers; only what is compiled can hold one."""
 
     def __init__(self) -> None:
-        super().__init__(name="Abreast")
+        super().__init__(name="Batched")
 
 
-@register_model(Abreast)
+@register_model(Batched)
 class _Model(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, VECTOR)  # type: ignore[no-untyped-call]
 
 
-abreast = Abreast()
+BATCHED = Batched()
 
 
 def _wide(context: Any, build: Any, value: Any, kind: Any) -> Any:
     """A vector as it is, a number in all lanes."""
-    if isinstance(kind, Abreast):
+    if isinstance(kind, Batched):
         return value
     return wide(build, context.cast(build, value, kind, types.float64))
 
@@ -56,8 +56,8 @@ def _operator(function: Any, makes: Callable[[Any, Any, Any], Any]) -> None:
     @type_callable(function)
     def typed(context: Any) -> Any:
         def typer(a: Any, b: Any) -> Any:
-            vectors = [isinstance(k, Abreast) for k in (a, b)]
-            return abreast if any(vectors) and all(isinstance(k, Abreast | types.Float) for k in (a, b)) else None
+            vectors = [isinstance(k, Batched) for k in (a, b)]
+            return BATCHED if any(vectors) and all(isinstance(k, Batched | types.Float) for k in (a, b)) else None
 
         return typer
 
@@ -65,7 +65,7 @@ def _operator(function: Any, makes: Callable[[Any, Any, Any], Any]) -> None:
         a, b = (_wide(context, build, *pair) for pair in zip(args, signature.args, strict=True))
         return makes(build, a, b)
 
-    for pair in ((Abreast, Abreast), (Abreast, types.Float), (types.Float, Abreast)):
+    for pair in ((Batched, Batched), (Batched, types.Float), (types.Float, Batched)):
         lower_builtin(function, *pair)(lowered)
 
 
@@ -85,9 +85,9 @@ def _function(function: Any, name: str) -> None:
 
     @type_callable(function)
     def typed(context: Any) -> Any:
-        return lambda a: abreast if isinstance(a, Abreast) else None
+        return lambda a: BATCHED if isinstance(a, Batched) else None
 
-    @lower_builtin(function, Abreast)  # type: ignore[untyped-decorator]
+    @lower_builtin(function, Batched)  # type: ignore[untyped-decorator]
     def lowered(context: Any, build: Any, signature: Any, args: Any) -> Any:
         kind = ir.FunctionType(VECTOR, [VECTOR])
         return build.call(cgutils.get_or_insert_function(build.module, kind, f"llvm.{name}.v{LANES}f64"), args)
@@ -95,10 +95,10 @@ def _function(function: Any, name: str) -> None:
 
 @type_callable(operator.le)
 def _all_at_most(context: Any) -> Any:
-    return lambda a, b: types.boolean if isinstance(a, Abreast) and isinstance(b, Abreast) else None
+    return lambda a, b: types.boolean if isinstance(a, Batched) and isinstance(b, Batched) else None
 
 
-@lower_builtin(operator.le, Abreast, Abreast)  # type: ignore[untyped-decorator]
+@lower_builtin(operator.le, Batched, Batched)  # type: ignore[untyped-decorator]
 def _all_lanes_at_most(context: Any, build: Any, signature: Any, args: Any) -> Any:
     """True if it is so in all lanes, which a NaN is not."""
     each = build.fcmp_ordered("<=", *args)
@@ -113,10 +113,10 @@ _function(abs, "fabs")
 
 @type_callable(operator.neg)
 def _negative(context: Any) -> Any:
-    return lambda a: abreast if isinstance(a, Abreast) else None
+    return lambda a: BATCHED if isinstance(a, Batched) else None
 
 
-@lower_builtin(operator.neg, Abreast)  # type: ignore[untyped-decorator]
+@lower_builtin(operator.neg, Batched)  # type: ignore[untyped-decorator]
 def _negated(context: Any, build: Any, signature: Any, args: Any) -> Any:
     return build.fneg(args[0])
 
@@ -135,7 +135,7 @@ def _take(context: Any, array: Any, at: Any) -> Any:
     def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
         return build.load(_place(context, build, signature.args[0], *args), align=8)
 
-    return abreast(array, types.uint64), generate
+    return BATCHED(array, types.uint64), generate
 
 
 def _put(context: Any, array: Any, at: Any, value: Any) -> Any:
@@ -145,7 +145,7 @@ def _put(context: Any, array: Any, at: Any, value: Any) -> Any:
         build.store(args[2], _place(context, build, signature.args[0], *args[:2]), align=8)
         return context.get_dummy_value()
 
-    return types.void(array, types.uint64, abreast), generate
+    return types.void(array, types.uint64, BATCHED), generate
 
 
 def _pack(context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
@@ -157,7 +157,7 @@ def _pack(context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
             whole = build.insert_element(whole, number, ir.Constant(ir.IntType(32), k))
         return whole
 
-    return abreast(*[types.float64] * LANES), generate
+    return BATCHED(*[types.float64] * LANES), generate
 
 
 def _fused(sign: Callable[[Any, Any], Any]) -> Callable[..., Any]:
@@ -165,14 +165,14 @@ def _fused(sign: Callable[[Any, Any], Any]) -> Callable[..., Any]:
 
     def typed(context: Any, total: Any, a: Any, b: Any) -> Any:
         kinds = (total, a, b)
-        kind = abreast if any(isinstance(k, Abreast) for k in kinds) else types.float64
+        kind = BATCHED if any(isinstance(k, Batched) for k in kinds) else types.float64
 
         def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
-            if kind is abreast:
+            if kind is BATCHED:
                 args = [_wide(context, build, value, given) for value, given in zip(args, signature.args, strict=True)]
             return fused(build, sign(build, args[1]), args[2], args[0])
 
-        return kind(*(k if isinstance(k, Abreast) else types.float64 for k in kinds)), generate
+        return kind(*(k if isinstance(k, Batched) else types.float64 for k in kinds)), generate
 
     return typed
 
@@ -184,8 +184,8 @@ def _choose(context: Any, sign: Any, a: Any, b: Any) -> Any:
         positive = build.fcmp_ordered(">", args[0], ir.Constant(args[0].type, None if vectors else 0.0))
         return build.select(positive, args[1], args[2])
 
-    vectors = isinstance(sign, Abreast)
-    kind = abreast if vectors else types.float64
+    vectors = isinstance(sign, Batched)
+    kind = BATCHED if vectors else types.float64
     return kind(kind, kind, kind), generate
 
 
