@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -108,3 +109,22 @@ def test_importing_the_package_imports_no_numba() -> None:
     code = "import sys, coopoc; print('numba' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> None:
+    """A cache from before a type was renamed cannot be read: the kernel compiles anew and is kept again."""
+    (tmp_path / "own.py").write_text(
+        "from coopoc.kernels.compile import compiled\n\n\n@compiled\ndef twice(x):\n    return 2.0 * x\n\n\n"
+        "print(twice(4.0), sum(twice.stats.cache_hits.values()))\n"
+    )
+
+    def run() -> str:
+        command = [sys.executable, tmp_path / "own.py"]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    assert (run(), run()) == ("8.0 0\n", "8.0 1\n")
+    (index,) = tmp_path.glob("__pycache__/*.nbi")
+    with index.open("rb") as file:
+        version = pickle.load(file)
+    index.write_bytes(pickle.dumps(version) + b"cno_such_module\nThing\n.")
+    assert (run(), run()) == ("8.0 0\n", "8.0 1\n")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import compiled
+from .compile import compiled, part
 from .fleet_graph import MATRIX, VECTOR, Assumed, Measured, Pairs, advance, copy, most_pairs, pair_at_agreement
 from .small import (
     add,
@@ -66,7 +66,7 @@ def follow(
     return x, cov
 
 
-@compiled
+@part
 def linearise(
     run: int,
     t: int,
@@ -88,7 +88,7 @@ def linearise(
             store(graph[1], place, eta)
 
 
-@compiled
+@part
 def gather(
     run: int,
     t: int,
@@ -108,7 +108,7 @@ def gather(
                 store(beliefs[1], n, add(load(beliefs[1], n, VECTOR), load(messages[1], m, VECTOR)))
 
 
-@compiled
+@part
 def pass_messages(
     run: int,
     t: int,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -103,10 +103,19 @@ def _kept(made: Any, function: Function) -> Function:
     folders = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
     try:
         made.enable_caching()
-        made._cache._cache_file._source_stamp = _stamp(tuple(sorted(folders)))
+        file = made._cache._cache_file
+        file._source_stamp, file._load_index = _stamp(tuple(sorted(folders))), partial(_index_or_none, file._load_index)
     except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
         pass
     return cast(Function, made)
+
+
+def _index_or_none(load: Callable[[], Any]) -> Any:
+    """What is on disk; nothing if it names types that have been renamed since."""
+    try:
+        return load()
+    except (ImportError, AttributeError):
+        return {}
 
 
 @cache

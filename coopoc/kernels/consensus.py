@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Floats
 from .belief_propagation import linearise
-from .compile import compiled
+from .compile import compiled, part
 from .fleet_graph import MATRIX, VECTOR, Assumed, Measured, Pairs, advance, copy, most_pairs
 from .small import add, add_diagonal, apply, inverse, load, minus_apply, minus_product, scale, store, subtract
 
@@ -80,7 +80,7 @@ def follow(measured: Measured, pairs: Pairs, assumed: Assumed, rounds: int, rho:
     return x, cov
 
 
-@compiled
+@part
 def prepare(
     run: int, t: int, own: AnyArray, pairs: Pairs, graph: tuple[AnyArray, AnyArray], rho: float, state: Consensus
 ) -> None:
@@ -105,7 +105,7 @@ def prepare(
         store(state.outer, n, inverse(load(state.outer, n, MATRIX)))
 
 
-@compiled
+@part
 def solve(run: int, t: int, pairs: Pairs, graph: tuple[AnyArray, AnyArray], rho: float, state: Consensus) -> None:
     """Each vehicle's copies y = argmin f_i(y) + rho / 2 sum_k |y_k - a_k|^2, with a_k = z_k - u_k."""
     for n in range(len(state.holders)):
@@ -132,7 +132,7 @@ def solve(run: int, t: int, pairs: Pairs, graph: tuple[AnyArray, AnyArray], rho:
                 store(state.copy, m, apply(inner, eta))
 
 
-@compiled
+@part
 def agree(run: int, t: int, pairs: Pairs, state: Consensus) -> None:
     """z = mean over the holders of y + u, then u += y - z."""
     for n in range(len(state.holders)):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import compiled
+from .compile import compiled, part
 from .fleet_graph import VECTOR, Assumed, Measured, Pairs, at, filled, most_pairs
 from .small import add, load, scale, store, subtract
 
@@ -88,7 +88,7 @@ def follow(measured: Measured, pairs: Pairs, assumed: Assumed, rounds: int, anch
     return x
 
 
-@compiled
+@part
 def meet(run: int, t: int, pairs: Pairs, now: Estimates, fill: AnyArray) -> None:
     """Members of each vehicle's list."""
     fill[:] = 1
@@ -109,7 +109,7 @@ def meet(run: int, t: int, pairs: Pairs, now: Estimates, fill: AnyArray) -> None
             fill[j] += 1
 
 
-@compiled
+@part
 def start(
     run: int, t: int, measured: Measured, old: Estimates, now: Estimates, place: AnyArray, anchored: bool
 ) -> None:
@@ -133,7 +133,7 @@ def start(
                 place[old.member[entry]] = -1
 
 
-@compiled
+@part
 def measure(
     run: int, t: int, measured: Measured, pairs: Pairs, assumed: Assumed, now: Estimates, anchored: bool
 ) -> None:
@@ -163,7 +163,7 @@ def measure(
             now.anchor[n, c] = 0.0 if math.isnan(fix[c]) or not anchored else variance / r[c]
 
 
-@compiled
+@part
 def adapt(fix: AnyArray, now: Estimates) -> None:
     """w_i + mu L_i^T (delta_i - L_i w_i), and towards the own fix; mu = min(2 / |row|^2, 0.1)."""
     for n in range(len(now.degree)):
@@ -179,7 +179,7 @@ def adapt(fix: AnyArray, now: Estimates) -> None:
                 now.w[entry, c] -= step * gap * now.measures[entry]
 
 
-@compiled
+@part
 def combine(now: Estimates, new: AnyArray, place: AnyArray) -> None:
     """sum_j c_ij psi_j of those in contact that keep an estimate of the member, and the rest of the weight psi_i.
 

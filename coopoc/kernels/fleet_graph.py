@@ -79,7 +79,7 @@ def at(values: AnyArray, run: int, t: int, n: int) -> Any:
     return values[min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(n, values.shape[2] - 1)]
 
 
-@compiled
+@part
 def correct(x: AnyArray, cov: AnyArray, run: int, t: int, n: int, measured: Measured, assumed: Assumed) -> None:
     """One Kalman step of vehicle n alone, in place: x += dt u, P += Q, then one update per axis that was measured.
 
@@ -108,7 +108,7 @@ def correct(x: AnyArray, cov: AnyArray, run: int, t: int, n: int, measured: Meas
                     cov[b + 3 * i + j] -= gain * row[j]
 
 
-@compiled
+@part
 def begin_at_fix(x: AnyArray, cov: AnyArray, run: int, t: int, n: int, measured: Measured, assumed: Assumed) -> None:
     """Vehicle n stands at its fix, with the covariance of that."""
     r = at(assumed.fix, run, t, n)
@@ -117,7 +117,7 @@ def begin_at_fix(x: AnyArray, cov: AnyArray, run: int, t: int, n: int, measured:
         x[3 * n + c], cov[9 * n + 4 * c] = measured.gnss[run, t, n, c], r[c]
 
 
-@compiled
+@part
 def advance(run: int, t: int, x: AnyArray, own: AnyArray, measured: Measured, assumed: Assumed) -> None:
     """Positions x[t] (3 N) m and covariances own (9 N) m^2 of each vehicle from its own sensors; NaN m if inactive."""
     for n in range(measured.active.shape[2]):
@@ -137,7 +137,7 @@ def copy(source: AnyArray, target: AnyArray, count: int) -> None:
         target[k] = source[k]
 
 
-@compiled
+@part
 def most_pairs(pairs: Pairs) -> int:
     """At one step."""
     most = 0
@@ -179,7 +179,7 @@ def measurement(vector: Any, seen: Any, std: AnyArray, min_range: float, convert
     return information, apply(information, subtract((ground * here[2], ground * here[1], d * here[4]), vector))
 
 
-@compiled
+@part
 def pair(vector: Any, k: int, pairs: Pairs, relative: AnyArray, assumed: Assumed, converted: bool) -> Any:
     """`measurement` of a pair's vector x_second - x_first by both of its vehicles, summed."""
     information, eta = MATRIX, VECTOR
@@ -191,7 +191,7 @@ def pair(vector: Any, k: int, pairs: Pairs, relative: AnyArray, assumed: Assumed
     return information, eta
 
 
-@compiled
+@part
 def pair_at_agreement(vector: Any, cov: Any, k: int, pairs: Pairs, relative: AnyArray, assumed: Assumed) -> Any:
     """`pair`, linear where the believed vector and the converted measurements agree; eta refers to `vector`.
 

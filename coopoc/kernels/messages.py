@@ -8,7 +8,7 @@ whose position was used before, or has no fix, has new = 0.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy import uint64
@@ -28,7 +28,7 @@ age in steps, 1 if there is one, and 1 if its position counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
-NONE = np.int64(0)
+NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray
-from .compile import compiled
+from .compile import compiled, part
 
 
 @compiled
@@ -18,11 +18,10 @@ def add_squares(
     opposed: bool,
     residual: AnyArray,
     jacobian: AnyArray,
-    blocks: AnyArray,
-    gradient: AnyArray,
+    out: Any,
     sizes: Any,
 ) -> None:
-    """Add S^T S to blocks (B, P, d, d) and S^T r to the gradient (B, n, d), S the derivative by one of the nodes.
+    """Add S^T S to blocks and S^T r to the gradient, S the derivative by one of the nodes.
 
     Args:
         nodes: (M, arity).
@@ -31,9 +30,10 @@ def add_squares(
         opposed: the other node's derivative is -S, and adds too.
         residual: (B, M, k) r.
         jacobian: (B or 1, M or 1, k, d) S.
+        out: blocks (B, P, d, d) and gradient (B, n, d).
         sizes: tuples of length k and d, so that the compiler knows both.
     """
-    square = np.empty((len(sizes[1]), len(sizes[1])))
+    (blocks, gradient), square = out, np.empty((len(sizes[1]), len(sizes[1])))
     for b in range(len(residual)):
         each = jacobian[b % len(jacobian)]
         for m in range(len(nodes)):
@@ -56,7 +56,7 @@ def add_squares(
                 add(blocks[b, place[m, 2]], -1.0, square, sizes[1])
 
 
-@compiled
+@part
 def add(out: AnyArray, sign: float, square: AnyArray, size: Any) -> None:
     """Add sign times a matrix (d, d)."""
     for i in range(len(size)):

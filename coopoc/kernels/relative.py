@@ -72,7 +72,7 @@ def sine_and_cosine(turn: Any) -> Any:
     return choose(rest - 1.5, -one, one), choose(1.0 - abs(rest - 1.5), -other, other)
 
 
-@as_written
+@inner
 def vector(seen: Any) -> Any:
     """The measured vector, m."""
     ground = seen[0] * seen[3]
@@ -85,7 +85,7 @@ def angle(sine: float, cosine: float) -> float:
     return series(sine, cosine) if abs(sine) <= 0.25 * cosine else math.atan2(sine, cosine)
 
 
-@as_written
+@inner
 def series(sine: float, cosine: float) -> float:
     """atan2 of a small angle."""
     t = sine / cosine
@@ -120,7 +120,7 @@ def _of_several_runs(sine: Any, cosine: Any) -> Any:
     return each
 
 
-@as_written
+@inner
 def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
     """Information, upper triangle, of a converted measurement along (x, y, z): C^-1 of `vector_cov`, whose axes are
     those of range, azimuth and inclination."""
@@ -142,7 +142,7 @@ def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
     )
 
 
-@as_written
+@inner
 def at_measurement(seen: Any, std: Any, least: float) -> Any:
     """The information of `exact`, upper triangle, at the measured vector itself."""
     x, y, z = vector(seen)
@@ -162,7 +162,7 @@ def at_measurement(seen: Any, std: Any, least: float) -> Any:
     )
 
 
-@as_written
+@inner
 def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> Any:
     """J^T J, upper triangle, and J^T r of the whitened range, azimuth and inclination at the vector (x, y, z).
 
@@ -193,7 +193,7 @@ def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> An
     )
 
 
-@as_written
+@inner
 def dot(a: float, x: float, b: float, y: float, c: float, z: float) -> float:
     """a x + b y + c z."""
     total: float = plus(plus(a * x, b, y), c, z)
@@ -206,7 +206,7 @@ def incomplete(seen: Any) -> bool:
     return not seen[5] + seen[6] + seen[7] <= 0.0 * seen[0] + 1e300
 
 
-@as_written
+@inner
 def completed(seen: Any, gap: Any) -> Any:
     """The measurement, its missing components (of infinite deviation) those of the vector `gap`."""
     x, y, z = gap
@@ -223,7 +223,7 @@ def completed(seen: Any, gap: Any) -> Any:
     )
 
 
-@as_written
+@inner
 def converted_cov(seen: Any, std: Any, least: float) -> Any:
     """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
 

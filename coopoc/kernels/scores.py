@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import compiled
+from .compile import compiled, part
 
 
-@compiled
+@part
 def less(a: AnyArray, b: AnyArray) -> Any:
     """a - b, three numbers."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]

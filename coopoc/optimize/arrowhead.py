@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -17,18 +17,10 @@ from .linear import opposite
 from .normal import Pattern, pattern
 from .problem import Problem
 
+if TYPE_CHECKING:
+    from ..kernels.star import Star
+
 Part: TypeAlias = tuple[tuple[Ints, ...], tuple[Ints, ...]]
-
-
-class Star(NamedTuple):
-    """A separator of one point and groups of one: what `coopoc.kernels.star` takes."""
-
-    separator: int
-    others: Ints
-    corner: int
-    head: Ints
-    arm: Ints
-    transposed: Bools
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +45,8 @@ class Arrow:
     @cached_property
     def star(self) -> Star | None:
         """The same in short, if it is one whose nodes are all measured."""
+        from ..kernels.star import Star
+
         own = len(self.corner[0][0]), len(self.head[0][0])
         if len(self.separator) != 1 or self.group.shape[1] != 1 or own != (1, len(self.group)):
             return None
@@ -211,13 +205,13 @@ def marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool = False
 
 def _compiled(star: Star, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     """`marginals` of a star by the kernel; LinAlgError as there."""
-    from ..kernels.star import star_marginals
+    from ..kernels.star import Solved, star_marginals
 
     d = blocks.shape[-1]
-    cov, dx = np.empty((*gradient.shape, d)), np.empty_like(gradient)
-    if not star_marginals(*star, blocks, gradient, cov, dx, (0,) * d).all():
+    found = Solved(np.empty((*gradient.shape, d)), np.empty_like(gradient))
+    if not star_marginals(star, blocks, gradient, found, (0,) * d).all():
         raise np.linalg.LinAlgError("a block is not positive definite")
-    return cov, dx
+    return found
 
 
 def _inverse(matrix: Floats, many: bool) -> Floats:

@@ -135,7 +135,7 @@ def _compiled(scheme: Pattern, linear: Linear, nodes: Sequence[Ints]) -> tuple[F
         each = [np.ascontiguousarray(jacobian) for jacobian in jacobians]
         opposed = len(each) < touched.shape[1]
         for k, jacobian in enumerate(each):
-            add_squares(touched, place, k + opposed, opposed, residual, jacobian, blocks, gradient, sizes)
+            add_squares(touched, place, k + opposed, opposed, residual, jacobian, (blocks, gradient), sizes)
         if len(each) == 2:
             add_products(touched, place, each[0], each[1], blocks, sizes)
     return _stilled(scheme, blocks), gradient
