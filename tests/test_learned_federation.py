@@ -296,6 +296,7 @@ def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None
         ({"topology": Ring(), "compression": Float16()}, "compression = Float16"),
         ({"topology": Pairs((("c0", "c1"),))}, r"without a path from c0 to \['c2', 'c3'\]"),
         ({"topology": Pairs((("c0", "x"),))}, "pairs = "),
+        ({"topology": Pairs((("c0", "c11"),))}, r"pairs = 'c11': must be one of c0, .* Did you mean c1\?"),
         ({"topology": V2XGraph(drives(2), 1e9)}, "vehicle = 'c2'"),
         ({"rounds": 0}, "rounds = 0"),
     ],

@@ -10,6 +10,10 @@ from filterpy.kalman import KalmanFilter
 
 from coopoc import GNSS, LKFSA, MSMV, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
+from coopoc.methods.covariance_intersection import CovarianceIntersection
+from coopoc.methods.fixed_lag import FixedLagSmoother
+from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.mds import MDS
 from coopoc.methods.star import FORGOTTEN
 from coopoc.world.spherical import spherical, to_vector
 
@@ -213,10 +217,20 @@ def test_bad_knowledge_is_named(crossing: Fleet) -> None:
     recording = observe(crossing, S2)
     with pytest.raises(InputError, match="noise_model = 'guess'"):
         Kalman("guess")(recording)
+    with pytest.raises(InputError, match=r"noise_model = 'nominl': .* Did you mean nominal\?"):
+        Kalman("nominl")(recording)
     with pytest.raises(InputError, match="process_std"):
         NoiseModel("mine", S2, process_std=(0.1, 0.1, 0.0))
-    with pytest.raises(InputError, match="membership = 'rest'"):
+    with pytest.raises(InputError, match=r"membership = 'rest': .* Did you mean reset\?"):
         LKFSA(membership="rest")  # type: ignore[arg-type]
+    for method, field, given, near in (
+        (CovarianceIntersection, "criterion", "tracee", "trace"),
+        (FixedLagSmoother, "backend", "gtsan", "gtsam"),
+        (GaussianBeliefPropagation, "carry", "beliefs", "belief"),
+        (MDS, "missing", "path", "paths"),
+    ):
+        with pytest.raises(InputError, match=rf"{field} = '{given}': must be one of .* Did you mean {near}\?"):
+            method(**{field: given})
     with pytest.raises(InputError, match="x0"):
         Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 

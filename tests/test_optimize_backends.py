@@ -329,6 +329,7 @@ def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
     [
         (lambda p: solve(p, "ipopt"), "gauss-newton"),
         (lambda p: solve(p, "gtsam", colour="red"), "max_iterations"),
+        (lambda p: solve(p, "gtsam", max_iteration=3), r"Did you mean max_iterations\?"),
     ],
 )
 def test_unknown_names_list_the_known(dense: Recording, call, words: str) -> None:

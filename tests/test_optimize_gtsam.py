@@ -534,6 +534,8 @@ def test_an_endless_lag_is_the_whole_problem() -> None:
         assert set(newest.names) == set(stamps)
     newest = smoother.estimate(("7", "15", "16"))
     assert newest.x == pytest.approx(whole.x[[7, 15, 16]], abs=1e-6)
+    with pytest.raises(InputError, match=r"wanted = '155': .* Did you mean 15\?"):
+        smoother.estimate(("155",))
     every = smoother.estimate(problem.names)
     assert every.x == pytest.approx(whole.x, abs=1e-6)
     assert every.covariance == pytest.approx(whole.covariance, rel=0.05, abs=1e-3)  # their chord's J^T J, not ours

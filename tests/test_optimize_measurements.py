@@ -125,6 +125,9 @@ def test_angles_wrap() -> None:
 def test_a_decorated_function_is_all_it_takes() -> None:
     """A new measurement, the squared range, is at once in every backend."""
 
+    with pytest.raises(InputError, match=r"frame = 'bodi': .* Did you mean body\?"):
+        measurement("squared range", arity=2, components=("coordinate",), frame="bodi")  # type: ignore[arg-type]
+
     @measurement("squared range", arity=2, components=("coordinate",))
     def squared(dx, dy, dz, m=np):
         return (dx * dx + dy * dy + dz * dz,)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..plugins import suggestion
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.sensors import Sensors
@@ -139,7 +140,11 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
         "noise_model",
         repr(noise_model),
         "must be 'identity', 'nominal' or a NoiseModel",
-        "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
+        suggestion(
+            noise_model,
+            ("identity", "nominal"),
+            "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
+        ),
     )
 
 

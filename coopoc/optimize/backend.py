@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError, MissingLibraryError
 from ..one_file import in_file
-from ..plugins import find, names
+from ..plugins import find, names, suggestion
 from .problem import Problem
 
 Options: TypeAlias = dict[str, Any]
@@ -124,9 +124,8 @@ class Backend:
         allowed = _options(self.prepare)
         for name in options:
             if name not in allowed:
-                raise InputError(
-                    name, options[name], f"is no option of {self.name}, which has {allowed}", "Leave it out."
-                )
+                hint = suggestion(name, allowed, "Leave it out.")
+                raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"

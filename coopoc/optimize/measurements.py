@@ -194,7 +194,7 @@ def measurement(
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
     if frame not in get_args(Frame):
-        raise InputError("frame", repr(frame), f"must be one of {get_args(Frame)}", 'Use "world".')
+        raise unknown("frame", frame, get_args(Frame))
     if linear and (components != ("coordinate",) * 3 or frame != "world"):
         raise InputError(
             "linear", linear, "means that the formula is the vector itself, in the world frame", "Leave it out."
