@@ -28,7 +28,7 @@ def test_solo_bound_tends_to_the_riccati_solution() -> None:
 
 
 def gtsam_graph(fleet: Fleet, steps: int, v2x: V2X) -> gtsam.Marginals:
-    """Fixes, motions and converted sightings of the star of vehicle 0, all at the truth, as GTSAM factors."""
+    """Fixes, motions and converted measurements of the star of vehicle 0, all at the truth, as GTSAM factors."""
     links = find_links(fleet, [0], v2x.max_neighbours, v2x.radius, S2.min_range)
     graph, values, before = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
     for t in range(steps):

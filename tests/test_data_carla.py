@@ -71,7 +71,7 @@ def test_the_spreadsheet_layout_is_read_by_position(tmp_path: Path, fleet: Fleet
     np.testing.assert_allclose(read.position, fleet.position[:60], atol=1e-9)
 
 
-def test_without_ids_the_motion_tells_the_order(tmp_path: Path, fleet: Fleet, table: Table) -> None:
+def test_without_ids_the_motion_gives_the_order(tmp_path: Path, fleet: Fleet, table: Table) -> None:
     for order in ("time", "vehicle"):
         table(order, ids=False).to_csv(tmp_path / "carla.csv")
         read = read_carla(tmp_path / "carla.csv", vehicles=20)
@@ -94,7 +94,7 @@ def _standing(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _unrelated_yaw(frame: pd.DataFrame) -> pd.DataFrame:
-    """A few vehicles on one road: yaw agrees with the course and nobody comes the other way."""
+    """A few vehicles on one road: yaw agrees with the course without oncoming traffic."""
     frame = frame[frame["id"] == 100].reset_index(drop=True)
     return frame.assign(yaw=np.degrees(np.arctan2(frame["vy"], frame["vx"])))
 

@@ -83,8 +83,8 @@ def test_town04_is_hilly() -> None:
     gap = fleet.position[:, None] - fleet.position[:, :, None]
     distance = np.linalg.norm(gap, axis=-1)
     near = (distance < 30) & (distance > 0)
-    slope = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
-    assert np.mean(slope > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
+    elevation = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
+    assert np.mean(elevation > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
 
 
 def test_fleets_are_disjoint() -> None:
@@ -93,7 +93,7 @@ def test_fleets_are_disjoint() -> None:
         steps = min(len(one.t), len(other.t), 900)
         for x in np.moveaxis(one.position[:steps], 1, 0):
             same = np.abs(other.position[:steps] - x[:, None]).max(axis=2) < 0.5
-            assert same.mean(axis=0).max() < 0.5, "nobody drives where one of another fleet drives"
+            assert same.mean(axis=0).max() < 0.5, "no vehicle drives where one of another fleet drives"
 
 
 def test_storage_is_exact_deterministic_and_refuses_what_it_would_change(tmp_path: Path) -> None:

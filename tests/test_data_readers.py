@@ -189,7 +189,7 @@ def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
         load_fleet(tmp_path / "a.xml")
 
 
-def test_formats_are_told_apart(tmp_path: Path) -> None:
+def test_formats_are_distinguished(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(GOOD)
     (tmp_path / "carla.csv").write_text(",".join(f"c{k}" for k in range(15)) + "\n")
     assert [detect(tmp_path / n) for n in ("table.csv", "carla.csv", "a.parquet", "a.xml", "a.xlsx", "a.txt")] == [

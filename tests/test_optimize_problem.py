@@ -51,9 +51,9 @@ def test_jacobian_equals_casadis() -> None:
     residual = ca.vertcat(*rows)
     reference = ca.Function("r", [x], [residual, ca.jacobian(residual, ca.vec(x))])
     r, J = problem.whiten(problem.x0)
-    expected, slope = (np.asarray(a) for a in reference(problem.x0.T))
+    expected, jacobian = (np.asarray(a) for a in reference(problem.x0.T))
     assert r == pytest.approx(expected[:, 0], abs=1e-12)
-    assert J.toarray() == pytest.approx(slope, abs=1e-12)
+    assert J.toarray() == pytest.approx(jacobian, abs=1e-12)
     assert problem.cost(problem.x0) == pytest.approx(0.5 * r @ r)
 
 
@@ -95,7 +95,7 @@ def test_all_runs_at_once_hold_each_run(recording: Recording, length: int) -> No
         assert picked.cost(x) == single.cost(x)
 
 
-def test_knowledge_sets_the_weights(recording: Recording) -> None:
+def test_the_noise_model_sets_the_weights(recording: Recording) -> None:
     nominal = Problem.from_window(recording, 20, 0, 3)
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))
     x = np.random.default_rng(0).normal(size=(len(nominal.names), 3)) * 30
