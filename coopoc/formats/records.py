@@ -34,7 +34,7 @@ class Record:
 
     @property
     def ends(self) -> tuple[str, ...]:
-        """What the vertices must be."""
+        """Kinds of the vertices."""
         return ENDS.get(self.kind, (self.kind,))
 
     @property
@@ -78,7 +78,7 @@ class Grammar:
     others: tuple[str, ...] = ()
 
     def form(self, tag: str) -> str:
-        """What a line with a tag looks like."""
+        """Form of a line with a tag."""
         record = self.records[tag]
         one = "variance" if self.noise == "covariance" else "information"
         triangle = f"and the {record.size * (record.size + 1) // 2} numbers of the {self.noise}'s upper triangle"

@@ -127,7 +127,7 @@ def read(found: Any, box: Inbox, run: int, t: int, estimate: Any) -> None:
 def _piece(
     horizon: Any, recording: Recording, box: Inbox, known: NoiseModel, which: tuple[int, int, bool], names: Any
 ) -> Problem:
-    """What a step adds in a run: its members' fixes, motions from the step before, and relative measurements."""
+    """Measurements of a step in a run: its members' fixes, motions from the step before, and relative measurements."""
     (run, t, exact), (before, here) = which, names
     newest = steps_of(horizon.window, recording, box, run, (t, t))[0]
     problem = window_problem(horizon, [newest], known, exact, run, (t, t))

@@ -1,4 +1,4 @@
-"""NoiseModel: what a filter assumes about the noise. It is an axis of every study, never a hidden default."""
+"""NoiseModel: the noise that a filter assumes. It is an axis of every study, never a hidden default."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class NoiseModel:
         measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them.
 
         Args:
-            recording: what the training vehicles measured.
+            recording: of the training vehicles.
             fleet: their true motion.
         """
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]

@@ -22,7 +22,7 @@ Options: TypeAlias = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """What a solver returns and `solve` verifies; with a leading axis B where the solver was given one.
+    """Result of a solver, which `solve` verifies; with a leading axis B where the solver was given one.
 
     Args:
         x: (n, ambient) nodes, see Space.
@@ -67,7 +67,7 @@ class Capabilities:
     inequalities: bool = True
 
     def lacking(self, problem: Problem) -> list[str]:
-        """What the problem needs and these capabilities lack, in words; empty if the problem can be solved.
+        """The needs of the problem that these capabilities lack, in words; empty if the problem can be solved.
 
         >>> problem = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=0.0)
         >>> Capabilities().lacking(problem), Capabilities(constraints="linear").lacking(problem)

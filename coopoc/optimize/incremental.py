@@ -103,7 +103,7 @@ class FixedLag:
             wanted: names of the window, default those that have the newest stamp.
 
         Raises:
-            InputError: what a piece cannot have (realisations, fixed nodes, constraints), a new node without a stamp or
+            InputError: a piece with realisations, fixed nodes or constraints, a new node without a stamp or
                 older than the window, a node that changes its kind, nodes that the measurements leave free.
         """
         before = self._stamps

@@ -23,12 +23,12 @@ Formula = Callable[..., Sequence[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What a sensor sees of one node (arity 1) or of a second node from a first (arity 2).
+    """A sensor's measurement of one node (arity 1) or of a second node from a first (arity 2).
 
     Args:
         name: kind of the factors that carry it.
         arity: 1 or 2 nodes.
-        frame: what the formula gets. "world": the vector x, y, z of the point, or second - first. "body": that vector
+        frame: of the formula's vector. "world": the vector x, y, z of the point, or second - first. "body": that vector
             as the first node, a pose, sees it, R_i^T (p_j - p_i). "relative": it and the 3x3 components of R_i^T R_j;
             of one node, its own position and rotation.
         components: nature of each residual: a coordinate, a distance (m, > 0), an angle (rad, residuals wrap) or part

@@ -15,7 +15,7 @@ from .space import Space
 
 
 class Status(Enum):
-    """How a solve ended; the value is a sentence.
+    """Outcome of a solve; the value is a sentence.
 
     >>> print(Status.SOLVED.value)
     At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m.
