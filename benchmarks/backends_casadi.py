@@ -39,10 +39,10 @@ def casadi_exact(problem: Problem, method: str) -> Job:
         )
         return 0.5 * (casadi.sumsqr((x - fix) / casadi.repmat(fix_std, 1, NEIGHBOURS + 1)) + casadi.sumsqr(rest))
 
-    x, fix, sight = (
+    x, fix, relative = (
         casadi.SX.sym(name, 3, n) for name, n in (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS))
     )
-    nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, sight), "f": cost(x, fix, sight)}
+    nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, relative), "f": cost(x, fix, relative)}
     solver = casadi.nlpsol("solver", plugin, nlp, {**quiet, **({plugin: inner} if inner else {})})
 
     def batch() -> Any:

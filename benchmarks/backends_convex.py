@@ -21,7 +21,7 @@ def osqp_linear(problem: Problem) -> Job:
     runs = problem.batch or 1
     rows = [problem.pick(b).whiten(np.zeros((NEIGHBOURS + 1, 3))) for b in range(runs)]
     matrices = [csc_matrix(triu(J.T @ J, format="csc")) for _, J in rows]
-    pulls = [np.asarray(J.T @ r) for r, J in rows]
+    gradients = [np.asarray(J.T @ r) for r, J in rows]
     settings = {
         "scaling": 0,
         "rho": 1e-4,
@@ -37,23 +37,23 @@ def osqp_linear(problem: Problem) -> Job:
 
     def workspace(b: int) -> Any:
         made = osqp.OSQP()
-        made.setup(matrices[b].copy(), pulls[b], *nothing, **settings)
+        made.setup(matrices[b].copy(), gradients[b], *nothing, **settings)
         return made
 
     persistent = workspace(0)
 
     def batch() -> Any:
         found = []
-        for matrix, pull in zip(matrices, pulls, strict=True):
-            persistent.update(Px=matrix.data, q=pull)
+        for matrix, gradient in zip(matrices, gradients, strict=True):
+            persistent.update(Px=matrix.data, q=gradient)
             found.append(persistent.solve(raise_error=False).x)
         return np.stack(found).reshape(runs, -1, 3)
 
     def bare() -> Any:
         """By the extension module that osqp's Python class calls."""
         found, core = [], persistent._solver
-        for matrix, pull in zip(matrices, pulls, strict=True):
-            core.update_data_vec(pull, None, None)
+        for matrix, gradient in zip(matrices, gradients, strict=True):
+            core.update_data_vec(gradient, None, None)
             core.update_data_mat(matrix.data, None, None, None)
             core.solve()
             found.append(core.solution.x)
@@ -82,11 +82,11 @@ def cvxpy_linear(problem: Problem) -> Job:
     whitened = np.einsum("bkij,bkj->bki", root, edges.z)
     options = {"solver": "CLARABEL", "max_threads": 1}
 
-    def programme(weights: Any, fix: Any, pull: Any) -> tuple[Any, Any]:
+    def programme(weights: Any, fix: Any, gradient: Any) -> tuple[Any, Any]:
         """x (n, 3) and the programme; the weights (9, K), row by row, with the whitened vectors (K, 3)."""
         x = cvxpy.Variable((NEIGHBOURS + 1, 3))
         gap = (x[1:] - np.ones((NEIGHBOURS, 1)) @ x[:1]).T
-        parts = [cvxpy.sum(cvxpy.multiply(weights[3 * i : 3 * i + 3], gap), axis=0) - pull[:, i] for i in range(3)]
+        parts = [cvxpy.sum(cvxpy.multiply(weights[3 * i : 3 * i + 3], gap), axis=0) - gradient[:, i] for i in range(3)]
         terms = [
             cvxpy.sum_squares(part) for part in (cvxpy.multiply(x - fix, np.tile(weight, (NEIGHBOURS + 1, 1))), *parts)
         ]

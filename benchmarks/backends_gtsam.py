@@ -57,9 +57,9 @@ def custom_factors(fix: Any, vector: Any, root: Any) -> Any:
     model = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
 
     def edge(k: int) -> Callable[..., Any]:
-        def error(factor: Any, found: Any, slopes: Any) -> Any:
-            if slopes is not None:
-                slopes[0], slopes[1] = -root[k], root[k]
+        def error(factor: Any, found: Any, jacobians: Any) -> Any:
+            if jacobians is not None:
+                jacobians[0], jacobians[1] = -root[k], root[k]
             return root[k] @ (found.atPoint3(k + 1) - found.atPoint3(0) - vector[k])
 
         return error
@@ -141,7 +141,7 @@ def seen(x: Any, z: Any, std: Any) -> tuple[Any, Any]:
     flat2 = dx**2 + dy**2
     flat, r2 = np.sqrt(flat2), flat2 + dz**2
     r = np.sqrt(r2)
-    slope = np.stack(
+    jacobian = np.stack(
         [
             np.stack([dx / r, dy / r, dz / r], -1),
             np.stack([-dy / flat2, dx / flat2, 0 * r], -1),
@@ -149,7 +149,7 @@ def seen(x: Any, z: Any, std: Any) -> tuple[Any, Any]:
         ],
         -2,
     )
-    return wrap(np.stack(spherical(dx, dy, dz), -1) - z) / std, slope / std[..., None]
+    return wrap(np.stack(spherical(dx, dy, dz), -1) - z) / std, jacobian / std[..., None]
 
 
 def gtsam_exact(problem: Problem) -> Job:
@@ -160,11 +160,11 @@ def gtsam_exact(problem: Problem) -> Job:
     weight, std = 1.0 / np.array(KNOWN.gnss_std), np.array(SENSORS.relative_std)
     eye = np.diag(weight)
 
-    def one(prior: Any, residual: Any, slope: Any, order: Any) -> Any:
+    def one(prior: Any, residual: Any, jacobian: Any, order: Any) -> Any:
         graph = gtsam.GaussianFactorGraph()
         for k in keys:
             graph.add(k, eye, prior[k], unit)
-        for k, (a, b, c) in enumerate(zip(-slope, slope, -residual, strict=True), 1):
+        for k, (a, b, c) in enumerate(zip(-jacobian, jacobian, -residual, strict=True), 1):
             graph.add(0, a, k, b, c, unit)
         return graph.optimize(order).vector().reshape(-1, 3)
 
@@ -175,9 +175,9 @@ def gtsam_exact(problem: Problem) -> Job:
             order.push_back(k)
         while len(going):
             near = x[going]
-            residual, slope = seen(near, edges.z[going], std)
+            residual, jacobian = seen(near, edges.z[going], std)
             prior = (fixes.z[going] - near) * weight
-            step = np.stack([one(*given, order) for given in zip(prior, residual, slope, strict=True)])
+            step = np.stack([one(*given, order) for given in zip(prior, residual, jacobian, strict=True)])
             x[going] += step
             going = going[np.abs(step).max(axis=(1, 2)) > TOLERANCE]
         return x

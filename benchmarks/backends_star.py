@@ -27,7 +27,7 @@ class Row(NamedTuple):
 
 
 class Job(NamedTuple):
-    """Rows of one job, the hand-written loop second, and who says that an answer (solves, n, 3) is right."""
+    """Rows of one job, the hand-written loop second, and a check of an answer (solves, n, 3)."""
 
     rows: list[Row]
     right: Callable[[Any], bool]

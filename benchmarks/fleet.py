@@ -35,7 +35,7 @@ from coopoc.world.v2x import NO_MESSAGE
 VEHICLES, STEPS, BLOCK = 60, 900, 60.0
 SHORT, SEARCHED = 200, ((60, 60), (1000, 4))
 """Of the common report, which should take half a minute: steps of the drive; vehicles and steps of the searches."""
-SAYS = {True: "yes", False: "NO", None: "one step"}
+VERDICT = {True: "yes", False: "NO", None: "one step"}
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=10)
 KNOWN = co.NoiseModel.nominal(SENSORS)
 ROUNDS = 3
@@ -80,7 +80,7 @@ def town(vehicles: int, steps: int, seed: int = 0) -> co.Fleet:
 
 def timed(call: Callable[[], Any]) -> float:
     gc.collect()
-    gc.disable()  # GTSAM's factors are many objects, which every collection would visit at the cost of whoever is next
+    gc.disable()  # GTSAM's factors are many objects, which every collection would visit during another measurement
     began = time.process_time()
     call()
     spent = time.process_time() - began
@@ -195,7 +195,7 @@ def table(rows: Sequence[Row], peer: str) -> str:
             spent[peer] / spent[row.words],
             spent[row.words] / spent[rows[-1].words],
             row.difference,
-            SAYS[row.right],
+            VERDICT[row.right],
         ]
         for row in rows
     ]
@@ -352,7 +352,7 @@ def growth(sizes: Sequence[tuple[int, int]]) -> str:
         "search",
         "search, N x N",
         "draws of fixes",
-        "sightings",
+        "relative measurements",
         "observe",
         "exchange",
         "same links",
@@ -405,7 +405,8 @@ def main() -> None:
     """Print the tables."""
     recording = co.observe(town(VEHICLES, STEPS), SENSORS, CHANNEL)
     print(
-        f"{VEHICLES} vehicles, {STEPS} steps, {len(recording.links)} sightings; numba {numba.__version__}, gtsam "
+        f"{VEHICLES} vehicles, {STEPS} steps, {len(recording.links)} relative measurements; "
+        f"numba {numba.__version__}, gtsam "
         f"{version('gtsam')}.\n"
     )
     print("Batch smoother, whole drive:\n")

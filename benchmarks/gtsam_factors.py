@@ -65,34 +65,34 @@ def two_drives(steps: int) -> Problem:
 
 
 def custom_range(z: np.ndarray, point: Callable[[Any, int], np.ndarray], wide: Callable[[Any, int, np.ndarray], Any]):
-    def error(factor: Any, found: Any, slopes: list[np.ndarray] | None) -> np.ndarray:
+    def error(factor: Any, found: Any, jacobians: list[np.ndarray] | None) -> np.ndarray:
         i, j = factor.keys()
         gap = point(found, j) - point(found, i)
         far = math.sqrt(float(gap @ gap))
-        if slopes is not None:
+        if jacobians is not None:
             row = (gap / far)[None]
-            slopes[0], slopes[1] = wide(found, i, -row), wide(found, j, row)
+            jacobians[0], jacobians[1] = wide(found, i, -row), wide(found, j, row)
         return np.array([far - z[0]])
 
     return error
 
 
 def custom_spherical(z: np.ndarray):
-    def error(factor: Any, found: Any, slopes: list[np.ndarray] | None) -> np.ndarray:
+    def error(factor: Any, found: Any, jacobians: list[np.ndarray] | None) -> np.ndarray:
         i, j = factor.keys()
         x, y, up = (found.atPoint3(j) - found.atPoint3(i)).tolist()
         flat2 = x * x + y * y
         flat, r2 = math.sqrt(flat2), flat2 + up * up
         r = math.sqrt(r2)
-        if slopes is not None:
-            slope = np.array(
+        if jacobians is not None:
+            jacobian = np.array(
                 [
                     [x / r, y / r, up / r],
                     [-y / flat2, x / flat2, 0.0],
                     [x * up / (flat * r2), y * up / (flat * r2), -flat / r2],
                 ]
             )
-            slopes[0], slopes[1] = -slope, slope
+            jacobians[0], jacobians[1] = -jacobian, jacobian
         return np.array([r - z[0], math.remainder(math.atan2(y, x) - z[1], math.tau), math.atan2(flat, up) - z[2]])
 
     return error
@@ -102,17 +102,17 @@ def custom_relative_pose(z: np.ndarray):
     tz, back = z[:2], z[2:].reshape(2, 2).T
     angle = math.atan2(z[4], z[2])
 
-    def error(factor: Any, found: Any, slopes: list[np.ndarray] | None) -> np.ndarray:
+    def error(factor: Any, found: Any, jacobians: list[np.ndarray] | None) -> np.ndarray:
         i, j = factor.keys()
         a, b = found.atPose2(i), found.atPose2(j)
         between = a.between(b)
         t = between.translation()
-        if slopes is not None:
+        if jacobians is not None:
             first, second = np.zeros((3, 3)), np.zeros((3, 3))
             first[:2, :2], first[:2, 2] = -back, back @ [t[1], -t[0]]
             second[:2, :2] = back @ between.rotation().matrix()
             first[2, 2], second[2, 2] = -1.0, 1.0
-            slopes[0], slopes[1] = first, second
+            jacobians[0], jacobians[1] = first, second
         return np.append(back @ (t - tz), math.remainder(between.theta() - angle, math.tau))
 
     return error
@@ -121,8 +121,8 @@ def custom_relative_pose(z: np.ndarray):
 def custom_graph(problem: Problem) -> Any:
     """All pairs as CustomFactors, what has one node as GTSAM's own."""
     pairs = [factor.nodes.shape[1] == 2 for factor in problem.factors]
-    said = ["" if pair else form for pair, form in zip(pairs, forms(problem), strict=True)]
-    graph = native_graph(problem, said).graph
+    forms_ = ["" if pair else form for pair, form in zip(pairs, forms(problem), strict=True)]
+    graph = native_graph(problem, forms_).graph
     if problem.poses:
         point = lambda found, k: found.atPose2(k).translation()  # noqa: E731
         wide = lambda found, k, row: np.append(row @ found.atPose2(k).rotation().matrix(), [[0.0]], axis=1)  # noqa: E731
@@ -146,8 +146,8 @@ def ways(problem: Problem) -> dict[str, tuple[Callable[[], Any], Callable[[Any],
     x = initial_guess(problem)
     at = values(problem.space, which_turn(problem), x[0], range(len(problem.names)))
     found: dict[str, tuple[Callable[[], Any], Callable[[Any], Any]]] = {}
-    said = forms(problem)
-    if not any(isinstance(form, str) for form in said):
+    forms_ = forms(problem)
+    if not any(isinstance(form, str) for form in forms_):
         found["GTSAM's own"] = (
             lambda: native_graph(problem, forms(problem)).graph,
             lambda graph: graph.linearize(at).optimize(),

@@ -2,13 +2,12 @@
 
     python benchmarks/learned_gain.py            # two Markdown tables on stdout, about two minutes
 
-All rows use the same net and the same drives (town10-clients, pieces of 100 steps) on one thread unless said, one after
-the other in every round; the ratios are to be compared, the times are this machine's. "Plain torch" is the loop of
-KalmanNet's public training code re-expressed with our reference module: one Python step after the other, autograd, and
-torch.optim.AdamW. The flop floor is 2 flops for each weight of a layer and step (forward; three times that to train) at
-this core's measured peak of single-precision multiply-adds. One drive has another floor: to read all weights, which are
-more than the first cache holds. A row counts only if its answer is the reference's.
-"""
+All rows use the same net and the same drives (town10-clients, pieces of 100 steps) on one thread unless stated, one
+after the other in every round; the ratios are to be compared, the times are this machine's. "Plain torch" is the loop
+of KalmanNet's public training code re-expressed with our reference module: one Python step after the other, autograd,
+and torch.optim.AdamW. The flop floor is 2 flops for each weight of a layer and step (forward; three times that to
+train) at this core's measured peak of single-precision multiply-adds. One drive has another floor: to read all weights,
+which are more than the first cache holds. A row counts only if its answer is the reference's."""
 
 from __future__ import annotations
 

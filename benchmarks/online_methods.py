@@ -80,7 +80,7 @@ def bounds(fleet: co.Fleet, egos: tuple[int, ...], v2x: co.V2X) -> list[list[obj
 
 
 def recorded(job: str, steps: int, runs: int) -> co.Recording:
-    """What the ego of a job measures and hears."""
+    """Measurements and messages of a job's ego."""
     channel = co.V2X(max_neighbours=6, latency=0.3 if "late" in job else 0.0)
     recording = co.observe(co.load_fleet("town10").between(0, steps), SENSORS, channel, runs=runs, observers=[0])
     return spoofed(recording, 1 / 3, honest=[0]) if "spoofed" in job else recording

@@ -6,9 +6,8 @@
 The exact star of ten neighbours of backends.py. Ceres has no factor for range, azimuth and inclination in the world
 frame with a std each, so its users write one in Python; the fixes are its own NormalPrior, and its Schur complement
 eliminates the neighbours. Stone Soup's rows are in stone_soup.py. "x peer" is a row's time over that of the job's peer;
-a row counts only if its answer is that of the reference. What is not installed a line says. What the index has as jaxls
-is a language server for JAX, not the solver of that name.
-"""
+a row counts only if its answer is that of the reference. A line names what is not installed. What the index has as
+jaxls is a language server for JAX, not the solver of that name."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ from coopoc.optimize.initial import initial_guess
 RUNS, FEW = 200, 40
 
 
-def sighting(z: Any, std: Any) -> Any:
+def relative_factor(z: Any, std: Any) -> Any:
     """A cost function of the ego's and a neighbour's position, derivatives by hand."""
     import pyceres
 
@@ -52,10 +51,10 @@ def sighting(z: Any, std: Any) -> Any:
             if jacobians is None:
                 return True
             a, b, c = 1.0 / (r * std[0]), 1.0 / (flat2 * std[1]), 1.0 / (flat * r2 * std[2])
-            slope = np.array([a * x, a * y, a * up, -b * y, b * x, 0.0, c * x * up, c * y * up, -c * flat2])
+            derivative = np.array([a * x, a * y, a * up, -b * y, b * x, 0.0, c * x * up, c * y * up, -c * flat2])
             for jacobian, sign in zip(jacobians, (-1.0, 1.0), strict=True):
                 if jacobian is not None:
-                    jacobian[:] = sign * slope
+                    jacobian[:] = sign * derivative
             return True
 
     return RelativeMeasurement()
@@ -78,7 +77,7 @@ def ceres_exact(problem: Problem) -> Job:
         for point, fix in zip(points, fixes.z[b], strict=True):
             model.add_residual_block(pyceres.factors.NormalPrior(fix, spread), None, [point])
         for k in range(NEIGHBOURS):
-            model.add_residual_block(sighting(z[b][k], std), None, [points[0], points[k + 1]])
+            model.add_residual_block(relative_factor(z[b][k], std), None, [points[0], points[k + 1]])
         pyceres.solve(options, model, pyceres.SolverSummary())
         return points
 
@@ -121,8 +120,8 @@ PEERS: dict[str, Callable[[], list[Job]]] = {
 
 def main() -> None:
     """Print the table."""
-    says = {True: "yes", False: "NO", None: "by another way"}
-    lines = [[row["name"], row["us"], row["ratio"], says[row["right"]]] for row in measured()]
+    verdict = {True: "yes", False: "NO", None: "by another way"}
+    lines = [[row["name"], row["us"], row["ratio"], verdict[row["right"]]] for row in measured()]
     print(tabulate(lines, ["", "us", "x peer", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
 
 

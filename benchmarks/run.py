@@ -56,19 +56,19 @@ def slower(rows: Rows, baseline: Mapping[str, Mapping[str, float]], measured: Se
         baseline: ratio and tolerance by name.
         measured: benchmarks that have run, the first word of their rows' names.
     """
-    ratios, said = {row["name"]: row["ratio"] for row in rows}, []
+    ratios, failures = {row["name"]: row["ratio"] for row in rows}, []
     for name, wanted in baseline.items():
         if name.partition(": ")[0] not in measured:
             continue
         limit = wanted["ratio"] * wanted["tolerance"]
         if name not in ratios:
-            said.append(f"{name}: in the baseline, but not measured")
+            failures.append(f"{name}: in the baseline, but not measured")
         elif not ratios[name] <= limit:
-            said.append(
+            failures.append(
                 f"{name}: ratio {ratios[name]:.3g}, at most {limit:.3g} allowed ({wanted['ratio']:.3g} x "
                 f"{wanted['tolerance']:.3g})"
             )
-    return said
+    return failures
 
 
 def kept(rows: Rows, baseline: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
@@ -85,8 +85,8 @@ def kept(rows: Rows, baseline: Mapping[str, Mapping[str, float]]) -> dict[str, d
 
 def report(rows: Rows) -> str:
     """A Markdown table."""
-    says = {True: "yes", False: "NO", None: "by another way"}
-    lines = [[row["name"], row["us"], row["ratio"], says[row["right"]]] for row in rows]
+    verdict = {True: "yes", False: "NO", None: "by another way"}
+    lines = [[row["name"], row["us"], row["ratio"], verdict[row["right"]]] for row in rows]
     return tabulate(lines, ["", "us", "ratio", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", ""))
 
 
@@ -110,12 +110,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(report(rows))
     RESULTS.write_text(json.dumps(rows, indent=1) + "\n")
     baseline = json.loads(BASELINE.read_text()) if BASELINE.exists() else {}
-    said = wrong(rows) + (slower(rows, baseline, given.only) if given.gate else [])
+    failures = wrong(rows) + (slower(rows, baseline, given.only) if given.gate else [])
     if given.baseline:
         others = {name: row for name, row in baseline.items() if name.partition(": ")[0] not in given.only}
         BASELINE.write_text(json.dumps(others | kept(rows, baseline), indent=1) + "\n")
-    print("".join(f"\nFAILED {line}" for line in said))
-    return int(bool(said))
+    print("".join(f"\nFAILED {line}" for line in failures))
+    return int(bool(failures))
 
 
 if __name__ == "__main__":

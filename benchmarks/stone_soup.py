@@ -1,9 +1,8 @@
 """Stone Soup's rows of peers.py: the snapshot by its iterated Kalman filter, the joint filter by its linear one.
 
 Stone Soup has no measurement between two parts of a state, so a user subclasses its nonlinear model. The fixes are the
-prior and the sightings the measurement; from there its iterated update is Gauss-Newton on the same cost, and ends at
-the same minimum. One extended update does not: it is up to 19 m away.
-"""
+prior and the relative measurements the measurement; from there its iterated update is Gauss-Newton on the same cost,
+and ends at the same minimum. One extended update does not: it is up to 19 m away."""
 
 from __future__ import annotations
 
@@ -33,7 +32,7 @@ SHOWN = 20
 """Steps of the drive whose snapshots are solved."""
 
 
-class Sightings(NonLinearGaussianMeasurement):  # type: ignore[misc]
+class RelativeMeasurements(NonLinearGaussianMeasurement):  # type: ignore[misc]
     """Ranges and angles of all neighbours from the ego, in the order of the state; angles near the `seen` (K, 3)."""
 
     seen: Any
@@ -54,7 +53,7 @@ class Sightings(NonLinearGaussianMeasurement):  # type: ignore[misc]
         flat2 = dx**2 + dy**2
         flat, r2 = np.sqrt(flat2), flat2 + dz**2
         r = np.sqrt(r2)
-        slope = np.array(
+        jacobian = np.array(
             [
                 [dx / r, dy / r, dz / r],
                 [-dy / flat2, dx / flat2, 0 * r],
@@ -63,8 +62,8 @@ class Sightings(NonLinearGaussianMeasurement):  # type: ignore[misc]
         )
         out = np.zeros((NEIGHBOURS, 3, NEIGHBOURS + 1, 3))
         each = np.arange(NEIGHBOURS)
-        out[each, :, each + 1] = np.moveaxis(slope, 2, 0)
-        out[each, :, 0] = -np.moveaxis(slope, 2, 0)
+        out[each, :, each + 1] = np.moveaxis(jacobian, 2, 0)
+        out[each, :, 0] = -np.moveaxis(jacobian, 2, 0)
         return out.reshape(3 * NEIGHBOURS, SIZE)
 
 
@@ -96,9 +95,9 @@ def snapshot() -> Job:
 
 
 def updated(updater: Any, stars: list[tuple[Any, Any]]) -> Callable[[], Any]:
-    """Its update of the fixes (K + 1, 3) by the sightings (K, 3) of every star."""
+    """Its update of the fixes (K + 1, 3) by the relative measurements (K, 3) of every star."""
     variance = np.tile(np.square(SENSORS.relative_std), NEIGHBOURS)
-    model = Sightings(ndim_state=SIZE, mapping=tuple(range(SIZE)), noise_covar=np.diag(variance))
+    model = RelativeMeasurements(ndim_state=SIZE, mapping=tuple(range(SIZE)), noise_covar=np.diag(variance))
     prior = np.diag(np.tile(KNOWN.gnss_variance, NEIGHBOURS + 1))
     options = {"tolerance": TOLERANCE} if updater is IteratedKalmanUpdater else {}
     update = updater(measurement_model=model, **options).update

@@ -69,7 +69,7 @@ def with_ranges(
     return problem.add("range", pairs, np.maximum(np.abs(ranges), 0.1)[:, None], std)
 
 
-def sighted(
+def observed_poses(
     seed: int, d: int = 2, vehicles: int = 5, gnss_std: float = 3.5, std: float = 1.0, chain: bool = False
 ) -> Problem:
     """Vehicles of unknown heading that see each other by range and bearing (the vector d u with one std), and fixes.
@@ -135,11 +135,11 @@ CASES: dict[str, Case] = {
     "4 anchors, 3 vehicles, range std 1 m": partial(anchored, anchors=4, vehicles=3, d=2, range_std=1.0),
     "5 anchors, 1 vehicle without fix, 3-D": partial(anchored, anchors=5, vehicles=1, d=3, range_std=0.1),
     "5 anchors, 3 vehicles without fix, 3-D": partial(anchored, anchors=5, vehicles=3, d=3, range_std=0.1),
-    "range + bearing, unknown headings, mesh of 5, plane": sighted,
-    "range + bearing, mesh of 5, std 5 m": partial(sighted, std=5.0),
-    "range + bearing, chain of 5, plane": partial(sighted, chain=True),
-    "range + bearing, chain of 5, std 5 m": partial(sighted, chain=True, std=5.0),
-    "range + bearing, mesh of 4, 3-D": partial(sighted, vehicles=4, d=3),
+    "range + bearing, unknown headings, mesh of 5, plane": observed_poses,
+    "range + bearing, mesh of 5, std 5 m": partial(observed_poses, std=5.0),
+    "range + bearing, chain of 5, plane": partial(observed_poses, chain=True),
+    "range + bearing, chain of 5, std 5 m": partial(observed_poses, chain=True, std=5.0),
+    "range + bearing, mesh of 4, 3-D": partial(observed_poses, vehicles=4, d=3),
     "odometry + ranges, two robots, noise as modelled": partial(driven, noise=1.0),
     "odometry + ranges, two robots, noise 0.1": partial(driven, noise=0.1),
     "odometry + ranges, two robots, noise 5": partial(driven, noise=5.0),

@@ -17,6 +17,6 @@ def timed(call: Callable[[], Any]) -> float:
 
 
 def medians(spend: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, float]:
-    """Of what each of them says it has spent, one after the other in every round."""
+    """Medians of the reported times, taken one after the other in every round."""
     spent = [[each() for each in spend.values()] for _ in range(rounds)]
     return dict(zip(spend, np.median(spent, axis=0).tolist(), strict=True))

@@ -16,7 +16,7 @@ Bools: TypeAlias = npt.NDArray[np.bool_]
 AnyArray: TypeAlias = npt.NDArray[Any]
 
 KINDS: dict[Any, tuple[str, str]] = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
-"""What an array may be made of: the kinds of dtype, and what one entry is called."""
+"""Allowed kinds of dtype -> the name of one entry."""
 
 
 def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
@@ -41,7 +41,7 @@ def checked(
 
     Args:
         field: name of the values in an error.
-        values: what was given.
+        values: array-like.
         axes: the shape in letters, such as "(R, T, N, 3)".
         shape: the shape in numbers, -1 where any length will do; None for any shape.
         dtype: float, int or bool. Numbers that are not of that kind are refused, and never rounded or parsed.

@@ -94,20 +94,35 @@ def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:
     return loaded if isinstance(loaded, Mapping) else {}
 
 
-def unknown(noun: str, name: object, known: Iterable[str]) -> InputError:
+def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
+    """The hint for an unknown name: the nearest known one, or another hint if none is near.
+
+    Args:
+        name: that was asked for.
+        known: names that exist.
+        otherwise: hint if none is near.
+
+    >>> suggestion("tracee", ("trace", "det"), "Pick one.")
+    'Did you mean trace?'
+    """
+    near = difflib.get_close_matches(str(name), list(known), n=1)
+    return f"Did you mean {near[0]}?" if near else otherwise
+
+
+def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None = None) -> InputError:
     """The error for an unknown name: lists the known ones and proposes the nearest.
 
     Args:
         noun: kind of the thing, such as "method".
         name: that was asked for.
         known: names that exist.
+        otherwise: hint if none is near; None for one about the list of names.
 
     >>> print(unknown("method", "kalmann", ["gnss", "kalman"]))
     method = 'kalmann': must be one of gnss, kalman. Did you mean kalman?
     """
     known = list(known)
-    near = difflib.get_close_matches(str(name), known, n=1)
     listed = noun in GROUPS.values()
     other = "List all with: coopoc list." if listed else "Use one of these names." if known else "There is none to use."
-    hint = f"Did you mean {near[0]}?" if near else other
+    hint = suggestion(name, known, other if otherwise is None else otherwise)
     return InputError(noun, repr(name), "must be one of " + (", ".join(known) or "(there is none)"), hint)

@@ -64,7 +64,7 @@ class Card:
         return f"simulated with SUMO {self.sumo} on CARLA's {self.map}, seed {self.recipe['seed']}, smoothed"
 
     def fields(self) -> dict[str, str]:
-        """What a reader wants to know, field by field."""
+        """The card in words, field by field."""
         return {
             "map": f"{self.map}, {self.map_licence}",
             "made by": f"{self.command} (SUMO {self.sumo})",

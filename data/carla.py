@@ -18,6 +18,7 @@ from tqdm import tqdm
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, MissingLibraryError
+from coopoc.plugins import suggestion, unknown
 from coopoc.world.fleet import Fleet
 
 from .conventions import INTERVALS, disagreement, frame, interval, row_order
@@ -156,11 +157,12 @@ def _columns(table: pd.DataFrame, given: dict[str, str | int], file: str) -> dic
     for key, column in given.items():
         valid = column in headers if isinstance(column, str) else 0 <= column < len(headers)
         if key not in (*LAYOUT, "t") or not valid:
+            wrong = (column, headers) if key in (*LAYOUT, "t") else (key, (*LAYOUT, "t"))
             raise InputError(
                 f"{file}: columns[{key!r}]",
                 repr(column),
                 f"keys are {', '.join(LAYOUT)}, t; the file has {', '.join(headers)}",
-                "Name a header or give its position, counted from 0.",
+                suggestion(*wrong, "Name a header or give its position, counted from 0."),
             )
         names[key] = column if isinstance(column, str) else headers[column]
     missing = [key for key in NEEDED if key not in names]
@@ -177,7 +179,7 @@ def _columns(table: pd.DataFrame, given: dict[str, str | int], file: str) -> dic
 def _check_options(order: str | None, handedness: str | None, dt: float | None) -> None:
     for name, value, allowed in (("order", order, ORDERS), ("handedness", handedness, ("left", "right"))):
         if value is not None and value not in allowed:
-            raise InputError(name, repr(value), f"must be one of {allowed}", "Or leave it out to have it detected.")
+            raise unknown(name, value, allowed, "Or leave it out to have it detected.")
     if dt is not None and not dt > 0:
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
 

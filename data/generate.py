@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from coopoc.errors import InputError
+from coopoc.plugins import unknown
 from coopoc.world.fleet import Fleet
 
 from . import store, traffic
@@ -95,7 +96,7 @@ def _recipe(recipe: str | Recipe) -> Recipe:
     if isinstance(recipe, Recipe):
         return recipe
     if recipe not in RECIPES:
-        raise InputError("recipe", recipe, f"must be one of {', '.join(RECIPES)}", "Or build a Recipe of your own.")
+        raise unknown("recipe", recipe, RECIPES, "Or build a Recipe of your own.")
     return RECIPES[recipe]
 
 

@@ -21,7 +21,7 @@ PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mappin
 
 @dataclass(frozen=True, eq=False)
 class MrclamLog:
-    """What five robots measured, and Vicon's truth.
+    """Measurements of five robots, and Vicon's truth.
 
     Args:
         fleet: Vicon truth on the steps, z = 0, NaN in gaps of Vicon.

@@ -12,7 +12,7 @@ _ANTICLOCKWISE = "-17 7 6 5 4 -8 -1 -2 -3 -0 -10"
 
 @dataclass(frozen=True)
 class Recipe:
-    """What SUMO is asked to drive, and what is kept of it.
+    """Settings of a SUMO run, and the part of it that is kept.
 
     Args:
         name: name of the fleet; vehicles are called name-00, name-01, ...

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ import numpy as np
 
 from coopoc.errors import InputError
 from coopoc.one_file import in_file
-from coopoc.plugins import find, names
+from coopoc.plugins import find, names, suggestion, unknown
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 
@@ -88,17 +89,25 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
             "data",
             repr(name),
             f"must be one of {', '.join(names('coopoc.datasets'))} or the path of a file or folder",
-            "List the bundled fleets with coopoc data list, or check the path.",
+            suggestion(
+                name,
+                names("coopoc.datasets"),
+                "List the bundled fleets with coopoc data list, or check the path.",
+            ),
         )
     chosen = detect(path) if format is None else format
     if chosen not in READERS:
-        raise InputError("format", repr(chosen), f"must be one of {', '.join(READERS)}", "Or leave it out.")
+        raise unknown("format", chosen, READERS, "Or leave it out.")
     try:
         return READERS[chosen](path, **options)
     except TypeError as error:
         if "unexpected keyword argument" not in str(error):
             raise
-        raise InputError("options", sorted(options), f"not all known to the {chosen} reader", str(error)) from None
+        reader = read_mrclam if chosen == "mrclam" else READERS[chosen]
+        known = list(inspect.signature(reader).parameters)[1:]
+        wrong = next((name for name in options if name not in known), "")
+        hint = suggestion(wrong, known, str(error))
+        raise InputError("options", sorted(options), f"not all known to the {chosen} reader", hint) from None
 
 
 def _made(found: Any, name: str) -> Fleet:
@@ -197,9 +206,9 @@ def convert(
     return fleet
 
 
-def _resampled(fleet: Fleet, dt: float | None = None, **unknown: Any) -> Fleet:
-    if unknown:
-        raise InputError("options", sorted(unknown), f"{fleet.name} is bundled and takes dt only", "Leave them out.")
+def _resampled(fleet: Fleet, dt: float | None = None, **others: Any) -> Fleet:
+    if others:
+        raise InputError("options", sorted(others), f"{fleet.name} is bundled and takes dt only", "Leave them out.")
     if dt is None:
         return fleet
     step, column = np.nonzero(fleet.present)

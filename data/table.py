@@ -10,6 +10,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.plugins import suggestion
 from coopoc.world.fleet import Fleet
 
 from .rows import assemble
@@ -40,12 +41,13 @@ def read_table(path: Path, *, dt: float | None = None, columns: Mapping[str, str
     wanted = [*NEEDED, *(VELOCITY if given else ())]
     for column in wanted:
         if names.get(column, column) not in frame.columns:
+            headers = [str(header) for header in frame.columns]
             raise InputError(
                 f"{path.name}: column {names.get(column, column)}",
                 "missing",
                 f"columns {', '.join(NEEDED)} are needed and {', '.join(VELOCITY)} go together; "
-                f"the file has {', '.join(map(str, frame.columns))}",
-                f'Add it, or name it: columns={{"{column}": "..."}}.',
+                f"the file has {', '.join(headers)}",
+                suggestion(names.get(column, column), headers, f'Add it, or name it: columns={{"{column}": "..."}}.'),
             )
     numbers = np.column_stack([numeric(frame, names.get(c, c), path.name) for c in wanted[1:]])
     vehicle = _ids(frame, names.get("id", "id"), path.name)

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from coopoc.errors import InputError, MissingLibraryError
+from coopoc.plugins import suggestion
 
 from .recipes import Recipe
 
@@ -112,9 +113,10 @@ def drive(recipe: Recipe, network: Path, routes: Path, out: Path) -> None:
 
 def _tour(tour: str, length: dict[str, float], distance: float) -> list[str]:
     edges = tour.split()
-    unknown = [e for e in edges if e not in length]
-    if unknown:
-        raise InputError("tours", unknown, "must be edges of the network", "Take ids from the file netconvert writes.")
+    wrong = [e for e in edges if e not in length]
+    if wrong:
+        hint = suggestion(wrong[0], length, "Take ids from the file netconvert writes.")
+        raise InputError("tours", wrong, "must be edges of the network", hint)
     return edges * int(np.ceil(distance / sum(length[e] for e in edges)))
 
 

@@ -1,6 +1,6 @@
 """What leaves the vehicles: a federation without TLS whose wire, server memory and files are searched for a drive.
 
-The first vehicle's drive is moved to where no other number lies. Everything between nodes and SuperLink passes a port
+The first vehicle's drive is moved away from all other numbers. Everything between nodes and SuperLink passes a port
 that keeps a copy. Prints the bytes, and in which forms the drive was found: none.
 
 Run:  python examples/flower_audit.py --rounds 2
@@ -29,7 +29,7 @@ from coopoc.learned.recipes import job_clients
 from coopoc.learned.training.clients import Client
 
 HOME = (8361947.123, -4720583.456, 913.77)
-"""Where the drive lies, m: far from all other numbers."""
+"""Offset of the drive, m: far from all other numbers."""
 REACH = 300.0
 """How far from there it and its noisy fixes are at most, m."""
 KINDS = ("<f8", ">f8", "<f4", ">f4")
@@ -66,7 +66,7 @@ def main(folder: Path = Path("runs/flower_audit"), data: str = "town10-clients",
         wire = {form for record in tap.records for form in secret.found(bytes(record))}
         files = [path for path in folder.rglob("*") if path.is_file() and "node-" not in str(path)]
         kept = {form for path in files for form in secret.found(path.read_bytes())}
-    of = " and ".join(sorted(looked)) or "nobody: it cannot be read here"
+    of = " and ".join(sorted(looked)) or "none: it cannot be read here"
     for place, forms in (("on the wire", wire), (f"in the memory of {of}", held), ("in the server's files", kept)):
         print(f"the drive {place}: {', '.join(sorted(forms)) or 'not found'}")
 

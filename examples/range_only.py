@@ -1,12 +1,12 @@
-"""Range-only cooperative localization: is the solution the best there is? A certificate tells.
+"""Range-only cooperative localization: is the solution the global optimum? A certificate proves it.
 
 Vehicles and anchors have fixes or not, and the ranges between them, no angles. The cost
 
     1/2 sum_i |x_i - z_i|^2 / sigma_i^2 + 1/2 sum_e (|x_j - x_i| - r_e)^2 / sigma_r^2
 
-is not convex: a vehicle without a fix may end on the wrong side of its anchors, and Gauss-Newton says SOLVED there too.
-`certify` looks at one eigenvalue and says whether any point can be better; where it does not certify, `shor` solves the
-semidefinite relaxation, whose value no point can beat, and starts Gauss-Newton from its solution.
+is not convex: a vehicle without a fix may end on the wrong side of its anchors, and Gauss-Newton reports SOLVED there
+too. `certify` looks at one eigenvalue, which shows whether any point can be better; where it does not certify, `shor`
+solves the semidefinite relaxation, whose value no point can beat, and starts Gauss-Newton from its solution.
 
 Run:  python examples/range_only.py
 """

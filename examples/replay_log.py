@@ -64,7 +64,7 @@ def kitti(odometry: Path, times: Path, truth: Path) -> Log:
 
 
 def bundled(vehicle: str = "town10-24") -> Log:
-    """A simulated drive with the velocity noise of the paper's training, for those who have no log at hand."""
+    """A simulated drive with the velocity noise of the paper's training, in place of a log."""
     fleet = co.load_fleet("town10").select([vehicle])
     seen = co.observe(fleet, co.Sensors.paper_training(), co.V2X(max_neighbours=0))
     return Log(fleet.t, np.cumsum(seen.dt * seen.velocity[0, :, 0], axis=0), fleet.position[:, 0])

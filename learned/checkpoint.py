@@ -45,7 +45,7 @@ class Checkpoint:
         return unflatten(self.history[row][None], self.model)[0]
 
     def kept(self, row: int) -> int:
-        """Row up to `row` whose weights validated best: what a training that ended there would have kept.
+        """Row up to `row` whose weights validated best: those kept by a training that ended there.
 
         The loss of a federation is the mean over its clients, weighted by their training pieces.
         """

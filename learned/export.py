@@ -28,7 +28,7 @@ INPUTS = (*Memory._fields, "gnss", "velocity", "dt")
 OUTPUTS = (*(f"next_{name}" for name in Memory._fields), "gain")
 """Memory after the step, of which `next_x` (B, 3) m is the estimate, and the gain (B, 3, 3)."""
 AGREE = 1e-5
-"""How far any number of any step may be from the net's own, m where it is a position."""
+"""Largest difference of any number of any step from the net's own, m where it is a position."""
 STEPS, LANES = 50, 3
 Run = Callable[[Sequence[AnyArray]], Sequence[AnyArray]]
 """One exported step: arrays in the order of INPUTS -> arrays in the order of OUTPUTS."""

@@ -46,7 +46,7 @@ EVERYWHERE = (
 
 
 def jobs(recipe: str) -> dict[str, Job]:
-    """What is shipped of a recipe, by names such as individual1: seed 0, start at the first fix, noise per axis."""
+    """Shipped nets of a recipe, by names such as individual1: seed 0, start at the first fix, noise per axis."""
     return {f"{job.name}{job.client or ''}": job for job in jobs_of(recipe, Setting(), load_fleet(CLIENTS))}
 
 

@@ -16,7 +16,7 @@ from .training.machine import one_core
 
 
 class StepByStep(Protocol):
-    """What `LearnedGain` needs of a net; `nets.gain.Recurrent` has all of it."""
+    """Protocol of a net for `LearnedGain`; `nets.gain.Recurrent` satisfies it."""
 
     positions: tuple[str, ...]
 

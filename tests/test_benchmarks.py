@@ -40,10 +40,10 @@ def test_the_gate_allows_what_is_within_the_tolerance(run: ModuleType) -> None:
 
 @pytest.mark.parametrize("ratio", [1.51, float("nan")])
 def test_the_gate_names_the_row_that_is_slower(run: ModuleType, ratio: float) -> None:
-    said = run.slower([row("a: ours", ratio), row("b: ours", 0.01)], BASELINE, ["a", "b"])
-    assert len(said) == 1
-    assert said[0].startswith("a: ours: ratio")
-    assert "1.5 allowed" in said[0]
+    printed = run.slower([row("a: ours", ratio), row("b: ours", 0.01)], BASELINE, ["a", "b"])
+    assert len(printed) == 1
+    assert printed[0].startswith("a: ours: ratio")
+    assert "1.5 allowed" in printed[0]
 
 
 def test_a_row_that_was_not_measured_fails_unless_its_benchmark_did_not_run(run: ModuleType) -> None:
@@ -95,9 +95,9 @@ def test_the_command_prints_writes_and_fails(
     monkeypatch.setattr(run, "gather", lambda names: gathered(names, lambda name: loaded))
     assert run.main(["--only", "growth", *arguments]) == code
     assert json.loads(run.RESULTS.read_text()) == [{**rows[0], "name": "growth: ours"}]
-    said = capsys.readouterr().out
-    assert "| growth: ours" in said
-    assert ("FAILED growth: ours" in said) == bool(code)
+    printed = capsys.readouterr().out
+    assert "| growth: ours" in printed
+    assert ("FAILED growth: ours" in printed) == bool(code)
 
 
 def test_medians_are_those_of_interleaved_rounds(load: Any) -> None:

@@ -28,7 +28,7 @@ def test_solo_bound_tends_to_the_riccati_solution() -> None:
 
 
 def gtsam_graph(fleet: Fleet, steps: int, v2x: V2X) -> gtsam.Marginals:
-    """Fixes, motions and converted sightings of the star of vehicle 0, all at the truth, as GTSAM factors."""
+    """Fixes, motions and converted measurements of the star of vehicle 0, all at the truth, as GTSAM factors."""
     links = find_links(fleet, [0], v2x.max_neighbours, v2x.radius, S2.min_range)
     graph, values, before = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
     for t in range(steps):
@@ -91,6 +91,8 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours: in
 
 
 def test_exact_fixes_have_no_bound(crossing: Fleet) -> None:
+    with pytest.raises(InputError, match=r"information = 'fleets': must be one of star, fleet. Did you mean fleet\?"):
+        posterior_bound(crossing, Sensors(), 0, V2X(), information="fleets")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="relative_std"):
         posterior_bound(crossing, Sensors(range_std=0), 0, V2X(max_neighbours=2))
     with pytest.raises(InputError, match="vehicle"):

@@ -16,7 +16,7 @@ def test_three_hundred_vehicles_saturate_the_channel_at_ten_hertz(rate: float, s
     assert channel_load(jam, 350, rate) == pytest.approx(np.full(300, share))
 
 
-def test_each_hears_who_is_near(crossing: Fleet) -> None:
+def test_each_receives_the_messages_in_range(crossing: Fleet) -> None:
     """Against SciPy's distances, with sizes and rates of their own, and someone absent."""
     rng = np.random.default_rng(1)
     size, rate, place = rng.uniform(100, 400, 8), rng.uniform(1, 10, 8), crossing.position.copy()

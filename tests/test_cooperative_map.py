@@ -120,7 +120,7 @@ def test_the_covariance_means_something(formation: Fleet, window: int) -> None:
 
 
 def test_a_fix_is_used_once_in_a_window(formation: Fleet) -> None:
-    """At 1 Hz a message is held for ten steps; used at each of them it would be ten fixes, and NEES would tell."""
+    """At 1 Hz a message is held for ten steps; used at each of them it would be ten fixes, and NEES would show it."""
     fleet = formation.between(0, 150)
     recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0), runs=20, observers=[0])
     track = CooperativeMAP(window=8)(recording, [0])
@@ -153,8 +153,8 @@ def test_it_uses_nothing_that_comes_later(method: CooperativeMAP, crossing: Flee
 
 
 @pytest.mark.parametrize("window", [1, 4])
-def test_who_is_never_heard_is_left_out(crossing: Fleet, window: int) -> None:
-    """All messages lost: the estimate is that without neighbours, and nothing is said of the neighbours."""
+def test_a_neighbour_without_messages_is_left_out(crossing: Fleet, window: int) -> None:
+    """All messages lost: the estimate is that without neighbours, and the neighbours have no estimate."""
     silent = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=2)
     alone = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
     track = CooperativeMAP(window=window)(silent, [0])

@@ -71,7 +71,7 @@ def test_the_spreadsheet_layout_is_read_by_position(tmp_path: Path, fleet: Fleet
     np.testing.assert_allclose(read.position, fleet.position[:60], atol=1e-9)
 
 
-def test_without_ids_the_motion_tells_the_order(tmp_path: Path, fleet: Fleet, table: Table) -> None:
+def test_without_ids_the_motion_gives_the_order(tmp_path: Path, fleet: Fleet, table: Table) -> None:
     for order in ("time", "vehicle"):
         table(order, ids=False).to_csv(tmp_path / "carla.csv")
         read = read_carla(tmp_path / "carla.csv", vehicles=20)
@@ -94,7 +94,7 @@ def _standing(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _unrelated_yaw(frame: pd.DataFrame) -> pd.DataFrame:
-    """A few vehicles on one road: yaw agrees with the course and nobody comes the other way."""
+    """A few vehicles on one road: yaw agrees with the course without oncoming traffic."""
     frame = frame[frame["id"] == 100].reset_index(drop=True)
     return frame.assign(yaw=np.degrees(np.arctan2(frame["vy"], frame["vx"])))
 
@@ -108,7 +108,10 @@ BAD: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], dict[str, Any], str
     "NaN": (lambda f: f.assign(y=f["y"].where(f.index != 3)), {}, "row 4, column y", "Interpolate"),
     "missing": (lambda f: f.drop(columns=["vx", "ax"]), {}, "column vx = missing", "columns="),
     "column": (lambda f: f, {"columns": {"x": "easting"}}, "columns['x'] = 'easting'", "header"),
+    "header": (lambda f: f, {"columns": {"x": "xx"}}, "columns['x'] = 'xx'", "Did you mean x?"),
+    "key": (lambda f: f, {"columns": {"yav": "x"}}, "columns['yav'] = 'x'", "Did you mean yaw?"),
     "order": (lambda f: f, {"order": "rows"}, "order = 'rows'", "detected"),
+    "near": (lambda f: f, {"order": "times"}, "order = 'times'", "Did you mean time?"),
     "option": (lambda f: f, {"handedness": "up"}, "handedness = 'up'", "detected"),
     "interval": (lambda f: f, {"dt": -0.1}, "dt = -0.1 s", "in seconds"),
     "contradiction": (lambda f: f, {"order": "vehicle", "dt": 0.1}, "'vehicle': must be 'time'", "Leave it out"),

@@ -83,8 +83,8 @@ def test_town04_is_hilly() -> None:
     gap = fleet.position[:, None] - fleet.position[:, :, None]
     distance = np.linalg.norm(gap, axis=-1)
     near = (distance < 30) & (distance > 0)
-    slope = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
-    assert np.mean(slope > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
+    elevation = np.degrees(np.arcsin(np.abs(gap[..., 2][near] / distance[near])))
+    assert np.mean(elevation > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
 
 
 def test_fleets_are_disjoint() -> None:
@@ -93,7 +93,7 @@ def test_fleets_are_disjoint() -> None:
         steps = min(len(one.t), len(other.t), 900)
         for x in np.moveaxis(one.position[:steps], 1, 0):
             same = np.abs(other.position[:steps] - x[:, None]).max(axis=2) < 0.5
-            assert same.mean(axis=0).max() < 0.5, "nobody drives where one of another fleet drives"
+            assert same.mean(axis=0).max() < 0.5, "no vehicle drives where one of another fleet drives"
 
 
 def test_storage_is_exact_deterministic_and_refuses_what_it_would_change(tmp_path: Path) -> None:
@@ -116,13 +116,19 @@ def test_storage_is_exact_deterministic_and_refuses_what_it_would_change(tmp_pat
 def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="town10-validation"):
         load_fleet("town11")
-    with pytest.raises(InputError, match="must be one of table, tum, fcd, carla, mrclam"):
+    with pytest.raises(InputError, match=r"data = 'town10-client'.* Did you mean town10-clients\?"):
+        load_fleet("town10-client")
+    with pytest.raises(InputError, match=r"must be one of table, tum, fcd, carla, mrclam\. Or leave it out"):
         load_fleet(tmp_path, format="bag")
+    with pytest.raises(InputError, match=r"format = 'tabel': .* Did you mean table\?"):
+        load_fleet(tmp_path, format="tabel")
     with pytest.raises(InputError, match=r"must end in \.csv"):
         detect(tmp_path / "drive.bag")
     with pytest.raises(InputError, match=r"options = \['columns'\]: town10 is bundled"):
         load_fleet("town10", columns={})
     convert("town10-clients", tmp_path / "a.csv")
+    with pytest.raises(InputError, match=r"options = \['colums'\]: .* Did you mean columns\?"):
+        load_fleet(tmp_path / "a.csv", colums={})
     with pytest.raises(InputError, match="vehicle_lenght"):
         load_fleet(tmp_path / "a.csv", vehicle_lenght=4)
 

@@ -114,6 +114,8 @@ def test_a_recipe_that_nobody_can_drive_is_refused(change: dict[str, object], th
 def test_an_unknown_recipe_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="town10-clients"):
         make("town11", tmp_path, tmp_path)
+    with pytest.raises(InputError, match=r"recipe = 'town10-client': .* Did you mean town10-clients\?"):
+        make("town10-client", tmp_path, tmp_path)
 
 
 @with_sumo

@@ -189,7 +189,7 @@ def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
         load_fleet(tmp_path / "a.xml")
 
 
-def test_formats_are_told_apart(tmp_path: Path) -> None:
+def test_formats_are_distinguished(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text(GOOD)
     (tmp_path / "carla.csv").write_text(",".join(f"c{k}" for k in range(15)) + "\n")
     assert [detect(tmp_path / n) for n in ("table.csv", "carla.csv", "a.parquet", "a.xml", "a.xlsx", "a.txt")] == [
@@ -220,3 +220,9 @@ def test_a_table_with_yaw_and_velocity_has_a_frame_to_find(tmp_path: Path, heade
 def test_an_unknown_vehicle_is_named_with_the_known_ones() -> None:
     with pytest.raises(InputError, match=r"must be one of town10-clients-00, town10-clients-01"):
         load_fleet("town10-clients").index("town10-99")
+
+
+def test_a_column_by_a_wrong_name_is_proposed(tmp_path: Path) -> None:
+    (tmp_path / "drive.csv").write_text(GOOD.replace("id,t,x,y,z", "id,t,easting,y,z"))
+    with pytest.raises(InputError, match=r"column estings = missing: .* Did you mean easting\?"):
+        load_fleet(tmp_path / "drive.csv", columns={"x": "estings"})

@@ -145,7 +145,7 @@ def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path: Path, dimension: int,
         ("A0 L5 A1 B0 L7 B1", (ord("B") << 56) + 1),  # two robots
         ("A0 L5 A1 A2 L7 A4", 4),
         ("A0 L0 A1 A2 L1 A4", (ord("A") << 56) + 4),  # a number comes twice
-        ("x0 L5 x1 x2 m7 L6", (ord("L") << 56) + 6),  # letters do not tell poses from points: the record does
+        ("x0 L5 x1 x2 m7 L6", (ord("L") << 56) + 6),  # letters do not distinguish poses from points: the record does
     ],
 )
 def test_every_g2o_record_comes_back_to_rounding(tmp_path: Path, dimension: int, names: str, key: int) -> None:

@@ -27,6 +27,7 @@ VERTEX_SE2:PRIOR 0 A0 0 0 0 1 0 0 1 0 1
 """
 BAD_PYFG = {
     "unknown record": ("EDGE_RANGE", "EDGE_RNG", "line 6 = EDGE_RNG", "VERTEX_SE2, VERTEX_XY, VERTEX_SE2:PRIOR"),
+    "misspelt record": ("EDGE_RANGE", "EDGE_RNG", "line 6 = EDGE_RNG", "Did you mean EDGE_RANGE?"),
     "missing word": ("L0 5 0.1", "L0 5", "line 6 = EDGE_RANGE 1 A0 L0 5 (5 words)", "EDGE_RANGE stamp i j r variance"),
     "no number": ("5 0.1", "five 0.1", "line 6", "all finite numbers"),
     "not finite": ("5 0.1", "nan 0.1", "line 6", "all finite numbers"),
@@ -114,6 +115,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
     _assert_refused(lambda: write_graph(replace(graph, ranges=flat), tmp_path / "a.g2o"), "ranges[1]", "singular")
     _assert_refused(lambda: write_graph(graph, tmp_path / "a.toro"), "path = a.toro", ".pyfg or .g2o")
     _assert_refused(lambda: load_graph(tmp_path / "a"), "path = a", ".pyfg or .g2o")
+    _assert_refused(lambda: load_graph(tmp_path / "a.pfg"), "path = a.pfg", "Did you mean .pyfg?")
     _assert_refused(lambda: load_graph(tmp_path / "none.g2o"), "none.g2o", "must be a file")
     assert not list(tmp_path.iterdir())
 

@@ -35,8 +35,8 @@ def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
     }
     for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
         weight = float(SURROGATES[loss].weight(np.array(r**2), np.array(mu)))
-        slope = (paper_rho(loss, np.sqrt(r**2 + 1e-7), mu) - paper_rho(loss, np.sqrt(r**2 - 1e-7), mu)) / 2e-7
-        assert weight == pytest.approx(slope, abs=1e-6)
+        gradient_ = (paper_rho(loss, np.sqrt(r**2 + 1e-7), mu) - paper_rho(loss, np.sqrt(r**2 - 1e-7), mu)) / 2e-7
+        assert weight == pytest.approx(gradient_, abs=1e-6)
         dual = minimize_scalar(lambda w, r=r: w * r**2 + penalties[loss](w), bounds=(0, 1), options={"xatol": 1e-12})
         assert dual.fun == pytest.approx(paper_rho(loss, r, mu), abs=1e-5)
         assert weight == pytest.approx(dual.x, abs=2e-3)
@@ -149,7 +149,7 @@ def test_wrong_input_says_what_to_do(make, field: str) -> None:
         make()
 
 
-def test_doubts_that_leave_nothing_are_told() -> None:
+def test_gnc_that_rejects_every_fix_is_reported() -> None:
     """Two fixes of one point 80 m apart, both candidates: believing neither is cheapest, and then the point is free."""
     torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0)
     assert solve_gnc(torn, [0], throw=False).status is Status.RANK_DEFICIENT

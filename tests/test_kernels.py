@@ -39,8 +39,8 @@ def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
     track = JointFilter(known, exact=False)(recording, [0])
     n, order = 12, [0, *recording.links.neighbour[:3]]
     peer = KalmanFilter(dim_x=n, dim_z=n + 9, dim_u=n)
-    sight = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
-    peer.B, peer.H = 0.1 * np.eye(n), np.vstack([np.eye(n), sight])
+    vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
+    peer.B, peer.H = 0.1 * np.eye(n), np.vstack([np.eye(n), vectors])
     peer.Q = np.kron(np.eye(4), np.diag(np.square(known.process_std)))
     where = to_vector(recording.relative[0])
     noise = np.zeros((n + 9, n + 9))

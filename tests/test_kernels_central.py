@@ -66,7 +66,7 @@ def test_poor_and_very_good_measurements_are_the_oracle(crossing: Fleet) -> None
 
 
 def test_a_run_knows_nothing_of_those_it_shares_its_covariance_with(crossing: Fleet) -> None:
-    """To the last bit, whether runs hear the same or not."""
+    """To the last bit, whether runs receive the same or not."""
     method = CentralFilter("identity")
     for loss in (0.0, 0.3):
         recordings = [observe(crossing, S2, V2X(max_neighbours=4, loss=loss), runs=runs) for runs in (1, 3)]
@@ -78,7 +78,7 @@ def test_a_run_knows_nothing_of_those_it_shares_its_covariance_with(crossing: Fl
 
 
 def test_the_filter_is_filterpys(crossing: Fleet) -> None:
-    """All vehicles in one state, every sighting a row: with unit noise the whole problem is linear."""
+    """All vehicles in one state, every relative measurement a row: with unit noise the whole problem is linear."""
     fleet = crossing.select(range(6)).between(0, 30)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2)
     track = CentralFilter("identity")(recording, range(6))

@@ -230,10 +230,10 @@ def test_bytes_and_the_cap_are_each_receivers_own(crossing: Fleet) -> None:
     checked = 0
     for t, vehicle in np.ndindex(60, 8):
         mine = (capped.step == t) & ((capped.first == vehicle) | (capped.second == vehicle))
-        heard = np.where(capped.first == vehicle, capped.at_first[0], capped.at_second[0]) >= 0
+        received = np.where(capped.first == vehicle, capped.at_first[0], capped.at_second[0]) >= 0
         sees = ((recording.links.step == t) & (recording.links.observer == vehicle)).sum() == mine.sum()
-        if sees and (mine & heard).any() and (mine & ~heard).any():
-            assert gap[mine & heard].max() < gap[mine & ~heard].min()
+        if sees and (mine & received).any() and (mine & ~received).any():
+            assert gap[mine & received].max() < gap[mine & ~received].min()
             checked += 1
     assert checked > 10
 

@@ -20,7 +20,7 @@ FITTED = replace(KNOWN, gnss_std=S2.gnss_std)
 
 
 def formed(formation: Fleet, **options: float) -> Recording:
-    """A star of four, of which one neighbour lies by 20 m and more."""
+    """A star of four, of which one neighbour is spoofed by 20 m and more."""
     fleet = formation.select(range(4)).between(0, 6)
     seen = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
     gnss = seen.gnss.copy()
@@ -28,7 +28,7 @@ def formed(formation: Fleet, **options: float) -> Recording:
     return replace(seen, gnss=gnss)
 
 
-def test_the_robust_window_is_the_least_squares_solution_of_scipy_without_the_liar(formation: Fleet) -> None:
+def test_the_robust_window_is_the_least_squares_solution_of_scipy_without_the_outlier(formation: Fleet) -> None:
     """The last of three steps, the weights being those that the truth gives, and J^T J inverted."""
     recording = formed(formation)
     track = CooperativeMAP(window=3, noise_model=FITTED, robust="truncated", threshold=1 - 1e-9)(recording, [0])
@@ -55,11 +55,11 @@ def test_the_robust_window_is_the_least_squares_solution_of_scipy_without_the_li
 
 
 def test_robust_snapshots_are_those_of_gtsam(formation: Fleet) -> None:
-    """GncLMOptimizer on unit vectors and fixes, the neighbours' being its suspects: the same points."""
+    """GncLMOptimizer on unit vectors and fixes, the neighbours' being its outlier candidates: the same points."""
     recording = formed(formation)
     track = CooperativeMAP(noise_model="identity", robust="truncated")(recording, [0])
     unit, columns = gtsam.noiseModel.Unit.Create(3), [0, *recording.links.neighbour[:3]]
-    liars = 0
+    rejected = 0
     for run in range(2):
         for t in range(6):
             graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -81,5 +81,5 @@ def test_robust_snapshots_are_those_of_gtsam(formation: Fleet) -> None:
             assert track.neighbours[run, 3 * t : 3 * t + 3] == pytest.approx(points[1:], abs=1e-6)
             square = np.square(recording.gnss[run, t, columns[1:]] - points[1:]).sum(axis=1)
             assert np.array_equal(optimiser.getWeights()[4:], square <= chi2.ppf(0.99, 3))
-            liars += int((optimiser.getWeights() == 0).sum())
-    assert liars >= 12
+            rejected += int((optimiser.getWeights() == 0).sum())
+    assert rejected >= 12

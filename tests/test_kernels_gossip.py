@@ -15,7 +15,7 @@ S2 = Sensors.paper_scenario2()
 
 @pytest.mark.parametrize("method", [GaussianBeliefPropagation("identity"), ConsensusADMM("identity", rounds=200)])
 def test_two_vehicles_reach_the_least_squares_solution(method, crossing: Fleet) -> None:
-    """The first step of a pair is a linear problem of two fixes and two sightings: numpy.linalg.lstsq."""
+    """The first step of a pair is a linear problem of two fixes and two relative measurements: numpy.linalg.lstsq."""
     recording = observe(crossing.select(["c0", "c3"]).between(0, 2), S2, V2X(max_neighbours=1, radius=200.0))
     first = recording.links.step == 0
     ahead = to_vector(recording.relative[0, first]) * np.where(recording.links.observer[first] == 0, 1.0, -1.0)[:, None]

@@ -20,7 +20,7 @@ def star(dimension: int = 3, reverse: bool = False) -> Problem:
     z = truth + rng.normal(0, 0.5, (RUNS, 5, dimension))
     problem = Problem([f"v{k}" for k in range(5)], separator=(2,), dimension=dimension)
     problem = problem.add("position", range(5), z, std=np.arange(1.0, 1.0 + dimension))
-    pairs = [(2, k) if not reverse else (k, 2) for k in (0, 1, 4)]  # nobody sees v3
+    pairs = [(2, k) if not reverse else (k, 2) for k in (0, 1, 4)]  # v3 is not measured
     gaps = [np.linalg.norm(truth[i] - truth[j]) for i, j in pairs]
     shift = [truth[j] - truth[i] for i, j in pairs]
     full = np.eye(dimension) + 0.1 * np.tri(dimension)

@@ -178,7 +178,7 @@ def rms(method: Method, seen: Recording, fleet: Fleet) -> float:
 
 @pytest.mark.parametrize("sums", [True, False])
 def test_with_the_same_knowledge_it_is_the_joint_filter(sums: bool) -> None:
-    """In a formation, where nobody comes or goes, and with a message at every step."""
+    """In a formation, where no vehicle comes or goes, and with a message at every step."""
     seen = drive(formation_fleet(6, 60), V2X(5))
     known = NoiseModel.nominal(NOISE)
     mine, joint = CooperativeGain(known, sums)(seen), JointFilter(known)(seen)
@@ -212,9 +212,9 @@ def test_net_noise_serves_other_filters_of_a_star(v2x: V2X) -> None:
     np.testing.assert_allclose(JointFilter(given)(seen).x, JointFilter(known)(seen).x, atol=1e-12)
 
 
-def test_sums_say_what_lost_messages_said() -> None:
-    """With exact motion and sightings two vehicles are one: the estimate is the mean of all fixes of both, of the other
-    one up to its last message, however many were lost."""
+def test_sums_hold_the_content_of_lost_messages() -> None:
+    """With exact motion and measurements two vehicles are one: the estimate is the mean of all fixes of both, of the
+    other one up to its last message, however many were lost."""
     fleet = formation_fleet(2, 60)
     exact = Sensors(
         (2.0,) * 3, velocity_std_ratio=0.0, velocity_floor=1e-7, range_std=1e-4, azimuth_std=1e-5, inclination_std=1e-5
@@ -258,8 +258,8 @@ def test_bytes_are_those_of_what_arrived(crossing: Fleet) -> None:
 
 def test_neighbours_help_without_anybody_knowing_the_noise() -> None:
     fleet = formation_fleet(6, 200)
-    seen, nobody = drive(fleet, V2X(5, loss=0.3), 10), NoiseNet()
-    together, solo = rms(CooperativeGain(nobody), seen, fleet), rms(NoiseFilter(nobody), seen, fleet)
+    seen, unaware = drive(fleet, V2X(5, loss=0.3), 10), NoiseNet()
+    together, solo = rms(CooperativeGain(unaware), seen, fleet), rms(NoiseFilter(unaware), seen, fleet)
     assert together < 0.6 * solo
     assert together < 1.1 * rms(JointFilter("nominal"), seen, fleet)
     assert solo < 1.1 * rms(Kalman("nominal"), seen, fleet)

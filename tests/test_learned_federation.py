@@ -107,7 +107,7 @@ EVERYTHING: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("options", EVERYTHING, ids=str)
 def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], options: dict[str, Any]) -> None:
-    """Same seed, same weights, bit for bit, whoever is listed first and whoever is trained beside."""
+    """Same seed, same weights, bit for bit, whatever the order of the clients."""
     one, other = trained(four, seed=3, **options), trained(four[::-1], seed=3, **options)
     how: dict[str, Any] = {"rounds": 3, "local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options}
     together = federate_many([Steady(), Steady()], [four[::-1], four], [8, 3], **how)[1]
@@ -255,7 +255,7 @@ def test_bad_answers_are_rejected_and_training_goes_on(number: int, faults: dict
     assert all("changes the weights by" in row.rejected["c1"] for row in two.history[1:])
 
 
-def test_a_client_that_was_never_heard_does_not_choose_the_weights(four: tuple[Client, ...]) -> None:
+def test_a_client_that_never_answered_does_not_choose_the_weights(four: tuple[Client, ...]) -> None:
     """Its pieces are not finite, so that its loss is infinite in every round; the others' best round is kept."""
 
     def without_fixes(pieces: Any) -> Any:
@@ -268,7 +268,7 @@ def test_a_client_that_was_never_heard_does_not_choose_the_weights(four: tuple[C
     assert ("c3", SERVER) not in fed.history[1].traffic
 
 
-def test_absent_clients_count_with_what_they_last_said(four: tuple[Client, ...]) -> None:
+def test_absent_clients_count_with_their_last_answer(four: tuple[Client, ...]) -> None:
     fed = trained(four, 4, participation=Participation(0.5), seed=1)
     for before, row in zip(fed.history, fed.history[1:], strict=False):
         for i, name in enumerate(fed.names):
@@ -296,6 +296,7 @@ def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None
         ({"topology": Ring(), "compression": Float16()}, "compression = Float16"),
         ({"topology": Pairs((("c0", "c1"),))}, r"without a path from c0 to \['c2', 'c3'\]"),
         ({"topology": Pairs((("c0", "x"),))}, "pairs = "),
+        ({"topology": Pairs((("c0", "c11"),))}, r"pairs = 'c11': must be one of c0, .* Did you mean c1\?"),
         ({"topology": V2XGraph(drives(2), 1e9)}, "vehicle = 'c2'"),
         ({"rounds": 0}, "rounds = 0"),
     ],
@@ -334,7 +335,7 @@ def test_the_ledger_counts_every_byte(four: tuple[Client, ...], compression: Com
     assert account.servers == (SERVER,)
     sent, received = (account.of("training", way=way)[0] for way in ("broadcast", "per receiver"))
     rounds = np.array([sum(name not in row.absent for row in fed.history[1:]) for name in fed.names])
-    np.testing.assert_array_equal(sent, [*rounds * (size + 4), 3 * 12])  # the server tells all at once
+    np.testing.assert_array_equal(sent, [*rounds * (size + 4), 3 * 12])  # the server broadcasts
     np.testing.assert_array_equal(received, [3 * 12] * 4 + [rounds.sum() * (size + 4)])
     np.testing.assert_array_equal(air.of("training", "on air", "broadcast")[0] - sent, [*100 * rounds, 300])
     np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [300] * 4 + [100 * rounds.sum()])
@@ -491,8 +492,8 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
         atol=1e-5,
     )
     assert torch.equal(shifted.training.gnss, four[0].training.gnss)
-    honest, liar = trained(four[:1], 1), trained(four[:1], 1, participation=Byzantine(names=("c0",), scale=-1.0))
-    torch.testing.assert_close(liar.history[1].weights - 0.3, 0.3 - honest.history[1].weights)
+    honest, byzantine = trained(four[:1], 1), trained(four[:1], 1, participation=Byzantine(names=("c0",), scale=-1.0))
+    torch.testing.assert_close(byzantine.history[1].weights - 0.3, 0.3 - honest.history[1].weights)
     hurt = trained(four, 6, participation=Byzantine(names=("c0",), scale=-20.0))
     kept = trained(four, 6, participation=Byzantine(names=("c0",), scale=-20.0), aggregate="median")
     assert not hurt.history[-1].rejected

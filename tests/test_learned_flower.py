@@ -147,14 +147,14 @@ def test_flowers_own_average_of_the_answers_is_the_new_net() -> None:
     from flwr.app import Message
     from flwr.serverapp.strategy import FedAvg
 
-    job, fleet, said = job_of(TINY | {"rounds": 1}), drives(), list[Message]()
+    job, fleet, answers = job_of(TINY | {"rounds": 1}), drives(), list[Message]()
 
-    def heard(node: Node, message: Message) -> Message | None:
-        said.extend([reply] if (reply := node(message)) and message.metadata.message_type == "train" else [])
+    def recorded(node: Node, message: Message) -> Message | None:
+        answers.extend([reply] if (reply := node(message)) and message.metadata.message_type == "train" else [])
         return reply
 
-    rows, _ = deployed(job, {i: partial(heard, honest(job, fleet, i)) for i in range(4)})
-    arrays, _ = FedAvg().aggregate_train(1, said)
+    rows, _ = deployed(job, {i: partial(recorded, honest(job, fleet, i)) for i in range(4)})
+    arrays, _ = FedAvg().aggregate_train(1, answers)
     assert arrays
     assert rows[1].weights.numpy() == pytest.approx(arrays["theta"].numpy(), abs=1e-7)
     assert not torch.equal(rows[1].weights, rows[0].weights)

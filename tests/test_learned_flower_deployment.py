@@ -1,6 +1,6 @@
 """Deployments on loopback: SuperLink, SuperNodes, TLS and keys; a node that dies; what the wire and the server hold.
 
-The wire, the server's memory and its files are searched for a drive that can be told from everything else. An app that
+The wire, the server's memory and its files are searched for a drive that is distinct from everything else. An app that
 gives this drive away shows that the search would find it.
 """
 
@@ -145,7 +145,7 @@ def whole(job: Job, fleet: Fleet) -> Federation:
 
 def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
     """The card of a checkpoint whose weights are, round by round, NumPy's average of what those who counted made, and
-    those of `federate`, bit by bit, as long as nobody is missing."""
+    those of `federate`, bit by bit, as long as no client is missing."""
     recipe, seed, expected, found = job.recipe, job.setting.seed, whole(job, fleet), load(path)
     own = job_clients(job, fleet)
     assert found.history is not None

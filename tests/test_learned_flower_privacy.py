@@ -59,7 +59,7 @@ class Local(Grid):  # type: ignore[misc]
 
     def __init__(self, app: ClientApp, nodes: int, silent: tuple[int, int] | None = None) -> None:
         TaskIdentity.task_id = TaskIdentity.run_id = TaskIdentity.node_id = 1  # who sends the server's messages
-        self.app, self.silent, self.asked, self.heard = app, silent, 0, list[Message]()
+        self.app, self.silent, self.asked, self.received = app, silent, 0, list[Message]()
         self.contexts = {n + 1: Context(1, n + 1, {"partition-id": n}, RecordDict(), {}) for n in range(nodes)}
 
     run = SimpleNamespace(run_id=1)
@@ -78,7 +78,7 @@ class Local(Grid):  # type: ignore[misc]
         """Stage after stage; the `silent` (node, stage) does not answer from that stage on."""
         replies = [self._answer(message) for message in messages]
         self.asked += 1
-        self.heard += [r for r in replies if r.has_content()]
+        self.received += [r for r in replies if r.has_content()]
         return replies
 
     def _answer(self, message: Message) -> Message:
@@ -130,11 +130,11 @@ def test_what_a_client_sends_is_masked() -> None:
     job, drives = job_of(TINY | {"rounds": 1}), fleet()
     grid = Local(secure_client_app(partial(partition, fleet=drives, job=job)), 4)
     led(secure_server_app(job, 4, lambda number, theta: None, 12), grid)
-    arrays = [array for m in grid.heard for record in m.content.array_records.values() for array in record.values()]
+    arrays = [array for m in grid.received for record in m.content.array_records.values() for array in record.values()]
     assert not arrays
     sent = [
         record[Key.MASKED_PARAMETERS]
-        for m in grid.heard
+        for m in grid.received
         for record in m.content.config_records.values()
         if Key.MASKED_PARAMETERS in record
     ]

@@ -97,7 +97,8 @@ def test_noise_is_the_inverse_of_epsilon() -> None:
 
 
 def test_the_ceiling_is_the_auc_of_the_best_attack() -> None:
-    """A client's clip among the noise of T rounds, told from noise alone by their sum: the U statistic of scipy."""
+    """A client's clip among the noise of T rounds, distinguished from noise alone by their sum: the U statistic of
+    scipy."""
     noise = np.random.default_rng(0).normal(0, 3.0, (2, 4000, 9)).sum(-1)
     found = stats.mannwhitneyu(noise[0] + 9.0, noise[1]).statistic / 4000**2
     assert auc_bound(3.0, 9) == pytest.approx(found, abs=0.015)

@@ -58,10 +58,10 @@ def test_untrained_net_is_filterpys_filter() -> None:
     assert track.covariance is not None
     for t in range(1, 60):
         levels = after(levels, fixes[t], speeds[t], 0.1)
-        levelled = noise(levels, 0.1)
-        r = levelled.gnss.numpy()
+        levels_noise = noise(levels, 0.1)
+        r = levels_noise.gnss.numpy()
         theirs.P, theirs.R = theirs.P * (r / before), np.diag(r)
-        theirs.predict(u=speeds[t].numpy(), Q=np.diag((levelled.ratio * levelled.gnss).numpy()))
+        theirs.predict(u=speeds[t].numpy(), Q=np.diag((levels_noise.ratio * levels_noise.gnss).numpy()))
         theirs.update(fixes[t].numpy())
         before = r
         np.testing.assert_allclose(track.x[0, t, 0], theirs.x, atol=1e-9)
@@ -97,7 +97,7 @@ def test_loss_is_torchs_gaussian_likelihood() -> None:
     torch.testing.assert_close(like.losses(theta, seen), theirs)
 
 
-def test_levels_tell_the_noise() -> None:
+def test_levels_hold_the_noise() -> None:
     """1 m, 2 m and 4 m, drawn a little towards their mean square, and 15 % of a velocity that turns."""
     recording = observe(drive(300), Sensors(gnss_std=(1.0, 2.0, 4.0), velocity_std_ratio=0.15), runs=60)
     fixes, speeds = (torch.tensor(a[:, :, 0]) for a in (recording.gnss, recording.velocity))
@@ -107,8 +107,8 @@ def test_levels_tell_the_noise() -> None:
         shares.append(levels.turns / levels.squares)
     count = float(levels.fixes[0, 0])
     weight = POOL**2 / (POOL + count)
-    pulled = (count * np.array([1.0, 4.0, 16.0]) + weight * 7.0) / (count + weight)
-    np.testing.assert_allclose(noise(levels, 0.1).gnss.mean(0), pulled, rtol=0.06)
+    shrunk = (count * np.array([1.0, 4.0, 16.0]) + weight * 7.0) / (count + weight)
+    np.testing.assert_allclose(noise(levels, 0.1).gnss.mean(0), shrunk, rtol=0.06)
     np.testing.assert_allclose(torch.stack(shares[50:])[..., :2].mean().sqrt(), 0.15, rtol=0.1)
 
 

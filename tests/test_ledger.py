@@ -26,7 +26,7 @@ ROOT = Path(__file__).parent.parent
 
 
 def ring(vehicles: int, steps: int = 10) -> Fleet:
-    """Vehicles that stand within sight of each other."""
+    """Vehicles that measure each other."""
     turn = np.linspace(0, 2 * np.pi, vehicles, endpoint=False)
     place = np.broadcast_to(np.stack([9 * np.cos(turn), 9 * np.sin(turn), 0 * turn], axis=1), (steps, vehicles, 3))
     return Fleet(tuple(f"v{i}" for i in range(vehicles)), np.arange(steps) * 0.1, place, 0 * place)
@@ -92,7 +92,7 @@ def test_break_even_of_the_papers_training() -> None:
     """methods.md section 9.6: 20 rounds of 19,938 weights both ways are 3.2 MB per vehicle: about an hour of a CAM
     stream of 0.9 kB/s, or 15 min of 350 B at 10 Hz."""
     weights = 20 * 4 * 19_938.0
-    once = of_training(["a", "b", "hub"], [weights] * 3, [weights, weights, 2 * weights], ["hub"])
+    once = of_training(["a", "b", "server"], [weights] * 3, [weights, weights, 2 * weights], ["server"])
     assert once.per_vehicle("training") == pytest.approx(3.19e6, rel=1e-3)
     assert once.per_vehicle("training", way="broadcast") == 1.5 * weights
     for rate, minutes in ((900.0, 59.1), (3500.0, 15.2)):
@@ -151,6 +151,6 @@ def test_a_ledger_refuses_what_does_not_fit() -> None:
     with pytest.raises(InputError, match="seconds"):
         Ledger(("a",), np.zeros(2), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)))
     with pytest.raises(InputError, match="names"):
-        Ledger(("a",), np.zeros(1), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)), servers=("hub",))
+        Ledger(("a",), np.zeros(1), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)), servers=("server",))
     with pytest.raises(InputError, match="kind"):
         Ledger.empty(["a"]).of("training", "wire")  # type: ignore[arg-type]

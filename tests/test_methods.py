@@ -10,6 +10,10 @@ from filterpy.kalman import KalmanFilter
 
 from coopoc import GNSS, LKFSA, MSMV, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
+from coopoc.methods.covariance_intersection import CovarianceIntersection
+from coopoc.methods.fixed_lag import FixedLagSmoother
+from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.mds import MDS
 from coopoc.methods.star import FORGOTTEN
 from coopoc.world.spherical import spherical, to_vector
 
@@ -78,7 +82,7 @@ def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
 
 @pytest.mark.parametrize("method", COOPERATIVE, ids=label)
 def test_no_message_ever_is_at_best_the_solo_filter(method, crossing: Fleet) -> None:
-    """All messages lost: on-board sightings of vehicles that say nothing must not move the ego much."""
+    """All messages lost: relative measurements of vehicles without messages must not move the ego much."""
     recording = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=3)
     track, solo = method(recording, [0]), Kalman(method.noise_model)(recording, [0])
     assert (track.received_bytes == 0).all()
@@ -110,9 +114,9 @@ def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
     known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
     track = JointFilter(known, exact=False)(recording, [0])
     n, order = 4, [0, *recording.links.neighbour[:3]]
-    sight = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
+    vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
     peer = KalmanFilter(dim_x=3 * n, dim_z=3 * n + 9, dim_u=3 * n)
-    peer.B, peer.H = 0.1 * np.eye(3 * n), np.vstack([np.eye(3 * n), sight])
+    peer.B, peer.H = 0.1 * np.eye(3 * n), np.vstack([np.eye(3 * n), vectors])
     peer.Q = np.kron(np.eye(n), np.diag(np.square(known.process_std)))
     where = to_vector(recording.relative[0])
     peer.x = np.concatenate([recording.gnss[0, 0, 0], (recording.gnss[0, 0, 0] + where[:3]).ravel()])
@@ -202,21 +206,31 @@ def test_a_known_start_has_no_nees(formation: Fleet) -> None:
     assert nees_inside(track, fleet).min() >= 0.95
 
 
-def test_fitted_knowledge_finds_the_acting_noise(formation: Fleet) -> None:
+def test_a_fitted_noise_model_finds_the_acting_noise(formation: Fleet) -> None:
     training = observe(formation, Sensors(gnss_std=(1.0, 2.0, 3.0), velocity_reading="speed"), runs=2)
     fitted = NoiseModel.fitted(training, formation)
     assert fitted.gnss_std == pytest.approx((1.0, 2.0, 3.0), rel=0.02)
     assert fitted.process_std == pytest.approx((0.1, 0.1, 0.1), rel=0.02)
 
 
-def test_bad_knowledge_is_named(crossing: Fleet) -> None:
+def test_a_bad_noise_model_is_named(crossing: Fleet) -> None:
     recording = observe(crossing, S2)
     with pytest.raises(InputError, match="noise_model = 'guess'"):
         Kalman("guess")(recording)
+    with pytest.raises(InputError, match=r"noise_model = 'nominl': .* Did you mean nominal\?"):
+        Kalman("nominl")(recording)
     with pytest.raises(InputError, match="process_std"):
         NoiseModel("mine", S2, process_std=(0.1, 0.1, 0.0))
-    with pytest.raises(InputError, match="membership = 'rest'"):
+    with pytest.raises(InputError, match=r"membership = 'rest': .* Did you mean reset\?"):
         LKFSA(membership="rest")  # type: ignore[arg-type]
+    for method, field, given, near in (
+        (CovarianceIntersection, "criterion", "tracee", "trace"),
+        (FixedLagSmoother, "backend", "gtsan", "gtsam"),
+        (GaussianBeliefPropagation, "carry", "beliefs", "belief"),
+        (MDS, "missing", "path", "paths"),
+    ):
+        with pytest.raises(InputError, match=rf"{field} = '{given}': must be one of .* Did you mean {near}\?"):
+            method(**{field: given})
     with pytest.raises(InputError, match="x0"):
         Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 

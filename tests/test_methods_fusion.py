@@ -58,8 +58,8 @@ def test_ci_is_not_over_confident_in_traffic() -> None:
     assert found["msmv-r"].mean() > 6.0
 
 
-def test_what_is_said_late_is_no_surer_than_it_is() -> None:
-    """Monte Carlo: an estimate brought forward by half a second and more errs by no more than its variance says."""
+def test_a_late_message_is_no_surer_than_it_is() -> None:
+    """Monte Carlo: an estimate brought forward by half a second and more errs by no more than its variance."""
     fleet = co.load_fleet("town10").between(0, 200)
     recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0), runs=20, observers=[0])
     known = NoiseModel.nominal(recording.sensors)
@@ -102,7 +102,8 @@ def test_a_platoon_has_no_lateral_shape() -> None:
 
 
 def test_the_relaxation_finds_what_many_starts_find() -> None:
-    """Independent check: the best of forty random starts of scipy.optimize.least_squares, on who is heard."""
+    """Independent check: the best of forty random starts of scipy.optimize.least_squares, on the neighbours
+    received."""
     fleet = co.load_fleet("town10").between(0, 2)
     recording = observe(fleet, S2, V2X(max_neighbours=5, loss=0.4), runs=4, observers=[12])
     track = QCQPRelaxation()(recording, [12])
@@ -205,8 +206,8 @@ def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3), runs=1)
     box = inbox(recording, 0, method.message)
     who = recording.links.neighbour[box.link]
-    said = {(int(s), int(j)) for s, j in zip(box.newest[0], who, strict=True) if s >= 0}
-    secret = np.array([[j > 0 and (t, j) not in said for j in range(8)] for t in range(60)])
+    received = {(int(s), int(j)) for s, j in zip(box.newest[0], who, strict=True) if s >= 0}
+    secret = np.array([[j > 0 and (t, j) not in received for j in range(8)] for t in range(60)])
     if method in FILTERS:
         secret = np.logical_and.accumulate(secret[::-1])[::-1]
     assert secret.sum() > 20

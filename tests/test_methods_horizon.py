@@ -168,7 +168,7 @@ def test_a_lag_of_the_whole_drive_is_filterpys_smoother(crossing: Fleet) -> None
 class Last(NamedTuple):
     """The last window of a run over an ideal channel: its steps, arrival cost, points, and what made them."""
 
-    sights: list[WindowStep]
+    steps: list[WindowStep]
     arrival: Arrival
     points: np.ndarray
     horizon: Any
@@ -184,23 +184,23 @@ def last_window(recording: Recording, known: NoiseModel, length: int, exact: boo
     settings = Settings(length, exact, 10 if exact else 0, 0.03, 10.0, False)
     (runs, horizon), span = next(each_group(seen, length)), (steps - length, steps - 1)
     advance(horizon, seen, assumed, box.arrival, settings, runs, (0, steps), empty(seen))
-    sights = steps_of(horizon.window, recording, box, run, span)
+    steps = steps_of(horizon.window, recording, box, run, span)
     points = points_of(horizon.window, run, span)
-    return Last(sights, arrival_of(horizon, run, span[0]), points, horizon, span)
+    return Last(steps, arrival_of(horizon, run, span[0]), points, horizon, span)
 
 
 def whitened(x: np.ndarray, window: Last) -> np.ndarray:
     """Residuals of a window as they stand in the text books, from its steps and the arrival cost alone."""
-    counts = [len(sight.previous) for sight in window.sights]
+    counts = [len(step.previous) for step in window.steps]
     points = np.split(x.reshape(-1, 3), np.cumsum(counts)[:-1])
     arrival, rows = window.arrival, []
     root = np.linalg.cholesky(arrival.information + 1e-12 * np.eye(3 * counts[0]))
     rows.append(root.T @ (points[0] - arrival.at).ravel() - np.linalg.solve(root, arrival.eta))
-    for k, (sight, here) in enumerate(zip(window.sights, points, strict=True)):
-        rows.append((here - sight.fix) / sight.fix_std)
+    for k, (step, here) in enumerate(zip(window.steps, points, strict=True)):
+        rows.append((here - step.fix) / step.fix_std)
         if k:
-            rows.append((here - points[k - 1][sight.previous] - sight.moved) / sight.moved_std)
-        gap = np.stack(spherical(*(here[1:] - here[0]).T), axis=-1) - sight.relative
+            rows.append((here - points[k - 1][step.previous] - step.moved) / step.moved_std)
+        gap = np.stack(spherical(*(here[1:] - here[0]).T), axis=-1) - step.relative
         rows.append(np.concatenate([gap[:, :1], wrap(gap[:, 1:])], axis=1) / S2.relative_std)
     return np.concatenate([r.ravel() for r in rows])
 
@@ -321,7 +321,7 @@ def test_a_road_is_solved_with_the_whole_arrival_cost(crossing: Fleet, backend: 
     recording = observe(crossing.between(0, 14), S2, V2X(max_neighbours=4), runs=1)
     known = resolve("nominal", recording)
     window = last_window(recording, known, 4, False, 0)
-    problem = window_problem(window.horizon, window.sights, known, False, 0, window.span)
+    problem = window_problem(window.horizon, window.steps, known, False, 0, window.span)
     problem, x = limited(problem, recording.dt, 0.3, None), window.points
     solution = solution_of(problem, window.arrival, x, backend)
     r, jacobian = problem.whiten(x)

@@ -97,7 +97,7 @@ def block(cov: np.ndarray, k: int) -> np.ndarray:
     return cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
 
 
-def test_the_linearised_sighting_is_the_spherical_measurement() -> None:
+def test_the_linearised_measurement_is_the_spherical_measurement() -> None:
     """Independent checks: SciPy's finite differences, and the converted covariance at the measured vector."""
     vector, relative = np.array([6.0, -8.0, 1.5]), np.array([11.0, -0.8, 1.5])
     root, residual = rows(vector, relative, S2, False)
@@ -425,7 +425,7 @@ def test_loss_is_that_of_the_channel(formation: Fleet) -> None:
 
 
 def fleet_marginals(fleet: Fleet, steps: int, v2x: V2X) -> gtsam.Marginals:
-    """Fixes, motions and converted sightings of everybody, all at the truth, as GTSAM factors."""
+    """Fixes, motions and converted measurements of all vehicles, all at the truth, as GTSAM factors."""
     links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, SPEED.min_range)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for t, i in np.argwhere(fleet.present[:steps]):

@@ -175,7 +175,7 @@ def test_the_active_bound_is_scipys() -> None:
 
 NO_FIX = Problem(("a", "b", "c")).add("range", [("a", "b"), ("b", "c")], [[5.0], [6.0]], std=1.0)
 APART = Problem(("a", "b", "c", "d")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
-ISLAND = APART.add("displacement", [("a", "b"), ("c", "d")], [[4, 0, 0], [1, 0, 0]], std=1.0)
+DETACHED = APART.add("displacement", [("a", "b"), ("c", "d")], [[4, 0, 0], [1, 0, 0]], std=1.0)
 ONE_PLACE = Problem(("a", "b"), x0=np.zeros((2, 3))).add("position", "a", [0, 0, 0], std=1.0)
 
 
@@ -221,7 +221,7 @@ def test_the_capabilities_of_the_documentation_are_the_declared_ones() -> None:
 
 @pytest.mark.parametrize("backend", backends())
 def test_what_cannot_be_solved_is_said_by_every_backend(backend: str) -> None:
-    for problem, free in ((NO_FIX, {"a", "b", "c"}), (ISLAND, {"c", "d"})):
+    for problem, free in ((NO_FIX, {"a", "b", "c"}), (DETACHED, {"c", "d"})):
         found = solve(problem, backend, throw=False)
         assert found.status is Status.RANK_DEFICIENT
         assert set(found.unobservable) == free

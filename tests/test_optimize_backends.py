@@ -176,8 +176,8 @@ def custom(factor: Factor, node: list[int], z: np.ndarray):
         v = values.atPoint3(node[1]) - values.atPoint3(node[0])
         if jacobians is not None:
             step = 1e-5 * np.eye(3)
-            slope = [(known.predict(v + d) - known.predict(v - d)) / 2e-5 for d in step]
-            jacobians[0], jacobians[1] = -np.array(slope).T, np.array(slope).T
+            jacobian = [(known.predict(v + d) - known.predict(v - d)) / 2e-5 for d in step]
+            jacobians[0], jacobians[1] = -np.array(jacobian).T, np.array(jacobian).T
         return known.difference(v, None, z, np.empty(0))
 
     return error
@@ -215,11 +215,11 @@ def test_a_linear_problem_equals_lstsq(points: int, backend: str) -> None:
     assert solution.covariance == pytest.approx(own, rel=1e-9, abs=1e-12)
 
 
-def test_the_hub_changes_the_elimination_and_not_the_answer(crossing_recording: Recording) -> None:
+def test_the_separator_changes_the_elimination_and_not_the_answer(crossing_recording: Recording) -> None:
     window = Problem.from_window(crossing_recording, 20, 0, 6)
-    with_hub, without = solve(window), solve(replace(window, separator=()))
-    assert with_hub.x == pytest.approx(without.x, abs=1e-8)
-    assert with_hub.covariance == pytest.approx(without.covariance, abs=1e-9)
+    with_separator, without = solve(window), solve(replace(window, separator=()))
+    assert with_separator.x == pytest.approx(without.x, abs=1e-8)
+    assert with_separator.covariance == pytest.approx(without.covariance, abs=1e-9)
     walk = solve(chain_of(30, separator=(10, 20)))
     assert walk.x == pytest.approx(solve(chain_of(30)).x, abs=1e-8)
 
@@ -329,6 +329,7 @@ def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
     [
         (lambda p: solve(p, "ipopt"), "gauss-newton"),
         (lambda p: solve(p, "gtsam", colour="red"), "max_iterations"),
+        (lambda p: solve(p, "gtsam", max_iteration=3), r"Did you mean max_iterations\?"),
     ],
 )
 def test_unknown_names_list_the_known(dense: Recording, call, words: str) -> None:

@@ -127,7 +127,7 @@ def test_it_ends_where_gauss_newton_ends(dense: Recording, case: str, method: st
 def test_a_graph_of_poses_is_scipys(seed: int, method: str) -> None:
     """SciPy over (x, y, angle), with residuals written here."""
     problem = flat_graph(seed)
-    prior, relative, sights = problem.factors
+    prior, relative, bearings = problem.factors
     n = 12
 
     def angle(rotation: np.ndarray) -> np.ndarray:
@@ -142,16 +142,16 @@ def test_a_graph_of_poses_is_scipys(seed: int, method: str) -> None:
         z = angle(relative.z)
         moved = rotate(-z, rotate(-turn[i], at[j] - at[i]) - relative.z[:, :2])
         turned = wrap(turn[j] - turn[i] - z)[:, None]
-        a, b = sights.nodes.T
+        a, b = bearings.nodes.T
         gap = rotate(-turn[a], at[b] - at[a])
-        bearing = wrap(np.arctan2(gap[:, 1], gap[:, 0]) - sights.z[:, 1])
+        bearing = wrap(np.arctan2(gap[:, 1], gap[:, 0]) - bearings.z[:, 1])
         z0 = angle(prior.z)
         first = [*rotate(-z0, at[:1] - prior.z[:, :2])[0] / 0.1, *wrap(turn[:1] - z0) / 0.05]
         return np.concatenate(
             [
                 first,
                 (np.concatenate([moved, turned], axis=1) / [0.1, 0.1, 0.03]).ravel(),
-                (np.linalg.norm(gap, axis=1) - sights.z[:, 0]) / 0.2,
+                (np.linalg.norm(gap, axis=1) - bearings.z[:, 0]) / 0.2,
                 bearing / 0.03,
             ]
         )

@@ -46,7 +46,7 @@ def minima(problem: Problem, starts: int = 15) -> list[Solution]:
 
 @pytest.mark.parametrize("seed", [1, 2, 6])
 def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int) -> None:
-    """Gauss-Newton says SOLVED at both; scipy.optimize.least_squares finds nothing below the certified one."""
+    """Gauss-Newton reports SOLVED at both; scipy.optimize.least_squares finds nothing below the certified one."""
     problem = anchored(seed)
     best, *others = minima(problem)
     local = [solution for solution in others if solution.cost > best.cost + 1.0]
@@ -63,8 +63,8 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
         assert str(refused).startswith("not certified")
     rng = np.random.default_rng(1)
     for _ in range(8):
-        start, slope = rng.uniform(-20, 20, 12), lambda y: problem.whiten(y.reshape(6, 2))[1].toarray()
-        found = least_squares(lambda y: problem.whiten(y.reshape(6, 2))[0], start, jac=slope)
+        start, jacobian = rng.uniform(-20, 20, 12), lambda y: problem.whiten(y.reshape(6, 2))[1].toarray()
+        found = least_squares(lambda y: problem.whiten(y.reshape(6, 2))[0], start, jac=jacobian)
         assert found.cost >= verdict.lower_bound * (1 - 1e-9)
 
 

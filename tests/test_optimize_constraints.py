@@ -111,8 +111,8 @@ def test_a_linear_problem_in_a_box_is_scipys(seed: int, backend: str, options: d
     solution = solved(problem.constrain("position", problem.names, lower, upper), backend, options)
     assert solution.x.ravel() == pytest.approx(found.x, abs=1e-6)
     assert solution.cost == pytest.approx(found.cost, rel=1e-9)
-    pull = gradient(problem, solution.x).reshape(-1, 3) * 1e-3  # m per unit of cost
-    assert solution.x == pytest.approx(np.clip(solution.x - pull, lower, upper), abs=1e-6)
+    gradient_ = gradient(problem, solution.x).reshape(-1, 3) * 1e-3  # m per unit of cost
+    assert solution.x == pytest.approx(np.clip(solution.x - gradient_, lower, upper), abs=1e-6)
     assert solution.covariance == pytest.approx(solve(problem).covariance, abs=1e-9)
     if backend == "osqp":
         assert solution.iterations == 1
@@ -134,13 +134,13 @@ def test_an_active_bound_is_the_same_in_all(dense: Recording, length: int, seed:
         assert other.cost == pytest.approx(first.cost, rel=1e-9)
         assert other.x == pytest.approx(first.x, abs=1e-6)
         assert other.covariance == pytest.approx(first.covariance, abs=1e-6)
-    pull = gradient(problem, first.x).reshape(-1, 3)
+    gradient_ = gradient(problem, first.x).reshape(-1, 3)
     low, high = first.x < lower + 1e-7, first.x > upper - 1e-7
     assert low[1:].any()
     assert high[1:].any()
-    assert pull[~low & ~high] == pytest.approx(0.0, abs=1e-5)
-    assert (pull[low & ~high] > -1e-5).all()
-    assert (pull[high & ~low] < 1e-5).all()
+    assert gradient_[~low & ~high] == pytest.approx(0.0, abs=1e-5)
+    assert (gradient_[low & ~high] > -1e-5).all()
+    assert (gradient_[high & ~low] < 1e-5).all()
     assert first.gradient_norm < 1e-4
 
 
@@ -209,10 +209,14 @@ def scipys(problem: Problem, method: str) -> tuple[np.ndarray, float]:
         return z - road(x, y)
 
     def rise_slope(flat: np.ndarray) -> np.ndarray:
-        slope = np.zeros((n, 3 * n))
+        jacobian = np.zeros((n, 3 * n))
         k = np.arange(n)
-        slope[k, 3 * k], slope[k, 3 * k + 1], slope[k, 3 * k + 2] = -2.0 / 15.0 * np.cos(flat[::3] / 15.0), -0.05, 1.0
-        return slope
+        jacobian[k, 3 * k], jacobian[k, 3 * k + 1], jacobian[k, 3 * k + 2] = (
+            -2.0 / 15.0 * np.cos(flat[::3] / 15.0),
+            -0.05,
+            1.0,
+        )
+        return jacobian
 
     def speed(flat: np.ndarray) -> np.ndarray:
         return np.linalg.norm((ties @ flat).reshape(-1, 3), axis=1) / 0.5

@@ -534,6 +534,8 @@ def test_an_endless_lag_is_the_whole_problem() -> None:
         assert set(newest.names) == set(stamps)
     newest = smoother.estimate(("7", "15", "16"))
     assert newest.x == pytest.approx(whole.x[[7, 15, 16]], abs=1e-6)
+    with pytest.raises(InputError, match=r"wanted = '155': .* Did you mean 15\?"):
+        smoother.estimate(("155",))
     every = smoother.estimate(problem.names)
     assert every.x == pytest.approx(whole.x, abs=1e-6)
     assert every.covariance == pytest.approx(whole.covariance, rel=0.05, abs=1e-3)  # their chord's J^T J, not ours
@@ -613,12 +615,12 @@ def exact_smoother(lag: float) -> tuple[gtsam.IncrementalFixedLagSmoother, Calla
     smoother, keys = gtsam.IncrementalFixedLagSmoother(lag, params), {}
 
     def error(known, z):
-        def of(factor, found, slopes):
+        def of(factor, found, derivatives):
             gap = found.atPoint3(factor.keys()[1]) - found.atPoint3(factor.keys()[0])
-            if slopes is not None:
+            if derivatives is not None:
                 steps = 1e-6 * np.eye(3)
-                slope = np.stack([(known.predict(gap + s) - known.predict(gap - s)) / 2e-6 for s in steps], axis=1)
-                slopes[0], slopes[1] = np.asfortranarray(-slope), np.asfortranarray(slope)
+                derivative = np.stack([(known.predict(gap + s) - known.predict(gap - s)) / 2e-6 for s in steps], axis=1)
+                derivatives[0], derivatives[1] = np.asfortranarray(-derivative), np.asfortranarray(derivative)
             return known.difference(gap, None, z, np.empty(0))
 
         return of
@@ -643,7 +645,7 @@ def exact_smoother(lag: float) -> tuple[gtsam.IncrementalFixedLagSmoother, Calla
     return smoother, update
 
 
-def test_sightings_linearised_once_are_as_good_as_exact_ones(crossing: Fleet) -> None:
+def test_measurements_linearised_once_are_as_good_as_exact_ones(crossing: Fleet) -> None:
     """Against GTSAM's smoother with exact factors, linearised afresh at every step: RT-LE within 2 %."""
     steps, ours, theirs, apart_by = 40, [], [], []
     for seed in range(2):

@@ -39,12 +39,12 @@ def test_derivative_equals_casadis(kind: str, dimension: int) -> None:
     reference = ca.Function("h", [v], [formula, ca.jacobian(formula, v)])
     vectors = VECTORS[:, :dimension]
     zero, constants = np.zeros((len(vectors), size)), np.broadcast_to(given, (len(vectors), len(given)))
-    value, slope = known.differentiate(vectors, None, zero, constants)
-    slope = np.broadcast_to(slope, (len(vectors), size, dimension))
+    value, derivative = known.differentiate(vectors, None, zero, constants)
+    derivative = np.broadcast_to(derivative, (len(vectors), size, dimension))
     for i, vector in enumerate(vectors):
         h, J = (np.asarray(a) for a in reference(vector))
         assert value[i] == pytest.approx(h[:, 0], abs=1e-13)
-        assert slope[i] == pytest.approx(J, abs=1e-13)
+        assert derivative[i] == pytest.approx(J, abs=1e-13)
     assert known.predict(vectors, given) == pytest.approx(value, abs=1e-13)
 
 
@@ -60,8 +60,8 @@ def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
     z = ca.SX.sym("z", space.ambient)
     local = [*ca.vertsplit(v), *(turned[i, j] for i in range(d) for j in range(d))]
     formula = ca.vertcat(*known.residual(local, ca.vertsplit(z), [], Symbolic))
-    slopes = [ca.substitute(ca.jacobian(formula, s), w, 0) for s in (v, w)]
-    reference = ca.Function("h", [v, turn, z], [ca.substitute(formula, w, 0), ca.horzcat(*slopes)])
+    derivatives = [ca.substitute(ca.jacobian(formula, s), w, 0) for s in (v, w)]
+    reference = ca.Function("h", [v, turn, z], [ca.substitute(formula, w, 0), ca.horzcat(*derivatives)])
     if d == 3:
         turns, others = ROTATIONS, ROTATIONS[::-1]
     else:
@@ -70,11 +70,11 @@ def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
     near = turns @ exp(np.full((50, space.angles), 1e-3))
     for measured in (others, near, turns):
         z_values = space.join(VECTORS[::-1, :d], measured)
-        value, slope = known.differentiate(VECTORS[:, :d], turns, z_values, np.empty((50, 0)))
+        value, derivative = known.differentiate(VECTORS[:, :d], turns, z_values, np.empty((50, 0)))
         for i in range(50):
             h, J = (np.asarray(a) for a in reference(VECTORS[i, :d], turns[i], z_values[i]))
             assert value[i] == pytest.approx(h[:, 0], abs=1e-9)
-            assert slope[i] == pytest.approx(J, abs=1e-9)
+            assert derivative[i] == pytest.approx(J, abs=1e-9)
 
 
 def test_a_relative_pose_is_scipys_logarithm() -> None:
@@ -107,9 +107,9 @@ def test_dual_arithmetic_equals_casadis() -> None:
     reference = ca.Function("f", [v], [expression, ca.jacobian(expression, v)])
     ours = formula(*seeds(VECTORS), dual_numbers)
     for i, vector in enumerate(VECTORS):
-        value, slope = (np.asarray(a).ravel() for a in reference(vector))
+        value, derivative = (np.asarray(a).ravel() for a in reference(vector))
         assert ours.value[i] == pytest.approx(value[0], rel=1e-12)
-        assert ours.derivative[:, i] == pytest.approx(slope, rel=1e-11, abs=1e-12)
+        assert ours.derivative[:, i] == pytest.approx(derivative, rel=1e-11, abs=1e-12)
 
 
 def test_angles_wrap() -> None:
@@ -124,6 +124,9 @@ def test_angles_wrap() -> None:
 
 def test_a_decorated_function_is_all_it_takes() -> None:
     """A new measurement, the squared range, is at once in every backend."""
+
+    with pytest.raises(InputError, match=r"frame = 'bodi': .* Did you mean body\?"):
+        measurement("squared range", arity=2, components=("coordinate",), frame="bodi")  # type: ignore[arg-type]
 
     @measurement("squared range", arity=2, components=("coordinate",))
     def squared(dx, dy, dz, m=np):

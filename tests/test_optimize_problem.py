@@ -51,9 +51,9 @@ def test_jacobian_equals_casadis() -> None:
     residual = ca.vertcat(*rows)
     reference = ca.Function("r", [x], [residual, ca.jacobian(residual, ca.vec(x))])
     r, J = problem.whiten(problem.x0)
-    expected, slope = (np.asarray(a) for a in reference(problem.x0.T))
+    expected, jacobian = (np.asarray(a) for a in reference(problem.x0.T))
     assert r == pytest.approx(expected[:, 0], abs=1e-12)
-    assert J.toarray() == pytest.approx(slope, abs=1e-12)
+    assert J.toarray() == pytest.approx(jacobian, abs=1e-12)
     assert problem.cost(problem.x0) == pytest.approx(0.5 * r @ r)
 
 
@@ -95,7 +95,7 @@ def test_all_runs_at_once_hold_each_run(recording: Recording, length: int) -> No
         assert picked.cost(x) == single.cost(x)
 
 
-def test_knowledge_sets_the_weights(recording: Recording) -> None:
+def test_the_noise_model_sets_the_weights(recording: Recording) -> None:
     nominal = Problem.from_window(recording, 20, 0, 3)
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))
     x = np.random.default_rng(0).normal(size=(len(nominal.names), 3)) * 30
@@ -131,6 +131,7 @@ BAD = {
     "degrees std": (lambda: PAIR.add("azimuth", ("a", "b"), 1.0, std=4.0), "radians"),
     "zero range": (lambda: PAIR.add("range", ("a", "b"), 0.0, std=1.0), "Coincident"),
     "unknown node": (lambda: PAIR.add("range", ("a", "c"), 5.0, std=1.0), "one of a, b"),
+    "misspelt node": (lambda: Problem(("car", "bus")).add("range", ("car", "buss"), 5.0, std=1.0), "Did you mean bus"),
     "unknown index": (lambda: Problem(("a",), (Factor("position", [[3]], [[0, 0, 0]], std=1.0),)), "index < 1"),
     "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "two different points"),
     "unknown kind": (lambda: PAIR.add("doppler", ("a", "b"), 5.0, std=1.0), "spherical"),
@@ -156,6 +157,10 @@ BAD = {
     "separator twice": (lambda: Problem(("a", "b"), separator=(0, 0)), "twice"),
     "x0 not finite": (lambda: Problem(("a",), x0=[[np.nan, 0, 0]]), "x0 = not finite"),
     "shape of x": (lambda: PAIR.cost([0, 0, 0]), r"x = shape \(3,\)"),
+    "misspelt point": (
+        lambda: solve(Problem(("car",)).add("position", ["car"], [[0, 0, 0]], std=1.0))["carr"],
+        "mean car",
+    ),
     "unknown point": (lambda: solve(PAIR)["c"], "must be one of a, b"),
     "iterations": (lambda: solve(PAIR, max_iterations=2.5), "max_iterations = 2.5"),
     "tolerance": (lambda: solve(PAIR, tolerance=float("nan")), "tolerance = nan"),

@@ -140,8 +140,8 @@ def test_matrices_are_coras(name: str) -> None:
     S[:c, :c] -= L.dense
     assert pytest.approx(expected("S_rand"), abs=1e-6) == S
     assert L.sparse.toarray() == pytest.approx(L.dense)
-    slope = np.concatenate([tangent(form, Y[:c], gradient[:c]), gradient[c:]])
-    assert slope == pytest.approx(expected("expected_rgrad"), abs=1e-7)
+    gradient_ = np.concatenate([tangent(form, Y[:c], gradient[:c]), gradient[c:]])
+    assert gradient_ == pytest.approx(expected("expected_rgrad"), abs=1e-7)
     bent = S @ expected("rand_dX")
     bent[:c] = tangent(form, Y[:c], bent[:c])
     assert bent == pytest.approx(expected("hessProd"), rel=1e-7, abs=1e-6)
@@ -328,15 +328,15 @@ def test_what_has_no_relaxation_is_refused() -> None:
 
 
 def test_priors_and_fixes_in_the_worlds_frame_place_poses() -> None:
-    """pose_chordal and held say the same where the prior is stiff; isotropic fixes among poses are exact."""
+    """pose_chordal and fixed agree where the prior is strong; isotropic fixes among poses are exact."""
     problem = two_robots(1, noise=0.3)
     assert problem.x0 is not None
-    stiff = problem.add("pose_chordal", "A0", problem.x0[0], [1e-2] * 6)
-    free, held = shor(stiff), shor(replace(problem, fixed=(0,)))
+    strong = problem.add("pose_chordal", "A0", problem.x0[0], [1e-2] * 6)
+    free, held = shor(strong), shor(replace(problem, fixed=(0,)))
     assert free.lower_bound == pytest.approx(held.lower_bound, rel=1e-5)
     assert free.solution is not None
     assert held.solution is not None
     assert free.solution.x == pytest.approx(held.solution.x, abs=1e-4)
-    assert free.solution.cost == pytest.approx(brute(stiff, starts=8, spread=6.0), rel=1e-5)
+    assert free.solution.cost == pytest.approx(brute(strong, starts=8, spread=6.0), rel=1e-5)
     fixed = problem.add("position", [0, 2, 5], problem.x0[[0, 2, 5], :2], 0.5)
     assert solve(replace(fixed, x0=shor(fixed).x)).cost == pytest.approx(brute(fixed, starts=8, spread=6.0), rel=1e-5)

@@ -28,8 +28,8 @@ def test_losses_and_weights_are_gtsams(name: str, scale: float) -> None:
     ours, theirs = Loss(name, scale), GTSAMS[name].Create(scale)
     assert ours.cost(r**2) == pytest.approx([2 * theirs.loss(v) for v in r], rel=1e-12)
     assert ours.weight(r**2) == pytest.approx([theirs.weight(v) for v in r], rel=1e-12)
-    slope = (ours.cost(r[1:] ** 2 + 1e-6) - ours.cost(r[1:] ** 2 - 1e-6)) / 2e-6
-    assert ours.weight(r[1:] ** 2) == pytest.approx(slope, rel=1e-4, abs=1e-8)
+    gradient_ = (ours.cost(r[1:] ** 2 + 1e-6) - ours.cost(r[1:] ** 2 - 1e-6)) / 2e-6
+    assert ours.weight(r[1:] ** 2) == pytest.approx(gradient_, rel=1e-4, abs=1e-8)
 
 
 def native(seed: int, wrong: int = 0, loss: Loss | None = None) -> Problem:
@@ -78,11 +78,11 @@ def test_a_robust_problem_costs_what_it_costs_in_gtsam(name: str) -> None:
     x = problem.x0 + np.random.default_rng(1).normal(0, 0.5, (12, 3))
     assert problem.cost(x) == pytest.approx(gtsams(problem).error(values(x)), rel=1e-12)
     r, J = problem.whiten(x)
-    slope = approx_fprime(x.ravel(), lambda flat: problem.cost(flat.reshape(-1, 3)), 1e-6)
-    assert J.T @ r == pytest.approx(slope, abs=2e-3 * np.abs(slope).max())
+    gradient_ = approx_fprime(x.ravel(), lambda flat: problem.cost(flat.reshape(-1, 3)), 1e-6)
+    assert J.T @ r == pytest.approx(gradient_, abs=2e-3 * np.abs(gradient_).max())
 
 
-def sighted(name: str, seed: int) -> Problem:
+def observed(name: str, seed: int) -> Problem:
     """Two points among four that are held, by robust measurements of one number each, a third of them wrong."""
     rng = np.random.default_rng(seed)
     anchors = np.array([[0, 0, 0], [30, 0, 2], [0, 30, 4], [30, 30, 9.0]])
@@ -106,7 +106,7 @@ def geman_mcclure(s: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("seed", range(3))
 def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
     """SciPy's own huber and cauchy (elementwise, rho of (r / C)^2 times C^2), its solver and differences."""
-    problem = sighted(name, seed)
+    problem = observed(name, seed)
     plain = replace(problem, factors=tuple(replace(f, loss=None) for f in problem.factors))
 
     def residual(free: np.ndarray) -> np.ndarray:

@@ -138,8 +138,8 @@ def covariance(own: Floats, vectors: Floats, fix: Floats, received: tuple[int, .
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_greedy_choice_is_the_best_of_all(seed: int) -> None:
-    """Every subset of four neighbours by brute force: each pick lowers the trace most of all that are left, by as much
-    as it says, and two picks are within a hundredth of the best pair."""
+    """Every subset of four neighbours by brute force: each pick lowers the trace most of all that are left, by its
+    utility, and two picks are within a hundredth of the best pair."""
     rng = np.random.default_rng(seed)
     places = [[0.0, 0, 0], *(rng.uniform(-20, 20, (4, 3)) * [1, 1, 0.1]).tolist()]
     sensors, channel = replace(S2, gnss_std=(2.0, 3.0, 5.0)), V2X(4, radius=100.0, schedule=INFORMATIVE)
@@ -175,7 +175,7 @@ def test_the_greedy_choice_is_the_best_of_all(seed: int) -> None:
 
 def test_what_the_receiver_knows_is_what_a_filter_knows(crossing: Fleet) -> None:
     """Against filterpy: the ego's own fixes, and the vector to a neighbour whose messages arrive at steps 1, 2 and 6,
-    forgotten 0.35 s later, and out of sight at step 8."""
+    forgotten 0.35 s later, and not measured at step 8."""
     seen = observe(crossing.between(0, 12), S2, V2X(7, radius=1e3, max_age=0.35, schedule=INFORMATIVE))
     link = seen.links.of(0)
     link = link[(seen.links.step[link] != 8) | (seen.links.neighbour[link] != 3)]

@@ -129,11 +129,11 @@ def test_spoofed_neighbours_are_unmasked(formation: Fleet) -> None:
     """A rigid ring of ten: the robust estimate stays near the clean one where least squares is metres off."""
     fleet = formation.between(0, 10)
     clean = observe(fleet, S2, V2X.ideal(10), runs=8, observers=[0])
-    lies = spoofed(clean, 0.2, honest=[0])
+    attacked = spoofed(clean, 0.2, honest=[0])
     plain, robust = CooperativeMAP(window=5), CooperativeMAP(window=5, robust="truncated")
     at_best = rt_le(plain(clean, [0]), fleet).mean()
-    assert rt_le(plain(lies, [0]), fleet).mean() > 5 * at_best
-    assert rt_le(robust(lies, [0]), fleet).mean() < 1.3 * at_best
+    assert rt_le(plain(attacked, [0]), fleet).mean() > 5 * at_best
+    assert rt_le(robust(attacked, [0]), fleet).mean() < 1.3 * at_best
     assert rt_le(robust(clean, [0]), fleet).mean() < 1.05 * at_best
     trusting = replace(robust, threshold=1 - 1e-12)(clean, [0])
     assert trusting.x == pytest.approx(plain(clean, [0]).x, abs=1e-3)
@@ -147,7 +147,7 @@ def test_the_egos_own_fixes_may_be_outliers(formation: Fleet) -> None:
     gnss[:, :, 0] += 30.0
     velocity[:, :, 0] += 60.0
     sure = CooperativeMAP(window=4, robust="truncated")
-    unsure = replace(sure, suspect_ego=True)
+    unsure = replace(sure, ego_candidates=True)
     for wrong in (replace(clean, gnss=gnss), replace(clean, velocity=velocity)):
         assert rt_le(unsure(wrong, [0]), fleet).mean() < 1.6 * rt_le(sure(clean, [0]), fleet).mean()
         assert rt_le(unsure(wrong, [0]), fleet).mean() < 0.7 * rt_le(sure(wrong, [0]), fleet).mean()
@@ -159,7 +159,7 @@ def test_where_every_fix_is_rejected_all_of_them_count(formation: Fleet) -> None
     gnss = clean.gnss.copy()
     gnss[:, ::2, 0] += 200.0
     torn = replace(clean, gnss=gnss)
-    track = CooperativeMAP(window=3, robust="truncated", suspect_ego=True)(torn, [0])
+    track = CooperativeMAP(window=3, robust="truncated", ego_candidates=True)(torn, [0])
     assert track.x == pytest.approx(CooperativeMAP(window=3)(torn, [0]).x, abs=1e-6)
     assert track.notes == ("5 problems whose GNC weights rejected every fix were solved with all of them",)
 

@@ -84,25 +84,25 @@ def test_a_net_step_by_step_is_its_track(known: bool, crossing: Fleet) -> None:
         np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-5)
 
 
-def sightings(recording: Recording, box: Inbox, run: int, t: int) -> list[RelativeMeasurement]:
-    """What an ego sees at step t, with the messages that are new to it, as a `Recording` and an `Inbox` tell it."""
+def relative_measurements(recording: Recording, box: Inbox, run: int, t: int) -> list[RelativeMeasurement]:
+    """What an ego sees at step t, with the messages that are new to it, from a `Recording` and an `Inbox`."""
     seen = []
     for k in range(box.start[t], box.start[t + 1]):
         link = box.link[k]
         j, sent = recording.links.neighbour[link], box.newest[run, k]
-        said: dict[str, Any] = {}
+        message: dict[str, Any] = {}
         if box.fresh[run, k]:
-            said = {
+            message = {
                 "gnss": recording.gnss[run, sent, j],
                 "velocity": recording.velocity[run, sent, j],
                 "age": (t - sent) * recording.dt,
             }
-        seen.append(RelativeMeasurement(recording.ids[j], recording.relative[run, link], **said))
+        seen.append(RelativeMeasurement(recording.ids[j], recording.relative[run, link], **message))
     return seen
 
 
 def blinking(recording: Recording) -> Recording:
-    """The recording with a fifth of its sightings left out."""
+    """The recording with a fifth of its relative measurements left out."""
     kept = np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2
     links = Links(*(part[kept] for part in (recording.links.step, recording.links.observer, recording.links.neighbour)))
     return replace(recording, links=links, relative=recording.relative[:, kept], arrival=recording.arrival[:, kept])
@@ -119,15 +119,15 @@ CHANNELS = {
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("exact", [True, False])
 def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: Fleet) -> None:
-    """Neighbours come and go, a fifth of the sightings fails, and some are seen without a message; the track comes from
-    the recording's inbox."""
+    """Neighbours come and go, a fifth of the measurements fails, and some are seen without a message; the track comes
+    from the recording's inbox."""
     recording = blinking(observe(crossing, S2, CHANNELS[channel], runs=2))
     assert len(set(recording.neighbours(0).tolist())) > 2
     method = JointFilter("nominal", exact=exact)
     track, box = method(recording, [0]), inbox(recording, 0, method.message)
     stream = JointFilter(NoiseModel.nominal(recording.sensors), exact).start(max_age=recording.v2x.max_age)
     for t in range(len(recording.t)):
-        seen = sightings(recording, box, 1, t)
+        seen = relative_measurements(recording, box, 1, t)
         x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
         np.testing.assert_allclose(x, track.x[1, t, 0], atol=1e-12)
         np.testing.assert_allclose(cov, track.covariance[1, t, 0], atol=1e-12)
@@ -166,7 +166,7 @@ def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(method: Any
 
 @pytest.mark.parametrize("name", ["identity", "nominal", "fitted", "okf", "joint", "edge"])
 def test_a_missing_fix_has_infinite_variance(name: str) -> None:
-    """Against filterpy's update with a variance of 1e18 m^2, whatever the fix says."""
+    """Against filterpy's update with a variance of 1e18 m^2, whatever the fix."""
     stream = STARTS[name]()
     _, before = stream.step(Z, U, 0.1)
     x, cov = stream.step([np.nan] * 3, U, 0.1)
@@ -316,7 +316,7 @@ def test_bad_starts_are_named() -> None:
         oracle.start()
 
 
-def test_bad_sightings_are_named() -> None:
+def test_bad_relative_measurements_are_named() -> None:
     with pytest.raises(InputError, match=r"^relative = "):
         RelativeMeasurement("b", [-1.0, 0.0, 1.5])
     for field, wrong in {
@@ -334,7 +334,7 @@ def test_bad_sightings_are_named() -> None:
 
 
 def test_neighbours_help_while_the_fix_is_missing() -> None:
-    """A tunnel for the ego only: a sighting of a vehicle with fixes keeps its covariance bounded, alone it grows."""
+    """A tunnel for the ego only: a measurement of a vehicle with fixes keeps its covariance bounded, alone it grows."""
     known = NoiseModel.nominal(Sensors())
     helped, alone = (JointFilter(known).start() for _ in range(2))
     assert isinstance(helped, StarStream)

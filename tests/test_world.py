@@ -170,9 +170,9 @@ def test_loss_delay_rate_and_cap_act_on_messages(formation: Fleet) -> None:
     cap = observe(fleet, S2, V2X(max_neighbours=4, bytes_per_second=640), runs=1, observers=[0])
     capped = inbox(cap, 0, FIX_AND_VELOCITY)
     assert capped.received_bytes[0] == 640 * (19.9 + 1)  # 199 steps, and the bucket that was full
-    heard = [capped.fresh[0, cap.links.neighbour[capped.link] == j].mean() for j in np.unique(cap.links.neighbour)]
-    assert max(heard) > 0.9  # the nearest is heard, the farthest pays
-    assert min(heard) < 0.1
+    received = [capped.fresh[0, cap.links.neighbour[capped.link] == j].mean() for j in np.unique(cap.links.neighbour)]
+    assert max(received) > 0.9  # the nearest is heard, the farthest pays
+    assert min(received) < 0.1
 
 
 def test_a_fix_is_fresh_once(crossing: Fleet) -> None:

@@ -1,1 +1,1 @@
-"""What a Track is worth: errors, consistency, bounds and intervals."""
+"""Evaluation of a Track: errors, consistency, bounds and intervals."""

@@ -1,4 +1,4 @@
-"""Errors of trajectories whose frame is free: the best rigid motion onto the truth, and what is left."""
+"""Errors of trajectories whose frame is free: the best rigid motion onto the truth, and the residual."""
 
 from __future__ import annotations
 

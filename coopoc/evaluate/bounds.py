@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import Floats, Ints, checked
 from ..errors import InputError
 from ..methods.drift_state import drifting, require_white
+from ..plugins import unknown
 from ..world.fleet import Fleet
 from ..world.links import Links
 from ..world.sensing import find_links
@@ -54,7 +55,7 @@ def posterior_bound(
     """
     v2x = _checked(sensors, v2x)
     if information not in ("star", "fleet"):
-        raise InputError("information", repr(information), "must be 'star' or 'fleet'", "For solo give K = 0.")
+        raise unknown("information", information, ("star", "fleet"), "For solo give K = 0.")
     column = fleet.index(ego)
     if not fleet.present[:, column].all():
         raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")

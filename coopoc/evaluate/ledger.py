@@ -130,7 +130,7 @@ def of_training(
 
 
 def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
-    """The ledger of a drive: what the egos of a track broadcast and received.
+    """The ledger of a drive: the messages that the egos of a track broadcast and received.
 
     Args:
         track: with its bytes on air.

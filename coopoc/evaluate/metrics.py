@@ -57,7 +57,7 @@ def max_error(track: Track, fleet: Fleet) -> Floats:
 
 
 def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
-    """Error of what the egos think of their neighbours, sqrt(mean over links |x_j - truth_j|^2), (R, E) m.
+    """Error of the egos' estimates of their neighbours, sqrt(mean over links |x_j - truth_j|^2), (R, E) m.
 
     NaN where an ego has no neighbour or the method does not estimate them.
     """

@@ -56,7 +56,7 @@ def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, 
 
 
 def paired_difference(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
-    """Mean of a - b on the same egos and runs, with its interval: what the two share cancels.
+    """Mean of a - b on the same egos and runs, with its interval: common noise cancels.
 
     Args:
         a: (E, R) or (R,) of one metric, the same draws in the same places.

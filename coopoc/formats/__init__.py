@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..errors import InputError
+from ..plugins import suggestion
 from .g2o import read_g2o, write_g2o
 from .graph import Graph
 from .pyfg import read_pyfg, write_pyfg
@@ -37,5 +38,6 @@ def write_graph(graph: Graph, path: str | Path) -> None:
 def _suffix(path: str | Path) -> str:
     suffix = Path(path).suffix
     if suffix not in GRAPHS:
-        raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", "Rename or convert the file.")
+        hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
+        raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)
     return suffix

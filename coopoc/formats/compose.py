@@ -1,4 +1,4 @@
-"""Graph -> lines: what the writers of PyFG and g2o share."""
+"""Graph -> lines: shared by the writers of PyFG and g2o."""
 
 from __future__ import annotations
 

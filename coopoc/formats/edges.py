@@ -1,4 +1,4 @@
-"""What a graph file measures: poses, points and ranges between the vertices that it names."""
+"""Measurements of a graph file: poses, points and ranges between the vertices that it names."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge m
 
 
 class Edges:
-    """What the three kinds share: read-only arrays with one row per measurement, NaN for a stamp that is not given."""
+    """Base of the three kinds: read-only arrays with one row per measurement, NaN for a stamp that is not given."""
 
     nodes: Ints
     stamps: Floats

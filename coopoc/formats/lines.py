@@ -36,7 +36,7 @@ def to_numbers(file: str, lines: Sequence[int], words: Sequence[Sequence[str]], 
         file: name and (M,) line numbers, for messages.
         lines: name and (M,) line numbers, for messages.
         words: (M, columns).
-        form: what a line must look like, for messages.
+        form: of a line, for messages.
 
     Raises:
         InputError: another number of words, a word that is no number or not a finite one, with its line.

@@ -1,4 +1,4 @@
-"""Records -> Graph: what the readers of PyFG and g2o share."""
+"""Records -> Graph: shared by the readers of PyFG and g2o."""
 
 from __future__ import annotations
 

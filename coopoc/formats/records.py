@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 from ..errors import InputError
+from ..plugins import suggestion
 from .edges import ENDS
 from .lines import wrong
 
@@ -33,7 +34,7 @@ class Record:
 
     @property
     def ends(self) -> tuple[str, ...]:
-        """What the vertices must be."""
+        """Kinds of the vertices."""
         return ENDS.get(self.kind, (self.kind,))
 
     @property
@@ -77,7 +78,7 @@ class Grammar:
     others: tuple[str, ...] = ()
 
     def form(self, tag: str) -> str:
-        """What a line with a tag looks like."""
+        """Form of a line with a tag."""
         record = self.records[tag]
         one = "variance" if self.noise == "covariance" else "information"
         triangle = f"and the {record.size * (record.size + 1) // 2} numbers of the {self.noise}'s upper triangle"
@@ -107,8 +108,9 @@ def collect(file: str, lines: Iterable[tuple[int, list[str]]], grammar: Grammar)
         tag = words[0]
         record = grammar.records.get(tag)
         if record is None:
-            known = ", ".join([*grammar.records, *grammar.others])
-            raise InputError(f"{file}: line {number}", tag, f"must be one of {known}", "Remove or convert the line.")
+            known = [*grammar.records, *grammar.others]
+            hint = suggestion(tag, known, "Remove or convert the line.")
+            raise InputError(f"{file}: line {number}", tag, f"must be one of {', '.join(known)}", hint)
         if record.dimension and not dimension:
             dimension, since = record.dimension, f"line {number}, {tag}"
         if record.dimension not in (0, dimension):

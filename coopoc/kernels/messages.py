@@ -1,6 +1,6 @@
 """What the last message of each member of a star holds at a step, for LANES runs side by side.
 
-The one place that says what a message means: who is in the star, where each member stood in the last one, its motion
+The one place that defines a message: the members of the star, the place of each in the last one, its motion
 since then, and its position as broadcast, brought forward to now. A message that is missing or lost has held = 0, one
 whose position was used before, or has no fix, has new = 0.
 """

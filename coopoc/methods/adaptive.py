@@ -27,7 +27,7 @@ ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 
 @dataclass(frozen=True, eq=False)
 class NoiseAdaptive(ABC):
-    """What the noise-adaptive filters share; they differ in how they revise the variance r of the fixes.
+    """Base of the noise-adaptive filters, which differ in how they revise the variance r of the fixes.
 
     A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in r
     and a part from motion. When r is revised, the past is reread with it: a start at a fix that was believed too good,
@@ -114,7 +114,7 @@ class AdaptiveKalman(NoiseAdaptive):
 
 
 def velocity_note(assumed: Sensors) -> str:
-    """What is assumed of the velocity, for tables and figures.
+    """The noise model of the velocity, for tables and figures.
 
     >>> velocity_note(Sensors())
     'assumes velocity noise of 10 % of each axis, at least 0.05 m/s'

@@ -29,7 +29,7 @@ from .track import Method
 from .variational import VariationalKalman
 
 Factory = Callable[[NoiseModel | str], Method]
-"""What a method assumes about noise -> the method. A third party's entry point in `coopoc.methods` is one, too."""
+"""Noise model -> the method. A third party's entry point in `coopoc.methods` is one, too."""
 
 METHODS: Mapping[str, Factory] = {
     "gnss": lambda noise_model: GNSS(),

@@ -61,7 +61,7 @@ class CooperativeMAP:
         noise_model: "identity", "nominal" or a NoiseModel.
         robust: "truncated" or "geman-mcclure"; None for no robust loss.
         threshold: probability that the fixes of an honest neighbour in a window pass (of a robust loss).
-        suspect_ego: the ego's own fixes and its odometry may be outliers, too, each as one group. Where every fix is
+        ego_candidates: the ego's own fixes and its odometry may be outliers, too, each as one group. Where every fix is
             rejected the window's position is unobservable: it is solved with all of them, and the notes count it.
 
     References:
@@ -78,7 +78,7 @@ class CooperativeMAP:
     noise_model: NoiseModel | str = "nominal"
     robust: str | None = None
     threshold: float = 0.99
-    suspect_ego: bool = False
+    ego_candidates: bool = False
     name: str = "cooperative-map"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
@@ -122,7 +122,7 @@ class CooperativeMAP:
         freedom = 3.0 * np.maximum(np.arange(self.window + 1), 1)
         bound = 2.0 * gammaincinv(0.5 * freedom, self.threshold)
         rounds = ROUNDS if self.robust else 0
-        return GNC(bound, self.robust == "truncated", self.suspect_ego, RATE, EASY, SETTLED, rounds)
+        return GNC(bound, self.robust == "truncated", self.ego_candidates, RATE, EASY, SETTLED, rounds)
 
     def _solve(self, problem: Problem, vehicle: Ints, counts: Counter[str]) -> tuple[Floats, Floats]:
         """Newest points (n, 3) and the ego's covariance of a window, by the backend."""
@@ -143,10 +143,10 @@ class CooperativeMAP:
 
     def _weighted(self, problem: Problem, vehicle: Ints, counts: Counter[str]) -> Problem:
         """The problem with the GNC weights of its candidates: the fixes of each vehicle, and the ego's odometry."""
-        fixes = np.flatnonzero(vehicle != vehicle[0]) if not self.suspect_ego else np.arange(len(vehicle))
+        fixes = np.flatnonzero(vehicle != vehicle[0]) if not self.ego_candidates else np.arange(len(vehicle))
         candidates: Candidates = [(0, fixes.tolist())]
         groups = vehicle[fixes]
-        if self.suspect_ego and len(problem.separator) > 1:
+        if self.ego_candidates and len(problem.separator) > 1:
             own = np.flatnonzero(np.isin(problem.factors[1].nodes[:, 0], problem.separator))
             candidates = [*candidates, (1, own.tolist())]
             groups = np.concatenate([groups, np.full(len(own), -1)])

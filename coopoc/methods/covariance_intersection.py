@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ..errors import InputError
 from ..kernels.intersection import follow
+from ..plugins import unknown
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
@@ -55,7 +55,7 @@ class CovarianceIntersection:
 
     def __post_init__(self) -> None:
         if self.criterion not in ("trace", "det"):
-            raise InputError("criterion", repr(self.criterion), "must be 'trace' or 'det'", "Pick one.")
+            raise unknown("criterion", self.criterion, ("trace", "det"))
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.

@@ -1,4 +1,4 @@
-"""What all cooperative methods share: each ego opens its inbox, follows its star, and fills its part of the Track."""
+"""The loop of all cooperative methods: each ego opens its inbox, follows its star, and fills its part of the Track."""
 
 from __future__ import annotations
 

@@ -13,6 +13,7 @@ from ..optimize.backend import require_backend
 from ..optimize.factor import Factor
 from ..optimize.incremental import FixedLag
 from ..optimize.problem import Problem
+from ..plugins import unknown
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -66,7 +67,7 @@ class FixedLagSmoother:
         if self.lag != int(self.lag) or self.lag < 0:
             raise InputError("lag", self.lag, "must be a whole number >= 0", "Use 0 for the filter.")
         if self.backend not in BACKENDS:
-            raise InputError("backend", repr(self.backend), f"must be one of {BACKENDS}", "Leave it out.")
+            raise unknown("backend", self.backend, BACKENDS, "Leave it out.")
         require_backend(self.backend)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
@@ -126,7 +127,7 @@ def read(found: Any, box: Inbox, run: int, t: int, estimate: Any) -> None:
 def _piece(
     horizon: Any, recording: Recording, box: Inbox, known: NoiseModel, which: tuple[int, int, bool], names: Any
 ) -> Problem:
-    """What a step adds in a run: its members' fixes, motions from the step before, and relative measurements."""
+    """Measurements of a step in a run: its members' fixes, motions from the step before, and relative measurements."""
     (run, t, exact), (before, here) = which, names
     newest = steps_of(horizon.window, recording, box, run, (t, t))[0]
     problem = window_problem(horizon, [newest], known, exact, run, (t, t))

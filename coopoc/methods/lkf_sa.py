@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from ..errors import InputError
 from ..kernels.lkf_sa import follow
+from ..plugins import unknown
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -44,7 +44,7 @@ class LKFSA:
     def __post_init__(self) -> None:
         for field, allowed in (("transition", ("identity", "ones")), ("membership", ("keep", "reset"))):
             if getattr(self, field) not in allowed:
-                raise InputError(field, repr(getattr(self, field)), f"must be one of {allowed}", "Pick one.")
+                raise unknown(field, getattr(self, field), allowed)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""

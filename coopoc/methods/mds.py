@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
+from ..plugins import unknown
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -57,7 +58,7 @@ class MDS:
             if value != int(value) or value < 0:
                 raise InputError(field, value, "must be a whole number >= 0", "Use 0 for none.")
         if self.missing not in ("paths", "angles"):
-            raise InputError("missing", repr(self.missing), "must be 'paths' or 'angles'", "Pick one.")
+            raise unknown("missing", self.missing, ("paths", "angles"))
 
     @property
     def message(self) -> Message:

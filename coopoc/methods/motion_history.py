@@ -1,4 +1,4 @@
-"""How a vehicle moved lately, by dead reckoning, and the checks of what a stream is given."""
+"""Recent motion of a vehicle by dead reckoning, and the checks of a stream's inputs."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class MotionHistory:
         """A fix of `age` seconds ago moved to now, (3,) m, NaN for none, and the variance of that motion, (3,) m^2.
 
         Raises:
-            InputError: an age that is negative, or beyond what is kept.
+            InputError: an age that is negative, or beyond the history.
         """
         fix, moved, late = fix_or_none(gnss), np.zeros(3), np.zeros(3)
         if not np.isnan(fix).all():

@@ -1,4 +1,4 @@
-"""NoiseModel: what a filter assumes about the noise. It is an axis of every study, never a hidden default."""
+"""NoiseModel: the noise that a filter assumes. It is an axis of every study, never a hidden default."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..plugins import suggestion
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.sensors import Sensors
@@ -70,7 +71,7 @@ class NoiseModel:
         measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them.
 
         Args:
-            recording: what the training vehicles measured.
+            recording: of the training vehicles.
             fleet: their true motion.
         """
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
@@ -139,7 +140,11 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
         "noise_model",
         repr(noise_model),
         "must be 'identity', 'nominal' or a NoiseModel",
-        "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
+        suggestion(
+            noise_model,
+            ("identity", "nominal"),
+            "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
+        ),
     )
 
 

@@ -8,7 +8,7 @@ from ..arrays import Floats
 
 
 def complete(measured: Floats, guess: Floats | None = None) -> Floats:
-    """All distances: the mean of what the two ends measured; where neither did, a guess or the shortest path.
+    """All distances: the mean of the two ends' measurements; where neither did, a guess or the shortest path.
 
     Args:
         measured: (B, n, n) m, NaN where i has not measured j; measured pairs must connect all.

@@ -28,7 +28,7 @@ POSITION = (0.0,) * 3
 
 @dataclass(frozen=True, eq=False)
 class StarStep:
-    """What one ego knows at one step of the n members of its star, itself first.
+    """Information of one ego at one step about the n members of its star, itself first.
 
     Args:
         step: t.
@@ -127,7 +127,7 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 
 
 def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
-    """What a filter assumes of them, as `coopoc.kernels.messages.Assumptions`: a message holds a fix and a velocity,
+    """The noise that a filter assumes, as `coopoc.kernels.messages.Assumptions`: a message holds a fix and a velocity,
     whose error the fix of `age` steps ago has made age times."""
     velocity_noise, fixes = known.velocity_noise, np.ascontiguousarray(known.fix_variance(recording))
     process = np.zeros((1, 1, 1, 3)) if len(velocity_noise) else np.ascontiguousarray(known.process_variance(recording))
@@ -189,7 +189,7 @@ def held_motion(
 
 
 def _when_sent(variance: Floats, members: Ints, sent: Ints, t: int) -> Floats:
-    """(R or 1, n or 1, 3) of what is assumed of each fix, broadcastable to (R, T, N, 3), when it was sent."""
+    """(R or 1, n or 1, 3) assumed variance of each fix, broadcastable to (R, T, N, 3), when it was sent."""
     if variance.shape[:3] == (1, 1, 1):
         return np.asarray(variance[0])
     runs = np.arange(len(sent))[:, None]

@@ -1,4 +1,4 @@
-"""Streaming with neighbours: the star around one vehicle, fed step by step with what it measures and receives."""
+"""Streaming with neighbours: the star around one vehicle, fed step by step with measurements and messages."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class StarStream:
     that is measured but whose messages never arrive, nothing is assumed.
 
     Args:
-        known: what the filter assumes.
+        known: the noise model.
         refine: one Gauss-Newton step on range and angles.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
         interval: s, dt of the recordings that the assumed process noise belongs to.
@@ -137,7 +137,7 @@ class StarStream:
             velocity: (3,) m/s of the ego, the mean over the step.
             dt: s since the last step.
             fix_age: s, of the fix.
-            neighbours: what is measured now, once each.
+            neighbours: the relative measurements of now, one for each neighbour.
 
         Raises:
             InputError: as `Stream.step`; a neighbour that is given twice. The filter is then as it was before.

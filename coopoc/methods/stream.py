@@ -38,7 +38,7 @@ class Solo(Protocol[State]):
 
 
 class Stream(Generic[State]):
-    """A solo filter of one's own, fed step by step: `step` takes what is new and returns the estimate.
+    """A solo filter of one's own, step by step: `step` takes the new measurements and returns the estimate.
 
     Args:
         solo: the filter.
@@ -80,7 +80,7 @@ class AxisStates(NamedTuple):
 
 
 class FilterStream:
-    """A compiled solo filter, fed step by step: `step` takes what is new and returns the estimate.
+    """A compiled solo filter, step by step: `step` takes the new measurements and returns the estimate.
 
     Args:
         motion: noise of the motion.
@@ -99,7 +99,7 @@ class FilterStream:
 
     @property
     def state(self) -> AxisStates | None:
-        """What the filter carries; None before the first fix."""
+        """State of the filter; None before the first fix."""
         return None if np.isnan(self._state[0, 0]) else AxisStates(*self._state.T.copy())
 
     def step(
@@ -137,7 +137,8 @@ class FilterStream:
 
 
 def alone(noise_model: NoiseModel | str) -> NoiseModel:
-    """What a filter without a recording assumes: "identity" or a NoiseModel of constant noise, which needs none."""
+    """The noise model of a filter without a recording: "identity" or a NoiseModel of constant noise, which needs
+    none."""
     name = noise_model.name if isinstance(noise_model, NoiseModel) else noise_model
     bound = isinstance(noise_model, NoiseModel) and (
         type(noise_model) is not NoiseModel or noise_model.velocity is not None

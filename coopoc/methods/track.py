@@ -69,7 +69,7 @@ class Method(Protocol):
 
     @property
     def message(self) -> Message:
-        """What each vehicle broadcasts for it."""
+        """The message that each vehicle broadcasts."""
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos."""

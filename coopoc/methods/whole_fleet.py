@@ -1,4 +1,4 @@
-"""What the whole-fleet methods share: arrays by name for the kernels, answers that come late, bytes, the Track."""
+"""The loop of the whole-fleet methods: arrays by name for the kernels, answers that come late, bytes, the Track."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Answer(NamedTuple):
-    """What the fleet finds out at each step.
+    """Estimates of the fleet at each step.
 
     Attributes:
         x: (R, T, N, 3) m of all vehicles, of any shape.
@@ -47,7 +47,7 @@ def fleet_track(
     *,
     both_ways: bool = True,
 ) -> Track:
-    """Track of the egos from what the whole fleet finds out.
+    """Track of the egos from the whole fleet's estimates.
 
     Args:
         method: whose Track it is.

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError, MissingLibraryError
 from ..one_file import in_file
-from ..plugins import find, names
+from ..plugins import find, names, suggestion
 from .problem import Problem
 
 Options: TypeAlias = dict[str, Any]
@@ -22,7 +22,7 @@ Options: TypeAlias = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """What a solver returns and `solve` verifies; with a leading axis B where the solver was given one.
+    """Result of a solver, which `solve` verifies; with a leading axis B where the solver was given one.
 
     Args:
         x: (n, ambient) nodes, see Space.
@@ -67,7 +67,7 @@ class Capabilities:
     inequalities: bool = True
 
     def lacking(self, problem: Problem) -> list[str]:
-        """What the problem needs and these capabilities lack, in words; empty if the problem can be solved.
+        """The needs of the problem that these capabilities lack, in words; empty if the problem can be solved.
 
         >>> problem = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=0.0)
         >>> Capabilities().lacking(problem), Capabilities(constraints="linear").lacking(problem)
@@ -124,9 +124,8 @@ class Backend:
         allowed = _options(self.prepare)
         for name in options:
             if name not in allowed:
-                raise InputError(
-                    name, options[name], f"is no option of {self.name}, which has {allowed}", "Leave it out."
-                )
+                hint = suggestion(name, allowed, "Leave it out.")
+                raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"

@@ -119,6 +119,6 @@ def check() -> int:
 
 
 def _ranges() -> Problem:
-    """The same vehicles with the range alone: what a relaxation takes."""
+    """The same vehicles with the range alone, for a relaxation."""
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
     return problem.add("range", ("ego", "b"), 10.0, std=0.5)

@@ -61,7 +61,7 @@ class Constraint:
 
     @property
     def measurement(self) -> Measurement:
-        """What the constraint bounds."""
+        """The measurement that the constraint bounds."""
         return lookup(self.kind)
 
     @property

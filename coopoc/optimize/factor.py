@@ -74,7 +74,7 @@ class Factor:
 
     @property
     def measurement(self) -> Measurement:
-        """What the factor measures."""
+        """The measurement of the factor."""
         return lookup(self.kind)
 
     @cached_property

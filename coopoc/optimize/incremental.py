@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
+from ..plugins import suggestion
 from .backend import require_backend
 from .backends.gauss_newton import linear_step
 from .backends.gtsam_forms import forms
@@ -102,7 +103,7 @@ class FixedLag:
             wanted: names of the window, default those that have the newest stamp.
 
         Raises:
-            InputError: what a piece cannot have (realisations, fixed nodes, constraints), a new node without a stamp or
+            InputError: a piece with realisations, fixed nodes or constraints, a new node without a stamp or
                 older than the window, a node that changes its kind, nodes that the measurements leave free.
         """
         before = self._stamps
@@ -133,7 +134,8 @@ class FixedLag:
         names = tuple(wanted)
         for name in names:
             if name not in stamps:
-                raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", "See stamps.")
+                hint = suggestion(name, stamps, "See stamps.")
+                raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", hint)
         return self._read(names, Space(self._dimension or 3, any(self._turns[name] for name in names)))
 
     def _age(self, moments: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""What a measurement sees of its nodes, and how that changes when the nodes move."""
+"""The vector between a measurement's nodes in its frame, and its derivative by the nodes."""
 
 from __future__ import annotations
 

@@ -23,12 +23,12 @@ Formula = Callable[..., Sequence[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What a sensor sees of one node (arity 1) or of a second node from a first (arity 2).
+    """A sensor's measurement of one node (arity 1) or of a second node from a first (arity 2).
 
     Args:
         name: kind of the factors that carry it.
         arity: 1 or 2 nodes.
-        frame: what the formula gets. "world": the vector x, y, z of the point, or second - first. "body": that vector
+        frame: of the formula's vector. "world": the vector x, y, z of the point, or second - first. "body": that vector
             as the first node, a pose, sees it, R_i^T (p_j - p_i). "relative": it and the 3x3 components of R_i^T R_j;
             of one node, its own position and rotation.
         components: nature of each residual: a coordinate, a distance (m, > 0), an angle (rad, residuals wrap) or part
@@ -194,7 +194,7 @@ def measurement(
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
     if frame not in get_args(Frame):
-        raise InputError("frame", repr(frame), f"must be one of {get_args(Frame)}", 'Use "world".')
+        raise unknown("frame", frame, get_args(Frame))
     if linear and (components != ("coordinate",) * 3 or frame != "world"):
         raise InputError(
             "linear", linear, "means that the formula is the vector itself, in the world frame", "Leave it out."

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
+from ..plugins import suggestion
 from .constraint import Constraint
 from .factor import Factor
 from .inputs import numbers
@@ -54,7 +55,7 @@ def no_such_node(node: Any, names: Sequence[str]) -> InputError:
     """The error for a node that is neither a name nor an index."""
     known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     allowed = f"must be an index < {len(names)} or one of {known}"
-    return InputError("node", repr(node), allowed, "Name the point when the Problem is made.")
+    return InputError("node", repr(node), allowed, suggestion(node, names, "Name the point when the Problem is made."))
 
 
 def points(space: Space, n: int, field: str, x: npt.ArrayLike, ranks: tuple[int, ...] = (2, 3)) -> Floats:

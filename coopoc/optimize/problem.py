@@ -238,11 +238,11 @@ class Problem:
         measurements are treated as in `from_window`.
 
         Args:
-            recording: what was measured.
+            recording: of the measurements.
             step: t.
             ego: column or id.
             run: realisation, None for all R at once.
-            noise: what is assumed of it, default the recording's sensors.
+            noise: noise model, default the recording's sensors.
 
         Raises:
             InputError: unknown ego, step or run.
@@ -275,7 +275,7 @@ class Problem:
         """The problem of consecutive steps, oldest first; the ego's points are the separator (see `window_factors`).
 
         Args:
-            steps: what was measured.
+            steps: the measurements of each.
             sensors: relative noise; None: unit covariance of the converted vectors.
             names: of the points, step by step; default their numbers.
         """

@@ -10,11 +10,12 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..plugins import suggestion
 from .space import Space
 
 
 class Status(Enum):
-    """How a solve ended; the value is a sentence.
+    """Outcome of a solve; the value is a sentence.
 
     >>> print(Status.SOLVED.value)
     At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m.
@@ -81,7 +82,8 @@ class Solution:
         """(ambient,) estimate of a node by name; InputError that lists the names if there is none."""
         if point not in self.names:
             known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
-            raise InputError("point", repr(point), f"must be one of {known}", "See solution.names.")
+            hint = suggestion(point, self.names, "See solution.names.")
+            raise InputError("point", repr(point), f"must be one of {known}", hint)
         where: Floats = self.x[self.names.index(point)]
         return where
 

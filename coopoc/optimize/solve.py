@@ -64,7 +64,7 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
 
 
 def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
-    """What a backend finds, and what is true of it."""
+    """The result of a backend, and its assessment."""
     began = time.perf_counter()
     solver = backend.solver(problem, options)
     start = _start(problem)[None]
@@ -140,7 +140,7 @@ def _without_direction(problem: Problem, kind: str, nodes: Ints) -> InputError:
 
 
 def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
-    """What x is, by its assessment alone."""
+    """Status of x, by its assessment alone."""
     if truth.violation > FEASIBLE:
         return Status.INFEASIBLE
     if truth.unobservable:

@@ -22,7 +22,7 @@ Columns = list[Any]
 
 @dataclass(frozen=True)
 class Term:
-    """What the structure knows of a factor or a constraint.
+    """Structure of a factor or a constraint.
 
     Args:
         measurement: of the kind.
@@ -199,7 +199,7 @@ def _product(a: list[Columns], b: list[Columns]) -> list[Columns]:
 
 
 def _seen(known: Measurement, at: Columns, turned: list[Columns], nodes: Ints) -> Columns:
-    """What `local` gives the formula: the vector's columns and, if the frame is relative, the rotation's."""
+    """Inputs of the formula as by `local`: the vector's columns and, if the frame is relative, the rotation's."""
     first, last = nodes[:, 0].tolist(), nodes[:, -1].tolist()
     vector = [c[last] - c[first] if known.arity == 2 else c[last] for c in at]
     if known.frame == "world":

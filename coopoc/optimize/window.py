@@ -18,7 +18,7 @@ from .factor import Factor
 
 
 class Noise(Protocol):
-    """What is assumed of the noise; `coopoc.methods.NoiseModel` is one."""
+    """Protocol of a noise model; `coopoc.methods.NoiseModel` is one."""
 
     @property
     def sensors(self) -> Sensors | None:

@@ -1,1 +1,1 @@
-"""What happens on the road, and what vehicles may see of it."""
+"""The true fleet, and the measurements and messages of its vehicles."""

@@ -38,7 +38,7 @@ class Inbox:
 
 
 def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
-    """What `ego` has received when each neighbour broadcasts `message`.
+    """Messages that `ego` has received when each neighbour broadcasts `message`.
 
     Args:
         recording: the links, the sending schedule and the arrivals.

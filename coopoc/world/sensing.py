@@ -136,7 +136,7 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
 
 
 def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:
-    """What was drawn for the key, if anyone still holds it, or drawn now; read-only, so that many may hold it."""
+    """The draws of a key, shared while a recording holds them, else drawn now; read-only."""
     found = _alive.get(key)
     if found is None:
         found = draw()
@@ -244,7 +244,7 @@ def _relative_measurements(fleet: Fleet, links: Links, sensors: Sensors, runs: i
 
 
 def _heading(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
-    """(R, L) rad that the observer's wrong heading turns what it sees by."""
+    """(R, L) rad by which the observer's heading error rotates its measurements."""
     turned = np.zeros((runs, len(links)))
     for kind, std in (("heading", sensors.heading_std), ("heading_bias", sensors.heading_bias_std)):
         for column in np.unique(links.observer) if std > 0 else ():

@@ -32,7 +32,7 @@ def spoofed(
     its own false fix, too: name the egos among the honest ones.
 
     Args:
-        recording: what was measured.
+        recording: of an honest fleet.
         share: in [0, 1].
         low: m, least offset.
         high: m, largest offset.

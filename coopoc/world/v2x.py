@@ -62,7 +62,7 @@ class V2X:
 
     @classmethod
     def ideal(cls, max_neighbours: int = 6) -> V2X:
-        """Every message at every step, at once, for free: what the paper's baselines assume."""
+        """Every message at every step, at once, for free, as the paper's baselines assume."""
         return cls(max_neighbours=max_neighbours)
 
     @classmethod
@@ -94,7 +94,7 @@ class V2X:
 
 @dataclass(frozen=True)
 class Message:
-    """What a vehicle sends in one step: `rounds` messages of `numbers` float32, 4 bytes each.
+    """The messages of a vehicle in one step: `rounds` messages of `numbers` float32, 4 bytes each.
 
     Args:
         numbers: in each round.

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from coopoc.arrays import Bools, Floats
 from coopoc.errors import InputError
+from coopoc.plugins import unknown
 from coopoc.world.fleet import Fleet
 
 from .guard import screen
@@ -69,8 +70,9 @@ class Pairs(Topology):
         """The pairs; InputError for an unknown client."""
         there = np.zeros((len(names), len(names)), dtype=bool)
         for pair in self.pairs:
-            if not set(pair) <= set(names):
-                raise InputError("pairs", pair, f"must name two of {list(names)}", "See the names of the clients.")
+            for name in pair:
+                if name not in names:
+                    raise unknown("pairs", name, names)
             i, j = (list(names).index(name) for name in pair)
             there[i, j] = there[j, i] = i != j
         return there

@@ -22,7 +22,7 @@ POLL = 0.2
 
 @dataclass(frozen=True)
 class Wait:
-    """How long a round waits for answers.
+    """Time that a round waits for answers.
 
     Args:
         timeout: s, at most.

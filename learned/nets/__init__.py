@@ -1,1 +1,1 @@
-"""What is trained: nets that filter, as functions of flat weights."""
+"""Nets that filter, as functions of flat weights."""

@@ -94,7 +94,7 @@ class CooperativeGain:
 
     @property
     def message(self) -> Message:
-        """What each vehicle broadcasts."""
+        """The message that each vehicle broadcasts."""
         return SUMS if self.sums else NEWEST
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:

@@ -1,4 +1,5 @@
-"""What a net is to training, federation, checkpoints, streams and studies: `Gain`, and `Recurrent` for one by steps.
+"""Protocol of a net for training, federation, checkpoints, streams and studies: `Gain`, and `Recurrent` for one by
+steps.
 
 A net of your own is one class in one file. Subclass `Recurrent` and write
 

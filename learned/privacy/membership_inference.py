@@ -31,7 +31,7 @@ FALSE_POSITIVES = 0.01
 
 @dataclass(frozen=True)
 class AttackResult:
-    """How well scores separate members from others.
+    """Separation of members from others by scores.
 
     Args:
         auc: area under the ROC curve; 0.5 is chance.

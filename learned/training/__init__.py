@@ -1,1 +1,1 @@
-"""How nets are trained: clients and their pieces, schedules, the loop."""
+"""Training of nets: clients and their pieces, schedules, the loop."""

@@ -28,8 +28,8 @@ OPTIMISERS = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam, "adamw": torch.o
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one literal training ended: the optimiser steps that stayed finite, and the best validation loss, m^2, of the
-    checks on the way (the constant-gain filter has about 0.37 on the bundled clients)."""
+    """Outcome of one literal training: the optimiser steps that stayed finite, and the best validation loss, m^2, of
+    the checks on the way (the constant-gain filter has about 0.37 on the bundled clients)."""
 
     optimiser: str
     learning_rate: float

@@ -1,4 +1,4 @@
-"""How training uses the machine: one core per process, memory that it keeps, a line of the terminal to report on."""
+"""Resources of training: one core per process, memory that it keeps, a line of the terminal to report on."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def intersect(
 
     Args:
         own: (R, 3) m with (R, 3, 3) m^2. others: (R, k, 3) m with (R, k, 3, 3) m^2; all totals positive definite.
-        used: (R, k) False where another says nothing; its numbers must be finite all the same. criterion: of P.
+        used: (R, k) False where another sends nothing; its numbers must be finite all the same. criterion: of P.
 
     Returns:
         the fused belief, split again (P = Pd + Pi), and w (R,).
@@ -131,12 +131,12 @@ def _best_weight(root: Floats, share: Floats, criterion: Criterion) -> Floats:
     """
     runs = len(share)
     low, high = np.full(runs, LEAST), np.ones(runs)
-    at_one = _slope(high, root, share, criterion)[0] <= 0
-    at_zero = _slope(low, root, share, criterion)[0] >= 0
+    at_one = _derivative(high, root, share, criterion)[0] <= 0
+    at_zero = _derivative(low, root, share, criterion)[0] >= 0
     low, high = np.where(at_one, 1.0, LEAST), np.where(at_zero & ~at_one, LEAST, 1.0)
     w = (low + high) / 2
     for _ in range(ROUNDS):
-        first, second = _slope(w, root, share, criterion)
+        first, second = _derivative(w, root, share, criterion)
         low, high = np.where(first <= 0, w, low), np.where(first >= 0, w, high)
         newton = w - first / np.where(second > 0, second, np.inf)
         before, w = w, np.where((newton >= low) & (newton <= high), newton, (low + high) / 2)
@@ -145,18 +145,18 @@ def _best_weight(root: Floats, share: Floats, criterion: Criterion) -> Floats:
     return w
 
 
-def _slope(w: Floats, root: Floats, share: Floats, criterion: Criterion) -> tuple[Floats, Floats]:
+def _derivative(w: Floats, root: Floats, share: Floats, criterion: Criterion) -> tuple[Floats, Floats]:
     """First and second derivative (R,) of tr P or of log det P by w, from those of the information."""
     scale, bottom = _scales(w, share)
     sign = np.where(np.arange(share.shape[1]) < 3, 1.0, -1.0)
     value = np.where(share > 0, scale / bottom, 1.0)
-    information, rise, bend = _gram(
+    information, derivative, curvature = _gram(
         root, np.stack([value, sign * share / bottom**2, -2.0 * share * (1.0 - share) / bottom**3])
     )
     cov = np.linalg.inv(information)
-    climb = cov @ rise
+    climb = cov @ derivative
     outer = cov if criterion == "trace" else np.eye(3)
     twice = 2.0 if criterion == "trace" else 1.0
     first = -np.trace(climb @ outer, axis1=-2, axis2=-1)
     second = twice * np.trace(climb @ climb @ outer, axis1=-2, axis2=-1)
-    return first, second - np.trace(cov @ bend @ outer, axis1=-2, axis2=-1)
+    return first, second - np.trace(cov @ curvature @ outer, axis1=-2, axis2=-1)

@@ -30,7 +30,7 @@ DENSE = 200
 """Numbers that can move up to which fatrop is faster than ipopt: 2.0 against 3.8 ms for 165 of a window, 6.6 against
 2.3 for 330."""
 ROUNDS = 10
-"""How often the chart of the poses is moved."""
+"""Moves of the chart of the poses, at most."""
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
 METHODS = ("auto", "fatrop", "ipopt")
@@ -89,7 +89,7 @@ def fallback(problem: Problem, options: dict[str, Any]) -> dict[str, Any] | None
 
 
 def _chosen(structure: Structure, sides: tuple[Floats, Floats], method: str) -> str:
-    """What "auto" takes."""
+    """The method of "auto"."""
     if method != "auto":
         return method
     return "fatrop" if structure.movable.sum() <= DENSE and np.array_equal(*sides) else "ipopt"

@@ -31,7 +31,7 @@ FATROP = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "accepta
 
 @dataclass(frozen=True, eq=False)
 class Programme:
-    """What is built once.
+    """A programme, built once.
 
     Args:
         structure: of the problems that it solves.

@@ -24,7 +24,7 @@ from ..problem import Problem
 from .osqp_programme import CLOSE, Infeasible, Programme, filled
 
 FAR = 1e-6
-"""What a step of 1 m costs beside a violation of 1 m, where none can be avoided."""
+"""Cost of a step of 1 m over that of a violation of 1 m, where none can be avoided."""
 
 
 def prepare(
@@ -95,7 +95,7 @@ class _Limits:
     upper: Floats
 
     def around(self, x: Floats) -> tuple[Floats, Floats]:
-        """What C dx may be at x (n, ambient)."""
+        """Bounds of C dx at x (n, ambient)."""
         space, constraints = self.problem.space, self.problem.constraints
         seen = [local(space, c.measurement, x[None], c.nodes)[0][0][bounded(c)] for c in constraints]
         value = np.concatenate([np.empty(0), *seen])

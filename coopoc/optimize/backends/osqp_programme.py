@@ -42,13 +42,13 @@ BOUNDED = {
     "polish_refine_iter": 10,
     "adaptive_rho": 1,
 }
-"""What changes where there are constraints."""
+"""Settings that change under constraints."""
 NEGLIGIBLE = 1e-11
 """m, an error of a coordinate that no tolerance asks to be smaller."""
 CLOSE = 1e-9
 """m, by which a bound may be missed."""
 REPAIRS = 5
-"""How often a quadratic programme is continued before its answer is refused."""
+"""Continuations of a quadratic programme before its answer is refused."""
 
 
 class Infeasible(np.linalg.LinAlgError):
@@ -79,7 +79,7 @@ class Workspace:
             lower, upper = self._finite(lower), self._finite(upper)
         self.solver.update_data_vec(q, lower, upper)
         self.solver.update_data_mat(values, None, None, None)
-        if lower is None:  # the workspace is kept: what it has solved before shall not show
+        if lower is None:  # the workspace is kept: earlier solves must not show
             self.solver.warm_start(self._zero, None)
 
     def polish(self, wanted: bool) -> None:

@@ -19,7 +19,7 @@ TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Certificate:
-    """What is known of a solution's cost against the smallest cost of any point.
+    """Bounds of a solution's cost against the smallest cost of any point.
 
     Args:
         certified: no point has a cost smaller by more than the tolerance.
@@ -27,7 +27,7 @@ class Certificate:
         cost: of the solution.
         lower_bound: no point has a smaller cost.
         smallest_eigenvalue: of C - L.
-        surrogate: what was replaced; all the above then is about the surrogate and its own minimum.
+        surrogate: the replaced factors; all the above then is about the surrogate and its own minimum.
     """
 
     certified: bool

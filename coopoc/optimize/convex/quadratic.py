@@ -202,9 +202,9 @@ TERMS: dict[str, Callable[[_Place, Factor, Any], Terms]] = {
     "pose_chordal": _pose,
     "relative_pose_chordal": _relative_pose,
 }
-"""What has this form."""
+"""Measurements of this form."""
 WORLD = ("position", "displacement", "pose_chordal")
-"""What is measured in the world's frame."""
+"""Measurements in the world's frame."""
 
 
 def _weights(factor: Factor, d: int) -> tuple[Floats, Floats]:

@@ -20,7 +20,7 @@ DENSE = 500
 
 
 class Reduced(Protocol):
-    """What the solvers on the constrained rows need."""
+    """Data of the solvers on the constrained rows."""
 
     def times(self, X: Floats) -> Floats:
         """C X."""

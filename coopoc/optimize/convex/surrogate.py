@@ -16,7 +16,7 @@ from .quadratic import TERMS, one_weight
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:
-    """The problem to relax, and a line per kind that was replaced: what is certified is this problem, not the first."""
+    """The problem to relax, and a line per kind that was replaced: this problem is certified, not the first."""
 
     problem: Problem
     replaced: tuple[str, ...]
