@@ -155,6 +155,10 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     monkeypatch.setattr(fleet, "SHORT", 12)
     found |= {f"fleet: {job}: {each.words}" for job, _, rows in fleet.parts() for each in rows}
     found |= {f"fleet: neighbours, {vehicles} vehicles" for vehicles, _ in fleet.SEARCHED}
+    cliffs = load("cliffs")
+    monkeypatch.setattr(cliffs, "STEPS", 4)
+    monkeypatch.setattr(cliffs, "RUNS", 1)
+    found |= {f"cliffs: {case.name}" for case in (*cliffs.method_cases(), *cliffs.stream_cases())}
     named = {name for name in baseline if not name.startswith("learned_gain: ")}
     assert named <= found
     assert {name for name in found if name.endswith((": ours", ", compiled"))} <= named
