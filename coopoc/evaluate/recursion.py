@@ -83,7 +83,7 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
 
 
 def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> Iterator[tuple[int, Floats]]:
-    """Filtering bound (3n, 3n) where fixes err for a while, which the state then holds (`Drift`).
+    """Filtering bound (3n, 3n) where fixes have time-correlated errors, which the state then holds (`Drift`).
 
     Args:
         stages: without the fixes, which do not see positions alone.

@@ -1,4 +1,4 @@
-"""The joint filter for receivers that err for a while: it estimates their errors along with the positions."""
+"""The joint filter for time-correlated errors of fixes: it estimates them along with the positions."""
 
 from __future__ import annotations
 

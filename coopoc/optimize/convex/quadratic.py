@@ -53,7 +53,7 @@ def quadratic(problem: Problem) -> Quadratic:
     position, rotation = problem.space.position(x), np.array(problem.space.rotation(x))
     if not problem.fixed:
         rotation[:] = np.eye(d)
-    rows, kept = _hold(
+    rows, kept = _substitute_fixed(
         _sparse(terms, place.size), place, np.array(problem.fixed, np.int64), position - origin, rotation
     )
     poses = np.setdiff1d(place.poses, problem.fixed)
@@ -74,7 +74,7 @@ def quadratic(problem: Problem) -> Quadratic:
     )
 
 
-def _hold(rows: Any, place: _Place, fixed: Ints, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
+def _substitute_fixed(rows: Any, place: _Place, fixed: Ints, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
     """A with the terms of fixed nodes moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to
     keep."""
     if not len(fixed):
