@@ -157,12 +157,12 @@ def _columns(table: pd.DataFrame, given: dict[str, str | int], file: str) -> dic
     for key, column in given.items():
         valid = column in headers if isinstance(column, str) else 0 <= column < len(headers)
         if key not in (*LAYOUT, "t") or not valid:
-            wrong = (column, headers) if key in (*LAYOUT, "t") else (key, (*LAYOUT, "t"))
+            wrong, near = (column, list(headers)) if key in (*LAYOUT, "t") else (key, [*LAYOUT, "t"])
             raise InputError(
                 f"{file}: columns[{key!r}]",
                 repr(column),
                 f"keys are {', '.join(LAYOUT)}, t; the file has {', '.join(headers)}",
-                suggestion(*wrong, "Name a header or give its position, counted from 0."),
+                suggestion(wrong, near, "Name a header or give its position, counted from 0."),
             )
         names[key] = column if isinstance(column, str) else headers[column]
     missing = [key for key in NEEDED if key not in names]

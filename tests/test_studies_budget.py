@@ -17,6 +17,7 @@ from coopoc.studies import budget_tables as tables
 from coopoc.studies import scene
 from coopoc.study import numbers
 from coopoc.study.tables import Table
+from coopoc.world.channels import CHANNELS
 from coopoc.world.sensing import find_links
 
 QUICK = {"runs": 2, "egos": "2", "max_neighbours": "0,2", "method": "kalman,joint,split-ci,bound"}
@@ -72,7 +73,7 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
 
 
 def test_channels_keep_their_order(results: Results) -> None:
-    error = {name: numbers.mean(results, at(channel=name)) for name in scene.CHANNELS}
+    error = {name: numbers.mean(results, at(channel=name)) for name in CHANNELS}
     assert error["ideal"] == min(error.values())  # type: ignore[type-var]
     assert numbers.mean(results, at(method="bound", noise_model="bound", channel="ideal")) is not None
 

@@ -132,10 +132,10 @@ def test_failures_come_back_as_rows_and_a_killer_ends_the_run(
 def test_a_run_ends_when_no_worker_is_left(
     study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 2.0)
+    monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 6.0)
     (tmp_path / "trouble").write_text("kill")
     worker()
-    with pytest.raises(WorkerDiedError, match="no worker is left for 2 s"):
+    with pytest.raises(WorkerDiedError, match="no worker is left for 6 s"):
         run_study(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False, cluster=scheduler)
     (tmp_path / "trouble").unlink()
     found = run_study(study, tmp_path, settings={"trouble": str(tmp_path / "trouble")}, progress=False)

@@ -39,15 +39,11 @@ def apart(function: Function) -> Function:
 
 def _within(function: Function, **options: bool) -> Function:
     """Without wrappers for callers from Python, which would be machine code of its own."""
-    made = njit(
-        nogil=True,
-        error_model="numpy",
-        fastmath={"contract"},
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        **options,
+    untyped: Any = njit
+    wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return cast(
+        Function, untyped(nogil=True, error_model="numpy", fastmath={"contract"}, **wrappers, **options)(function)
     )
-    return cast(Function, made(function))
 
 
 instructions = cast(Callable[[Callable[..., Any]], Callable[..., Any]], intrinsic)
