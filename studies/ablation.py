@@ -152,7 +152,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "ablation",
-    "What is each choice in an estimator worth: window, iterations, exact step, knowledge of the noise?",
+    "What is each choice in an estimator worth: window, iterations, exact step, noise model?",
     cell=cell,
     grid=_grid(),
     settings={

@@ -135,7 +135,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
 
 STUDY = Study(
     "aggregation",
-    "Which rule should combine the clients' nets when they are alike, differ, lie or stay away?",
+    "Which rule should combine the clients' nets when clients are alike, heterogeneous, poisoned or absent?",
     cell=cell,
     key=key,
     grid={"condition": tuple(CONDITIONS), "method": METHODS, "scenario": (1, 2)},

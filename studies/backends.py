@@ -184,7 +184,7 @@ def _findings(results: Results) -> dict[str, str]:
         "minima": f"{len(frame)} solves; {100 * frame['same'].mean():.1f} % end where SciPy's least squares does, and "
         f"{(other['cost_gap'] > 1e-6).sum()} in a worse minimum.",
         "same cost": f"{len(wrong)} have the referee's cost at another place." if len(wrong) else "",
-        "failed": f"Not at a minimum, and said so: {counts}." if counts else "",
+        "failed": f"Not at a minimum, and reported as such: {counts}." if counts else "",
     }
 
 
@@ -207,7 +207,7 @@ STUDY = lineup.study(
     tables={"agreement": _agreement, "cost": _cost},
     findings=_findings,
     limitations=(
-        "The referee is local, too: of problems with several minima it says which was found, not which is the lowest.",
+        "The referee is local, too: of problems with several minima it shows which was found, not which is the lowest.",
         "Times are of one call at a time and of this machine.",
     ),
     minutes=2,

@@ -75,14 +75,14 @@ def _pareto(results: Results) -> Plot | None:
         for panel in (left, right):
             plain_log(panel.yaxis)
             plain_log(panel.xaxis)
-        left.set(ylabel="RT-LE [m]", xlabel="Training bytes per second of driving", title="decided alone")
-        right.set(xlabel="Received while deciding, payload [B/s]", title="decided together")
+        left.set(ylabel="RT-LE [m]", xlabel="Training bytes per second of driving", title="solo")
+        right.set(xlabel="Received online, payload [B/s]", title="online cooperation")
         legend(right, drawn)
     text = (
         "RT-LE against bytes. Left: what each vehicle sends and receives in training, spread over 1, 10 and 100 hours "
         "of driving (right to left). Right: payload that an ego receives over a channel that loses nothing, at each K, "
         "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound forgets "
-        "what newcomers did before; estimates and sums tell it."
+        "what newcomers did before; estimates and sums carry it."
     )
     return Plot(figure, scene.caption(results, text))
 

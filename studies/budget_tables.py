@@ -85,10 +85,10 @@ def channels(results: Results) -> Table | None:
         ("On air [B/s]", partial(_rate, kind="on air")),
     ]
     text = (
-        f"K = {_most(results)} over channels as they are in the field: rate, latency, loss in bursts, and what a "
+        f"K = {_most(results)} over field channels (CAM, BSM, CPM): rate, latency, bursts of loss, and what a "
         "message carries anyway. Payload is what a method adds."
     )
-    head = ("Channel", "Method", "NoiseModel")
+    head = ("Channel", "Method", "Noise model")
     return crossed(results, head, rows, columns, scene.caption(results, text), decimals=3)
 
 
@@ -128,7 +128,7 @@ def schedules(results: Results) -> Table | None:
     differences = {f"{each} - {SCHEDULES[0]}": {"schedule": each} for each in SCHEDULES[1:]}
     columns = across(interval, {each: {"schedule": each} for each in SCHEDULES}) + across(less, differences)
     text = (
-        "RT-LE [m] when an ego hears no more than the cap, by whom it hears first; differences are paired, with 95 % "
+        "RT-LE [m] when an ego receives no more than the cap, by schedule; differences are paired, with 95 % "
         f"intervals. K = {_most(results)} at 10 Hz."
     )
     options: dict[str, Any] = {"best": "min", "unranked": tuple(differences), "decimals": 3}
@@ -179,12 +179,12 @@ def even(results: Results) -> Table | None:
     once = [(f"{name}, {total.per_vehicle('training') / 1e3:,.0f} kB", time(total)) for name, total in ran.items()]
     honest = [where for where in _methods(results) if ran and where["noise_model"] in ("nominal", "trained")]
     text = (
-        f"Driving time after which deciding together (K = {_most(results)}) has moved as many bytes as each training "
+        f"Driving time after which online cooperation (K = {_most(results)}) has moved as many bytes as each training "
         "moved per vehicle, once: payload, per receiver."
     )
     columns = [("Payload [B/s]", _rate), *once]
     rows = [(_labels(where), where) for where in honest]
-    return crossed(results, ("Channel", "Deciding"), rows, columns, scene.caption(results, text))
+    return crossed(results, ("Channel", "Online"), rows, columns, scene.caption(results, text))
 
 
 def ledger(results: Results) -> Table | None:
@@ -203,10 +203,10 @@ def ledger(results: Results) -> Table | None:
     text = (
         f"The ledger per vehicle: {look(method).label.lower()}, {known}, K = {k}, and the driving time after which it "
         f"has moved as many bytes as a training. Broadcast: what is sent, each message once, a server's included; per "
-        f"receiver: a copy for each that hears it. Nothing is added to the payload of a training, which goes by "
+        f"receiver: a copy for each that receives it. Nothing is added to the payload of a training, which goes by "
         f"another network."
     )
-    header = ("Channel", "Counted", "Deciding [B/s]", *ran)
+    header = ("Channel", "Counted", "Online [B/s]", *ran)
     return Table(header, tuple(body), scene.caption(results, text)) if body else None
 
 

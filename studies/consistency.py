@@ -1,4 +1,4 @@
-"""Which method's covariance can be believed: NEES of everything that claims one."""
+"""Which methods are consistent: NEES of all that claim a covariance."""
 
 from __future__ import annotations
 
@@ -89,14 +89,14 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "consistency",
-    "Which method's covariance can be believed?",
+    "Which methods are consistent?",
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "backend": "gauss-newton", "runs": 20, "train_seeds": 1},
     shares=("max_neighbours",),
     tables={"nees": _table},
     figures={"nees": _figure},
     findings=_findings,
-    limitations=("White noise over an ideal channel: what late messages, biases and lies do is in other studies.",),
+    limitations=("White noise over an ideal channel: late messages, biases and spoofing are other studies.",),
     minutes=10,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

@@ -62,7 +62,7 @@ def _grid() -> list[dict[str, Any]]:
             of(*line, receivers=which, max_neighbours=k, loss=0.0)
             for which in RECEIVERS
             for k in (0, 6)
-            for line in (*LINES[:3], ("joint", "told"))
+            for line in (*LINES[:3], ("joint", "per-fix"))
         ),
     ]
 
@@ -96,11 +96,11 @@ def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
     if p["method"] in TRAINED:
         nets: list[tuple[int, Any]] = [(s, weights.checkpoint("cooperative", p, s).model) for s in weights.seeds(p)]
         return [(seed, CooperativeGain(net, TRAINED[p["method"]], p["method"])) for seed, net in nets]
-    if p["noise_model"] != "told":
+    if p["noise_model"] != "per-fix":
         return lineup.methods(p, seen)
     process = NoiseModel.nominal(seen.sensors).process_variance(seen)
     fix = np.square(gnss_std(p, scene.fleet(p["data"])))[None]
-    known = NetNoise("told", seen.sensors, fix=fix, process=process)
+    known = NetNoise("per-fix", seen.sensors, fix=fix, process=process)
     return [(None, find("coopoc.methods", p["method"])(known))]
 
 
@@ -126,13 +126,13 @@ def recording(p: Params) -> Recording:
     return replace(seen, gnss=gnss, sensors=replace(seen.sensors, gnss_std=(mean_std,) * 3))
 
 
-HEARS = (
-    "The learned gain is told no noise of GNSS and velocity; nominal filters know it. Messages of 14 numbers (learned, "
-    "split CI) or 8 (the others)."
+INPUTS = (
+    "The learned gain is given no noise of GNSS and velocity; nominal filters know it. Messages of 14 numbers "
+    "(learned, split CI) or 8 (the others)."
 )
 BOUND = (
-    "Bounds are for the rms over runs and a channel that loses nothing; with its past, a new neighbour has also told "
-    "what it did before, as sums and split CI's estimates do."
+    "Bounds are for the rms over runs and a channel that loses nothing; with its past, a new neighbour's messages "
+    "carry what it measured before, as sums and split CI's estimates do."
 )
 METHOD = ("loss", "method", "noise_model")
 FILTERS = {**ALIKE, "method": list(dict.fromkeys(method for method, _ in LINES))}
@@ -149,7 +149,7 @@ def _table(
     kept = present(results, where, value)
     if kept is None:
         return None
-    caption = scene.caption(results, text, HEARS)
+    caption = scene.caption(results, text, INPUTS)
     return pivot(results, rows, "max_neighbours", value, kept, caption, best=None, **options)
 
 
@@ -171,7 +171,7 @@ def _figure(results: Results) -> Plot | None:
         "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs; dotted black: the bound "
         "with its past. LKF-SA lies far above."
     )
-    return panels(shown, scene.caption(results, text, HEARS, BOUND), 2.1 + 2.0 * len(shown), 3.2)
+    return panels(shown, scene.caption(results, text, INPUTS, BOUND), 2.1 + 2.0 * len(shown), 3.2)
 
 
 def _findings(results: Results) -> dict[str, str]:
@@ -195,7 +195,7 @@ def _finding(results: Results, loss: float) -> str:
 
 STUDY = lineup.study(
     "cooperative_gain",
-    "Can vehicles that tell each other how large their noise is do without knowing it, and when messages are lost?",
+    "Can vehicles that send their estimated noise do without known noise, and when messages are lost?",
     cell=cell,
     key=key,
     prepare=prepare,
@@ -223,8 +223,8 @@ STUDY = lineup.study(
             _table,
             value="rt_le_m",
             text=f"RT-LE [m] where two receivers in five have {POOR:g} m and the others {GOOD:g} m (mixed), and where "
-            f"all have {POOR:g} m in the middle third of the drive (changing); nominal filters are told the rms, "
-            "'told' ones each fix's own.",
+            f"all have {POOR:g} m in the middle third of the drive (changing); nominal filters know the rms, "
+            "'per-fix' ones the noise of each fix.",
             where={"receivers": list(RECEIVERS)},
             rows=("receivers", "method", "noise_model"),
             decimals=3,

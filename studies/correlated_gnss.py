@@ -102,7 +102,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "correlated_gnss",
-    "What is cooperation worth when GNSS errors last, so that no filter can average them out alone?",
+    "What is cooperation worth when GNSS errors are time-correlated, so that no solo filter averages them out?",
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "drift_time_s": 60.0, "runs": 30, "train_seeds": 1},
     shares=(*scene.LASTING, "max_neighbours"),

@@ -62,7 +62,7 @@ def _table(results: Results, value: str, text: str, decimals: int) -> Table | No
         for method, known in LINES
     ]
     columns = across(number, {f"{size:g}°": {"size": size} for size in DEGREES})
-    head = ("Heading error", "K", "Method", "NoiseModel")
+    head = ("Heading error", "K", "Method", "Noise model")
     return crossed(results, head, rows, columns, scene.caption(results, text, NOTE), decimals=decimals)
 
 
@@ -87,7 +87,7 @@ def _figure(results: Results) -> Plot | None:
 
 FINDING = (
     "4° of {words}, K = {k}: the joint filter goes from {none:.2f} m to {ignored:.2f} m if it takes the heading as "
-    "exact, {known:.2f} m if it is told; alone {alone:.2f} m."
+    "exact, {known:.2f} m if the error is modelled; alone {alone:.2f} m."
 )
 
 
@@ -109,7 +109,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "heading_error",
-    "How wrong may the heading be before neighbours that are seen by it do more harm than good?",
+    "How wrong may the heading be before relative measurements that depend on it do more harm than good?",
     grid=_grid(),
     settings={**scene.TOWN, "runs": 30, "train_seeds": 0},
     shares=(*KINDS, "max_neighbours"),

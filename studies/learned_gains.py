@@ -64,7 +64,7 @@ def _table(results: Results, name: str) -> Table | None:
         f"RT-LE, and its rms over runs as a multiple of the {words}. NEES: 3 is consistent; share of steps whose "
         "run-averaged NEES is in its 99 % band (gate: 0.95)."
     )
-    head = ("Method", "NoiseModel", "Velocity noise it assumes")
+    head = ("Method", "Noise model", "Velocity noise it assumes")
     return crossed(results, head, rows, columns, scene.caption(results, text, **CASES[name]), decimals=3)
 
 
@@ -132,7 +132,7 @@ STUDY = lineup.study(
     figures={"multiples": _figure},
     findings=_findings,
     limitations=(
-        "Told the noise that acts, which the others are not: the Kalman filters with nominal and oracle noise. The "
+        "The Kalman filters with nominal and oracle noise model know the acting noise, the others do not. The "
         "adaptive filters learn the noise of fixes and assume the velocity noise of the training.",
         "What was trained at 5 to 20 % and 1 to 6 m saw the noise of the tests among others; the paper's nets saw one.",
     ),

@@ -59,7 +59,7 @@ def of(method: str, known: str, /, **at: Any) -> dict[str, Any]:
     return {**at, "method": method, "noise_model": known}
 
 
-HEAD = ("Method", "NoiseModel")
+HEAD = ("Method", "Noise model")
 
 
 def labelled(pairs: Iterable[tuple[str, str]], **at: Any) -> list[tuple[tuple[str, str], dict[str, Any]]]:

@@ -142,7 +142,7 @@ def _innovations(results: Results) -> Plot | None:
 NEES: dict[str, Any] = {"wanted": _of("nominal", method=FILTERS), "best": None}
 STUDY = lineup.study(
     "neighbours",
-    "What does another neighbour buy while deciding, at what cost, and does training together replace it?",
+    "What does another neighbour gain online, at what cost, and does collaborative training replace it?",
     grid=_grid(),
     where=_meaningful,
     settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 5, "backend": "gauss-newton"},

@@ -105,8 +105,9 @@ def _transfer(results: Results) -> str:
     ):
         return ""
     return (
-        f"Fitted relative noise is the data sheet's of the training vehicles, {scene.relative(assumed)}, nobody nearer "
-        f"than {assumed.min_range:g} m; in this data it is {scene.relative(acting)}, down to {acting.min_range:g} m."
+        f"Fitted relative noise is the data sheet's of the training vehicles, {scene.relative(assumed)}, no vehicle "
+        f"nearer than {assumed.min_range:g} m; in this data it is {scene.relative(acting)}, down to "
+        f"{acting.min_range:g} m."
     )
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 EPSILONS = (1.0, 3.0, 10.0, 30.0, 100.0, math.inf)
 FLEETS = ("town10-clients", "town04")
-"""Four clients, the paper's, and sixty: the vehicles of a fleet that nobody is tested on."""
+"""Four clients, the paper's, and sixty: the vehicles of a fleet that holds no test drive."""
 LOST = 10.0
 """m, at which RT-LE is cut: the fixes alone have 6 m in scenario 2, and a filter may be 1e27 m away."""
 ATTACKS = (("client", "loss"), ("client", "gradient"), ("aggregate", "loss"))
@@ -211,7 +211,7 @@ def _grid() -> list[dict[str, Any]]:
 
 STUDY = Study(
     "privacy",
-    "What does a client-level (epsilon, delta) cost in accuracy, and what does it hide from a probe?",
+    "What does a client-level (epsilon, delta) cost in accuracy, and what does it hide from membership inference?",
     cell=cell,
     key=key,
     grid=_grid(),

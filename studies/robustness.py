@@ -76,8 +76,8 @@ def _figure(results: Results) -> Plot | None:
 
 
 FINDING = (
-    "K = {k}, 20 % spoofed: who trusts everybody has {trusting:.2f} m, who is careful {careful:.2f} m, who listens to "
-    "nobody {alone:.2f} m; without an attack care costs {cost:+.3f} m."
+    "K = {k}, 20 % spoofed: the joint filter has {trusting:.2f} m, the window with GNC {careful:.2f} m, the solo "
+    "filter {alone:.2f} m; without an attack GNC costs {cost:+.3f} m."
 )
 
 
@@ -98,7 +98,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "robustness",
-    "What do neighbours with false fixes do to those who listen, and what does it cost to be careful?",
+    "What do spoofed neighbours do to cooperative methods, and what does robustness cost?",
     grid=_grid(),
     settings={**scene.TOWN, "backend": "gauss-newton", "runs": 10, "train_seeds": 0},
     shares=("max_neighbours", "spoofed_share"),
@@ -109,7 +109,7 @@ STUDY = lineup.study(
     figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
-        "Velocities and sightings stay true: a liar who also forges its motion can be found by neither.",
+        "Velocities and relative measurements stay true: a spoofer that also forges its motion is found by neither.",
         "Spoofed vehicles do not coordinate: each has an offset of its own.",
     ),
     minutes=20,

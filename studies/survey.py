@@ -75,11 +75,11 @@ def ended(began: float, found: Mapping[str, Results], page: Path) -> int:
 
 LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
 QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "correlated_gnss": ("If errors of GNSS last?", ("own", "common")),
+    "correlated_gnss": ("If GNSS errors are time-correlated?", ("own", "common")),
     "latency_loss": ("If messages are late or lost?", ("late", "lost one by one")),
     "heading_error": ("If the heading is wrong?", ("heading_bias_deg, K = 2", "heading_bias_deg, K = 10")),
-    "robustness": ("If neighbours lie?", ("K = 4", "K = 10")),
-    "consistency": ("Whose covariance can be believed?", ("credible",)),
+    "robustness": ("If neighbours are spoofed?", ("K = 4", "K = 10")),
+    "consistency": ("Which methods are consistent?", ("credible",)),
 }
 """Study -> question, and the keys of the findings that answer it."""
 

@@ -216,7 +216,7 @@ def test_fitted_knowledge_is_taken(crossing: Fleet) -> None:
         (lambda r: CooperativeMAP(window=0), "window"),
         (lambda r: CooperativeMAP(backend="ipopt"), "backend"),
         (lambda r: CooperativeMAP(noise_model="guess")(r, [0]), "noise_model"),
-        (lambda r: CooperativeMAP()(r, ["nobody"]), "egos"),
+        (lambda r: CooperativeMAP()(r, ["missing"]), "egos"),
     ],
 )
 def test_wrong_input_says_what_to_do(recording: Recording, make, field: str) -> None:

@@ -204,7 +204,7 @@ def test_net_noise_serves_other_filters_of_a_star(v2x: V2X) -> None:
     known = NoiseModel.nominal(NOISE)
     shape = seen.gnss.shape
     given = NetNoise(
-        "told",
+        "net",
         NOISE,
         fix=np.broadcast_to(known.gnss_variance, shape).copy(),
         process=np.broadcast_to(known.process_variance(seen), shape).copy(),

@@ -54,7 +54,7 @@ def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing: Fleet) -> Non
         ({"share": 1.2}, "share"),
         ({"share": 0.1, "low": 9.0, "high": 5.0}, "low"),
         ({"share": 0.1, "seed": -1}, "seed"),
-        ({"share": 0.1, "honest": ["nobody"]}, "egos"),
+        ({"share": 0.1, "honest": ["missing"]}, "egos"),
     ],
 )
 def test_an_attack_says_what_is_wrong(lied_to: Recording, options: dict, field: str) -> None:

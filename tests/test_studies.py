@@ -346,7 +346,8 @@ def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path:
     shown = published(tmp_path / "neighbours")
     assert all("GNSS is simulated" in view["caption"] for view in shown["tables"])
     assert (
-        "range 1 m, angles 4°, nobody nearer than 2 m; in this data it is range 0.09" in shown["findings"]["transfer"]
+        "range 1 m, angles 4°, no vehicle nearer than 2 m; in this data it is range 0.09"
+        in shown["findings"]["transfer"]
     )
 
 
