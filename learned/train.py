@@ -18,7 +18,7 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
-from .federation.federated import federate_many
+from .federation.federated import Plan, federate_many
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
 from .training.clients import Client, Segments, Start
 from .training.fit import Fit, Task, fit_many
@@ -145,17 +145,8 @@ def _task(job: Job, data: Sequence[Client]) -> Task:
 
 def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
-    done = federate_many(
-        nets,
-        [data[j.setting] for j in todo],
-        [j.setting.seed for j in todo],
-        recipe.rounds,
-        recipe.aggregate,
-        recipe.local_epochs,
-        recipe.schedule,
-        stage,
-        recipe.local_epoch,
-    )
+    plan = Plan(recipe.rounds, recipe.aggregate, recipe.local_epochs, recipe.schedule, recipe.local_epoch)
+    done = federate_many(nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], plan, stage)
     found = []
     for job, federation in zip(todo, done, strict=True):
         rows = [row.card for row in federation.history]

@@ -121,16 +121,13 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
 
 def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
     from coopoc.learned.federation.compression import Float16, Quantised, TopK
-    from coopoc.learned.federation.federated import federate_many
+    from coopoc.learned.federation.federated import Plan, federate_many
     from coopoc.learned.federation.topology import Ring, V2XGraph
 
     name = p["method"]
     wires = dict(zip(WIRES, (Float16(), TopK(0.1), Quantised(8), Quantised(4)), strict=True))
     graph = {"ring": Ring(), "v2x": V2XGraph(members(p), float(p["radius_m"]))}.get(name)
-    done = federate_many(
-        nets,
-        groups,
-        range(len(nets)),
+    plan = Plan(
         int(p["rounds"]),
         "mean" if name in (*WIRES, *GRAPHS) else name,
         int(p["local_epochs"]),
@@ -138,6 +135,7 @@ def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]
         compression=wires.get(name),
         topology=graph,
     )
+    done = federate_many(nets, groups, range(len(nets)), plan)
     return tuple(
         Trained(
             fed.model,

@@ -112,7 +112,7 @@ def cell(p: Params) -> list[Row]:
 
 def trained(p: Params) -> Trained:
     """Federations of all training seeds with the cell's epsilon, equal weights and all clients in every round."""
-    from coopoc.learned.federation.federated import federate_many
+    from coopoc.learned.federation.federated import Plan, federate_many
     from coopoc.learned.nets.gain_net import GainNet
     from coopoc.learned.nets.okf import NoiseParameters
     from coopoc.learned.privacy.differential import Privacy, auc_bound, epsilon, noise_for
@@ -128,16 +128,9 @@ def trained(p: Params) -> Trained:
     count = len(drives.ids)
     clip = plan.clipped(z, count) if z else math.inf
     tap = Tap(Privacy(clip, z, delta, count) if z else None)
-    made = federate_many(
-        [net(seed=seed) for seed in seeds],
-        groups,
-        seeds,
-        plan.rounds,
-        "uniform",
-        plan.local_epochs,
-        Schedule(learning_rate=plan.learning_rate, weight_decay=plan.weight_decay),
-        privacy=tap,
-    )
+    optimiser = Schedule(learning_rate=plan.learning_rate, weight_decay=plan.weight_decay)
+    federation = Plan(plan.rounds, "uniform", plan.local_epochs, optimiser, privacy=tap)
+    made = federate_many([net(seed=seed) for seed in seeds], groups, seeds, federation)
     alone = z / math.sqrt(count)
     price = {
         "clip": clip,

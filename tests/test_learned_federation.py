@@ -16,7 +16,7 @@ from coopoc import Fleet, InputError, Sensors, load_fleet
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.compression import Compression, Float16, Quantised, TopK
-from coopoc.learned.federation.federated import federate_many
+from coopoc.learned.federation.federated import Plan, federate_many
 from coopoc.learned.federation.history import Federation, ledger
 from coopoc.learned.federation.local import adapt, local_fit
 from coopoc.learned.federation.means import FedProx
@@ -110,7 +110,7 @@ def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], opti
     """Same seed, same weights, bit for bit, whatever the order of the clients."""
     one, other = trained(four, seed=3, **options), trained(four[::-1], seed=3, **options)
     how: dict[str, Any] = {"rounds": 3, "local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options}
-    together = federate_many([Steady(), Steady()], [four[::-1], four], [8, 3], **how)[1]
+    together = federate_many([Steady(), Steady()], [four[::-1], four], [8, 3], Plan(**how))[1]
     for a, b, c in zip(one.history, other.history, together.history, strict=True):
         assert torch.equal(a.weights, b.weights)
         assert torch.equal(a.weights, c.weights)

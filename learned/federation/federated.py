@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -26,6 +26,67 @@ from .participation import Participation, Turn
 from .rule import Combine, Rule
 from .server import SERVER, Exchange, Group, Protection, Server, Standing
 from .topology import Mesh, Topology, connected, disagreement
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How nets are federated; the arguments of `federate` say what each is.
+
+    Raises:
+        InputError: less than one round or local epoch; options that exclude each other.
+
+    >>> Plan(rounds=3).local.epochs
+    5
+    """
+
+    rounds: int = 20
+    aggregate: str | Rule | Combine = "mean"
+    local_epochs: int = 5
+    schedule: Schedule = field(default_factory=Schedule)
+    epoch: Epoch = "pass"
+    participation: Participation = field(default_factory=Participation)
+    compression: Compression | None = None
+    privacy: Protection | None = None
+    topology: Topology | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("rounds", "local_epochs"):
+            if (value := getattr(self, name)) < 1:
+                raise InputError(name, value, "must be >= 1", "The paper has 20 rounds.")
+        if self.topology is None:
+            return
+        if self.aggregate != "mean":
+            hint = "Neighbours mix by Metropolis weights."
+            raise InputError("aggregate", self.aggregate, 'must be "mean" with a topology', hint)
+        for name in ("compression", "privacy"):
+            if (given := getattr(self, name)) is not None:
+                allowed = (
+                    "must be None with a topology: the receiver of an update must know the weights it started from"
+                )
+                raise InputError(name, given, allowed, "Train with a server.")
+
+    @property
+    def rule(self) -> Rule:
+        """The aggregation rule."""
+        return rule(self.aggregate)
+
+    @property
+    def local(self) -> Schedule:
+        """Schedule of a client's round."""
+        return self.rule.local(replace(self.schedule, epochs=self.local_epochs, epoch=self.epoch))
+
+    def step(self, team: Group) -> Server | Mesh:
+        """The server or the mesh of a team; InputError for a rule that needs more clients, or that privacy does not
+        cover."""
+        if self.topology is not None:
+            return Mesh(connected(self.topology, team.names), self.participation)
+        chosen, asked = self.rule, self.participation.count(len(team.names))
+        if asked < chosen.least:
+            given, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
+            raise InputError("aggregate", given, allowed, "Ask more clients, or take the median.")
+        if self.privacy is not None:
+            self.privacy.check(chosen)
+        return Server(chosen, self.participation, self.compression, self.privacy)
 
 
 def federate(
@@ -81,21 +142,11 @@ def federate(
     79756
     """
     found = find("coopoc.nets", model) if isinstance(model, str) else model
-    return federate_many(
-        [found() if isinstance(found, type) else found],
-        [clients],
-        [seed],
-        rounds,
-        aggregate,
-        local_epochs,
-        schedule,
-        progress,
-        epoch,
-        participation=participation,
-        compression=compression,
-        privacy=privacy,
-        topology=topology,
-    )[0]
+    start = found() if isinstance(found, type) else found
+    optimiser, presence = schedule or Schedule(), participation or Participation()
+    protection = compression, privacy, topology
+    plan = Plan(rounds, aggregate, local_epochs, optimiser, epoch, presence, *protection)
+    return federate_many([start], [clients], [seed], plan, progress)[0]
 
 
 @one_core()
@@ -103,40 +154,20 @@ def federate_many(
     models: Sequence[Gain],
     groups: Sequence[Sequence[Client]],
     seeds: Sequence[int],
-    rounds: int = 20,
-    aggregate: str | Rule | Combine = "mean",
-    local_epochs: int = 5,
-    schedule: Schedule | None = None,
+    plan: Plan,
     progress: str | None = None,
-    epoch: Epoch = "pass",
-    *,
-    participation: Participation | None = None,
-    compression: Compression | None = None,
-    privacy: Protection | None = None,
-    topology: Topology | None = None,
 ) -> list[Federation]:
     """`federate` for many independent federations in one rollout."""
-    for name, value in (("rounds", rounds), ("local_epochs", local_epochs)):
-        if value < 1:
-            raise InputError(name, value, "must be >= 1", "The paper has 20 rounds.")
-    began, chosen, presence = time.perf_counter(), rule(aggregate), participation or Participation()
-    local = chosen.local(replace(schedule or Schedule(), epochs=local_epochs, epoch=epoch))
+    began, local, presence, meshed = time.perf_counter(), plan.local, plan.participation, plan.topology is not None
     teams = [_group(group, seed) for group, seed in zip(groups, seeds, strict=True)]
-    if topology is not None:
-        _check_decentralised(aggregate, compression, privacy)
-    steps = [
-        _server(team, chosen, presence, compression, privacy)
-        if topology is None
-        else Mesh(connected(topology, team.names), presence)
-        for team in teams
-    ]
+    steps = [plan.step(team) for team in teams]
     stack = stacked(models[0], groups, teams)
-    standings = [_start(theta, team, chosen) for theta, team in zip(flatten(models), teams, strict=True)]
+    standings = [_start(theta, team, plan.rule) for theta, team in zip(flatten(models), teams, strict=True)]
     reports = stack.validated(standings)
     histories = [[Round(0, s.theta, (math.nan,) * len(r), r)] for s, r in zip(standings, reports, strict=True)]
-    for number in watched(range(1, rounds + 1), progress, "round"):
+    for number in watched(range(1, plan.rounds + 1), progress, "round"):
         turns = [presence.turns(team.seed, number, team.names) for team in teams]
-        local_work = stack.adapted(standings, turns, number, rounds, local)
+        local_work = stack.adapted(standings, turns, number, plan.rounds, local)
         exchanges = []
         for i, (step, team, work) in enumerate(zip(steps, teams, local_work, strict=True)):
             standings[i], exchange = step(team, standings[i], number, turns[i], work.weights, reports[i])
@@ -145,9 +176,10 @@ def federate_many(
         for history, *rest in zip(histories, teams, standings, turns, local_work, exchanges, reports, strict=True):
             history.append(_row(history[-1], *rest))
     seconds = (time.perf_counter() - began) / len(groups)
-    own = [None if topology is None else s.held for s in standings]
+    own = [s.held if meshed else None for s in standings]
     return [
-        _selected(models[0], *rest, seconds, privacy is not None) for rest in zip(histories, teams, own, strict=True)
+        _selected(models[0], *rest, seconds, plan.privacy is not None)
+        for rest in zip(histories, teams, own, strict=True)
     ]
 
 
@@ -161,36 +193,6 @@ def _group(clients: Sequence[Client], seed: int) -> Group:
 def _start(theta: Tensor, team: Group, chosen: Rule) -> Standing:
     held = theta.expand(len(team.names), -1)
     return Standing(theta, held, chosen.start(theta), torch.zeros_like(held), (None,) * len(team.names))
-
-
-def _server(
-    team: Group,
-    chosen: Rule,
-    presence: Participation,
-    compression: Compression | None,
-    privacy: Protection | None,
-) -> Server:
-    """The server of a federation; InputError for a rule that needs more clients, or that privacy does not cover."""
-    asked = presence.count(len(team.names))
-    if asked < chosen.least:
-        given, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
-        raise InputError("aggregate", given, allowed, "Ask more clients, or take the median.")
-    if privacy is not None:
-        privacy.check(chosen)
-    return Server(chosen, presence, compression, privacy)
-
-
-def _check_decentralised(
-    aggregate: str | Rule | Combine, compression: Compression | None, privacy: Protection | None
-) -> None:
-    """InputError for options that need a server."""
-    if aggregate != "mean":
-        hint = "Neighbours mix by Metropolis weights."
-        raise InputError("aggregate", aggregate, 'must be "mean" with a topology', hint)
-    for name, given in (("compression", compression), ("privacy", privacy)):
-        if given is not None:
-            allowed = "must be None with a topology: the receiver of an update must know the weights it started from"
-            raise InputError(name, given, allowed, "Train with a server.")
 
 
 def _row(
