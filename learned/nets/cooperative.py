@@ -28,7 +28,7 @@ SUMS = Message("sums since departure", 14, cumulative=True)
 
 @dataclass(frozen=True, eq=False)
 class NetNoise(NoiseModel):
-    """Noise of all vehicles in one recording, estimated by the net on board of each, for any filter of a star.
+    """Noise of the vehicles in one recording, estimated by the net on board of each, for any filter of a star.
 
     Relative noise is the data sheet's: vehicles that drive alone in training show nothing of it.
 
@@ -41,9 +41,11 @@ class NetNoise(NoiseModel):
     process: Floats | None = None
 
     @classmethod
-    def by(cls, model: NoiseNet, recording: Recording) -> NetNoise:
-        """By the same net on board of every vehicle."""
-        fix, process = estimate_noise(model, recording)
+    def by(cls, model: NoiseNet, recording: Recording, egos: Sequence[int] | None = None) -> NetNoise:
+        """By the same net on board of every vehicle, or of the egos and of whom they ever measure."""
+        links = recording.links
+        stars = None if egos is None else [*egos, *(links.neighbour[links.of(ego)] for ego in egos)]
+        fix, process = estimate_noise(model, recording, None if stars is None else np.unique(np.hstack(stars)))
         return cls("net", recording.sensors, fix=fix, process=process)
 
     def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
@@ -110,7 +112,9 @@ class CooperativeGain:
                 "must be 0 s with sums",
                 "Use CooperativeGain(noise, sums=False).",
             )
-        model = NetNoise.by(self.noise, recording) if isinstance(self.noise, NoiseNet) else self.noise
+        model = self.noise
+        if isinstance(model, NoiseNet):
+            model = NetNoise.by(model, recording, recording.columns(egos, missing=True))
         process = np.ascontiguousarray(model.process_variance(recording))
         known = assumptions(recording, model)._replace(process=process, velocity_noise=np.empty(0))
 

@@ -244,14 +244,20 @@ class NoiseFilter:
         return torch.from_numpy(np.broadcast_to(given, shape).reshape(1, -1, 3).copy())
 
 
-def estimate_noise(model: NoiseNet, recording: Recording) -> tuple[Floats, Floats]:
-    """Variances of fixes and of motion (R, T, N, 3) m^2 by the net on board of every vehicle; run by run."""
-    theta, found = flatten([model]).double(), []
+def estimate_noise(
+    model: NoiseNet, recording: Recording, vehicles: Sequence[int] | None = None
+) -> tuple[Floats, Floats]:
+    """Variances of fixes and of motion (R, T, N, 3) m^2 by the net on board of each vehicle, default all; run by run.
+
+    Those of the other vehicles are NaN.
+    """
+    columns = np.arange(recording.gnss.shape[2]) if vehicles is None else np.asarray(vehicles, dtype=np.int64)
+    theta, (fix, process) = flatten([model]).double(), np.full((2, *recording.gnss.shape), np.nan)
     with one_core(), torch.inference_mode():
-        for gnss, velocity in zip(recording.gnss, recording.velocity, strict=True):
-            noise = model.variances(theta, lanes(gnss[None]), lanes(velocity[None]), recording.dt)
-            found.append([runs(a, 1)[0] for a in noise])
-    fix, process = (np.stack(a) for a in zip(*found, strict=True))
+        for run, own in enumerate(zip(recording.gnss, recording.velocity, strict=True)):
+            noise = model.variances(theta, *(lanes(a[None, :, columns]) for a in own), recording.dt)
+            for found, part in zip((fix, process), noise, strict=True):
+                found[run, :, columns] = np.moveaxis(runs(part, 1)[0], 1, 0)
     return fix, process
 
 
