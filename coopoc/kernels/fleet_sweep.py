@@ -25,6 +25,10 @@ HARD = 1e7
 """Weight of the motion over that of a fix beyond which D - D S^-1 D loses its digits."""
 
 
+EXTRA, HALVINGS = 20, 12
+"""Sweeps beyond the asked ones while steps must be shortened, and how often one is halved."""
+
+
 class Drive(NamedTuple):
     """One run.
 
@@ -91,20 +95,54 @@ def smooth(
         numpy.linalg.LinAlgError: a number is not finite.
     """
     stays = _stays(drive.place)
-    inverses: list[Floats] = []
-    for exact in range(steps + 1):
-        motions, before = _motions(at, stays, drive), at
-        weight, eta = linearise(at, drive, exact == 0)
-        vectors = _vectors(sum_vectors(at, drive, eta), drive.place)
-        inverses = _eliminate(drive, weight, motions, memory, vectors, tick)
-        at = _substitute(at, drive.place, motions, inverses, vectors)
-    while steps and not settled(float(np.nanmax(np.abs(at - before)))):
+    sweeps, whole = 0, False
+    while True:
         moved, before = _motions(at, stays, drive), at
-        vectors = _vectors(sum_vectors(at, drive, linearise(at, drive, False)[1]), drive.place)
-        for t, motion in enumerate(moved[:-1]):
-            vectors[t + 1][motion.new] += _marginalised(inverses[t], vectors[t], motion)
+        weight, eta = linearise(at, drive, sweeps == 0)
+        vectors = _vectors(sum_vectors(at, drive, eta), drive.place)
+        if sweeps <= steps or not whole:
+            motions, inverses = moved, _eliminate(drive, weight, moved, memory, vectors, tick)
+            sweeps += 1
+        else:
+            for t, motion in enumerate(moved[:-1]):
+                vectors[t + 1][motion.new] += _marginalised(inverses[t], vectors[t], motion)
         at = _substitute(at, drive.place, moved, inverses, vectors)
-    return at, _marginals(at, drive.place, motions, inverses)
+        if sweeps > 1:
+            at, whole = descended(before, at, drive)
+        size = float(np.nanmax(np.abs(at - before))) if whole or sweeps <= steps + EXTRA else np.inf
+        if sweeps > steps and (not steps or ((whole or size == np.inf) and settled(size))):
+            return at, _marginals(at, drive.place, motions, inverses)
+
+
+def descended(before: Floats, at: Floats, drive: Drive) -> tuple[Floats, bool]:
+    """The step from `before` to `at`, halved until it does not raise the cost, and whether it is whole."""
+    cost = misfit(before, drive)
+    for k in range(HALVINGS):
+        shorter = before + 0.5**k * (at - before)
+        if misfit(shorter, drive) <= cost * (1.0 + 1e-12):
+            return shorter, k == 0
+    return before, False
+
+
+def misfit(at: Floats, drive: Drive) -> float:
+    """Sum of the squared whitened residuals of fixes, motions, ranges and angles at positions (T, N, 3) m."""
+    pairs, total = drive.pairs, float(np.nansum(drive.fix_weight * (drive.fix - at) ** 2))
+    total += float(np.nansum(drive.motion_weight[1:] * (drive.motion[1:] - np.diff(at, axis=0)) ** 2))
+    step = np.repeat(np.arange(len(at)), np.diff(pairs.start))
+    gap = at[step, pairs.second] - at[step, pairs.first]
+    for link, vector in ((pairs.link, gap), (pairs.link_back, -gap)):
+        used = pairs.alive[0] & (link >= 0)
+        seen, (x, y, z) = drive.relative[link[used]], vector[used].T
+        flat = np.hypot(x, y)
+        apart = np.stack(
+            [
+                np.where(seen[:, 0] >= 0.0, seen[:, 0] - np.hypot(flat, z), 0.0),
+                np.arctan2(seen[:, 1] * x - seen[:, 2] * y, seen[:, 2] * x + seen[:, 1] * y),
+                np.arctan2(seen[:, 3] * z - seen[:, 4] * flat, seen[:, 4] * z + seen[:, 3] * flat),
+            ]
+        )
+        total += float(np.sum((apart / drive.assumed.std[:, None]) ** 2))
+    return total
 
 
 def _vectors(eta: Floats, place: Ints) -> list[Floats]:

@@ -30,8 +30,9 @@ class BatchSmoother:
     """argmin of sum |x_t - x_{t-1} - dt u_t|^2_Q + sum |z - x|^2_GNSS + sum |h(x_j - x_i) - y|^2 over fleet and drive.
 
     The converted measurements make a linear problem; from its solution one exact Gauss-Newton step on range and angles
-    is enough on average. Steps with the same factors, each a tenth of
-    its cost, follow until none moves a position by `settle`: then it is the most probable drive. Time makes the normal
+    is enough on average. Steps with the same factors, each a tenth of its cost, follow until none moves a position by
+    `settle`: then it is the most probable drive. A step that raises the cost is halved, and the next one linearised
+    anew: where angles are noisy and fixes poor, a whole step may leave by kilometres. Time makes the normal
     equations block-tridiagonal with blocks of 3N x 3N, and motion noise is diagonal, so that one sweep eliminates step
     after step,
 

@@ -105,7 +105,7 @@ class CooperativeMAP:
             yield Estimate(slice(None), found.x, found.covariance, box.link, found.neighbours)
 
         track = follow_egos(self, recording, egos, drive, missing=True)
-        loop = () if self._runs_compiled else (f"{self.backend} loops over the runs",)
+        loop = known.notes if self._runs_compiled else (*known.notes, f"{self.backend} loops over the runs")
         return replace(track, notes=(*loop, *(f"{count} {note}" for note, count in counts.items() if count)))
 
     @property

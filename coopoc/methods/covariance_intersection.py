@@ -73,4 +73,4 @@ class CovarianceIntersection:
             )
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
-        return follow_egos(self, recording, egos, drive, missing=True)
+        return follow_egos(self, recording, egos, drive, known.notes, missing=True)

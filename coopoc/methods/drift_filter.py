@@ -55,4 +55,4 @@ class DriftFilter:
             x, cov, neighbours = follow(seen, assumed, known.exact_relative, drift, POSITION_AND_DRIFT)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
-        return follow_egos(self, recording, egos, drive, missing=True)
+        return follow_egos(self, recording, egos, drive, known.notes, missing=True)

@@ -82,7 +82,7 @@ class FixedLagSmoother:
             found = follow(recording, box, known, seen, assumed)
             yield Estimate(slice(None), found.x, found.covariance, box.link, found.neighbours)
 
-        return follow_egos(self, recording, egos, drive, notes + looped, missing=True)
+        return follow_egos(self, recording, egos, drive, known.notes + notes + looped, missing=True)
 
     def _settings(self, known: NoiseModel, lag: int) -> Any:
         from ..kernels.horizon import Settings

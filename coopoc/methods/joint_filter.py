@@ -51,7 +51,7 @@ class JointFilter:
             x, cov, neighbours = follow(measurements(recording, ego, box), assumed, refine, None, POSITION)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
-        return follow_egos(self, recording, egos, drive, missing=True)
+        return follow_egos(self, recording, egos, drive, known.notes, missing=True)
 
     def start(
         self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0, max_age: float = 1.0

@@ -48,11 +48,12 @@ class LKFSA:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        assumed = assumptions(recording, resolve(self.noise_model, recording))
+        known = resolve(self.noise_model, recording)
+        assumed = assumptions(recording, known)
         ones, reset = self.transition == "ones", self.membership == "reset"
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
             x, variance, neighbours = follow(measurements(recording, ego, box), assumed, ones, reset)
             yield Estimate(slice(None), x, variance[..., None] * np.eye(3), box.link, neighbours)
 
-        return follow_egos(self, recording, egos, drive, missing=True)
+        return follow_egos(self, recording, egos, drive, known.notes, missing=True)

@@ -83,7 +83,7 @@ class MDS:
 
         track = follow_egos(method, recording, egos, follow, missing=True)
         between = f"{100 * count[0] / max(count[1], 1):.0f} % of the distances between neighbours were measured"
-        return replace(track, covariance=None, notes=(between, *notes))
+        return replace(track, covariance=None, notes=(between, *known.notes, *notes))
 
     def _follow(
         self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, find: Finder, count: Ints

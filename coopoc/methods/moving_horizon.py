@@ -92,7 +92,9 @@ class MovingHorizon:
 
         track = follow_egos(self, recording, egos, drive, missing=True)
         loop = () if self._runs_compiled else (f"{self.backend} loops over the runs",)
-        return replace(track, notes=(*loop, *(f"{count} {what}" for what, count in counts.items() if count)))
+        return replace(
+            track, notes=(*known.notes, *loop, *(f"{count} {what}" for what, count in counts.items() if count))
+        )
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, counts: Counter[str]) -> Any:
         """The elimination's estimates; where the backend has to solve a window, those of the backend."""

@@ -48,4 +48,4 @@ class MSMV:
             x, cov, theirs = follow(measurements(recording, ego, box, own), assumed)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
-        return follow_egos(self, recording, egos, drive, (RECONSTRUCTION,), missing=True)
+        return follow_egos(self, recording, egos, drive, (*known.notes, RECONSTRUCTION), missing=True)

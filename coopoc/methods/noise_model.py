@@ -31,6 +31,7 @@ class NoiseModel:
         process_std: (3,) m per step, constant; None to follow the velocity.
         gnss_std: (3,) m.
         velocity: (T, N, 3) m/s true velocity, for the oracle only.
+        notes: of the Track, what was changed to stay within double precision.
     """
 
     name: str
@@ -38,6 +39,7 @@ class NoiseModel:
     process_std: tuple[float, float, float] | None = None
     gnss_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     velocity: Floats | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for field in ("process_std", "gnss_std"):
@@ -124,18 +126,23 @@ class NoiseModel:
         return vector_cov(relative, self.sensors.relative_std, self.sensors.min_range)
 
 
+FINEST = 1e-5
+"""Least std that is assumed of a relative measurement, over the largest of a fix: 1 / FINEST^2 = 1e10 of the 1e16 that
+double precision tells apart, so that what fixes say of a star as a whole is not lost beside what holds it together."""
+
+
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
-    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors.
+    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST.
 
     >>> resolve("identity", None).gnss_std
     (1.0, 1.0, 1.0)
     """
     if isinstance(noise_model, NoiseModel):
-        return noise_model
+        return _resolvable(noise_model)
     if noise_model == "identity":
         return NoiseModel.identity()
     if noise_model == "nominal":
-        return NoiseModel.nominal(recording.sensors)
+        return _resolvable(NoiseModel.nominal(recording.sensors))
     raise InputError(
         "noise_model",
         repr(noise_model),
@@ -146,6 +153,18 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
             "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
         ),
     )
+
+
+def _resolvable(known: NoiseModel) -> NoiseModel:
+    """With relative noise of at least FINEST of a fix's, angles at a distance of 1 m; a note says so."""
+    least = FINEST * max(known.gnss_std)
+    if known.sensors is None or min(known.sensors.relative_std) >= least:
+        return known
+    names = ("range_std", "azimuth_std", "inclination_std")
+    raised = {name: max(getattr(known.sensors, name), min(least, np.pi)) for name in names}
+    beside = f"finer ones beside a fix of {max(known.gnss_std):g} m exceed double precision"
+    note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
+    return replace(known, sensors=replace(known.sensors, **raised), notes=(note,))
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

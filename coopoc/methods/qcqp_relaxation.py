@@ -64,7 +64,7 @@ class QCQPRelaxation:
                 yield Estimate(star.step, points[:, 0], covariance, star.links, points[:, 1:])
 
         track = follow_egos(self, recording, egos, follow, missing=True)
-        return replace(track, notes=(f"{sum(tight)} of {len(tight)} relaxations were tight", *notes))
+        return replace(track, notes=(f"{sum(tight)} of {len(tight)} relaxations were tight", *known.notes, *notes))
 
 
 def _locate(problem: Problem, tight: list[bool]) -> tuple[Floats, Floats]:

@@ -150,7 +150,7 @@ def alone(noise_model: NoiseModel | str) -> NoiseModel:
             "needs a recording, and a stream has none",
             "Pass NoiseModel.nominal(Sensors(...)), a fitted NoiseModel or 'identity'.",
         )
-    return noise_model if isinstance(noise_model, NoiseModel) else resolve(noise_model, None)  # type: ignore[arg-type]
+    return resolve(noise_model, None)  # type: ignore[arg-type]
 
 
 def motion_noise(known: NoiseModel, interval: float) -> MotionNoise:

@@ -86,7 +86,7 @@ def fleet_track(
             x, cov = bring_forward(held, x, cov, own, assumed._replace(process=process, fix=fix))
     x, cov = x.reshape(*shape, 3), None if cov is None else cov.reshape(*shape, 3, 3)
     received, sent, seconds = met.received_bytes[:, columns], met.sent_bytes[:, columns], time.perf_counter() - began
-    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, notes=found.notes)
+    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, notes=known.notes + found.notes)
 
 
 def kernel_arguments(

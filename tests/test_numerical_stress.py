@@ -1,0 +1,124 @@
+"""Noise from a tenth of a millimetre to ten kilometres, in line, far away, close together: estimates that stay sane."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.methods.catalogue import METHODS
+
+STEPS = 15
+COOPERATIVE = (
+    "lkf-sa",
+    "lkf-sa-edge",
+    "msmv-r",
+    "joint",
+    "drift",
+    "ci",
+    "split-ci",
+    "cooperative-map",
+    "cooperative-map-5",
+    "cooperative-map-gnc",
+    "fixed-lag",
+    "mhe",
+    "gbp",
+    "central-filter",
+    "batch-smoother",
+)
+
+
+def in_line(count: int, gap: float, offset: float = 0.0) -> co.Fleet:
+    """Vehicles one behind the other along x at 10 m/s."""
+    t = np.arange(STEPS) / 10
+    position, velocity = np.full((STEPS, count, 3), offset), np.zeros((STEPS, count, 3))
+    position[..., 0] += gap * np.arange(count) + 10.0 * t[:, None]
+    velocity[..., 0] = 10.0
+    return co.Fleet(tuple(f"v{i}" for i in range(count)), t, position, velocity)
+
+
+def drawn(seed: int) -> tuple[co.Fleet, co.Sensors]:
+    """A fleet in line or scattered, each standard deviation anywhere within eight orders of magnitude."""
+    rng = np.random.default_rng(seed)
+    gap, count = float(10 ** rng.uniform(0.5, 2)), int(rng.integers(2, 7))
+    fleet = in_line(count, gap)
+    if rng.uniform() < 0.5:
+        fleet = replace(fleet, position=fleet.position + rng.normal(0, gap, (1, count, 3)))
+
+    def std(low: float, high: float) -> float:
+        return float(10 ** rng.uniform(low, high))
+
+    even = rng.uniform() < 0.5
+    white = std(-4, 4)
+    fix = (white, white, white) if even else (white, std(-4, 4), std(-4, 4))
+    return fleet, co.Sensors(
+        gnss_std=fix,
+        range_std=min(gap, std(-4, 2)),
+        azimuth_std=std(-6, -1),
+        inclination_std=std(-6, -1),
+        velocity_floor=std(-4, 2),
+        velocity_std_ratio=std(-4, 0),
+    )
+
+
+def observed(fleet: co.Fleet, sensors: co.Sensors, runs: int = 2, seed: int = 0) -> co.Recording:
+    return co.observe(fleet, sensors, co.V2X(max_neighbours=10), runs=runs, seed=seed)
+
+
+def situations() -> Iterator[tuple[str, co.Fleet, co.Sensors]]:
+    """Geometries and noises that leave little of sixteen digits."""
+    for seed in range(8):
+        yield f"drawn {seed}", *drawn(seed)
+    poor = co.Sensors(gnss_std=(10.0, 10.0, 10.0), range_std=5.0)
+    yield "collinear", in_line(8, 10.0), poor
+    yield "collinear, closer than the range's noise", in_line(8, 3.0), poor
+    yield "10^6 m away", in_line(4, 10.0, 1e6), co.Sensors()
+    yield "in one place", in_line(4, 0.0), co.Sensors()
+    yield "10^-6 m apart", in_line(4, 1e-6), co.Sensors()
+    yield "micrometres beside kilometres", in_line(4, 10.0), co.Sensors((1e3, 1e3, 1e3), range_std=1e-6)
+
+
+@pytest.mark.parametrize(("fleet", "sensors"), [pytest.param(*rest, id=name) for name, *rest in situations()])
+def test_estimates_stay_sane_where_digits_are_few(fleet: co.Fleet, sensors: co.Sensors) -> None:
+    """No method leaves its own fixes by more than their noise may; every covariance is symmetric, none is negative."""
+    recording = observed(fleet, sensors)
+    fixes = np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
+    for name in COOPERATIVE:
+        track = METHODS[name]("nominal")(recording, [0])
+        assert np.abs(track.x[:, :, 0] - fleet.position[:, 0]).max() < 5.0 * fixes + 5.0 * min(
+            sensors.range_std, 1.0
+        ), name
+        if track.covariance is not None:
+            size = np.abs(track.covariance).max(axis=(-1, -2), keepdims=True)
+            assert np.abs(track.covariance - np.swapaxes(track.covariance, -1, -2)).max() <= 1e-9 * size.max(), name
+            assert (np.linalg.eigvalsh(track.covariance / size) > -1e-9).all(), name
+
+
+def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_the_track_says_so() -> None:
+    """1e-5 of a fix is the least std that is assumed beside it: finer ones made the joint covariance negative."""
+    fleet, sensors = in_line(4, 10.0), co.Sensors(gnss_std=(800.0, 2.0, 0.02), azimuth_std=1.5e-6, inclination_std=6e-6)
+    track = co.JointFilter("nominal")(observed(fleet, sensors), [0])
+    assert any("at least 0.008 m and rad" in note for note in track.notes)
+    assert (np.linalg.eigvalsh(track.covariance) > 0.0).all()
+    usual = co.JointFilter("nominal")(observed(fleet, co.Sensors()), [0])
+    assert not usual.notes
+
+
+def test_the_smoother_descends_where_whole_steps_lead_away() -> None:
+    """Azimuths of 9 degrees, ranges of a tenth of a millimetre, poor fixes: undamped Gauss-Newton ends 36 km off."""
+    fleet = in_line(5, 11.84)
+    sensors = co.Sensors(
+        gnss_std=(0.8, 19.0, 58.0),
+        velocity_floor=0.04,
+        velocity_std_ratio=0.018,
+        range_std=1e-4,
+        azimuth_std=0.155,
+        inclination_std=6e-4,
+    )
+    recording = observed(fleet, sensors, 6, 13)
+    settled = co.BatchSmoother("nominal")(recording, [0]).x
+    error = np.linalg.norm(settled[:, :, 0] - fleet.position[:, 0], axis=-1)
+    assert error.max() < 3.0 * np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
