@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -106,6 +106,21 @@ def number(
     if not low <= found <= high:
         raise InputError(field, value, f"must be {allowed}", hint)
     return found
+
+
+Kind = TypeVar("Kind")
+
+
+def instance(field: str, value: object, kind: type[Kind], hint: str = "") -> Kind:
+    """`value` if it is of a class; InputError that names the field otherwise.
+
+    >>> instance("track", None, dict)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: track = None: must be a dict. Give dict(...).
+    """
+    if not isinstance(value, kind):
+        raise InputError(field, repr(value)[:60], f"must be a {kind.__name__}", hint or f"Give {kind.__name__}(...).")
+    return value
 
 
 def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hint: str) -> None:

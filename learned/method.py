@@ -15,7 +15,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
-from coopoc.world.recording import Recording
+from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .stream import GainState, SoloGain, StepByStep
@@ -83,7 +83,7 @@ class LearnedGain:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
-        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
         with one_core(), torch.inference_mode():
             moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)
@@ -104,7 +104,7 @@ class LearnedGain:
         if trace is None:
             allowed = "must be a net with a trace, such as GainNet"
             raise InputError("model", type(self.model).__name__, allowed, "Read its gain from a stream's state.")
-        columns = recording.columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos, missing=True)
         gnss, velocity, x0 = self._lanes(recording, columns)
         states: list[tuple[Tensor, ...]] = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
         with one_core(), torch.inference_mode():

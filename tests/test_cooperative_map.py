@@ -103,7 +103,7 @@ def test_the_track_is_the_problems_solution(recording: Recording, window: int) -
 def test_backends_give_the_same_track(crossing: Fleet, backend: str, window: int) -> None:
     recording = observe(crossing.between(0, 12), S2, V2X(max_neighbours=4, loss=0.2), runs=2)
     reference = CooperativeMAP(window=window)(recording, [0])
-    track = CooperativeMAP(backend, window)(recording, [0])
+    track = CooperativeMAP(backend=backend, window=window)(recording, [0])
     assert track.x == pytest.approx(reference.x, abs=5e-5)
     assert track.covariance == pytest.approx(reference.covariance, abs=5e-4)
     assert track.notes == (f"{backend} loops over the runs",)

@@ -23,16 +23,16 @@ from coopoc.world.v2x import FIX_AND_VELOCITY
 
 FITTED = NoiseModel("fitted", S2, (0.3, 0.2, 0.01))
 METHODS = [
-    MovingHorizon(1),
-    MovingHorizon(6),
-    MovingHorizon(6, exact=False),
-    MovingHorizon(4, noise_model="identity"),
-    MovingHorizon(4, noise_model=FITTED),
-    FixedLagSmoother(0),
-    FixedLagSmoother(3),
-    FixedLagSmoother(3, smoothed=True),
-    FixedLagSmoother(3, exact=False),
-    FixedLagSmoother(2, noise_model="identity", smoothed=True),
+    MovingHorizon(horizon=1),
+    MovingHorizon(horizon=6),
+    MovingHorizon(horizon=6, exact=False),
+    MovingHorizon(horizon=4, noise_model="identity"),
+    MovingHorizon(horizon=4, noise_model=FITTED),
+    FixedLagSmoother(lag=0),
+    FixedLagSmoother(lag=3),
+    FixedLagSmoother(lag=3, smoothed=True),
+    FixedLagSmoother(lag=3, exact=False),
+    FixedLagSmoother(lag=2, noise_model="identity", smoothed=True),
 ]
 Smoother = MovingHorizon | FixedLagSmoother
 
@@ -74,13 +74,13 @@ def test_the_horizon_is_the_oracle(crossing: Fleet, channel: V2X, method: Smooth
 def test_messages_of_any_age_stand_where_the_oracle_has_them(formation: Fleet, latency: float) -> None:
     """Within the horizon, beyond it, and older than a message may be."""
     channel = V2X(max_neighbours=3, latency=latency, loss=0.3, max_age=1.0)
-    recording, method = observe(formation.between(0, 24), S2, channel, runs=5, observers=[0]), MovingHorizon(7)
+    recording, method = observe(formation.between(0, 24), S2, channel, runs=5, observers=[0]), MovingHorizon(horizon=7)
     assert ("dropped" in "".join(method(recording, [0]).notes)) is (latency > 0.7)
     assert_is_the_oracle(recording, method, 0, range(0, 5, 4), 1e-6)
 
 
 @pytest.mark.parametrize(
-    "method", [MovingHorizon(5), FixedLagSmoother(4), FixedLagSmoother(4, smoothed=True)], ids=label
+    "method", [MovingHorizon(horizon=5), FixedLagSmoother(lag=4), FixedLagSmoother(lag=4, smoothed=True)], ids=label
 )
 def test_vehicles_that_appear_and_vanish_and_fixes_that_are_missing(crossing: Fleet, method: Smoother) -> None:
     position, velocity = crossing.position.copy(), crossing.velocity.copy()
@@ -109,6 +109,6 @@ def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet, make: type) -
 
 def test_windows_that_still_move_are_counted(monkeypatch: pytest.MonkeyPatch, crossing: Fleet) -> None:
     monkeypatch.setattr(module, "SWEEPS", 0)
-    recording, method = observe(crossing.between(0, 20), S2, V2X(max_neighbours=4), runs=2), MovingHorizon(4)
+    recording, method = observe(crossing.between(0, 20), S2, V2X(max_neighbours=4), runs=2), MovingHorizon(horizon=4)
     assert "still moving" in method(recording, [0, 3]).notes[0]
     assert_is_the_oracle(recording, method, 0, range(1))

@@ -146,7 +146,7 @@ def test_vehicles_in_one_place_are_solved_converted() -> None:
     for robust in (None, "truncated"):
         found = CooperativeMAP(window=2, robust=robust)(recording, [0])
         assert "solved converted" in found.notes[0]
-        looped = CooperativeMAP("gtsam", window=2)(recording.of_runs(slice(0, 3)), [0])
+        looped = CooperativeMAP(backend="gtsam", window=2)(recording.of_runs(slice(0, 3)), [0])
         if robust is None:
             assert np.median(np.abs(found.x[:3] - looped.x)) < 1e-3
 

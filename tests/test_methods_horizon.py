@@ -29,11 +29,11 @@ from coopoc.world.spherical import spherical, to_vector, wrap
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 METHODS = [
-    FixedLagSmoother(3),
-    FixedLagSmoother(3, noise_model="identity"),
-    FixedLagSmoother(3, smoothed=True),
-    MovingHorizon(4),
-    MovingHorizon(4, noise_model="identity"),
+    FixedLagSmoother(lag=3),
+    FixedLagSmoother(lag=3, noise_model="identity"),
+    FixedLagSmoother(lag=3, smoothed=True),
+    MovingHorizon(horizon=4),
+    MovingHorizon(horizon=4, noise_model="identity"),
 ]
 LATE = V2X(max_neighbours=4, loss=0.2, latency=0.2)
 
@@ -92,13 +92,13 @@ def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
 def test_no_message_ever_is_at_best_the_solo_filter(crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=3)
     solo = rt_le(Kalman("nominal")(recording, [0]), crossing).mean()
-    for method in (FixedLagSmoother(3), MovingHorizon(4)):
+    for method in (FixedLagSmoother(lag=3), MovingHorizon(horizon=4)):
         assert rt_le(method(recording, [0]), crossing).mean() < 1.2 * solo
 
 
 def test_bytes_are_those_of_the_inbox(crossing: Fleet) -> None:
     recording = observe(crossing, S2, replace(LATE, overhead=100), runs=2)
-    for method in (FixedLagSmoother(1), MovingHorizon(3)):
+    for method in (FixedLagSmoother(lag=1), MovingHorizon(horizon=3)):
         track, box = method(recording, [3]), inbox(recording, 3, method.message)
         assert np.array_equal(track.received_bytes[:, 0], box.received_bytes)
         assert (track.sent_bytes == box.sent_bytes).all()
@@ -110,8 +110,8 @@ def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model
     """The law of performance.md 1.2 and methods.md 6.9; JointFilter is held against filterpy in test_methods."""
     recording = observe(crossing.between(0, 30), S2, v2x, runs=2)
     peer = JointFilter(noise_model, exact=False)(recording, [0, 3])
-    lags = [FixedLagSmoother(lag, noise_model=noise_model, exact=False) for lag in (1, 10)]
-    horizons = [MovingHorizon(n, noise_model=noise_model, exact=False) for n in (1, 5)]
+    lags = [FixedLagSmoother(lag=lag, noise_model=noise_model, exact=False) for lag in (1, 10)]
+    horizons = [MovingHorizon(horizon=n, noise_model=noise_model, exact=False) for n in (1, 5)]
     for method in (*lags, *horizons):
         track = method(recording, [0, 3])
         assert track.x == pytest.approx(peer.x, abs=1e-8)
@@ -122,7 +122,7 @@ def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model
 def test_no_lag_is_the_joint_filter(formation: Fleet) -> None:
     """Its exact step, too, and over a late channel."""
     recording = observe(formation.between(0, 60), S2, LATE, runs=3, observers=[0, 3])
-    track, peer = FixedLagSmoother(0)(recording, [0, 3]), JointFilter()(recording, [0, 3])
+    track, peer = FixedLagSmoother(lag=0)(recording, [0, 3]), JointFilter()(recording, [0, 3])
     assert track.x == pytest.approx(peer.x, abs=1e-8)
     assert track.covariance == pytest.approx(peer.covariance, abs=1e-8)
 
@@ -133,7 +133,7 @@ def test_fixed_lag_equals_gtsam(crossing: Fleet, smoothed: bool) -> None:
     recording = observe(crossing.between(0, 15), S2, V2X(max_neighbours=3, loss=0.2), runs=2)
     for noise_model, exact, close in (("identity", True, 1e-8), ("nominal", False, 1e-7), ("nominal", True, 0.15)):
         ours, theirs = (
-            FixedLagSmoother(3, backend, smoothed, noise_model, exact)(recording, [0])
+            FixedLagSmoother(noise_model, lag=3, backend=backend, smoothed=smoothed, exact=exact)(recording, [0])
             for backend in ("gauss-newton", "gtsam")
         )
         assert theirs.x == pytest.approx(ours.x, abs=close)
@@ -147,7 +147,7 @@ def test_a_lag_of_the_whole_drive_is_filterpys_smoother(crossing: Fleet) -> None
     """Independent check: filterpy's rts_smoother on one vehicle."""
     recording = observe(crossing.between(0, 30), S2, V2X(max_neighbours=0), runs=1)
     known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-    track = FixedLagSmoother(40, smoothed=True, noise_model=known)(recording, [2])
+    track = FixedLagSmoother(lag=40, smoothed=True, noise_model=known)(recording, [2])
     peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     peer.B, peer.H = 0.1 * np.eye(3), np.eye(3)
     peer.Q, peer.R = np.diag(np.square(known.process_std)), np.diag(known.gnss_variance)
@@ -209,7 +209,7 @@ def test_the_window_is_at_its_minimum(formation: Fleet) -> None:
     """Independent check: scipy.optimize.least_squares on the whole window with its arrival cost, from the truth."""
     fleet = formation.select(range(4)).between(0, 12)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track, known = MovingHorizon(4)(recording, [0]), resolve("nominal", recording)
+    track, known = MovingHorizon(horizon=4)(recording, [0]), resolve("nominal", recording)
     order = [0, *recording.links.neighbour[:3]]
     start = fleet.position[7:12, order].ravel()
     for run in range(2):
@@ -224,7 +224,7 @@ def test_late_messages_stand_at_their_true_time(formation: Fleet) -> None:
     """Independent check: numpy.linalg.lstsq over all steps, rows written out from the arrivals of the messages."""
     fleet = formation.select(range(4)).between(0, 9)
     recording = observe(fleet, S2, V2X(max_neighbours=3, latency=0.2, loss=0.3), runs=3, observers=[0])
-    track, dt, now = MovingHorizon(12, noise_model="identity")(recording, [0]), recording.dt, 8
+    track, dt, now = MovingHorizon(horizon=12, noise_model="identity")(recording, [0]), recording.dt, 8
     for run in range(3):
         rows, right = [], []
         place = {(v, s): 4 * s + v for s in range(now + 1) for v in range(4)}
@@ -261,7 +261,7 @@ def test_a_late_message_is_worth_more_in_its_place() -> None:
     """In traffic that brakes, at 1 s of latency: fixes that are brought forward make a filter over-confident."""
     fleet = load_fleet("town10").between(300, 400)
     recording = observe(fleet, S2, V2X(max_neighbours=4, latency=1.0), runs=5, observers=[12])
-    late, forward = MovingHorizon(10)(recording, [12]), JointFilter()(recording, [12])
+    late, forward = MovingHorizon(horizon=10)(recording, [12]), JointFilter()(recording, [12])
     assert late.notes == ()
     assert rt_le(late, fleet).mean() < 0.92 * rt_le(forward, fleet).mean()
     assert nees(late, fleet).mean() < 3.6 < 5.0 < nees(forward, fleet).mean()
@@ -270,14 +270,14 @@ def test_a_late_message_is_worth_more_in_its_place() -> None:
 def test_what_comes_after_the_horizon_is_dropped_and_counted(formation: Fleet) -> None:
     fleet = formation.select(range(3)).between(0, 20)
     recording = observe(fleet, S2, V2X(max_neighbours=2, latency=0.5), runs=2, observers=[0])
-    track = MovingHorizon(4)(recording, [0])
+    track = MovingHorizon(horizon=4)(recording, [0])
     assert track.notes == (f"{2 * 2 * 15} fixes came later than the horizon and were dropped",)
     solo = Kalman()(recording, [0])  # without a fix of theirs neighbours say nothing of where the ego is
     assert track.x[:, 0, 0] == pytest.approx(solo.x[:, 0, 0], abs=1e-4)
-    assert MovingHorizon(5)(recording, [0]).notes == ()
+    assert MovingHorizon(horizon=5)(recording, [0]).notes == ()
 
 
-@pytest.mark.parametrize("method", [FixedLagSmoother(2), MovingHorizon(2)], ids=label)
+@pytest.mark.parametrize("method", [FixedLagSmoother(lag=2), MovingHorizon(horizon=2)], ids=label)
 def test_consistent_and_on_the_bound(method, formation: Fleet) -> None:
     """NEES gate as in test_methods; RT-LE is not below the filtering bound of the star beyond its interval, nor far."""
     sensors = replace(S2, velocity_reading="speed")
@@ -296,7 +296,8 @@ def test_smoothing_is_held_to_the_smoothing_bound(formation: Fleet) -> None:
     fleet, v2x = formation.select(range(4)).between(0, 60), V2X(max_neighbours=3)
     recording = observe(fleet, sensors, v2x, runs=20, observers=[0])
     scores = [
-        np.sqrt((rt_le(FixedLagSmoother(lag, smoothed=True)(recording, [0]), fleet) ** 2).mean()) for lag in (0, 3, 10)
+        np.sqrt((rt_le(FixedLagSmoother(lag=lag, smoothed=True)(recording, [0]), fleet) ** 2).mean())
+        for lag in (0, 3, 10)
     ]
     assert (
         scores[0] > scores[1] > scores[2] > 0.9 * bound_rt_le(posterior_bound(fleet, sensors, 0, v2x, smoothing=True))
@@ -308,7 +309,8 @@ def test_backends_solve_the_same_windows(crossing: Fleet, backend: str) -> None:
     recording = observe(crossing.between(0, 12), S2, V2X(max_neighbours=3, latency=0.2), runs=1)
     for noise_model, exact, close in (("nominal", False, 1e-6), ("nominal", True, 2e-3)):
         ours, theirs = (
-            MovingHorizon(4, b, noise_model=noise_model, exact=exact)(recording, [0]) for b in ("gauss-newton", backend)
+            MovingHorizon(horizon=4, backend=b, noise_model=noise_model, exact=exact)(recording, [0])
+            for b in ("gauss-newton", backend)
         )
         assert theirs.x == pytest.approx(ours.x, abs=close)
         assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-9)
@@ -342,7 +344,7 @@ def test_a_top_speed_is_scipys_constrained_minimum(formation: Fleet) -> None:
     """Independent check: scipy's SLSQP on the whole (first) window of a vehicle that may do 9.8 m/s and does 10."""
     fleet = formation.select(range(2)).between(0, 3)
     recording = observe(fleet, S2, V2X(max_neighbours=1), runs=1, observers=[0], seed=3)
-    track = MovingHorizon(2, "casadi", top_speed=9.8)(recording, [0])
+    track = MovingHorizon(horizon=2, backend="casadi", top_speed=9.8)(recording, [0])
     window = last_window(recording, resolve("nominal", recording), 3, True, 0)
     start = window.points
 
@@ -368,10 +370,10 @@ def hill(x, y, m):
 def test_constraints_hold_and_help(formation: Fleet) -> None:
     fleet = formation.select(range(3)).between(0, 12)
     recording = observe(fleet, S2, V2X(max_neighbours=2), runs=1, observers=[0])
-    free = MovingHorizon(3)(recording, [0])
+    free = MovingHorizon(horizon=3)(recording, [0])
     for backend in ("osqp", "casadi"):
-        band = MovingHorizon(3, backend, road=(-1.5, 1.5))(recording, [0])
-        level = MovingHorizon(3, backend, road=0.0)(recording, [0])
+        band = MovingHorizon(horizon=3, backend=backend, road=(-1.5, 1.5))(recording, [0])
+        level = MovingHorizon(horizon=3, backend=backend, road=0.0)(recording, [0])
         assert np.abs(band.x[..., 2]).max() <= 1.5 + 1e-6
         assert np.abs(level.x[..., 2]).max() < 1e-6
         assert rt_le(level, fleet).mean() < rt_le(band, fleet).mean() < rt_le(free, fleet).mean()
@@ -382,17 +384,19 @@ def test_constraints_hold_and_help(formation: Fleet) -> None:
     height = hill(*np.moveaxis(fleet.position[..., :2], -1, 0), np)
     raised = replace(fleet, position=fleet.position + height[..., None] * [0, 0, 1])
     drive = observe(raised, S2, V2X(max_neighbours=2), runs=1, observers=[0])
-    track = MovingHorizon(3, "casadi", road=hill, top_speed=15.0)(drive, [0])
+    track = MovingHorizon(horizon=3, backend="casadi", road=hill, top_speed=15.0)(drive, [0])
     x, y, z = np.moveaxis(track.x, -1, 0)
     assert z == pytest.approx(hill(x, y, np), abs=1e-6)
-    assert rt_le(track, raised).mean() < rt_le(MovingHorizon(3)(drive, [0]), raised).mean()
+    assert rt_le(track, raised).mean() < rt_le(MovingHorizon(horizon=3)(drive, [0]), raised).mean()
 
 
 def test_a_top_speed_is_no_trouble_to_who_stands() -> None:
     """The speed has no derivative at zero; a standing vehicle's windows are solved all the same."""
     position = np.tile([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]], (10, 1, 1))
     fleet = Fleet(("a", "b"), np.arange(10) * 0.1, position, 0 * position)
-    track = MovingHorizon(4, "casadi", road=0.0, top_speed=20.0)(observe(fleet, S2, V2X(max_neighbours=1)), [0])
+    track = MovingHorizon(horizon=4, backend="casadi", road=0.0, top_speed=20.0)(
+        observe(fleet, S2, V2X(max_neighbours=1)), [0]
+    )
     assert track.notes == ("casadi loops over the runs",)
     assert np.abs(track.x[..., 2]).max() < 1e-6
 
@@ -405,16 +409,16 @@ def test_the_catalogue_has_them() -> None:
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda: FixedLagSmoother(-1), "lag"),
-        (lambda: FixedLagSmoother(2, "osqp"), "backend"),
-        (lambda: MovingHorizon(0), "horizon"),
-        (lambda: MovingHorizon(5, "ipopt"), "backend"),
-        (lambda: MovingHorizon(5, road=0.0), "backend"),
-        (lambda: MovingHorizon(5, "osqp", road=hill), "backend"),
-        (lambda: MovingHorizon(5, "osqp", top_speed=20.0), "backend"),
-        (lambda: MovingHorizon(5, "casadi", top_speed=0.0), "top_speed"),
-        (lambda: MovingHorizon(5, "casadi", road=(1.0, 0.0)), "road"),
-        (lambda: MovingHorizon(5, "osqp", road=np.nan), "road"),
+        (lambda: FixedLagSmoother(lag=-1), "lag"),
+        (lambda: FixedLagSmoother(lag=2, backend="osqp"), "backend"),
+        (lambda: MovingHorizon(horizon=0), "horizon"),
+        (lambda: MovingHorizon(horizon=5, backend="ipopt"), "backend"),
+        (lambda: MovingHorizon(horizon=5, road=0.0), "backend"),
+        (lambda: MovingHorizon(horizon=5, backend="osqp", road=hill), "backend"),
+        (lambda: MovingHorizon(horizon=5, backend="osqp", top_speed=20.0), "backend"),
+        (lambda: MovingHorizon(horizon=5, backend="casadi", top_speed=0.0), "top_speed"),
+        (lambda: MovingHorizon(horizon=5, backend="casadi", road=(1.0, 0.0)), "road"),
+        (lambda: MovingHorizon(horizon=5, backend="osqp", road=np.nan), "road"),
     ],
 )
 def test_wrong_input_says_what_to_do(make, field: str) -> None:

@@ -84,7 +84,10 @@ def test_the_robust_track_is_the_windows_own_graduation(lied_to: Recording, loss
 def test_other_backends_give_the_same_robust_track(lied_to: Recording, crossing: Fleet) -> None:
     short = observe(crossing.between(0, 4), S2, V2X(max_neighbours=4, radius=40), observers=[0])
     short = spoofed(short, 0.6, honest=[0])
-    ours, theirs = (CooperativeMAP(backend, 3, robust="truncated")(short, [0]) for backend in ("gauss-newton", "gtsam"))
+    ours, theirs = (
+        CooperativeMAP(backend=backend, window=3, robust="truncated")(short, [0])
+        for backend in ("gauss-newton", "gtsam")
+    )
     assert theirs.x == pytest.approx(ours.x, abs=5e-5)
     assert theirs.notes == ("gtsam loops over the runs",)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from ..arrays import Floats, number, refuse
+from ..arrays import Floats, instance, number, refuse
 from ..errors import InputError
 from ..kernels.scores import distances, normalised, root_mean_squares
 from ..methods.track import Track
@@ -15,11 +15,14 @@ from ..world.recording import Recording
 
 def errors(track: Track, fleet: Fleet) -> Floats:
     """Distance between estimate and truth, (R, T, E) m."""
-    return distance(track.x, _truth(track, fleet))
+    truth = _truth(track, fleet)
+    return distance(track.x, truth)
 
 
 def _truth(track: Track, fleet: Fleet) -> Floats:
     """(T, E, 3) m of the egos; InputError if the fleet is not the one that was recorded."""
+    track = instance("track", track, Track, "A method makes one of a recording: the track stands before the fleet.")
+    fleet = instance("fleet", fleet, Fleet, "Score a track against its fleet: the track stands before the fleet.")
     egos = np.array(track.egos, dtype=np.int64)
     hint = "Score a track against the fleet that its recording was observed from."
     if len(track.t) != len(fleet.t):
@@ -77,14 +80,15 @@ def nees(track: Track, fleet: Fleet) -> Floats:
 
     NaN where the covariance is zero: at a start that is known, there is nothing to normalise by.
     """
+    truth = _truth(track, fleet)
     if track.covariance is None:
-        raise InputError(
-            "covariance", None, "this method claims none", "NEES needs a method that reports a covariance."
-        )
-    arrays = (np.ascontiguousarray(values) for values in (track.x, _truth(track, fleet), track.covariance))
+        hint = "NEES needs a method that reports a covariance."
+        raise InputError("covariance", None, "this method claims none", hint)
+    arrays = (np.ascontiguousarray(values) for values in (track.x, truth, track.covariance))
     found, sound = normalised(*arrays)
     if not sound:
-        raise np.linalg.LinAlgError("Singular covariance")
+        hint = "Assume noise in every direction: no standard deviation may be zero."
+        raise InputError("covariance", "singular", "must have an inverse for NEES", hint)
     return found
 
 

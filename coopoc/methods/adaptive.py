@@ -13,11 +13,12 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.solo import FixNoise
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .kalman import axis_track, filtered
 from .noise_model import NoiseModel
+from .options import check_options
 from .stream import FilterStream, motion_noise
 from .track import Track
 
@@ -47,6 +48,7 @@ class NoiseAdaptive(ABC):
     message: Message = NO_MESSAGE
 
     def __post_init__(self) -> None:
+        check_options(self)
         positive("prior_weight", self.prior_weight)
 
     @property
@@ -56,7 +58,7 @@ class NoiseAdaptive(ABC):
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
         x, p, _ = self._filtered(recording, columns)
         return axis_track(recording, columns, x, p, began, (velocity_note(self.assumed),))
 
@@ -66,7 +68,7 @@ class NoiseAdaptive(ABC):
 
     def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
-        noise = self._filtered(recording, recording.columns(egos, missing=True))[2]
+        noise = self._filtered(recording, check_recording(recording).columns(egos, missing=True))[2]
         known = np.broadcast_to(self.fixes.variance, (recording.runs, len(recording.t), len(egos), 3))
         return np.sqrt(noise if noise.size else known)
 

@@ -13,6 +13,7 @@ from ..world.exchange import exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
+from .options import check_options
 from .track import Track
 from .whole_fleet import Answer, fleet_track
 
@@ -58,7 +59,8 @@ class ConsensusADMM:
     cooperative: bool = True
 
     def __post_init__(self) -> None:
-        if self.rounds != int(self.rounds) or self.rounds < 1:
+        check_options(self)
+        if self.rounds < 1:
             raise InputError("rounds", self.rounds, "must be a whole number >= 1", "Use 1 for one exchange a step.")
         if not (np.isfinite(self.rho) and self.rho > 0):
             raise InputError("rho", self.rho, "must be positive and finite", "About the information of a fix, 1/m^2.")

@@ -15,6 +15,7 @@ from ..world.recording import Recording
 from ..world.v2x import Message
 from .central_filter import CENTRE, UPLOAD, centre
 from .noise_model import NoiseModel
+from .options import check_options
 from .track import Track
 from .whole_fleet import Answer, fleet_track
 
@@ -57,7 +58,8 @@ class BatchSmoother:
     message: Message = UPLOAD
 
     def __post_init__(self) -> None:
-        if self.exact_steps != int(self.exact_steps) or self.exact_steps < 0:
+        check_options(self)
+        if self.exact_steps < 0:
             raise InputError("exact_steps", self.exact_steps, "must be a whole number >= 0", "Use 1; 0 is linear only.")
         if not self.settle > 0:
             raise InputError("settle", f"{self.settle} m", "must be > 0", "Use 1e-3, or infinity for no further steps.")

@@ -13,6 +13,7 @@ from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel
+from .options import check_options
 from .track import Track
 from .whole_fleet import Answer, fleet_track
 
@@ -50,6 +51,9 @@ class CentralFilter:
     name: str = "central-filter"
     cooperative: bool = True
     message: Message = UPLOAD
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""

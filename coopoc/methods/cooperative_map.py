@@ -24,6 +24,7 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import assumptions, measurements
 from .track import Track
 from .window import Positions, dead_reckoned, last_met, steps_of, vehicles_of
@@ -55,10 +56,10 @@ class CooperativeMAP:
     that it receives.
 
     Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
         backend: of `coopoc.optimize.backends()`. Only gauss-newton batches over the runs; the others loop, which their
             tracks note.
         window: steps.
-        noise_model: "identity", "nominal" or a NoiseModel.
         robust: "truncated" or "geman-mcclure"; None for no robust loss.
         threshold: probability that the fixes of an honest neighbour in a window pass (of a robust loss).
         ego_candidates: the ego's own fixes and its odometry may be outliers, too, each as one group. Where every fix is
@@ -73,9 +74,9 @@ class CooperativeMAP:
     (4, 2, 1, 3)
     """
 
+    noise_model: NoiseModel | str = "nominal"
     backend: str = "gauss-newton"
     window: int = 1
-    noise_model: NoiseModel | str = "nominal"
     robust: str | None = None
     threshold: float = 0.99
     ego_candidates: bool = False
@@ -84,7 +85,8 @@ class CooperativeMAP:
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
-        if self.window != int(self.window) or self.window < 1:
+        check_options(self)
+        if self.window < 1:
             raise InputError("window", self.window, "must be a whole number >= 1", "Use 1 for a snapshot.")
         require_backend(self.backend)
         if self.robust is not None:

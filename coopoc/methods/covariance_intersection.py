@@ -9,10 +9,11 @@ from typing import Literal
 from ..kernels.intersection import follow
 from ..plugins import unknown
 from ..world.inbox import Inbox
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import ACCELERATION_STD, estimates, measurements
 from .track import Track
 
@@ -54,6 +55,7 @@ class CovarianceIntersection:
     message: Message = ESTIMATE_AND_COV
 
     def __post_init__(self) -> None:
+        check_options(self)
         if self.criterion not in ("trace", "det"):
             raise unknown("criterion", self.criterion, ("trace", "det"))
 
@@ -64,7 +66,7 @@ class CovarianceIntersection:
         age (age + 2) of its variances at most. Relative noise is rotated to the predicted geometry: at the measured one
         the weight would depend on the noise.
         """
-        known, columns = resolve(self.noise_model, recording), recording.columns(egos, missing=True)
+        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
         assumed, own = estimates(recording, known, columns, (1.0, 2.0), ACCELERATION_STD)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:

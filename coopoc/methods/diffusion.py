@@ -11,6 +11,7 @@ from ..world.exchange import exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
+from .options import check_options
 from .track import Track
 from .whole_fleet import Answer, fleet_track
 
@@ -58,7 +59,8 @@ class Diffusion:
     cooperative: bool = True
 
     def __post_init__(self) -> None:
-        if self.rounds != int(self.rounds) or self.rounds < 1:
+        check_options(self)
+        if self.rounds < 1:
             raise InputError("rounds", self.rounds, "must be a whole number >= 1", "150 is as published.")
 
     @property

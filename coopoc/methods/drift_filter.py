@@ -14,6 +14,7 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import assumptions, measurements
 from .track import Track
 
@@ -39,6 +40,9 @@ class DriftFilter:
     name: str = "drift"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from ..arrays import Floats, Ints
 from ..world.inbox import Inbox, inbox
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from .track import Method, Track
 
 
@@ -44,7 +44,7 @@ def follow_egos(
         InputError: an ego that is unknown, no observer of this recording, or absent at times; a missing fix.
     """
     began = time.perf_counter()
-    columns = recording.columns(egos, missing)
+    columns = check_recording(recording).columns(egos, missing)
     if not missing:
         recording.require_complete()
     shape = (recording.runs, len(recording.t), len(columns), 3)

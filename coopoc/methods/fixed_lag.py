@@ -19,6 +19,7 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import FORGOTTEN, assumptions, measurements
 from .track import Track
 from .window import places, steps_of, vehicles_of
@@ -38,11 +39,11 @@ class FixedLagSmoother:
     Messages are brought forward as there; MovingHorizon puts them at their true time.
 
     Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
         lag: steps.
         backend: "gauss-newton", batched over the runs, or "gtsam", its incremental fixed-lag smoother, which loops over
             the runs and makes each helding linear once, when it comes.
         smoothed: answer each step when it leaves the window, `lag` steps late; the last ones at the end of the drive.
-        noise_model: "identity", "nominal" or a NoiseModel.
         exact: False keeps heldings as converted vectors.
 
     Raises:
@@ -54,17 +55,18 @@ class FixedLagSmoother:
     (4, 2, 1, 3)
     """
 
+    noise_model: NoiseModel | str = "nominal"
     lag: int = 5
     backend: str = "gauss-newton"
     smoothed: bool = False
-    noise_model: NoiseModel | str = "nominal"
     exact: bool = True
     name: str = "fixed-lag"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
-        if self.lag != int(self.lag) or self.lag < 0:
+        check_options(self)
+        if self.lag < 0:
             raise InputError("lag", self.lag, "must be a whole number >= 0", "Use 0 for the filter.")
         if self.backend not in BACKENDS:
             raise unknown("backend", self.backend, BACKENDS, "Leave it out.")

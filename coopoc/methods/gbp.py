@@ -12,6 +12,7 @@ from ..world.exchange import exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
+from .options import check_options
 from .track import Track
 from .whole_fleet import Answer, fleet_track
 
@@ -59,7 +60,8 @@ class GaussianBeliefPropagation:
     cooperative: bool = True
 
     def __post_init__(self) -> None:
-        if self.rounds != int(self.rounds) or self.rounds < 1:
+        check_options(self)
+        if self.rounds < 1:
             raise InputError("rounds", self.rounds, "must be a whole number >= 1", "Use 1 for one exchange a step.")
         if not 0 <= self.damping < 1:
             raise InputError("damping", self.damping, "must be in [0, 1)", "Use 0 for none, 0.4 to 0.6 for hard loops.")

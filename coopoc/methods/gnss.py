@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .track import Track
 
@@ -24,7 +24,7 @@ class GNSS:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         began = time.perf_counter()
-        columns = recording.columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos, missing=True)
         fixes = recording.gnss[:, :, columns]
         there = np.isfinite(fixes).all(axis=-1, keepdims=True)
         newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)

@@ -12,9 +12,10 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.solo import FixNoise, drive
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .stream import FilterStream, alone, motion_noise
 from .track import Track
 
@@ -39,10 +40,13 @@ class Kalman:
     cooperative: bool = False
     message: Message = NO_MESSAGE
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
-        columns = recording.columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos, missing=True)
         known = resolve(self.noise_model, recording)
         gnss, velocity = recording.gnss.take(columns, axis=2), recording.velocity.take(columns, axis=2)
         variance = known.process_variance(recording, columns)

@@ -15,6 +15,7 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import assumptions, measurements
 from .track import Track
 
@@ -42,6 +43,7 @@ class LKFSA:
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
+        check_options(self)
         for field, allowed in (("transition", ("identity", "ones")), ("membership", ("keep", "reset"))):
             if getattr(self, field) not in allowed:
                 raise unknown(field, getattr(self, field), allowed)

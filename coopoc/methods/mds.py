@@ -12,11 +12,12 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..plugins import unknown
 from ..world.inbox import Inbox
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .bridge import bridge
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .scaling import complete, fit, majorise, shape
 from .star import StarStep, star_steps
 from .track import Track
@@ -53,9 +54,10 @@ class MDS:
     cooperative: bool = True
 
     def __post_init__(self) -> None:
+        check_options(self)
         for field in ("iterations", "ranges"):
             value = getattr(self, field)
-            if value != int(value) or value < 0:
+            if value < 0:
                 raise InputError(field, value, "must be a whole number >= 0", "Use 0 for none.")
         if self.missing not in ("paths", "angles"):
             raise unknown("missing", self.missing, ("paths", "angles"))
@@ -72,7 +74,7 @@ class MDS:
         """
         recording, known, notes = bridge(recording, resolve(self.noise_model, recording))
         links = recording.links
-        columns = recording.columns(egos)
+        columns = check_recording(recording).columns(egos)
         neighbours = np.unique(links.neighbour[np.isin(links.observer, columns)])
         listed = min(self.ranges, recording.v2x.max_neighbours) if np.isin(neighbours, recording.observers).any() else 0
         method = replace(self, ranges=listed)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import suppress
+
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import Floats, number
 from ..errors import InputError
 from ..kernels.motion import ROUNDING, push, since
 
@@ -69,21 +72,16 @@ class MotionHistory:
 
 def check_age(age: float, seen: float) -> None:
     """InputError unless the motion since a fix of this age, s, is kept."""
-    if not -ROUNDING <= age <= seen + ROUNDING:
-        raise InputError(
-            "fix_age",
-            f"{age} s",
-            f"must be in 0..{seen:g} s, the motion that is kept",
-            "Leave such a fix out (None), or keep more: start(..., history=).",
-        )
+    hint = "Leave such a fix out (None), or keep more: start(..., history=)."
+    kept = f"in 0..{seen:g} s, the motion that is kept"
+    number("fix_age", age, -ROUNDING, seen + ROUNDING, allowed=kept, hint=hint)
 
 
 def check_step(
     gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float, history: MotionHistory
 ) -> None:
     """InputError if a stream cannot take this step; the history is not changed."""
-    if not (np.isfinite(dt) and dt > 0):
-        raise InputError("dt", f"{dt} s", "must be finite and > 0", "Give the seconds since the last step.")
+    number("dt", dt, sys.float_info.min, allowed="finite and > 0", hint="Give the seconds since the last step.")
     three("velocity", velocity)
     if not np.isnan(fix_or_none(gnss)).all():
         check_age(fix_age, history.reach(dt))
@@ -97,7 +95,7 @@ def three(field: str, value: npt.ArrayLike) -> Floats:
     ...
     coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers. Give east, north, up.
     """
-    array = np.asarray(value, dtype=float)
+    array = numbers(value)
     if array.shape != (3,) or not np.isfinite(array).all():
         raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
     return array
@@ -105,13 +103,24 @@ def three(field: str, value: npt.ArrayLike) -> Floats:
 
 def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
     """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
-    if gnss is None or (np.shape(gnss) == (3,) and np.isnan(np.asarray(gnss, dtype=float)).all()):
-        return np.full(3, np.nan)
-    return three(field, gnss)
+    given = np.full(3, np.nan) if gnss is None else numbers(gnss)
+    return given if given.shape == (3,) and np.isnan(given).all() else three(field, "none" if gnss is None else gnss)
 
 
 def seconds(field: str, value: float) -> float:
     """A time that is finite and >= 0; InputError naming the field if it is not."""
-    if not (np.isfinite(value) and value >= 0):
-        raise InputError(field, f"{value} s", "must be finite and >= 0", "Give seconds.")
-    return value
+    found: float = number(field, value, hint="Give seconds.")
+    return found
+
+
+def numbers(value: npt.ArrayLike) -> Floats:
+    """As an array of floats; an empty one of what holds no numbers.
+
+    >>> numbers("east").size
+    0
+    """
+    with suppress(ValueError):
+        given = np.asarray(value)
+        if given.dtype.kind in "fiu":
+            return given.astype(float)
+    return np.empty(0)

@@ -16,6 +16,7 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import assumptions, measurements
 from .track import Track
 from .window import points_of, steps_of
@@ -45,13 +46,13 @@ class MovingHorizon:
     other solution. The covariance knows of equalities only: under an exact height it is singular.
 
     Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
         horizon: N, steps.
         backend: "gauss-newton" solves all runs at once by block elimination, and no constraints; others of
             `coopoc.optimize.backends()` loop over the runs: osqp can hold heights, casadi all.
         road: the height m of all vehicles, (lowest, highest), or a surface z = f(x, y, m) with m a namespace that has
             sqrt, atan2 and where.
         top_speed: m/s from step to step.
-        noise_model: "identity", "nominal" or a NoiseModel.
         exact: False keeps relative measurements as converted vectors.
 
     Raises:
@@ -63,18 +64,19 @@ class MovingHorizon:
     (4, 2, 1, 3)
     """
 
+    noise_model: NoiseModel | str = "nominal"
     horizon: int = 10
     backend: str = "gauss-newton"
     road: Road | None = None
     top_speed: float | None = None
-    noise_model: NoiseModel | str = "nominal"
     exact: bool = True
     name: str = "mhe"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
-        if self.horizon != int(self.horizon) or self.horizon < 1:
+        check_options(self)
+        if self.horizon < 1:
             raise InputError("horizon", self.horizon, "must be a whole number >= 1", "Use 10 to 20 at 10 Hz.")
         require_backend(self.backend)
         self._check_constraints()

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 from ..kernels.msmv import follow
 from ..world.inbox import Inbox
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import estimates, measurements
 from .track import Track
 
@@ -33,6 +34,9 @@ class MSMV:
     name: str = "msmv-r"
     cooperative: bool = True
 
+    def __post_init__(self) -> None:
+        check_options(self)
+
     @property
     def message(self) -> Message:
         """Without covariance under the identity noise model, with it otherwise."""
@@ -41,7 +45,7 @@ class MSMV:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
-        known, columns = resolve(self.noise_model, recording), recording.columns(egos, missing=True)
+        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
         assumed, own = estimates(recording, known, columns, (0.0, 1.0), 0.0)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:

@@ -11,7 +11,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..plugins import suggestion
 from ..world.fleet import Fleet
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.spherical import vector_cov
 
@@ -142,7 +142,7 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
     if noise_model == "identity":
         return NoiseModel.identity()
     if noise_model == "nominal":
-        return _resolvable(NoiseModel.nominal(recording.sensors))
+        return _resolvable(NoiseModel.nominal(check_recording(recording).sensors))
     raise InputError(
         "noise_model",
         repr(noise_model),

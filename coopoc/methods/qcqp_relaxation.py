@@ -17,6 +17,7 @@ from ..world.v2x import FIX_AND_VELOCITY, Message
 from .bridge import bridge
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
+from .options import check_options
 from .star import StarStep, star_steps
 from .track import Track
 
@@ -43,6 +44,9 @@ class QCQPRelaxation:
     name: str = "qcqp-relaxation"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..kernels.messages import Assumptions
 from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
 from ..kernels.star_stream import FIX, MESSAGE, MESSAGE_AGE, RELATIVE, VELOCITY, Noise, packed, resized, stream_step
-from .motion_history import MotionHistory, check_step, fix_or_none, seconds, three
+from .motion_history import MotionHistory, check_step, fix_or_none, numbers, seconds, three
 from .noise_model import NoiseModel
 from .star import ACCELERATION_STD, FORGOTTEN, relative_noise
 from .stream import motion_noise
@@ -44,8 +44,8 @@ class RelativeMeasurement:
 
     def __post_init__(self) -> None:
         row = np.full(11, np.nan)
-        relative = np.asarray(self.relative, dtype=float)
-        if relative.shape != (3,) or not self.id or not (0.0 <= relative[0] < math.inf or math.isnan(relative[0])):
+        relative, named = numbers(self.relative), isinstance(self.id, str) and self.id
+        if relative.shape != (3,) or not named or not (0.0 <= relative[0] < math.inf or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and >= 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
         row[RELATIVE], row[MESSAGE] = relative, float(self.velocity is not None)
@@ -142,12 +142,20 @@ class StarStream:
         Raises:
             InputError: as `Stream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
-        names, given = [s.id for s in neighbours], self._given
+        try:
+            names, given = [s.id for s in neighbours], self._given
+        except (TypeError, AttributeError):
+            hint = "Give a list of coopoc.RelativeMeasurement, empty for none."
+            raise InputError("neighbours", repr(neighbours)[:60], "must be relative measurements", hint) from None
         if len(set(names)) < len(names):
             raise InputError("neighbours", names, "must be given once each", "Merge the measurements of one vehicle.")
         if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
             check_step(gnss, velocity, dt, fix_age, self.history)
-        given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        try:
+            given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        except (TypeError, ValueError):
+            check_step(gnss, velocity, dt, fix_age, self.history)
+            raise
         k = len(names)
         if k >= self._index[1]:
             self._reserve(2 * (k + 1))

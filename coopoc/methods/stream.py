@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
@@ -9,11 +10,11 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import Floats, number
 from ..errors import InputError
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import ESTIMATE, GNSS, HISTORY_FULL, NO_FIX_YET, VELOCITY, FixNoise, packed, stream_step
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from .motion_history import MotionHistory, check_step, three
 from .noise_model import NoiseModel, resolve
 from .track import Track
@@ -124,7 +125,11 @@ class FilterStream:
         given, answer = self._given, np.empty(12)
         if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
             check_step(gnss, velocity, dt, fix_age, self.history)
-        given[GNSS], given[VELOCITY], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        try:
+            given[GNSS], given[VELOCITY], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        except (TypeError, ValueError):
+            check_step(gnss, velocity, dt, fix_age, self.history)
+            raise
         found = stream_step(given, self._state, self.history.rows, self._noise, answer)
         while found == HISTORY_FULL:
             self.history.grow()
@@ -165,8 +170,7 @@ def motion_noise(known: NoiseModel, interval: float) -> MotionNoise:
 
 def check_interval(interval: float) -> None:
     """InputError unless an interval is finite and > 0."""
-    if not (np.isfinite(interval) and interval > 0):
-        raise InputError("interval", f"{interval} s", "must be finite and > 0", "The dt that the noise belongs to.")
+    number("interval", interval, sys.float_info.min, allowed="finite and > 0", hint="The dt that the noise belongs to.")
 
 
 def scan(solo: Solo[State], recording: Recording, columns: Sequence[int], x0: Floats | None) -> Iterator[State]:
@@ -187,7 +191,7 @@ def solo_track(
     solo: Solo[State], recording: Recording, egos: Sequence[int | str], x0: Floats | None, notes: tuple[str, ...] = ()
 ) -> Track:
     """Track of a solo filter, which receives and sends nothing; InputError if an ego is unknown or absent."""
-    began, columns = time.perf_counter(), recording.columns(egos, missing=True)
+    began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
     found = [solo.read(state) for state in scan(solo, recording, columns, x0)]
     x = np.stack([position for position, _ in found], axis=1)
     claims = [covariance for _, covariance in found if covariance is not None]

@@ -8,8 +8,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, checked
 from ..errors import InputError
+from ..world.axes import texts
 from ..world.recording import Recording
 from ..world.v2x import Message
 
@@ -42,9 +43,22 @@ class Track:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("t", "x", "covariance", "received_bytes", "sent_bytes", "neighbours"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, frozen(getattr(self, name)))
+        egos = checked("egos", self.egos, "(E,)", (-1,), int)
+        object.__setattr__(self, "egos", tuple(egos.tolist()))
+        t, x = checked("t", self.t, "(T,)", (-1,)), checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
+        runs, steps = x.shape[:2]
+        shapes: dict[str, tuple[str, tuple[int, ...]]] = {
+            "t": ("(T,)", (steps,)),
+            "x": ("(R, T, E, 3)", (runs, len(t), len(egos), 3)),
+            "covariance": ("(R, T, E, 3, 3)", (*x.shape, 3)),
+            "received_bytes": ("(R, E)", (runs, len(egos))),
+            "sent_bytes": ("(R, E)", (runs, len(egos))),
+            "neighbours": ("(R, L, 3)", (runs, -1, 3)),
+        }
+        for name, (axes, shape) in shapes.items():
+            if name not in ("covariance", "neighbours") or getattr(self, name) is not None:
+                object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
+        object.__setattr__(self, "notes", texts("notes", self.notes))
         if not np.isfinite(self.x).all():
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
             raise InputError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..world.exchange import Exchange
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
@@ -65,7 +65,7 @@ def fleet_track(
     from ..kernels.answers import bring_forward, dead_reckon, newest
 
     began = time.perf_counter()
-    columns = recording.columns(egos, missing=True)
+    columns = check_recording(recording).columns(egos, missing=True)
     met, known = contacts(), resolve(noise_model, recording)
     arrival = met.both if both_ways else met.either
     measured, pairs, assumed = kernel_arguments(recording, met, known, arrival)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, number
 from ..optimize.constraint import Constraint
 from ..optimize.factor import Factor
 from ..optimize.measurements import measurement
@@ -116,7 +116,10 @@ def heights(road: Road | None) -> tuple[float, float]:
     """
     if road is None or callable(road):
         return -np.inf, np.inf
-    return road if isinstance(road, tuple) else (road, road)
+    low, high = road if isinstance(road, tuple | list) and len(road) == 2 else (road, road)
+    hint = "Give a height m, (lowest, highest), or a surface z = f(x, y, m)."
+    least, most = (number("road", z, -np.inf, np.inf, allowed="in m", hint=hint) for z in (low, high))
+    return least, most
 
 
 def violated(problem: Problem, x: Floats, tolerance: float = 1e-6) -> Bools:

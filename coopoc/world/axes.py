@@ -13,6 +13,17 @@ from ..errors import InputError
 from ..plugins import unknown
 
 
+def texts(field: str, values: object) -> tuple[str, ...]:
+    """A tuple of texts; InputError if it is one text, or holds anything else.
+
+    >>> texts("notes", ["a reconstruction"])
+    ('a reconstruction',)
+    """
+    if isinstance(values, str) or not isinstance(values, Iterable) or not all(isinstance(v, str) for v in values):
+        raise InputError(field, repr(values)[:60], "must be a sequence of texts", 'Give a tuple such as ("a note",).')
+    return tuple(values)
+
+
 def names(ids: Iterable[object]) -> tuple[str, ...]:
     """Ids of vehicles as a tuple of words; InputError if there is none, or one stands twice.
 

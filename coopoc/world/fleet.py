@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats, checked
+from ..arrays import Bools, Floats, checked, number
 from ..errors import InputError
 from .axes import clock, column, columns, interval, names
 
@@ -82,7 +82,9 @@ class Fleet:
         )
 
     def between(self, start: int, stop: int) -> Fleet:
-        """Steps start..stop-1 of the drive."""
+        """Steps start..stop-1 of the drive; negative ones count from the end. InputError if one is no whole number."""
+        for name, step in (("start", start), ("stop", stop)):
+            number(name, step, -(2**62), 2**62, kind=int, allowed="a step", hint="Count steps from 0.")
         return replace(
             self, t=self.t[start:stop], position=self.position[start:stop], velocity=self.velocity[start:stop]
         )

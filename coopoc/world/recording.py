@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, refuse
+from ..arrays import Bools, Floats, Ints, checked, instance, refuse
 from ..errors import InputError
-from .axes import clock, columns, interval, names
+from .axes import clock, columns, interval, names, texts
 from .consistency import check_links, check_measurements
 from .links import Links
 from .sensors import Sensors
@@ -68,7 +69,7 @@ class Recording:
             "broadcasts": checked("broadcasts", self.broadcasts, "(T, N)", gnss.shape[1:3], bool),
             "arrival": checked("arrival", self.arrival, "(R, L)", (len(gnss), links), int),
             "observers": tuple(checked("observers", self.observers, "(O,)", (-1,), int).tolist()),
-            "notes": tuple(self.notes),
+            "notes": texts("notes", self.notes),
         }
         for name, value in found.items():
             object.__setattr__(self, name, value)
@@ -162,3 +163,8 @@ class Recording:
             f"Recording({self.runs} runs x {len(self.t)} steps x {len(self.ids)} vehicles, {len(self.links)} links, "
             f"K <= {self.v2x.max_neighbours})"
         )
+
+
+def check_recording(value: Any) -> Recording:
+    """The value if it is a Recording; InputError otherwise."""
+    return instance("recording", value, Recording, "co.observe(fleet, sensors) makes one of a fleet.")

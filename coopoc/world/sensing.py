@@ -8,7 +8,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, number
+from ..arrays import AnyArray, Bools, Floats, Ints, instance, number
 from ..errors import InputError
 from .axes import columns
 from .fleet import Fleet
@@ -61,12 +61,10 @@ def observe(
     >>> observe(fleet, Sensors(), V2X(max_neighbours=1), runs=3)
     Recording(3 runs x 2 steps x 2 vehicles, 4 links, K <= 1)
     """
-    for name, value, kind in (("fleet", fleet, Fleet), ("sensors", sensors, Sensors), ("v2x", v2x or V2X(), V2X)):
-        if not isinstance(value, kind):
-            raise InputError(name, repr(value)[:60], f"must be {kind.__name__}", f"Give {kind.__name__}(...).")
+    fleet, sensors = instance("fleet", fleet, Fleet), instance("sensors", sensors, Sensors)
+    v2x = V2X.ideal() if v2x is None else instance("v2x", v2x, V2X)
     runs = number("runs", runs, 1, 2**32, kind=int, allowed=">= 1", hint="Use at least one noise run.")
     seed = number("seed", seed, 0, 2**63, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
-    v2x = v2x or V2X.ideal()
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
     links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range)

@@ -63,7 +63,7 @@ class Sensors:
         for field in fields(self):
             name, value = field.name, getattr(self, field.name)
             if name in words:
-                if value not in words[name]:
+                if not isinstance(value, str) or value not in words[name]:
                     raise unknown(name, value, words[name])
             elif isinstance(field.default, tuple):
                 size = len(field.default)

@@ -41,7 +41,7 @@ class V2X:
     "most informative", which lowers the bound of its position most (`coopoc.world.informative`)."""
 
     def __post_init__(self) -> None:
-        if self.schedule not in get_args(Schedule):
+        if not isinstance(self.schedule, str) or self.schedule not in get_args(Schedule):
             raise unknown("schedule", self.schedule, get_args(Schedule))
         limits: dict[str, tuple[float, float, str]] = {
             "max_neighbours": (0, 1e6, ">= 0"),

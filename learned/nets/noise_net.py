@@ -17,7 +17,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.star import FORGOTTEN
 from coopoc.methods.track import Method, Track
-from coopoc.world.recording import Recording
+from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch
@@ -222,7 +222,7 @@ class NoiseFilter:
     @one_core()
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
         gnss, velocity = (lanes(a[:, :, columns]) for a in (recording.gnss, recording.velocity))
         theta = flatten([self.model]).double()
         with torch.inference_mode():

@@ -18,7 +18,7 @@ from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.stream import FilterStream, check_interval
 from coopoc.methods.track import Track
-from coopoc.world.recording import Recording
+from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch, Segments
@@ -79,7 +79,7 @@ class OptimisedKF:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos."""
-        began, columns = time.perf_counter(), recording.columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
         velocity = recording.velocity[:, :, columns]
         dt = recording.dt
         process = np.square(self.process_std) + (np.array(self.velocity_ratio) * dt * velocity) ** 2
