@@ -7,12 +7,15 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from coopoc.errors import InputError
 from coopoc.study import store
+from coopoc.study.cell import Params, Row
 from coopoc.study.manifest import read
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Study
@@ -152,3 +155,16 @@ def test_a_manifest_survives_whoever_is_killed_while_writing_it(study: Study, tm
     assert read(tmp_path / "small").study == "small"
     run_study(study, tmp_path, progress=False)
     assert not left.exists()
+
+
+def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(study: Study, tmp_path: Path) -> None:
+    def cell(params: Params) -> list[Row]:
+        for finished in sorted((tmp_path / "small/cells").glob("*.parquet"))[:1]:
+            finished.unlink()
+        return study.cell(params)
+
+    with pytest.raises(InputError, match=r"lost \d+ of \d+ cells while it ran"):
+        run_study(replace(study, cell=cell), tmp_path, progress=False)
+    assert not (tmp_path / "small/tables").exists()
+    whole = run_study(study, tmp_path, progress=False)
+    assert whole.pending == 0

@@ -60,7 +60,8 @@ def run_study(
 
     Raises:
         InputError: an unknown study or setting, jobs < 1, an invalid shard, a folder that cannot be written or that
-            another run uses, a cluster that cannot compute, see `cluster.connected`, or an error of `study.key`.
+            another run uses or from which finished cells vanish, a cluster that cannot compute, see
+            `cluster.connected`, or an error of `study.key`.
         MissingLibraryError: `cluster` without Dask.
         WorkerDiedError: a worker process was killed, mostly for want of memory, or no worker of a cluster is left;
             finished cells are kept.
@@ -76,6 +77,9 @@ def run_study(
         if shard:
             return Results.load(folder, {cell.name for cell in part})
         results = Results.load(folder)
+        if results.pending:
+            lost = f"lost {results.pending} of {len(cells)} cells while it ran: something else removed or changed them"
+            raise InputError("out", str(folder), lost, "Repeat the command: it computes what is missing.")
         publish(study, results, folder, progress)
         return results
 
