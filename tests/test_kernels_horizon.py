@@ -101,7 +101,7 @@ def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet, make: type) -
     known = NoiseModel.oracle(S2, crossing.between(0, 20))
     wanted, found = (
         JointFilter(known, exact=False)(recording, [1]),
-        make(3, noise_model=known, exact=False)(recording, [1]),
+        make(known, exact=False, **({"lag": 3} if make is FixedLagSmoother else {"horizon": 3}))(recording, [1]),
     )
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-8)
     np.testing.assert_allclose(found.covariance, wanted.covariance, atol=1e-8)

@@ -35,7 +35,7 @@ SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
     "fitted": (Kalman(FITTED), Kalman(FITTED).start),
     "adaptive": (AdaptiveKalman(), AdaptiveKalman().start),
     "variational": (VariationalKalman(), VariationalKalman().start),
-    "okf": (OKF, lambda x0=None: OKF.start(x0)),
+    "okf": (OKF, OKF.start),
 }
 STARTS: dict[str, Callable[..., Any]] = {
     **{name: start for name, (_, start) in SOLO.items()},
@@ -61,6 +61,18 @@ def test_step_by_step_is_the_track(name: str, crossing: Fleet) -> None:
     x, cov = play(start(), recording, 3, run=1)
     np.testing.assert_allclose(x, track.x[1, :, 0], atol=1e-12)
     np.testing.assert_allclose(cov, track.covariance[1, :, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [name for name in SOLO if name != "okf"])
+def test_once_a_second_it_is_the_track_too(name: str, crossing: Fleet) -> None:
+    """Without a word about dt: a step's velocity is one measurement, however long the step."""
+    method, start = SOLO[name]
+    slow = replace(crossing, t=crossing.t * 10, velocity=crossing.velocity / 10)
+    recording = observe(slow, S2, V2X(max_neighbours=0), runs=2)
+    assert recording.dt == pytest.approx(1.0)
+    x, cov = play(start(), recording, 3, run=1)
+    np.testing.assert_allclose(x, method(recording, [3]).x[1, :, 0], atol=1e-11)
+    np.testing.assert_allclose(cov, method(recording, [3]).covariance[1, :, 0], atol=1e-11)
 
 
 @pytest.mark.parametrize("name", SOLO)
@@ -148,7 +160,7 @@ def peer(x: Floats, known: NoiseModel) -> Any:
 def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(method: Any, near: float) -> None:
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The
     star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
-    draw, stream = np.random.default_rng(0), method.start()
+    draw, stream = np.random.default_rng(0), method.start(interval=0.1)
     stream.step(Z, U, 0.1)
     theirs, t, path = peer(Z, FITTED), [0.0, 0.1], [0 * U, 0.1 * U]
     for k in range(200):
@@ -181,7 +193,9 @@ def test_a_missing_fix_has_infinite_variance(name: str) -> None:
 
 @pytest.mark.parametrize("name", STARTS)
 def test_a_long_step_is_two_short_ones(name: str) -> None:
-    once, twice = STARTS[name](), STARTS[name]()
+    """Where motion is white noise of steps of 0.1 s."""
+    given = {} if name == "net" else {"interval": 0.1}
+    once, twice = STARTS[name](**given), STARTS[name](**given)
     for stream in (once, twice):
         stream.step(Z, U, 0.1)
         stream.step(Z + 1.0, U, 0.1)
@@ -297,7 +311,7 @@ def test_history_is_as_long_as_asked_for() -> None:
         stream.step(Z, U, 0.1)
     stream.step(Z, U, 0.1, fix_age=0.5)
     assert len(stream.history) == 5
-    with pytest.raises(InputError, match=r"fix_age = 0.61 s: must be in 0..0.5 s"):
+    with pytest.raises(InputError, match=r"fix_age = 0.61: must be in 0..0.5 s"):
         stream.step(Z, U, 0.1, fix_age=0.61)
 
 

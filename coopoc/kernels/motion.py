@@ -15,14 +15,15 @@ ROUNDING = 1e-9
 class MotionNoise(NamedTuple):
     """Process noise of one step: q = dt / interval (base^2 + (interval max(ratio s, floor))^2) m^2 per axis.
 
-    s is the measured speed on the axis, or of the whole velocity. So a step of 0.2 s is as uncertain as two of 0.1 s.
+    s is the measured speed on the axis, or of the whole velocity. So a step of 0.2 s is as uncertain as two of 0.1 s if
+    `interval` is 0.1 s, and has the error of one velocity, twice as large, if each step is its own interval.
 
     Attributes:
         base: (3,) m per step of `interval`.
         ratio: (3,) share of the speed.
         floor: m/s.
         of_speed: 1.0 for a share of the whole speed, 0.0 for one of each axis.
-        interval: s.
+        interval: s; 0 for the dt of each step, whose velocity is then one measurement.
     """
 
     base: Floats
@@ -38,8 +39,9 @@ def process_variance(noise: MotionNoise, velocity: AnyArray, dt: float, axis: in
     speed = abs(velocity[axis])
     if noise.of_speed > 0.0:
         speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
-    moved = noise.interval * max(noise.ratio[axis] * speed, noise.floor)
-    variance: float = dt / noise.interval * (noise.base[axis] ** 2 + moved * moved)
+    interval = noise.interval if noise.interval > 0.0 else dt
+    moved = interval * max(noise.ratio[axis] * speed, noise.floor)
+    variance: float = dt / interval * (noise.base[axis] ** 2 + moved * moved)
     return variance
 
 

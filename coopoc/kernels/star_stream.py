@@ -213,9 +213,10 @@ def neighbour(star: Star, memory: Memory, noise: Noise, row: AnyArray, slot: int
         k,
         (1.0 + last[LAST_USED] / dt, age, 1.0 if held else 0.0, 1.0 if held and row[MESSAGE] > 0.0 and there else 0.0),
     )
-    share = dt / noise.motion.interval
+    interval = noise.motion.interval if noise.motion.interval > 0.0 else dt
+    share = dt / interval
     for c in range(3):
-        one = process_variance(noise.motion, last, noise.motion.interval, c) * share * share
+        one = process_variance(noise.motion, last, interval, c) * share * share
         values = last[c], one, row[8 + c] if there else 0.0, noise.known.broadcast[0, 0, 0, c]
         for lane in range(LANES):
             for i in range(4):

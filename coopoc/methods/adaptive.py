@@ -62,7 +62,9 @@ class NoiseAdaptive(ABC):
         x, p, _ = self._filtered(recording, columns)
         return axis_track(recording, columns, x, p, began, (velocity_note(self.assumed),))
 
-    def start(self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
+    def start(
+        self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
+    ) -> FilterStream:
         """Start the filter for one step at a time, as `Kalman.start`; `state.noise` is the estimated variance."""
         return FilterStream(motion_noise(NoiseModel.nominal(self.assumed), interval), self.fixes, x0, history)
 

@@ -58,13 +58,19 @@ class JointFilter:
         return follow_egos(self, recording, egos, drive, known.notes, missing=True)
 
     def start(
-        self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0, max_age: float = 1.0
+        self,
+        x0: npt.ArrayLike | None = None,
+        *,
+        interval: float | None = None,
+        history: float = 10.0,
+        max_age: float = 1.0,
     ) -> StarStream:
         """Start the filter for one step at a time: `step(gnss, velocity, dt, fix_age, neighbours=[...])`.
 
         Args:
             x0: (3,) m, known before the first step; None starts at the first fix.
-            interval: s, dt of the recordings that the assumed process noise belongs to.
+            interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times
+                its variance. None: every step is one, with the error of one measured velocity, as in a recording.
             history: s, how old a delayed fix may be.
             max_age: s, older messages of neighbours are not used.
 

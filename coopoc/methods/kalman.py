@@ -53,14 +53,17 @@ class Kalman:
         x, p, _ = filtered(gnss, velocity, variance, FixNoise(known.gnss_variance), recording.dt, self.x0)
         return axis_track(recording, columns, x, p, began)
 
-    def start(self, x0: npt.ArrayLike | None = None, *, interval: float = 0.1, history: float = 10.0) -> FilterStream:
+    def start(
+        self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
+    ) -> FilterStream:
         """Start the filter for one step at a time: `step(gnss, velocity, dt, fix_age)`.
 
         A stream has no recording, so that "nominal" is NoiseModel.nominal(sensors).
 
         Args:
             x0: (3,) m, known before the first step; None starts at the first fix.
-            interval: s, dt of the recordings that the assumed process noise belongs to.
+            interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times
+                its variance. None: every step is one, with the error of one measured velocity, as in a recording.
             history: s, how old a delayed fix may be.
 
         >>> x, covariance = Kalman("identity").start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)

@@ -68,13 +68,19 @@ class StarStream:
         known: the noise model.
         refine: one Gauss-Newton step on range and angles.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
-        interval: s, dt of the recordings that the assumed process noise belongs to.
+        interval: s, the step that the assumed process noise belongs to; None for every step.
         history: s, how old a delayed fix may be.
         max_age: s, older messages are not used.
     """
 
     def __init__(
-        self, known: NoiseModel, refine: bool, x0: npt.ArrayLike | None, interval: float, history: float, max_age: float
+        self,
+        known: NoiseModel,
+        refine: bool,
+        x0: npt.ArrayLike | None,
+        interval: float | None,
+        history: float,
+        max_age: float,
     ) -> None:
         motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
         assumed = Assumptions(

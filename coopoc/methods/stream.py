@@ -158,19 +158,21 @@ def alone(noise_model: NoiseModel | str) -> NoiseModel:
     return resolve(noise_model, None)  # type: ignore[arg-type]
 
 
-def motion_noise(known: NoiseModel, interval: float) -> MotionNoise:
-    """White motion noise as `known` assumes it of a recording with dt = `interval` s."""
-    check_interval(interval)
+def motion_noise(known: NoiseModel, interval: float | None) -> MotionNoise:
+    """White motion noise as `known` assumes it of a recording with dt = `interval` s; None for the dt of each step."""
+    interval = 0.0 if interval is None else check_interval(interval)
     if known.process_std is not None:
-        return MotionNoise(np.array(known.process_std, dtype=float), np.zeros(3), 0.0, 0.0, float(interval))
+        return MotionNoise(np.array(known.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
     assert known.sensors is not None
     ratio, of_speed = np.full(3, known.sensors.velocity_std_ratio), known.sensors.velocity_reading == "speed"
-    return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), float(interval))
+    return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), interval)
 
 
-def check_interval(interval: float) -> None:
-    """InputError unless an interval is finite and > 0."""
-    number("interval", interval, sys.float_info.min, allowed="finite and > 0", hint="The dt that the noise belongs to.")
+def check_interval(interval: float) -> float:
+    """The interval, s; InputError unless it is finite and > 0."""
+    hint = "The dt that the noise belongs to."
+    found: float = number("interval", interval, sys.float_info.min, allowed="finite and > 0", hint=hint)
+    return found
 
 
 def scan(solo: Solo[State], recording: Recording, columns: Sequence[int], x0: Floats | None) -> Iterator[State]:
