@@ -35,6 +35,7 @@ class Assessment:
         gradient_norm: |J^T r|, or with constraints |J^T r + C^T multipliers|.
         covariance: (n, dof, dof) m^2, rad^2.
         remaining: m or rad, largest move of a Gauss-Newton step.
+        promised: decrease of the cost that this step promises; infinite where constraints hold it.
         unobservable: names of nodes that can move without changing the cost.
         violation: largest of a constraint, m, rad or m/s.
         violated: which constraint that is, in words.
@@ -49,6 +50,7 @@ class Assessment:
     violation: float = 0.0
     violated: str = ""
     active: Active | None = None
+    promised: float = np.inf
 
 
 def assess(problem: Problem, x: Floats) -> Assessment:
@@ -71,7 +73,8 @@ def assess(problem: Problem, x: Floats) -> Assessment:
             if still is not None:
                 cov = cov * ~(still[:, :, None] | still[:, None, :])
             remaining = float(np.abs(dx).max(initial=0.0))
-            return Assessment(cost, size, cov, remaining, (), violation, violated, active)
+            promised = np.inf if active is not None else -0.5 * float(np.vdot(gradient, dx))
+            return Assessment(cost, size, cov, remaining, (), violation, violated, active, promised)
     except np.linalg.LinAlgError:
         pass
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)

@@ -1,4 +1,4 @@
-"""Whether a stationary point is a minimum: the curvature that Gauss-Newton leaves out."""
+"""Whether a point is a minimum: the curvature that Gauss-Newton leaves out, and what a Newton step still promises."""
 
 from __future__ import annotations
 
@@ -27,21 +27,48 @@ def is_minimum(problem: Problem, x: Floats) -> bool:
     The Hessian is J^T J + sum_k r_k d2 r_k / dx2. J^T J alone is positive definite at a saddle too, such as an ego on
     the line between two others whose ranges are longer than the line. Where there are constraints see lagrangian.py.
     """
+    return newton_decrease(problem, x) is not None
+
+
+def newton_decrease(problem: Problem, x: Floats) -> float | None:
+    """By how much a full Newton step from x (n, ambient) promises to lower the cost, 1/2 g^T H^-1 g; None if it curves
+    downwards there.
+
+    It is half the squared Newton decrement, the distance to the minimum in standard deviations, whatever the units of
+    the nodes (Boyd and Vandenberghe, Convex Optimization, section 9.5.1). A linear problem has J^T J alone and promises
+    nothing more here.
+    """
     if problem.linear or problem.constraints:
-        return True
+        return 0.0
     linear = problem.linearise(x[None])
     scheme, _ = structure(problem)
-    flat = assemble(scheme, squares(linear, [f.nodes for f in problem.factors]))[0]
+    nodes = [f.nodes for f in problem.factors]
     true = true_blocks(problem, linear)
+    if not np.isfinite(true).all():
+        return None
+    flat, gradient = normal_equations(scheme, linear, nodes)
+    gradient = gradient.ravel()
     own = scheme.pairs[:, 0] == scheme.pairs[:, 1]
-    true[own] += SLACK * flat[own] * np.eye(problem.space.dof)
-    if len(x) > SMALL:
-        return pivots(matrix(scheme, true)) is not None
+    sloped = true.copy()
+    sloped[own] += SLACK * flat[0][own] * np.eye(problem.space.dof)
+    for blocks in (true, sloped):
+        dx = _solved(scheme, blocks, gradient)
+        if dx is not None:
+            return float(0.5 * gradient @ dx)
+    return None
+
+
+def _solved(scheme: Pattern, blocks: Floats, rhs: Floats) -> Floats | None:
+    """H^-1 rhs of symmetric blocks (P, dof, dof); None unless H is positive definite."""
+    if scheme.nodes > SMALL:
+        factored = pivots(matrix(scheme, blocks))
+        return None if factored is None else np.asarray(factored.solve(rhs))
+    whole = dense(scheme, blocks)
     try:
-        np.linalg.cholesky(dense(scheme, true))
+        np.linalg.cholesky(whole)
     except np.linalg.LinAlgError:
-        return False
-    return bool(np.isfinite(true).all())
+        return None
+    return np.asarray(np.linalg.solve(whole, rhs))
 
 
 def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:

@@ -13,7 +13,7 @@ from ..errors import InputError
 from .active import constraint_rows
 from .assess import Assessment, assess
 from .backend import Backend, Options, require_backend
-from .curvature import is_minimum
+from .curvature import newton_decrease
 from .descend import MAX_ITERATIONS
 from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
@@ -22,6 +22,10 @@ from .solution import Solution, SolveError, Status
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
+DECREASE = 1e-10
+"""Share of the cost that one more step may still promise: in a flat valley points move far for no gain."""
+PROMISE = 1e-8
+"""What a Newton step may promise where Gauss-Newton's is below the tolerance: 1e-4 standard deviations away."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 
@@ -145,11 +149,15 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
         return Status.INFEASIBLE
     if truth.unobservable:
         return Status.RANK_DEFICIENT
-    if not truth.remaining <= POSITION_TOLERANCE:
+    still = truth.remaining <= POSITION_TOLERANCE
+    if not (still or truth.promised <= DECREASE * truth.cost):
         return Status.FAILED
-    fixed = truth.active
-    minimum = is_constrained_minimum(problem, x, fixed) if fixed else is_minimum(problem, x)
-    return Status.SOLVED if minimum else Status.SADDLE
+    if truth.active is not None:
+        return Status.SOLVED if is_constrained_minimum(problem, x, truth.active) else Status.SADDLE
+    left = newton_decrease(problem, x)
+    if left is None:
+        return Status.SADDLE
+    return Status.SOLVED if left <= max(DECREASE * truth.cost, PROMISE * still) else Status.FAILED
 
 
 def _raise(solution: Solution) -> None:

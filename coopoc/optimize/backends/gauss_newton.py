@@ -38,11 +38,10 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         patience = max_iterations if problem.batch is not None else min(max_iterations, PATIENCE)
         end = descend(problem, step, x, patience, tolerance)
         if end.converged.all() or patience == max_iterations:
-            return SolverResult(end.x, end.iterations)
-        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - patience, tolerance)
-        return SolverResult(
-            more.x, end.iterations + more.iterations, extras={"newton_steps": int(more.iterations.sum())}
-        )
+            return SolverResult(end.x, end.iterations, extras={"record": end.record})
+        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - patience, tolerance, exact=True)
+        extras = {"newton_steps": int(more.iterations.sum()), "record": np.concatenate([end.record, more.record])}
+        return SolverResult(more.x, end.iterations + more.iterations, extras=extras)
 
     return solver
 
