@@ -13,10 +13,11 @@ from ..arrays import Bools, Floats
 from .active import Active, active_at
 from .arrowhead import marginals, structure
 from .dense import diagonal_blocks, is_small, normal_matrix
-from .linear import Linear
+from .linear import Linear, cost_of
 from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
 from .problem import Problem
+from .sparse import Sparse, sparse
 
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
@@ -55,6 +56,8 @@ class Assessment:
 
 def assess(problem: Problem, x: Floats) -> Assessment:
     """Assessment of a single problem at x (n, ambient)."""
+    if (system := sparse(problem)) is not None and (found := _as_graph(system, x)) is not None:
+        return found
     linear = problem.linearise(x[None])
     cost = float(linear.cost[0])
     gradient, unconstrained = (_as_matrix if is_small(problem) else _as_blocks)(problem, linear)
@@ -80,6 +83,26 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
     unobservable = _unobservable(problem, problem.jacobian(linear), active)
     return Assessment(cost, size, unknown, np.nan, unobservable, violation, violated, active)
+
+
+def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
+    """The assessment of a large problem by its own factors; None if it is singular. The cost is the formulas' own."""
+    problem, entries, ldl = system.problem, system.entries, system.ldl
+    _, gradient, values = system.quadratic(x, "gauss-newton")
+    if not np.isfinite(values).all() or not ldl.factor(system.matrix(values)):
+        return None
+    dx = -ldl.solve(gradient)
+    row, column = (np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :]))
+    free = (row >= 0) & (column >= 0)
+    cov = np.zeros(row.shape)
+    cov[free] = ldl.inverse(row[free], column[free])
+    moving = entries.number >= 0
+    inflation = np.einsum("nii->ni", cov)[moving] * values[entries.diagonal]
+    if not ((inflation > 0) & (inflation < INFLATION)).all():
+        return None
+    remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
+    size = float(np.linalg.norm(gradient))
+    return Assessment(cost_of(problem.space, problem.factors, x[None])[0], size, cov, remaining, promised=promised)
 
 
 Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]

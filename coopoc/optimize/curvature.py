@@ -12,6 +12,7 @@ from .factor import Factor, unchecked
 from .linear import Linear, linearise, opposite
 from .normal import Pattern, assemble, normal_equations, squares
 from .problem import Problem
+from .sparse import Sparse, sparse
 
 STEP = 1e-4
 """Of the vector's length: the second derivative is a central difference of the exact first."""
@@ -40,6 +41,8 @@ def newton_decrease(problem: Problem, x: Floats) -> float | None:
     """
     if problem.linear or problem.constraints:
         return 0.0
+    if (system := sparse(problem)) is not None:
+        return _by_tapes(system, x)
     linear = problem.linearise(x[None])
     scheme, _ = structure(problem)
     nodes = [f.nodes for f in problem.factors]
@@ -56,6 +59,19 @@ def newton_decrease(problem: Problem, x: Floats) -> float | None:
         if dx is not None:
             return float(0.5 * gradient @ dx)
     return None
+
+
+def _by_tapes(system: Sparse, x: Floats) -> float | None:
+    """The same of a large problem."""
+    _, gradient, values = system.quadratic(x, "newton")
+    if not np.isfinite(values).all():
+        return None
+    if not system.ldl.factor(system.matrix(values)):
+        own = system.entries.diagonal
+        values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
+        if not system.ldl.factor(system.matrix(values)):
+            return None
+    return float(0.5 * gradient @ system.ldl.solve(gradient))
 
 
 def _solved(scheme: Pattern, blocks: Floats, rhs: Floats) -> Floats | None:

@@ -18,6 +18,7 @@ from .descend import MAX_ITERATIONS
 from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
 from .problem import Problem
+from .sparse import sparse
 from .solution import Solution, SolveError, Status
 
 POSITION_TOLERANCE = 1e-6
@@ -115,6 +116,8 @@ def _start(problem: Problem) -> Floats:
     if problem.linear and not problem.constraints:
         return np.asarray(somewhere(problem)[0])
     start: Floats = initial_guess(problem)[0]
+    if (system := sparse(problem)) is not None and np.isfinite(system.quadratic(start, "gauss-newton")[1]).all():
+        return start
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])
     for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
