@@ -7,19 +7,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats
-from .descend import FLAT, GIVE_UP, LEAST_DAMPING
+from .descend import GIVE_UP, LEAST_DAMPING
 from .ldl import LDL
 from .sparse import Sparse
 from .tape import Model
 
 OFF = 0.2
 """A share of the promised decrease this far from 1 casts doubt on J^T J."""
-DOUBT = 3
+DOUBT = 2
 """Doubtful steps before the exact Hessian takes over."""
-FACTOR = 4.0
-"""By which damping grows and (a little less) falls."""
-FIRST = 1e-3
+GROWTH, DECAY = 10.0, 5.0
+"""Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
+middle where a step overshoots."""
+FIRST = 1e-4
 """Damping once some is needed."""
+FLAT = 1e-14
+"""Share of the cost whose promise ends the loop: some 1e-6 standard deviations to go, before the step that is taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 HIDDEN = 1e-9
@@ -49,10 +52,10 @@ class Arrival:
 def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> Arrival:
     """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
 
-    H = J^T J, until three of its promises failed by more than a fifth; then the exact Hessian, with which the last steps
+    H = J^T J, until two of its promises failed by more than a fifth; then the exact Hessian, with which the last steps
     converge quadratically however large the residuals are. Where that is not positive definite J^T J takes over for
-    some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows fourfold where less than a quarter of the
-    promised decrease comes true and falls where more than three quarters do.
+    some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where less than a quarter of the promised
+    decrease comes true and falls where more than three quarters do.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, 2nd ed., section 10.3.
@@ -72,7 +75,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
                 doubt, model = -DOUBT, "gauss-newton"
                 cost, gradient, values = system.quadratic(x, model)
             else:
-                mu = max(FACTOR * mu, FIRST)
+                mu = _grown(mu)
             continue
         dx = -ldl.solve(gradient)
         promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
@@ -83,7 +86,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
         record.append((cost, mu, share))
         converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden)
         if not share > 0.0:
-            mu = max(FACTOR * mu, FIRST)
+            mu = _grown(mu)
             continue
         x = there
         mu = _next(mu, share)
@@ -96,10 +99,14 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 
 
+def _grown(mu: float) -> float:
+    return GROWTH * mu if mu > 0.0 else FIRST
+
+
 def _next(mu: float, share: float) -> float:
     if share > 0.75:
-        return mu / (FACTOR - 1.0) if mu > LEAST_DAMPING else 0.0
-    return max(FACTOR * mu, 0.1 * FIRST) if share < 0.25 else mu
+        return mu / DECAY if mu > LEAST_DAMPING else 0.0
+    return _grown(mu) if share < 0.25 else mu
 
 
 def _scale(system: Sparse, values: Floats) -> Floats:
