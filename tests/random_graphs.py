@@ -1,4 +1,4 @@
-"""Random factor graphs of robots that drive about, with what files of the field hold: odometry, loops, landmarks, ranges."""
+"""Random factor graphs of robots that drive about: odometry, loops, landmarks, ranges."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def random_graph(
     near = np.argwhere(np.triu(far[:count, :count] < REACH, 3))
     loop = near[rng.permutation(len(near))[:loops]]
     pairs = np.concatenate([odometry, loop.reshape(-1, 2)])
-    to_mark = np.argwhere(far[:count, count:] < 2 * REACH) + [0, count]
+    to_mark = np.argwhere(far[:count, count:] < 2 * REACH) + np.array([0, count])
     other = np.argwhere(far[:count, :count] < 2 * REACH)
     other = other[(other[:, 0] // steps) < (other[:, 1] // steps)]
     to_mark = to_mark[rng.permutation(len(to_mark))]

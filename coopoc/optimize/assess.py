@@ -92,7 +92,7 @@ def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
     if not np.isfinite(values).all() or not ldl.factor(system.matrix(values)):
         return None
     dx = -ldl.solve(gradient)
-    row, column = (np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :]))
+    row, column = np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :])
     free = (row >= 0) & (column >= 0)
     cov = np.zeros(row.shape)
     cov[free] = ldl.inverse(row[free], column[free])

@@ -28,7 +28,7 @@ GIVE_UP = 1e12
 LEAST_DAMPING = 1e-9
 """Damping below which none is left: far below any diagonal it changes no digit of a step."""
 FLAT = 1e-15
-"""Share of the cost below which a promised decrease is rounding: the valley is flat, and no step can be judged there."""
+"""Share of the cost below which a promised decrease is rounding: no step can be judged there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ def check_limits(max_iterations: int, tolerance: float) -> None:
 
 
 def _promised(problem: Problem, linear: Linear, dx: Floats, added: Floats, exact: bool) -> Floats:
-    """(B,) decrease of the cost that the model expects of a step: J^T J's, or the exact Hessian's, H dx = -g - added dx.
+    """(B,) decrease of the cost that the model expects of a step: J^T J, or the exact H dx = -g - added dx.
 
     1/2 |r|^2 - 1/2 |r + J dx|^2 takes any step, of a constrained programme too; the other takes Newton's only.
     """

@@ -1,4 +1,4 @@
-"""Sparse L D L^T of a Hessian with its analysis kept: solve, sign of the pivots, and marginals by selected inversion."""
+"""Sparse L D L^T of a Hessian with its analysis kept: solve, definiteness, and marginals by selected inversion."""
 
 from __future__ import annotations
 

@@ -47,6 +47,7 @@ class Problem:
         poses: the nodes that have a rotation.
         fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
         constraints: what must hold exactly.
+        start: what x0 is called in Solution.extras["start"], such as the start of a graph that won.
 
     Raises:
         InputError: repeated names, unknown nodes, kinds that need a pose, shapes that do not agree.
@@ -65,6 +66,7 @@ class Problem:
     poses: tuple[int, ...] = ()
     fixed: tuple[int, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    start: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))

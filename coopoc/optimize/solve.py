@@ -18,8 +18,8 @@ from .descend import MAX_ITERATIONS
 from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
 from .problem import Problem
-from .sparse import sparse
 from .solution import Solution, SolveError, Status
+from .sparse import sparse
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -97,7 +97,7 @@ def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
         unobservable=truth.unobservable,
         space=problem.space,
         violation=truth.violation,
-        extras=found.extras | violated,
+        extras=found.extras | violated | ({"start": problem.start} if problem.start else {}),
     )
 
 

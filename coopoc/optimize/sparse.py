@@ -1,4 +1,4 @@
-"""A single large problem by compiled tapes and a kept sparsity pattern: cost, gradient and either Hessian at a point."""
+"""A single large problem by compiled tapes and a kept sparsity pattern: cost, gradient and Hessian at a point."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Entries:
     def first(self) -> Ints:
         """(n,) first unknown of each node."""
         counts = (self.number >= 0).sum(axis=1)
-        return np.cumsum(counts) - counts
+        return np.asarray(np.cumsum(counts) - counts)
 
 
 def entries_of(problem: Problem) -> Entries:
@@ -131,7 +131,7 @@ class Sparse:
         return LDL()
 
     @cached_property
-    def _goals(self) -> dict[tuple[int, Model], Ints]:
+    def _goals(self) -> dict[tuple[int, Model], Any]:
         return {}
 
     def cost(self, x: Floats) -> float:
@@ -163,14 +163,14 @@ class Sparse:
                 accumulate(tape, x, factor.nodes, self.numbers[k], self._goal(k, factor, model), total)
         return total
 
-    def _goal(self, k: int, factor: Factor, model: Model) -> Ints:
+    def _goal(self, k: int, factor: Factor, model: Model) -> Any:
         if (k, model) not in self._goals:
             written = write(kind_of(factor, self.problem.space), model).entries
             self._goals[k, model] = _goal(self.entries, factor.nodes, written, self.problem.space.dof)
         return self._goals[k, model]
 
 
-def _goal(entries: Entries, nodes: Ints, written: Ints, dof: int) -> Ints:
+def _goal(entries: Entries, nodes: Ints, written: Ints, dof: int) -> Any:
     """(outputs, M) where each output of a tape is added: the cost, the gradient, the Hessian, or, last, nowhere."""
     m, nowhere = entries.size, entries.size + 1 + len(entries.indices)
     if len(written) <= 1:
@@ -181,7 +181,9 @@ def _goal(entries: Entries, nodes: Ints, written: Ints, dof: int) -> Ints:
     for out, (i, j) in enumerate(written.tolist()):
         if i < 0:
             continue
-        at, base = (columns[i], 1) if j < 0 else (entries.places(pairs[i // dof, j // dof], columns[i], columns[j]), 1 + m)
+        at, base = (
+            (columns[i], 1) if j < 0 else (entries.places(pairs[i // dof, j // dof], columns[i], columns[j]), 1 + m)
+        )
         goal[out] = np.where(at < 0, nowhere, base + at)
     return goal
 
@@ -192,13 +194,19 @@ _KEPT: WeakKeyDictionary[Problem, Sparse | None] = WeakKeyDictionary()
 
 
 def sparse(problem: Problem) -> Sparse | None:
-    """A large single problem ready to be evaluated, kept as long as the problem is; None if it is small, has a separator
-    or constraints, or a kind that no tape can hold."""
+    """A large single problem ready to be evaluated, kept as long as the problem is; None if it is small, has a
+    separator or constraints, or a kind that no tape can hold."""
     if problem.batch is not None or problem.separator or problem.constraints or len(problem.names) <= LARGE:
         return None
     if problem not in _KEPT:
         _KEPT[problem] = _made(problem)
     return _KEPT[problem]
+
+
+def keep(system: Sparse, problem: Problem) -> Problem:
+    """The problem, with the system of another that differs from it in x0 alone."""
+    _KEPT[problem] = system
+    return problem
 
 
 def _made(problem: Problem) -> Sparse | None:

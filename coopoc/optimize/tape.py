@@ -1,7 +1,7 @@
 """The tapes of a kind: its cost, gradient and curvature by the steps of its nodes, written from its one definition.
 
-CasADi runs the measurement's own formula, differentiates what it costs and hands over a list of scalar operations, which
-the kernel in kernels/graph_tape.py runs for all measurements.
+CasADi runs the measurement's own formula, differentiates what it costs and hands over a list of scalar operations,
+which the kernel in kernels/graph_tape.py runs for all measurements.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class Kind(NamedTuple):
 
 
 class Written(NamedTuple):
-    """A tape and what its outputs are: the cost, then entries (row, column) of the gradient (column -1) and of the upper
-    triangle of the curvature, by the dof of the first node and then of the second.
+    """A tape and what its outputs are: the cost, then entries (row, column) of the gradient (column -1) and of the
+    upper triangle of the curvature, by the dof of the first node and then of the second.
 
     Attributes:
         tape: for the kernel.

@@ -1,4 +1,4 @@
-"""The outer loop of a large problem: J^T J where its model is good, the exact Hessian where it misleads, and a record."""
+"""The outer loop of a large problem: J^T J where its model is good, the exact Hessian where it misleads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import numpy as np
 
 from ..arrays import Floats
 from .descend import GIVE_UP, LEAST_DAMPING
-from .ldl import LDL
 from .sparse import Sparse
 from .tape import Model
 
@@ -25,6 +24,8 @@ FLAT = 1e-14
 """Share of the cost whose promise ends the loop: some 1e-6 standard deviations to go, before the step that is taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
+SLOW = 0.2
+"""A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
 
@@ -52,18 +53,18 @@ class Arrival:
 def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> Arrival:
     """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
 
-    H = J^T J, until two of its promises failed by more than a fifth; then the exact Hessian, with which the last steps
-    converge quadratically however large the residuals are. Where that is not positive definite J^T J takes over for
-    some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where less than a quarter of the promised
-    decrease comes true and falls where more than three quarters do.
+    H = J^T J, until two of its promises failed by more than a fifth or hardly fell; then the exact Hessian, with which
+    the last steps converge quadratically however large the residuals are. Where that is not positive definite J^T J
+    takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where less than a quarter of
+    the promised decrease comes true and falls where more than three quarters do.
 
     References:
-        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, 2nd ed., section 10.3.
+        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
     """
     ldl, mu, doubt = system.ldl, 0.0, 0
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
-    newton, converged = 0, False
+    newton, converged, last = 0, False, np.inf
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     scale = _scale(system, values)
     while len(record) < max_iterations and not converged and mu < GIVE_UP:
@@ -91,8 +92,10 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
         x = there
         mu = _next(mu, share)
         if model == "gauss-newton":
-            doubt = doubt + 1 if doubt < 0 or abs(share - 1.0) > OFF else max(doubt - 1, 0)
+            off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
+            doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
             model = "newton" if doubt >= DOUBT else model
+        last = promised
         if not converged:
             cost, gradient, values = system.quadratic(x, model)
             scale = _scale(system, values) if model == "gauss-newton" else scale
