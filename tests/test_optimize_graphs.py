@@ -33,9 +33,11 @@ def flat_valley() -> Problem:
     return problem.add("range", [("a", "p"), ("b", "p")], [100.5, 100.5], std=0.1)
 
 
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
-def test_a_record_tells_every_iteration(backend: str) -> None:
-    found = solve(flat_valley(), backend)
+@pytest.mark.parametrize(
+    ("backend", "options"), [("gauss-newton", {}), ("gtsam", {"optimizer": "elimination"}), ("osqp", {})]
+)
+def test_a_record_tells_every_iteration(backend: str, options: dict[str, str]) -> None:
+    found = solve(flat_valley(), backend, **options)
     record = found.extras["record"]
     assert record.shape == (found.iterations, 3)
     assert np.diff(record[:, 0]).max() <= 0.0
