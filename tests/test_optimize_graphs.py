@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,14 @@ import pytest
 from random_graphs import random_graph
 from scipy.optimize import least_squares
 
+from coopoc import InputError
 from coopoc.formats.edges import PointEdges, PoseEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.arrowhead import structure
 from coopoc.optimize.curvature import matrix, newton_decrease, true_blocks
 from coopoc.optimize.dual import Dual
+from coopoc.optimize.fuse import fused
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
@@ -202,3 +205,41 @@ def test_marginals_by_selected_inversion_are_the_inverse(dimension: int) -> None
     own = cov.reshape(len(found.x), problem.space.dof, len(found.x), -1)
     own = own[np.arange(len(found.x)), :, np.arange(len(found.x))]
     assert found.covariance == pytest.approx(own, rel=1e-6, abs=1e-9 * own.max())
+
+
+def test_single_measurements_are_the_same_problem_as_arrays() -> None:
+    """Cost, nodes and covariance of a problem grown one by one, and of every form of noise."""
+    rng = np.random.default_rng(210)
+    names, at = [f"n{k}" for k in range(70)], np.cumsum(rng.normal(size=(70, 2)), axis=0)
+    whole = Problem(names, x0=at + 0.1, dimension=2)
+    single = whole
+    z = np.diff(at, axis=0) + 0.1 * rng.normal(size=(69, 2))
+    std = rng.uniform(0.1, 0.3, (69, 2))
+    pairs = list(pairwise(names))
+    root = np.tril(rng.uniform(1, 2, (5, 2, 2)))
+    whole = whole.add("displacement", pairs, z, std=std).add("position", names[:5], at[:5], sqrt_information=root)
+    whole = whole.add("range", pairs[:20], np.linalg.norm(z[:20], axis=1)[:, None], std=0.1, loss=Loss("huber", 1.0))
+    for k in range(69):
+        single = single.add("displacement", pairs[k], z[k], std=std[k])
+        if k < 5:
+            single = single.add("position", names[k], at[k], sqrt_information=root[k])
+        if k < 20:
+            single = single.add("range", pairs[k], [np.linalg.norm(z[k])], std=0.1, loss=Loss("huber", 1.0))
+    assert repr(fused(single)) == "Problem(70 points in the plane; 69 displacement, 5 position, 20 range)"
+    ours, theirs = solve(single), solve(whole)
+    assert single.cost(at) == pytest.approx(whole.cost(at), rel=1e-12)
+    assert ours.cost == pytest.approx(theirs.cost, rel=1e-12)
+    assert ours.x == pytest.approx(theirs.x, abs=1e-9)
+    assert ours.covariance == pytest.approx(theirs.covariance, abs=1e-12)
+
+
+def test_an_add_checks_what_is_added() -> None:
+    problem = Problem(("a", "b"), dimension=2)
+    with pytest.raises(InputError, match="must be a pose"):
+        problem.add("bearing", ("a", "b"), [0.1], std=0.1)
+    with pytest.raises(InputError, match="dimensions"):
+        problem.add("position", "a", [0.0, 0.0, 0.0], std=1.0)
+    batch = problem.add("position", "a", np.zeros((3, 1, 2)), std=1.0)
+    assert batch.batch == 3
+    with pytest.raises(InputError, match="must agree"):
+        batch.add("position", "b", np.zeros((4, 1, 2)), std=1.0)

@@ -118,6 +118,10 @@ class Problem:
     def _place(self) -> dict[str, int]:
         return {name: k for k, name in enumerate(self.names)}
 
+    @cached_property
+    def _turning(self) -> frozenset[int]:
+        return frozenset(self.poses)
+
     @property
     def _start_batch(self) -> int | None:
         return len(self.x0) if self.x0 is not None and self.x0.ndim == 3 else None
@@ -170,7 +174,22 @@ class Problem:
             loss=loss,
             cov=cov,
         )
-        return replace(self, factors=(*self.factors, factor))
+        return self._with(factor)
+
+    def _with(self, factor: Factor) -> Problem:
+        """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
+        check_item(factor, self.names, self._turning, self.dimension)
+        sizes = {b for b in (self.batch, factor.batch) if b is not None and b > 1}
+        if len(sizes) > 1:
+            hint = "Use the same number of realisations throughout."
+            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
+        grown = self.replace_unchecked(factors=(*self.factors, factor))
+        kept = {
+            name: self.__dict__[name] for name in ("_place", "_turning", "space", "movable") if name in self.__dict__
+        }
+        batches = [b for b in (self.batch, factor.batch) if b is not None]
+        grown.__dict__.update(kept, batch=max(batches) if batches else None)
+        return grown
 
     def constrain(
         self,

@@ -15,6 +15,7 @@ from .assess import Assessment, assess
 from .backend import Backend, Options, require_backend
 from .curvature import newton_decrease
 from .descend import MAX_ITERATIONS
+from .fuse import fused
 from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
 from .problem import Problem
@@ -60,6 +61,7 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    problem = problem if options.get("optimizer") == "gnc" else fused(problem)  # which has a weight per factor
     solution = _solved(problem, known, options)
     if solution.status is not Status.SOLVED and (other := known.fallback(problem, options)) is not None:
         solution = _after(solution, _solved(problem, known, other))
