@@ -184,7 +184,7 @@ class Problem:
             hint = "Use the same number of realisations throughout."
             raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
         grown = self.replace_unchecked(factors=(*self.factors, factor))
-        kept = {
+        kept: dict[str, Any] = {
             name: self.__dict__[name] for name in ("_place", "_turning", "space", "movable") if name in self.__dict__
         }
         batches = [b for b in (self.batch, factor.batch) if b is not None]

@@ -12,7 +12,9 @@ from .sparse import keep, sparse
 from .trust_region import Arrival, arrive
 
 STEPS = 12
-"""Of each start; a good one has nearly arrived by then."""
+"""Of each start at first; a good one has nearly arrived by then."""
+ROUNDS = ((3.0, 25), (1.25, 200))
+"""Those whose cost is within the first number of the least go on by as many steps as the second says."""
 SAME = 1e-3
 """Share by which costs may differ and count as the same minimum: the cheaper start then stays."""
 TOLERANCE = 1e-3
@@ -22,26 +24,35 @@ TOLERANCE = 1e-3
 def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> Problem:
     """The problem from the start that leads lowest; its x0 is where the steps from there have led.
 
-    A start from which no step was refused and no promise failed by half is taken at once: the others are tried where
-    the first had trouble. A problem that is not large takes the first.
+    A start from which no step was refused and no promise failed by half ends the search: others are tried where the
+    first had trouble, and all whose costs are near the least go on (ROUNDS). A problem that is not large takes the
+    first.
 
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
     """
-    system, best = sparse(problem), np.inf
+    system, tried = sparse(problem), {}
     for name, start in starts.items():
-        tried = problem.replace_unchecked(x0=start(), start=name)
+        x = start()
         if system is None:
-            return tried
-        assert tried.x0 is not None
-        end = arrive(system, tried.x0, STEPS, TOLERANCE)
-        cost = system.cost(end.x)
-        if cost < (1.0 - SAME) * best:
-            best, chosen = cost, keep(system, tried.replace_unchecked(x0=frozen(end.x)))
+            return problem.replace_unchecked(x0=frozen(x), start=name)
+        end = arrive(system, x, STEPS, TOLERANCE)
+        tried[name] = system.cost(end.x), end.x
         if smooth(end):
             break
-    return chosen
+    assert system is not None
+    least = min(cost for cost, _ in tried.values())
+    for within, steps in ROUNDS:
+        if all(cost <= (1.0 + SAME) * least for cost, _ in tried.values()):
+            break
+        close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
+        if len(close) > 1:
+            ends = {name: arrive(system, x, steps, TOLERANCE).x for name, x in close.items()}
+            tried = {name: (system.cost(x), x) for name, x in ends.items()}
+            least = min(cost for cost, _ in tried.values())
+    name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
+    return keep(system, problem.replace_unchecked(x0=frozen(x), start=name))
 
 
 def smooth(end: Arrival) -> bool:
