@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from random_graphs import random_graph
@@ -16,12 +17,15 @@ from coopoc.formats.edges import PointEdges, PoseEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.arrowhead import structure
+from coopoc.optimize.backends.gtsam_forms import forms
+from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, values, which_turn
 from coopoc.optimize.curvature import matrix, newton_decrease, true_blocks
 from coopoc.optimize.dual import Dual
 from coopoc.optimize.fuse import fused
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
+from coopoc.optimize.marginals import bayes_tree_marginals
 from coopoc.optimize.sparse import _made, sparse
 from coopoc.optimize.starts import chained
 
@@ -243,3 +247,27 @@ def test_an_add_checks_what_is_added() -> None:
     assert batch.batch == 3
     with pytest.raises(InputError, match="must agree"):
         batch.add("position", "b", np.zeros((4, 1, 2)), std=1.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_marginals_are_those_of_gtsams_bayes_tree(dimension: int) -> None:
+    problem = from_graph(random_graph(211, dimension, steps=60))
+    found = solve(problem)
+    theirs = bayes_tree_marginals(problem.whiten(found.x)[1], ~problem.movable, len(problem.names), problem.space.dof)
+    still = ~problem.movable
+    theirs[still[:, :, None] | still[:, None, :]] = 0.0
+    assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
+
+
+@pytest.mark.parametrize("seed", [212, 213, 214])
+def test_no_minimum_lies_above_gtsams(seed: int) -> None:
+    """From the same chained odometry, bad enough to matter, on graphs that GTSAM has every factor of."""
+    graph = random_graph(seed, steps=120, seen=0, loops=40, ranges=120, turn_std=0.05)
+    problem = from_graph(graph, start="odometry")
+    native = native_graph(problem, forms(problem)).graph
+    fix_nodes(problem, native)
+    at = values(problem.space, which_turn(problem), problem.x0, range(len(problem.names)))
+    theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams()).optimize()
+    found = solve(from_graph(graph))
+    assert found.status is Status.SOLVED
+    assert found.cost <= native.error(theirs) * (1 + 1e-9)
