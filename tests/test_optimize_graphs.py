@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -271,3 +274,19 @@ def test_no_minimum_lies_above_gtsams(seed: int) -> None:
     found = solve(from_graph(graph))
     assert found.status is Status.SOLVED
     assert found.cost <= native.error(theirs) * (1 + 1e-9)
+
+
+def test_what_is_kept_of_a_problem_goes_with_it() -> None:
+    problem = from_graph(random_graph(215))
+    solve(problem)
+    here = weakref.ref(problem)
+    del problem
+    gc.collect()
+    assert here() is None
+
+
+def test_threads_do_not_share_factors() -> None:
+    problem = from_graph(random_graph(216, 3, steps=60), start="odometry")
+    with ThreadPoolExecutor(4) as pool:
+        costs = {found.cost for found in pool.map(lambda _: solve(problem), range(8))}
+    assert len(costs) == 1

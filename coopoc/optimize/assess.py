@@ -87,7 +87,7 @@ def assess(problem: Problem, x: Floats) -> Assessment:
 
 def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
     """The assessment of a large problem by its own factors; None if it is singular. The cost is the formulas' own."""
-    problem, entries, ldl = system.problem, system.entries, system.ldl
+    entries, ldl = system.entries, system.ldl
     _, gradient, values = system.quadratic(x, "gauss-newton")
     if not np.isfinite(values).all() or not ldl.factor(system.matrix(values)):
         return None
@@ -102,7 +102,7 @@ def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
         return None
     remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
     size = float(np.linalg.norm(gradient))
-    return Assessment(cost_of(problem.space, problem.factors, x[None])[0], size, cov, remaining, promised=promised)
+    return Assessment(cost_of(system.space, system.factors, x[None])[0], size, cov, remaining, promised=promised)
 
 
 Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]

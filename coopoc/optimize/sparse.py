@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,6 +15,7 @@ from ..kernels.graph_tape import accumulate
 from .factor import Factor
 from .ldl import LDL
 from .problem import Problem
+from .space import Space
 from .tape import Model, kind_of, numbers_of, write
 
 
@@ -114,9 +116,17 @@ def _rows(number: Ints, count: Ints, block: tuple[Ints, Ints], height: Ints, sta
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
-    """A single problem over its m unknowns; build it with `sparse`."""
+    """A single problem over its m unknowns; build it with `sparse`. It does not hold the problem, which holds it.
 
-    problem: Problem
+    Args:
+        space: where the nodes live.
+        factors: of the problem.
+        entries: of its Hessians.
+        numbers: per factor, the inputs of its tape that are no nodes.
+    """
+
+    space: Space
+    factors: tuple[Factor, ...]
     entries: Entries
     numbers: tuple[Floats, ...]
 
@@ -125,10 +135,16 @@ class Sparse:
         """m."""
         return self.entries.size
 
-    @cached_property
+    @property
     def ldl(self) -> LDL:
-        """Factors of its Hessians, whose ordering is kept."""
-        return LDL()
+        """Factors of its Hessians, whose ordering is kept; each thread has its own."""
+        if not hasattr(self._local, "ldl"):
+            self._local.ldl = LDL()
+        return self._local.ldl  # type: ignore[no-any-return]
+
+    @cached_property
+    def _local(self) -> threading.local:
+        return threading.local()
 
     @cached_property
     def _goals(self) -> dict[tuple[int, Model], Any]:
@@ -153,20 +169,20 @@ class Sparse:
     def retract(self, x: Floats, step: Floats) -> Floats:
         """x after a step (m,)."""
         wide = np.append(step, 0.0)[self.entries.number]
-        return self.problem.space.retract(x, wide)
+        return self.space.retract(x, wide)
 
     def _sum(self, x: Floats, model: Model, size: int) -> Floats:
         total = np.zeros(size)
         with np.errstate(all="ignore"):
-            for k, factor in enumerate(self.problem.factors):
-                tape = write(kind_of(factor, self.problem.space), model).tape
+            for k, factor in enumerate(self.factors):
+                tape = write(kind_of(factor, self.space), model).tape
                 accumulate(tape, x, factor.nodes, self.numbers[k], self._goal(k, factor, model), total)
         return total
 
     def _goal(self, k: int, factor: Factor, model: Model) -> Any:
         if (k, model) not in self._goals:
-            written = write(kind_of(factor, self.problem.space), model).entries
-            self._goals[k, model] = _goal(self.entries, factor.nodes, written, self.problem.space.dof)
+            written = write(kind_of(factor, self.space), model).entries
+            self._goals[k, model] = _goal(self.entries, factor.nodes, written, self.space.dof)
         return self._goals[k, model]
 
 
@@ -215,4 +231,6 @@ def _made(problem: Problem) -> Sparse | None:
             write(kind_of(factor, problem.space), "newton")
     except NotImplementedError:
         return None
-    return Sparse(problem, entries_of(problem), tuple(numbers_of(factor) for factor in problem.factors))
+    return Sparse(
+        problem.space, problem.factors, entries_of(problem), tuple(numbers_of(factor) for factor in problem.factors)
+    )

@@ -37,7 +37,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     def solver(problem: Problem, x: Floats) -> SolverResult:
         if problem.linear and is_small(problem) and max_iterations:
             return one_step(problem, step, x)
-        if problem.batch is None and not problem.linear and (system := sparse(problem)) is not None:
+        if max_iterations and (system := sparse(problem)) is not None:
             return _graph(system, x, max_iterations, tolerance)
         patience = max_iterations if problem.batch is not None else min(max_iterations, PATIENCE)
         end = descend(problem, step, x, patience, tolerance)
