@@ -1,113 +1,154 @@
-"""Real factor graphs by us and by plain GTSAM on the same chordal objective: cost, error against truth, seconds.
+"""Factor graphs by us and by plain GTSAM on the same chordal objective: status, cost, iterations and CPU seconds.
 
-Run:  python benchmarks/graphs.py ../shared/data/pyfg            (all four, some minutes)
-      python benchmarks/graphs.py ../shared/data/pyfg mrclam5a   (one)
+Run:  python benchmarks/graphs.py                            (every PyFG file in ../shared/data/pyfg, if it is there)
+      python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
+      python benchmarks/graphs.py folder --hard              (any folder of PyFG and g2o files, with hard variants)
 
-GTSAM gets what a user would write: Pose2 variables, FrobeniusBetweenFactorPose2, RangeFactor, Levenberg-Marquardt.
-It has no factor for a landmark's position in a pose's frame with our weights, so that landmarks are poses whose
-rotation is not measured. CORA's own logs give 75.28 (mrclam5a) and 3152.35 (mrclam6) after rounding.
+GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
+as it comes, from chained odometry. It has no factor for a landmark's position in a pose's frame with our weights, so
+that landmarks are poses whose rotation is not measured. Ours is `solve` with start="auto", and from chained odometry;
+its seconds contain the search for the start, the checks and all marginals, GTSAM's the building of its graph.
 """
 
 from __future__ import annotations
 
+import os
+import resource
 import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import gtsam
 import numpy as np
+from hard_graphs import VARIANTS
 from tabulate import tabulate
 
 from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
-from coopoc.optimize.convex import staircase
+from coopoc.optimize.backends.gtsam_forms import pose_of
 from coopoc.optimize.graphs import from_graph
 
-RELAXED = ("mrclam5a", "mrclam6")
-"""The staircase of tiers and plaza1 takes more than five minutes."""
+FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 UNMEASURED = 1e6
 """Standard deviation of a rotation that a landmark does not have."""
 
 
-def plain_gtsam(problem: Problem) -> tuple[np.ndarray, float]:
-    """Positions (n, 2) and seconds of GTSAM's Levenberg-Marquardt with its own factors."""
-    began = time.perf_counter()
+def plain_gtsam(problem: Problem) -> tuple[np.ndarray, int]:
+    """Nodes (n, ambient) and iterations of GTSAM's Levenberg-Marquardt with its own factors."""
+    d, space, noise = problem.dimension, problem.space, gtsam.noiseModel
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    x0 = problem.x0
-    for k, row in enumerate(x0):
-        values.insert(k, gtsam.Pose2(row[0], row[1], float(np.arctan2(row[4], row[2]))))
-    first = problem.fixed[0]
-    graph.add(gtsam.PriorFactorPose2(first, values.atPose2(first), gtsam.noiseModel.Constrained.All(3)))
-    for k in set(range(len(x0))) - set(problem.poses):
-        graph.add(
-            gtsam.PriorFactorPose2(
-                k, values.atPose2(k), gtsam.noiseModel.Diagonal.Sigmas([UNMEASURED, UNMEASURED, 1.0])
-            )
-        )
+    for k, row in enumerate(problem.x0):
+        values.insert(k, pose_of(gtsam, d, row))
+    prior = getattr(gtsam, f"PriorFactorPose{d}")
+    for k in problem.fixed:
+        graph.add(prior(k, pose_of(gtsam, d, problem.x0[k]), noise.Constrained.All(space.dof)))
+    free = np.full(space.dof, UNMEASURED)
+    free[: d * (d - 1) // 2] = 1.0
+    free = free if d == 3 else free[::-1]
+    for k in set(range(len(problem.names))) - set(problem.poses):
+        graph.add(prior(k, pose_of(gtsam, d, problem.x0[k]), noise.Diagonal.Sigmas(free)))
+    chord, ranged = getattr(gtsam, f"FrobeniusBetweenFactorPose{d}"), getattr(gtsam, f"RangeFactorPose{d}")
+    fix, place = getattr(gtsam, f"FrobeniusPriorPose{d}"), getattr(gtsam, f"PoseTranslationPrior{d}D")
     for factor in problem.factors:
         std = np.broadcast_to(factor.std, (len(factor.nodes), factor.size))
-        for (i, j), z, s in zip(factor.nodes.tolist(), factor.z, std, strict=True):
+        for nodes, z, s in zip(factor.nodes.tolist(), factor.z, std, strict=True):
+            turn = s[d] if factor.kind.endswith("chordal") else UNMEASURED
+            sigmas = np.array([*([turn] * d + [UNMEASURED]) * d, *s[:d], UNMEASURED]) if len(s) >= d else s
+            model = noise.Diagonal.Sigmas(sigmas)
             if factor.kind == "range":
-                graph.add(gtsam.RangeFactorPose2(i, j, z[0], gtsam.noiseModel.Isotropic.Sigma(1, s[0])))
-                continue
-            landmark = factor.kind == "relative_position"
-            turn, angle = (UNMEASURED, 0.0) if landmark else (s[2], float(np.arctan2(z[4], z[2])))
-            sigmas = [turn, turn, UNMEASURED, turn, turn, UNMEASURED, s[0], s[1], UNMEASURED]
-            model = gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas))
-            graph.add(gtsam.FrobeniusBetweenFactorPose2(i, j, gtsam.Pose2(z[0], z[1], angle), model))
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
-    seconds = time.perf_counter() - began
-    poses = [found.atPose2(k) for k in range(len(x0))]
-    x = np.array(
-        [[p.x(), p.y(), np.cos(p.theta()), -np.sin(p.theta()), np.sin(p.theta()), np.cos(p.theta())] for p in poses]
-    )
-    x[[k for k in range(len(x0)) if k not in set(problem.poses)], 2:] = [1.0, 0.0, 0.0, 1.0]
-    return x, seconds
+                graph.add(ranged(*nodes, z[0], model))
+            elif factor.kind == "position":
+                graph.add(place(nodes[0], z, noise.Diagonal.Sigmas(s)))
+            elif factor.kind == "pose_chordal":
+                graph.add(fix(nodes[0], pose_of(gtsam, d, z).matrix(), model))
+            else:
+                full = z if len(z) > d else space.join(z)
+                graph.add(chord(*nodes, pose_of(gtsam, d, full), model))
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
+    found = optimizer.optimize()
+    poses = [getattr(found, f"atPose{d}")(k) for k in range(len(problem.names))]
+    x = np.array([space.join(p.translation(), p.rotation().matrix()) for p in poses])
+    x[[k for k in range(len(x)) if k not in set(problem.poses)], d:] = np.eye(d).ravel()
+    return x, optimizer.iterations()
 
 
 def error(graph: Graph, position: np.ndarray) -> float:
-    """ATE: rms of the poses after SE(2) alignment, m."""
-    return float(absolute_error(position[graph.is_pose], graph.position[graph.is_pose]).rmse)
+    """ATE: rms of the poses after alignment, m."""
+    truth = graph.position[graph.is_pose]
+    if len(truth) <= graph.dimension or not np.isfinite(truth).all():
+        return np.nan
+    return float(absolute_error(position[graph.is_pose], truth).rmse)
 
 
-def rows(path: Path) -> Iterator[list[object]]:
-    """One row per solver: ours and GTSAM's from chained odometry, and ours from a relaxation that needs no start."""
-    graph = load_graph(path)
-    problem = from_graph(graph)
-    size = str(len(problem.names))
-    ours = solve(problem, throw=False)
-    seconds = ours.build_seconds + ours.solve_seconds
-    yield [path.stem, size, "coopoc", ours.status.name, ours.cost, None, error(graph, ours.position), seconds]
-    x, seconds = plain_gtsam(problem)
-    yield [path.stem, size, "GTSAM LM", "-", problem.cost(x), None, error(graph, x[:, :2]), seconds]
-    if path.stem not in RELAXED:
+def row(name: str, graph: Graph) -> list[object]:
+    """Of one graph: ours from the automatic start, ours from chained odometry, and GTSAM's from there."""
+    cells: list[object] = [name, len(graph.names)]
+    for start in ("auto", "odometry"):
+        began = time.process_time()
+        problem = from_graph(graph, start=start)
+        found = solve(problem, throw=False)
+        cells += [found.status.name, found.cost, found.iterations, time.process_time() - began]
+        if start == "auto":
+            cells.insert(2, found.extras["start"])
+            cells.append(error(graph, found.position))
+    began = time.process_time()
+    if problem.poses:
+        x, iterations = plain_gtsam(problem)
+    else:
+        own = solve(problem, "gtsam", throw=False, optimizer="lm")
+        x, iterations = own.x, own.iterations
+    return [*cells, problem.cost(x), iterations, time.process_time() - began, error(graph, x[:, : graph.dimension])]
+
+
+HEADER = (
+    "graph nodes start auto cost iterations seconds ATE odometry cost iterations seconds GTSAM iterations seconds ATE"
+)
+
+
+def rows(files: list[Path], hard: bool) -> Iterator[list[object]]:
+    """A row per file and variant; the first solve of a process also loads libraries, and is done beforehand."""
+    row("warm", load_graph(files[0]))
+    for file in files:
+        graph = load_graph(file)
+        for variant, make in VARIANTS.items() if hard else [("", lambda graph: graph)]:
+            yield row(f"{file.stem} {variant}".strip(), make(graph))
+
+
+def main(*arguments: str) -> None:
+    """Print the table, and the totals."""
+    given = [a for a in arguments if not a.startswith("--")]
+    folder = Path(given[0]) if given else FOLDER
+    if not folder.is_dir():
+        print(f"no folder {folder}", file=sys.stderr)
         return
-    found = staircase(from_graph(graph, start="apart"))
-    assert found.solution is not None
-    yield [
-        path.stem,
-        size,
-        "coopoc staircase, robots apart",
-        found.solution.status.name,
-        found.solution.cost,
-        found.lower_bound,
-        error(graph, found.solution.position),
-        found.seconds,
-    ]
-
-
-def main(folder: str, *names: str) -> None:
-    """Print the table."""
-    found = [
-        row
-        for name in names or ("mrclam5a", "mrclam6", "tiers", "plaza1")
-        for row in rows(Path(folder) / f"{name}.pyfg")
-    ]
-    header = ["graph", "nodes", "solver", "status", "cost", "lower bound", "ATE [m]", "seconds"]
-    print(tabulate(found, header, tablefmt="github", floatfmt=("", "", "", "", ".2f", ".2f", ".3f", ".1f")))
+    files = sorted(f for f in folder.rglob("*") if f.suffix in (".pyfg", ".g2o"))
+    files = [f for f in files if not given[1:] or f.stem in given[1:]]
+    found = list(rows(files, "--hard" in arguments))
+    total: list[object] = [
+        "total",
+        "",
+        "",
+        "",
+        "",
+        "",
+        sum(r[6] for r in found),
+        "",
+        "",
+        "",
+        "",
+        sum(r[11] for r in found),
+    ]  # type: ignore[misc]
+    total += ["", "", sum(r[14] for r in found), ""]  # type: ignore[misc]
+    print(tabulate([*found, total], HEADER.split(), tablefmt="github", floatfmt=".6g"))
+    behind = [r[0] for r in found if not (r[3] == "SOLVED" and r[4] <= r[12] * (1 + 1e-9) + 1e-9)]  # type: ignore[operator]
+    slow = [r[0] for r in found if r[6] > 0.5 * r[14]]  # type: ignore[operator]
+    print(f"not SOLVED, or above GTSAM: {behind}; slower than half of GTSAM: {slow}")
+    print(f"largest memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 
 
 if __name__ == "__main__":

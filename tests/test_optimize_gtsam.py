@@ -10,12 +10,14 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from random_graphs import random_graph
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.optimize import Loss, Problem, Status, pose, solve
 from coopoc.optimize.backends.gtsam_forms import Part, forms
-from coopoc.optimize.backends.gtsam_native import native_graph, tangent, values, which_turn
+from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, tangent, values, which_turn
 from coopoc.optimize.backends.gtsam_optimizers import copied
+from coopoc.optimize.graphs import from_graph
 from coopoc.optimize.incremental import Estimates, FixedLag, priors
 
 OWN = ("lm",)
@@ -695,3 +697,22 @@ def test_a_smoother_names_what_is_wrong(call: Callable, words: str) -> None:
     smoother.update(ONE, {"a": 0.0})
     with pytest.raises(InputError, match=words):
         call(smoother)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_gtsam_is_gtsam_where_it_has_every_factor(dimension: int) -> None:
+    """By default its own optimiser finds the minimum; ours only adds the digits that its tolerance leaves."""
+    graph = random_graph(301, dimension, seen=0, steps=50)
+    problem = from_graph(graph, start="odometry")
+    found = solve(problem, "gtsam")
+    assert found.extras["method"] == "lm"
+    native = native_graph(problem, forms(problem)).graph
+    fix_nodes(problem, native)
+    posed = which_turn(problem)
+    at = values(problem.space, posed, problem.x0, range(len(problem.names)))
+    theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams())
+    end = native.error(theirs.optimize())
+    assert found.extras["lm_iterations"] == theirs.iterations()
+    assert end * (1 - 1e-4) < found.cost <= end
+    seen = from_graph(random_graph(302, dimension, steps=20), start="odometry")
+    assert solve(seen, "gtsam").extras["method"] == "elimination"  # it has no landmark in the body of a pose

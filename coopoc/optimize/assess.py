@@ -13,10 +13,11 @@ from ..arrays import Bools, Floats
 from .active import Active, active_at
 from .arrowhead import marginals, structure
 from .dense import diagonal_blocks, is_small, normal_matrix
-from .linear import Linear
+from .linear import Linear, cost_of
 from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
 from .problem import Problem
+from .sparse import Sparse, sparse
 
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
@@ -35,6 +36,7 @@ class Assessment:
         gradient_norm: |J^T r|, or with constraints |J^T r + C^T multipliers|.
         covariance: (n, dof, dof) m^2, rad^2.
         remaining: m or rad, largest move of a Gauss-Newton step.
+        promised: decrease of the cost that this step promises; infinite where constraints hold it.
         unobservable: names of nodes that can move without changing the cost.
         violation: largest of a constraint, m, rad or m/s.
         violated: which constraint that is, in words.
@@ -49,10 +51,13 @@ class Assessment:
     violation: float = 0.0
     violated: str = ""
     active: Active | None = None
+    promised: float = np.inf
 
 
 def assess(problem: Problem, x: Floats) -> Assessment:
     """Assessment of a single problem at x (n, ambient)."""
+    if (system := sparse(problem)) is not None and (found := _as_graph(system, x)) is not None:
+        return found
     linear = problem.linearise(x[None])
     cost = float(linear.cost[0])
     gradient, unconstrained = (_as_matrix if is_small(problem) else _as_blocks)(problem, linear)
@@ -71,12 +76,33 @@ def assess(problem: Problem, x: Floats) -> Assessment:
             if still is not None:
                 cov = cov * ~(still[:, :, None] | still[:, None, :])
             remaining = float(np.abs(dx).max(initial=0.0))
-            return Assessment(cost, size, cov, remaining, (), violation, violated, active)
+            promised = np.inf if active is not None else -0.5 * float(np.vdot(gradient, dx))
+            return Assessment(cost, size, cov, remaining, (), violation, violated, active, promised)
     except np.linalg.LinAlgError:
         pass
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
     unobservable = _unobservable(problem, problem.jacobian(linear), active)
     return Assessment(cost, size, unknown, np.nan, unobservable, violation, violated, active)
+
+
+def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
+    """The assessment of a large problem by its own factors; None if it is singular. The cost is the formulas' own."""
+    entries, ldl = system.entries, system.ldl
+    _, gradient, values = system.quadratic(x, "gauss-newton")
+    if not np.isfinite(values).all() or not ldl.factor(system.matrix(values)):
+        return None
+    dx = -ldl.solve(gradient)
+    row, column = np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :])
+    free = (row >= 0) & (column >= 0)
+    cov = np.zeros(row.shape)
+    cov[free] = ldl.inverse(row[free], column[free])
+    moving = entries.number >= 0
+    inflation = np.einsum("nii->ni", cov)[moving] * values[entries.diagonal]
+    if not ((inflation > 0) & (inflation < INFLATION)).all():
+        return None
+    remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
+    size = float(np.linalg.norm(gradient))
+    return Assessment(cost_of(system.space, system.factors, x[None])[0], size, cov, remaining, promised=promised)
 
 
 Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]

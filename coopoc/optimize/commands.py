@@ -24,7 +24,7 @@ def solve_file(
     /,
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
-    start: Literal["odometry", "apart", "file", "relaxed"] = "odometry",
+    start: Literal["auto", "odometry", "tree", "linear", "apart", "file", "relaxed"] = "auto",
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
     """Solve the factor graph of a PyFG or g2o file.
@@ -35,8 +35,9 @@ def solve_file(
         file: .pyfg or .g2o.
         backend: coopoc check shows them.
         objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
-        start: odometry chained from each robot's first vertex, from a ring (apart), the file's vertices, or the rounded
-            point of a convex relaxation that needs no start.
+        start: odometry chained from each robot's first vertex, a spanning tree over loops too, rotations relaxed
+            (linear), the lowest of these (auto), from a ring (apart), the file's vertices, or the rounded point of a
+            convex relaxation that needs no start.
         output: the solution as JSON; without it a summary goes to stdout.
     """
     problem = read_graph(file, objective, "apart" if start == "relaxed" else start)

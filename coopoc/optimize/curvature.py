@@ -1,4 +1,4 @@
-"""Whether a stationary point is a minimum: the curvature that Gauss-Newton leaves out."""
+"""Whether a point is a minimum: the curvature that Gauss-Newton leaves out, and what a Newton step still promises."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from .factor import Factor, unchecked
 from .linear import Linear, linearise, opposite
 from .normal import Pattern, assemble, normal_equations, squares
 from .problem import Problem
+from .sparse import Sparse, sparse
 
 STEP = 1e-4
 """Of the vector's length: the second derivative is a central difference of the exact first."""
@@ -27,21 +28,63 @@ def is_minimum(problem: Problem, x: Floats) -> bool:
     The Hessian is J^T J + sum_k r_k d2 r_k / dx2. J^T J alone is positive definite at a saddle too, such as an ego on
     the line between two others whose ranges are longer than the line. Where there are constraints see lagrangian.py.
     """
+    return newton_decrease(problem, x) is not None
+
+
+def newton_decrease(problem: Problem, x: Floats) -> float | None:
+    """By how much a full Newton step from x (n, ambient) promises to lower the cost, 1/2 g^T H^-1 g; None if it curves
+    downwards there.
+
+    It is half the squared Newton decrement, the distance to the minimum in standard deviations, whatever the units of
+    the nodes (Boyd and Vandenberghe, Convex Optimization, section 9.5.1). A linear problem has J^T J alone and promises
+    nothing more here.
+    """
     if problem.linear or problem.constraints:
-        return True
+        return 0.0
+    if (system := sparse(problem)) is not None:
+        return _by_tapes(system, x)
     linear = problem.linearise(x[None])
     scheme, _ = structure(problem)
-    flat = assemble(scheme, squares(linear, [f.nodes for f in problem.factors]))[0]
+    nodes = [f.nodes for f in problem.factors]
     true = true_blocks(problem, linear)
+    if not np.isfinite(true).all():
+        return None
+    flat, gradient = normal_equations(scheme, linear, nodes)
+    gradient = gradient.ravel()
     own = scheme.pairs[:, 0] == scheme.pairs[:, 1]
-    true[own] += SLACK * flat[own] * np.eye(problem.space.dof)
-    if len(x) > SMALL:
-        return pivots(matrix(scheme, true)) is not None
+    sloped = true.copy()
+    sloped[own] += SLACK * flat[0][own] * np.eye(problem.space.dof)
+    for blocks in (true, sloped):
+        dx = _solved(scheme, blocks, gradient)
+        if dx is not None:
+            return float(0.5 * gradient @ dx)
+    return None
+
+
+def _by_tapes(system: Sparse, x: Floats) -> float | None:
+    """The same of a large problem."""
+    _, gradient, values = system.quadratic(x, "newton")
+    if not np.isfinite(values).all():
+        return None
+    if not system.ldl.factor(system.matrix(values)):
+        own = system.entries.diagonal
+        values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
+        if not system.ldl.factor(system.matrix(values)):
+            return None
+    return float(0.5 * gradient @ system.ldl.solve(gradient))
+
+
+def _solved(scheme: Pattern, blocks: Floats, rhs: Floats) -> Floats | None:
+    """H^-1 rhs of symmetric blocks (P, dof, dof); None unless H is positive definite."""
+    if scheme.nodes > SMALL:
+        factored = pivots(matrix(scheme, blocks))
+        return None if factored is None else np.asarray(factored.solve(rhs))
+    whole = dense(scheme, blocks)
     try:
-        np.linalg.cholesky(dense(scheme, true))
+        np.linalg.cholesky(whole)
     except np.linalg.LinAlgError:
-        return False
-    return bool(np.isfinite(true).all())
+        return None
+    return np.asarray(np.linalg.solve(whole, rhs))
 
 
 def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -25,6 +25,10 @@ LINEAR = 1e-6
 last."""
 GIVE_UP = 1e12
 """Damping beyond which no step can help."""
+LEAST_DAMPING = 1e-9
+"""Damping below which none is left: far below any diagonal it changes no digit of a step."""
+FLAT = 1e-15
+"""Share of the cost below which a promised decrease is rounding: no step can be judged there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,22 +39,30 @@ class Descent:
         x: (B, n, ambient).
         iterations: (B,) linear steps taken.
         converged: (B,) the last step was below the tolerance.
+        record: (iterations, 3) of a single problem: the cost before each step, its damping, and which share of the
+            promised decrease came true; empty for B realisations.
     """
 
     x: Floats
     iterations: Ints
     converged: Bools
+    record: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 
 def descend(
-    problem: Problem, step: Step, x: Floats, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE
+    problem: Problem,
+    step: Step,
+    x: Floats,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+    exact: bool = False,
 ) -> Descent:
     """Gauss-Newton steps, damped where the linear model does not hold (Levenberg-Marquardt with Marquardt's scaling).
 
     (J^T J + mu diag(J^T J)) dx = -J^T r, mu = 0 at first. A step that raises the cost is refused; mu then grows, and
     also where the cost falls by less than a quarter of what the model promised: plain Gauss-Newton overshoots for ever
     where the true curvature exceeds twice that of J^T J, as in range-only problems of flat geometry. A realisation
-    leaves the batch when no point of it moves by more than `tolerance`.
+    leaves the batch when no point of it moves by more than `tolerance`, or where the promise is lost in rounding.
 
     Args:
         problem: one or B realisations.
@@ -58,6 +70,7 @@ def descend(
         x: (B, n, ambient) start.
         max_iterations: of linear steps.
         tolerance: m.
+        exact: the step's matrix is the exact Hessian, not J^T J.
 
     Raises:
         InputError: max_iterations that is no whole number >= 0, tolerance that is not > 0.
@@ -67,18 +80,24 @@ def descend(
     done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
     active, now = np.arange(len(x)), problem
     linear, near = problem.linearise(best), tolerance / LINEAR if problem.linear else tolerance
+    record: list[tuple[float, float, float]] = []
     for _ in range(max_iterations):
-        dx, solved = _try(step, problem, linear, mu[active])
+        dx, added, solved = _try(step, problem, linear, mu[active])
         count[active] += 1
         with np.errstate(all="ignore"):
             trial = now.linearise(problem.space.retract(linear.x, dx))
             small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
             better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
-        promised = trial.cost if problem.linear else _promised(problem, linear, dx)
-        mu[active] = _damping(mu[active], better, linear.cost, trial.cost, promised)
+        promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx, added, exact)
+        share = _share(linear.cost, trial.cost, promised, exact)
+        if problem.batch is None:
+            record.append((linear.cost[0], mu[0], share[0]))
+        mu[active] = _damping(mu[active], better, share)
         best[active[better]] = trial.x[better]
-        done[active[better & small]] = True
-        going = ~(better & small) & (mu[active] < GIVE_UP)
+        flat = solved & (promised <= FLAT * linear.cost) & (not problem.constraints)
+        there = (better & small) | flat
+        done[active[there]] = True
+        going = ~there & (mu[active] < GIVE_UP)
         if not going.any():
             break
         if not better[going].all():
@@ -88,7 +107,7 @@ def descend(
         if not going.all():
             active = active[going]
             now = problem.pick(active) if problem.batch else problem
-    return Descent(best, count, done)
+    return Descent(best, count, done, np.array(record).reshape(-1, 3))
 
 
 def one_step(problem: Problem, step: Step, x: Floats) -> SolverResult:
@@ -107,7 +126,7 @@ def minimise(problem: Problem, step: Step, x: Floats, max_iterations: int, toler
     if problem.linear and max_iterations:
         return one_step(problem, step, x)
     end = descend(problem, step, x, max_iterations, tolerance)
-    return SolverResult(end.x, end.iterations)
+    return SolverResult(end.x, end.iterations, extras={"record": end.record})
 
 
 def check_limits(max_iterations: int, tolerance: float) -> None:
@@ -118,27 +137,40 @@ def check_limits(max_iterations: int, tolerance: float) -> None:
         raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
 
 
-def _promised(problem: Problem, linear: Linear, dx: Floats) -> Floats:
-    """(B,) cost that the linear model expects after the step, 1/2 |r + J dx|^2 in place of 1/2 |r|^2."""
-    expected = linear.cost.copy()
+def _promised(problem: Problem, linear: Linear, dx: Floats, added: Floats, exact: bool) -> Floats:
+    """(B,) decrease of the cost that the model expects of a step: J^T J, or the exact H dx = -g - added dx.
+
+    1/2 |r|^2 - 1/2 |r + J dx|^2 takes any step, of a constrained programme too; the other takes Newton's only.
+    """
+    slope, bend = np.zeros(len(dx)), np.zeros(len(dx))
     for factor, r, jacobians in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
         moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(jacobians, factor.nodes.T, strict=True))
-        expected += np.einsum("bmk,bmk->b", r + 0.5 * moved, np.broadcast_to(moved, r.shape))
-    return expected
+        moved = np.broadcast_to(moved, r.shape)
+        slope += np.einsum("bmk,bmk->b", r, moved)
+        if not exact:
+            bend += np.einsum("bmk,bmk->b", moved, moved)
+    if exact:
+        bend = -slope - np.einsum("bni,bni->b", added, dx * dx)
+    return -slope - 0.5 * bend
 
 
-def _damping(mu: Floats, better: Bools, before: Floats, after: Floats, promised: Floats) -> Floats:
-    """The next mu (B,): by the share of the promised decrease that came true, where it stands out from rounding."""
-    decrease = before - promised
-    telling = decrease > 1e-9 * before
-    share = np.where(telling, (before - after) / np.where(telling, decrease, 1.0), 0.5)
-    lower = np.where(mu > 1e-5, mu / 5.0, 0.0)
-    kept = np.where(share > 0.75, lower, np.where(share < 0.25, np.maximum(4.0 * mu, 1e-2), mu))
-    return np.where(better, kept, np.maximum(10.0 * mu, 1e-3))
+def _share(before: Floats, after: Floats, promised: Floats, exact: bool) -> Floats:
+    """Share (B,) of the promised decrease that came true; where rounding hides it, what the model is worth there:
+    Newton's is right near a minimum, J^T J may not be."""
+    telling = promised > 1e-9 * before
+    return np.where(telling, (before - after) / np.where(telling, promised, 1.0), 1.0 if exact else 0.5)
 
 
-def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Bools]:
-    """The step, and for which realisations it is finite; a singular system counts as none."""
+def _damping(mu: Floats, better: Bools, share: Floats) -> Floats:
+    """The next mu (B,) by the share of the promised decrease that came true; once there is some it moves by factors, so
+    that the range below the first is tried, too."""
+    lower = np.where(mu > LEAST_DAMPING, mu / 5.0, 0.0)
+    kept = np.where(share > 0.75, lower, np.where(share < 0.25, np.where(mu > 0, 4.0 * mu, 1e-2), mu))
+    return np.where(better, kept, np.where(mu > 0, 10.0 * mu, 1e-3))
+
+
+def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Floats, Bools]:
+    """The step, its damping, and for which realisations it is finite; a singular system counts as none."""
     damping = np.zeros((*linear.x.shape[:2], problem.space.dof))
     if mu.any():
         damping = mu[:, None, None] * np.maximum(diagonal(problem, linear), 1e-9)
@@ -146,9 +178,9 @@ def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floa
         with np.errstate(all="ignore"):
             dx = step(linear, damping)
     except np.linalg.LinAlgError:
-        return np.zeros_like(damping), np.zeros(len(linear.x), dtype=bool)
+        return np.zeros_like(damping), damping, np.zeros(len(linear.x), dtype=bool)
     finite = np.asarray(np.isfinite(dx).all(axis=(1, 2)))
-    return np.where(finite[:, None, None], dx, 0.0), finite
+    return np.where(finite[:, None, None], dx, 0.0), damping, finite
 
 
 def diagonal(problem: Problem, linear: Linear) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,7 +34,7 @@ def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
     return values.reshape(count, -1) if values.ndim < 2 and values.size % count == 0 else values
 
 
-def check_item(item: object, names: Sequence[str], poses: Sequence[int], dimension: int) -> None:
+def check_item(item: object, names: Sequence[str], poses: Collection[int], dimension: int) -> None:
     """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
     if not isinstance(item, Factor | Constraint):
         hint = "Add measurements with Problem.add, constraints with Problem.constrain."
@@ -46,7 +46,8 @@ def check_item(item: object, names: Sequence[str], poses: Sequence[int], dimensi
         hint = f"Make it with Problem(names, dimension={item.dimension})." if known.plane else "Leave it out."
         raise InputError(f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {dimension}", hint)
     observers = {"world": nodes[:, :0], "body": nodes[:, :1], "relative": nodes}[known.frame]
-    if len(lacking := np.setdiff1d(observers, poses)):
+    turning = poses if isinstance(poses, frozenset) else frozenset(poses) if observers.size else frozenset()
+    if lacking := sorted(set(observers.ravel().tolist()) - turning):
         allowed = "must be a pose: the measurement is in its body frame"
         raise InputError(f"nodes of {item.kind}", names[lacking[0]], allowed, "Name it in Problem(names, poses=[...]).")
 

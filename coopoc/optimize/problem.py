@@ -47,6 +47,7 @@ class Problem:
         poses: the nodes that have a rotation.
         fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
         constraints: what must hold exactly.
+        start: what x0 is called in Solution.extras["start"], such as the start of a graph that won.
 
     Raises:
         InputError: repeated names, unknown nodes, kinds that need a pose, shapes that do not agree.
@@ -65,6 +66,7 @@ class Problem:
     poses: tuple[int, ...] = ()
     fixed: tuple[int, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    start: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))
@@ -115,6 +117,10 @@ class Problem:
     @cached_property
     def _place(self) -> dict[str, int]:
         return {name: k for k, name in enumerate(self.names)}
+
+    @cached_property
+    def _turning(self) -> frozenset[int]:
+        return frozenset(self.poses)
 
     @property
     def _start_batch(self) -> int | None:
@@ -168,7 +174,22 @@ class Problem:
             loss=loss,
             cov=cov,
         )
-        return replace(self, factors=(*self.factors, factor))
+        return self._with(factor)
+
+    def _with(self, factor: Factor) -> Problem:
+        """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
+        check_item(factor, self.names, self._turning, self.dimension)
+        sizes = {b for b in (self.batch, factor.batch) if b is not None and b > 1}
+        if len(sizes) > 1:
+            hint = "Use the same number of realisations throughout."
+            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
+        grown = self.replace_unchecked(factors=(*self.factors, factor))
+        kept: dict[str, Any] = {
+            name: self.__dict__[name] for name in ("_place", "_turning", "space", "movable") if name in self.__dict__
+        }
+        batches = [b for b in (self.batch, factor.batch) if b is not None]
+        grown.__dict__.update(kept, batch=max(batches) if batches else None)
+        return grown
 
     def constrain(
         self,

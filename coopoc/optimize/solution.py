@@ -18,10 +18,12 @@ class Status(Enum):
     """Outcome of a solve; the value is a sentence.
 
     >>> print(Status.SOLVED.value)
-    At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m.
+    At a minimum: one more step would move no point by over 1e-6 m, or lower the cost by less than 1e-10 of it.
     """
 
-    SOLVED = "At a minimum: one more Gauss-Newton step would move no point by more than 1e-6 m."
+    SOLVED = (
+        "At a minimum: one more step would move no point by over 1e-6 m, or lower the cost by less than 1e-10 of it."
+    )
     MAX_ITERATIONS = "Stopped at the limit of iterations before a minimum: raise max_iterations or give a better x0."
     SADDLE = "At a stationary point that is no minimum: give an x0 to the side of it, where the cost falls."
     RANK_DEFICIENT = "Some points can move without changing the cost: measure them, or add a position factor."

@@ -13,15 +13,21 @@ from ..errors import InputError
 from .active import constraint_rows
 from .assess import Assessment, assess
 from .backend import Backend, Options, require_backend
-from .curvature import is_minimum
+from .curvature import newton_decrease
 from .descend import MAX_ITERATIONS
+from .fuse import fused
 from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
 from .problem import Problem
 from .solution import Solution, SolveError, Status
+from .sparse import sparse
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
+DECREASE = 1e-10
+"""Share of the cost that one more step may still promise: in a flat valley points move far for no gain."""
+PROMISE = 1e-8
+"""What a Newton step may promise where Gauss-Newton's is below the tolerance: 1e-4 standard deviations away."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 
@@ -55,6 +61,7 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    problem = problem if options.get("optimizer") == "gnc" else fused(problem)  # which has a weight per factor
     solution = _solved(problem, known, options)
     if solution.status is not Status.SOLVED and (other := known.fallback(problem, options)) is not None:
         solution = _after(solution, _solved(problem, known, other))
@@ -92,7 +99,7 @@ def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
         unobservable=truth.unobservable,
         space=problem.space,
         violation=truth.violation,
-        extras=found.extras | violated,
+        extras=found.extras | violated | ({"start": problem.start} if problem.start else {}),
     )
 
 
@@ -111,6 +118,8 @@ def _start(problem: Problem) -> Floats:
     if problem.linear and not problem.constraints:
         return np.asarray(somewhere(problem)[0])
     start: Floats = initial_guess(problem)[0]
+    if (system := sparse(problem)) is not None and np.isfinite(system.quadratic(start, "gauss-newton")[1]).all():
+        return start
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])
     for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
@@ -145,11 +154,15 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
         return Status.INFEASIBLE
     if truth.unobservable:
         return Status.RANK_DEFICIENT
-    if not truth.remaining <= POSITION_TOLERANCE:
+    still = truth.remaining <= POSITION_TOLERANCE
+    if not (still or truth.promised <= DECREASE * truth.cost):
         return Status.FAILED
-    fixed = truth.active
-    minimum = is_constrained_minimum(problem, x, fixed) if fixed else is_minimum(problem, x)
-    return Status.SOLVED if minimum else Status.SADDLE
+    if truth.active is not None:
+        return Status.SOLVED if is_constrained_minimum(problem, x, truth.active) else Status.SADDLE
+    left = newton_decrease(problem, x)
+    if left is None:
+        return Status.SADDLE
+    return Status.SOLVED if left <= max(DECREASE * truth.cost, PROMISE * still) else Status.FAILED
 
 
 def _raise(solution: Solution) -> None:

@@ -134,6 +134,32 @@ def _factor(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tup
     return numbers, 0.5 * ca.sum1(square if term.loss is None else LOSSES[term.loss.name](square, term.loss.scale, m))
 
 
+def white(known: Measurement, space: Space, nodes: Any, steps: Any, given: list[Any], full: bool) -> Any:
+    """Whitened residual (size,) of one measurement after steps of its nodes (arity dof,).
+
+    Args:
+        nodes: (arity ambient,).
+        given: z, constants and weights.
+    """
+    import casadi as ca
+
+    place, step = ca.horzsplit(ca.reshape(nodes, space.ambient, -1).T), ca.horzsplit(ca.reshape(steps, space.dof, -1).T)
+    at, turned = _moved(space, place, step)
+    z, constants, weight = ([v[k] for k in range(v.numel())] for v in given)
+    seen = _seen(known, at, turned, np.arange(known.arity)[None])
+    return ca.vertcat(*_whitened(_residual(known, seen, z, constants, _namespace()), weight, full))
+
+
+def robust(square: Any, loss: Loss | None) -> Any:
+    """rho of the squared residual; that of a truncated loss has a kink, with nothing beyond."""
+    if loss is None:
+        return square
+    m = _namespace()
+    if loss.name == "truncated":
+        return m.where(square > loss.scale**2, loss.scale**2, square)
+    return LOSSES[loss.name](square, loss.scale, m)
+
+
 def _constraint(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tuple[Any, Any]:
     """Constants (M, .) and the numbers that are steered, row by row."""
     import casadi as ca

@@ -14,6 +14,8 @@ from ..dense import damped_step, is_small
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
 from ..linear import Linear
 from ..problem import Problem
+from ..sparse import Sparse, sparse
+from ..trust_region import arrive
 
 PATIENCE = 40
 """Gauss-Newton steps before the exact Hessian takes over: with large residuals J^T J alone creeps or overshoots."""
@@ -35,16 +37,24 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     def solver(problem: Problem, x: Floats) -> SolverResult:
         if problem.linear and is_small(problem) and max_iterations:
             return one_step(problem, step, x)
+        if max_iterations and (system := sparse(problem)) is not None:
+            return _graph(system, x, max_iterations, tolerance)
         patience = max_iterations if problem.batch is not None else min(max_iterations, PATIENCE)
         end = descend(problem, step, x, patience, tolerance)
         if end.converged.all() or patience == max_iterations:
-            return SolverResult(end.x, end.iterations)
-        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - patience, tolerance)
-        return SolverResult(
-            more.x, end.iterations + more.iterations, extras={"newton_steps": int(more.iterations.sum())}
-        )
+            return SolverResult(end.x, end.iterations, extras={"record": end.record})
+        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - patience, tolerance, exact=True)
+        extras = {"newton_steps": int(more.iterations.sum()), "record": np.concatenate([end.record, more.record])}
+        return SolverResult(more.x, end.iterations + more.iterations, extras=extras)
 
     return solver
+
+
+def _graph(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
+    """The result of a large problem from x (1, n, ambient)."""
+    end = arrive(system, x[0], max_iterations, tolerance)
+    extras = {"newton_steps": end.newton_steps, "record": end.record}
+    return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
 
 
 def linear_step(problem: Problem) -> Step:

@@ -1,4 +1,4 @@
-"""gtsam: its multifrontal elimination in a loop of ours, or its own optimisers on a graph of its own factors.
+"""gtsam: its own optimisers on a graph of its own factors, or its multifrontal elimination in a loop of ours.
 
 GTSAM has no factor for range, azimuth and inclination in the world frame with a std each, and a Python CustomFactor
 inside an optimiser that C++ owns copies all Values at each callback. So the loop that takes every problem is owned
@@ -8,6 +8,7 @@ costs less than GTSAM's own and their noise models.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,14 +22,14 @@ from ..linear import Linear
 from ..problem import Problem
 from .gtsam_forms import forms
 from .gtsam_native import estimate, fix_nodes, native_graph, values, which_turn
-from .gtsam_optimizers import OPTIMIZERS, all_native, gnc, levenberg_marquardt
+from .gtsam_optimizers import OPTIMIZERS, all_native, as_it_comes, gnc, levenberg_marquardt
 
 
 def prepare(
     structure: Problem,
     max_iterations: int = MAX_ITERATIONS,
     tolerance: float = TOLERANCE,
-    optimizer: str = "elimination",
+    optimizer: str = "auto",
 ) -> Solver:
     """Solver of a structure.
 
@@ -36,21 +37,52 @@ def prepare(
         structure: a problem whose structure counts.
         max_iterations: of linear solves.
         tolerance: m or rad, largest move of a node in the last step.
-        optimizer: "elimination" is our Levenberg-Marquardt with GTSAM's elimination, for every problem. "lm" is GTSAM's
-            own, for problems of its own factors only. "gnc" is its graduated non-convexity for losses "truncated" or
-            "geman-mcclure" of one scale, then "lm": it needs no good start to find the outliers; a factor without a
-            loss is a known inlier, and extras["weights"] has the weights (M,) of each factor's measurements.
+        optimizer: "lm" is GTSAM's own Levenberg-Marquardt on its own factors, for problems that have no others, to the
+            last digit. "elimination" is our loop with GTSAM's elimination, for every problem. "auto" is GTSAM's own
+            with its own settings where it has every factor, and then "elimination" for the last digits; linear
+            problems, which are one elimination, and realisations are left to that. "gnc" is its graduated
+            non-convexity for losses "truncated" or "geman-mcclure" of one scale, then "lm": it needs no good start to
+            find the outliers; a factor without a loss is a known inlier, and extras["weights"] has the weights (M,) of
+            each factor's measurements.
 
     Raises:
         InputError: an unknown optimizer, factors that GTSAM lacks (they are named).
     """
     check_limits(max_iterations, tolerance)
-    if optimizer == "elimination":
-        step = linear_step(structure)
-        return lambda problem, x: minimise(problem, step, x, max_iterations, tolerance)
     if optimizer not in OPTIMIZERS:
         raise unknown("optimizer", optimizer, OPTIMIZERS)
+    if optimizer in ("auto", "elimination"):
+        step, own = linear_step(structure), optimizer == "auto" and _own(structure)
+
+        def solver(problem: Problem, x: Floats) -> SolverResult:
+            used = 0
+            if own and max_iterations:
+                x, used = _own_way(problem, x, max_iterations)
+            end = minimise(problem, step, x, max_iterations - used, tolerance)
+            method = {"method": "lm", "lm_iterations": used} if own else {"method": "elimination"}
+            return replace(end, iterations=end.iterations + used, extras=end.extras | method)
+
+        return solver
     return looped(lambda problem, x: _optimised(problem, x, max_iterations, tolerance, optimizer))
+
+
+def _own(problem: Problem) -> bool:
+    """Whether GTSAM has every factor of a single problem that is not linear."""
+    if problem.linear or problem.batch is not None:
+        return False
+    return not any(isinstance(form, str) for form in forms(problem))
+
+
+def _own_way(problem: Problem, x: Floats, limit: int) -> tuple[Floats, int]:
+    """Where GTSAM's own optimiser comes from x (1, n, ambient), and its iterations; x where it does not start."""
+    posed, keys = which_turn(problem), range(len(problem.names))
+    graph = native_graph(problem, forms(problem)).graph
+    fix_nodes(problem, graph)
+    try:
+        at, used = as_it_comes(graph, values(problem.space, posed, x[0], keys), limit)
+    except RuntimeError:  # a singular system: `solve` names the nodes that are free
+        return x, 0
+    return estimate(problem.space, posed, at, keys)[None], used
 
 
 def _optimised(problem: Problem, x: Floats, max_iterations: int, tolerance: float, optimizer: str) -> SolverResult:
@@ -155,7 +187,7 @@ def _add(graph: Any, rows: list[tuple[list[list[int]], list[Floats], Floats]], b
 BACKEND = Backend(
     "gtsam",
     prepare,
-    "elimination by GTSAM, or its own Levenberg-Marquardt and GNC (optimizer=)",
+    "GTSAM's own factors and Levenberg-Marquardt where it has them all, else its elimination; GNC (optimizer=)",
     "gtsam",
     Capabilities(batched=True),
 )

@@ -59,7 +59,8 @@ def prepare(
             x = start[None]
             if not feasible:
                 return SolverResult(x, np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool), dict(programme.counts))
-        return replace(minimise(problem, step, x, max_iterations, tolerance), extras=dict(programme.counts))
+        found = minimise(problem, step, x, max_iterations, tolerance)
+        return replace(found, extras=found.extras | dict(programme.counts))
 
     return solver
 

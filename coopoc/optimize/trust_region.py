@@ -1,0 +1,125 @@
+"""The outer loop of a large problem: J^T J where its model is good, the exact Hessian where it misleads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from .descend import GIVE_UP, LEAST_DAMPING
+from .sparse import Sparse
+from .tape import Model
+
+OFF = 0.2
+"""A share of the promised decrease this far from 1 casts doubt on J^T J."""
+DOUBT = 2
+"""Doubtful steps before the exact Hessian takes over."""
+GROWTH, DECAY = 10.0, 5.0
+"""Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
+middle where a step overshoots."""
+FIRST = 1e-4
+"""Damping once some is needed."""
+FLAT = 1e-14
+"""Share of the cost whose promise ends the loop: some 1e-6 standard deviations to go, before the step that is taken."""
+LEAST_INFORMATION = 1e-9
+"""1/m^2 or 1/rad^2: the scale of what no measurement holds."""
+SLOW = 0.2
+"""A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
+HIDDEN = 1e-9
+"""Share of the cost below which rounding hides how much of a promised decrease came true."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """Where the loop ended.
+
+    Args:
+        x: (n, ambient).
+        iterations: factorisations.
+        converged: the last step was below the tolerance, or what it promised is rounding.
+        record: (iterations, 3) the cost before each, its damping, and which share of the promised decrease came true
+            (NaN where the matrix was not positive definite).
+        newton_steps: how many iterations used the exact Hessian.
+    """
+
+    x: Floats
+    iterations: int
+    converged: bool
+    record: Floats
+    newton_steps: int
+
+
+def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> Arrival:
+    """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
+
+    H = J^T J, until two of its promises failed by more than a fifth or hardly fell; then the exact Hessian, with which
+    the last steps converge quadratically however large the residuals are. Where that is not positive definite J^T J
+    takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where less than a quarter of
+    the promised decrease comes true and falls where more than three quarters do.
+
+    References:
+        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
+    """
+    ldl, mu, doubt = system.ldl, 0.0, 0
+    model: Model = "gauss-newton"
+    record: list[tuple[float, float, float]] = []
+    newton, converged, last = 0, False, np.inf
+    cost, gradient, values = system.quadratic(x, "gauss-newton")
+    scale = _scale(system, values)
+    while len(record) < max_iterations and not converged and mu < GIVE_UP:
+        newton += model == "newton"
+        definite = ldl.factor(system.matrix(_damped(system, values, mu * scale)))
+        if not definite:
+            record.append((cost, mu, np.nan))
+            if model == "newton":
+                doubt, model = -DOUBT, "gauss-newton"
+                cost, gradient, values = system.quadratic(x, model)
+            else:
+                mu = _grown(mu)
+            continue
+        dx = -ldl.solve(gradient)
+        promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
+        there = system.retract(x, dx)
+        after = system.cost(there)
+        hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
+        share = 1.0 if hidden else (cost - after) / promised
+        record.append((cost, mu, share))
+        converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden)
+        if not share > 0.0:
+            mu = _grown(mu)
+            continue
+        x = there
+        mu = _next(mu, share)
+        if model == "gauss-newton":
+            off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
+            doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
+            model = "newton" if doubt >= DOUBT else model
+        last = promised
+        if not converged:
+            cost, gradient, values = system.quadratic(x, model)
+            scale = _scale(system, values) if model == "gauss-newton" else scale
+    return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
+
+
+def _grown(mu: float) -> float:
+    return GROWTH * mu if mu > 0.0 else FIRST
+
+
+def _next(mu: float, share: float) -> float:
+    if share > 0.75:
+        return mu / DECAY if mu > LEAST_DAMPING else 0.0
+    return _grown(mu) if share < 0.25 else mu
+
+
+def _scale(system: Sparse, values: Floats) -> Floats:
+    """(m,) diagonal of J^T J."""
+    return np.maximum(values[system.entries.diagonal], LEAST_INFORMATION)
+
+
+def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
+    if not damping.any():
+        return values
+    whole = values.copy()
+    whole[system.entries.diagonal] += damping
+    return whole

@@ -1,0 +1,124 @@
+"""Random factor graphs of robots that drive about: odometry, loops, landmarks, ranges."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
+from coopoc.formats.graph import Graph
+
+REACH = 12.0
+"""m within which robots see one another and landmarks."""
+
+
+def random_graph(
+    seed: int,
+    dimension: int = 2,
+    robots: int = 2,
+    steps: int = 60,
+    landmarks: int = 6,
+    loops: int = 10,
+    ranges: int = 80,
+    seen: int = 40,
+    turn_std: float = 0.01,
+    step_std: float = 0.05,
+    range_std: float = 0.1,
+    priors: bool = False,
+) -> Graph:
+    """Robots A, B, ... of `steps` poses 1 m apart within 40 m, whose vertices hold the truth.
+
+    Args:
+        loops: relative poses between poses that are near each other, other than the odometry.
+        ranges: distances between poses and landmarks or other robots, at least five to each landmark if at all.
+        seen: landmarks' positions in the body of a pose.
+        turn_std: rad, of odometry and loops; step_std: m.
+        priors: landmarks have one each, of 0.1 m.
+    """
+    rng, d = np.random.default_rng(seed), dimension
+    p, turned = _paths(rng, d, robots, steps)
+    beside = rng.normal(0, 5, (landmarks, d)) * np.r_[1, 1, np.full(d - 2, 0.4)]
+    world = np.concatenate([p, p[rng.integers(0, len(p), landmarks)] + beside])
+    names = tuple(f"{chr(65 + r)}{k}" for r in range(robots) for k in range(steps))
+    names += tuple(f"L{k}" for k in range(landmarks))
+    count = robots * steps
+    odometry = np.array([(r * steps + k, r * steps + k + 1) for r in range(robots) for k in range(steps - 1)])
+    far = np.linalg.norm(world[:, None] - world[None], axis=-1)
+    near = np.argwhere(np.triu(far[:count, :count] < REACH, 3))
+    loop = near[rng.permutation(len(near))[:loops]]
+    pairs = np.concatenate([odometry, loop.reshape(-1, 2)])
+    to_mark = np.argwhere(far[:count, count:] < 2 * REACH) + np.array([0, count])
+    other = np.argwhere(far[:count, :count] < 2 * REACH)
+    other = other[(other[:, 0] // steps) < (other[:, 1] // steps)]
+    to_mark = to_mark[rng.permutation(len(to_mark))]
+    enough = np.concatenate([to_mark[to_mark[:, 1] == mark][:5] for mark in range(count, count + landmarks)])
+    ranged = np.concatenate([to_mark, other])
+    ranged = np.concatenate([enough, ranged[rng.permutation(len(ranged))]])[: ranges or None]
+    ranged = ranged[np.sort(np.unique(ranged, axis=0, return_index=True)[1])]
+    bodies = to_mark[rng.permutation(len(to_mark))[:seen]]
+    rotation = np.concatenate([turned, np.tile(np.eye(d), (landmarks, 1, 1))])
+    cov = np.diag(np.r_[np.full(d, step_std**2), np.full(1 if d == 2 else 3, turn_std**2)])
+
+    def local(nodes: np.ndarray, std: float) -> np.ndarray:
+        gap = world[nodes[:, 1]] - world[nodes[:, 0]]
+        return np.einsum("mji,mj->mi", turned[nodes[:, 0]], gap) + std * rng.normal(size=(len(nodes), d))
+
+    relative = np.einsum("mji,mjk->mik", turned[pairs[:, 0]], turned[pairs[:, 1]])
+    relative = relative @ _small(rng, d, len(pairs), turn_std)
+    moved = local(pairs, step_std)
+    distance = far[ranged[:, 0], ranged[:, 1]] + range_std * rng.normal(size=len(ranged))
+    marks = np.arange(count, count + landmarks)[:, None]
+    return Graph(
+        d,
+        names,
+        np.arange(len(names)) < count,
+        world,
+        _orientation(rotation),
+        relative_pose=PoseEdges(pairs, moved, _orientation(relative), np.tile(cov, (len(pairs), 1, 1))),
+        relative_point=PointEdges(bodies, local(bodies, 0.2), np.tile(0.04 * np.eye(d), (len(bodies), 1, 1)))
+        if len(bodies)
+        else PointEdges(),
+        ranges=RangeEdges(ranged, np.maximum(distance, 0.1), np.full(len(ranged), range_std**2))
+        if len(ranged)
+        else RangeEdges(),
+        point_prior=PointEdges(
+            marks, world[count:] + 0.1 * rng.normal(size=(landmarks, d)), np.tile(0.01 * np.eye(d), (landmarks, 1, 1))
+        )
+        if priors
+        else PointEdges(),
+    )
+
+
+def _paths(rng: np.random.Generator, d: int, robots: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (robots * steps, d) and rotations of drives that turn back towards the middle."""
+    found, turned = [], []
+    for _ in range(robots):
+        at, course, bend = rng.uniform(-10, 10, d) * np.r_[1, 1, np.full(d - 2, 0.2)], rng.uniform(-np.pi, np.pi), 0.0
+        for _ in range(steps):
+            home = np.arctan2(-at[1], -at[0]) - course
+            pull = 0.1 * np.sin(home) * max(0.0, np.hypot(at[0], at[1]) / 20.0 - 0.3)
+            bend = 0.8 * bend + 0.08 * rng.normal()
+            course += bend + pull
+            tilt = [] if d == 2 else [0.1 * rng.normal(), 0.1 * rng.normal()]
+            angles = [course, *tilt]
+            found.append(at.copy())
+            turned.append(
+                [[np.cos(course), -np.sin(course)], [np.sin(course), np.cos(course)]]
+                if d == 2
+                else Rotation.from_euler("zyx", angles).as_matrix()
+            )
+            at += np.array(turned[-1])[:, 0]
+    return np.array(found), np.array(turned)
+
+
+def _small(rng: np.random.Generator, d: int, count: int, std: float) -> np.ndarray:
+    if d == 3:
+        return Rotation.from_rotvec(std * rng.normal(size=(count, 3))).as_matrix()
+    angle = std * rng.normal(size=count)
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]).transpose(2, 0, 1)
+
+
+def _orientation(rotation: np.ndarray) -> np.ndarray:
+    if rotation.shape[-1] == 2:
+        return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])[:, None]
+    return Rotation.from_matrix(rotation).as_quat()

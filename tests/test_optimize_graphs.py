@@ -1,0 +1,292 @@
+"""Graphs of poses, landmarks and ranges: that the loop arrives, from which start, and that no status lies."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from random_graphs import random_graph
+from scipy.optimize import least_squares
+
+from coopoc import InputError
+from coopoc.formats.edges import PointEdges, PoseEdges
+from coopoc.formats.graph import Graph
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
+from coopoc.optimize.arrowhead import structure
+from coopoc.optimize.backends.gtsam_forms import forms
+from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, values, which_turn
+from coopoc.optimize.curvature import matrix, newton_decrease, true_blocks
+from coopoc.optimize.dual import Dual
+from coopoc.optimize.fuse import fused
+from coopoc.optimize.graphs import Objective, from_graph, read_graph
+from coopoc.optimize.linear_start import linear_start, project
+from coopoc.optimize.local_problem import LocalProblem
+from coopoc.optimize.marginals import bayes_tree_marginals
+from coopoc.optimize.sparse import _made, sparse
+from coopoc.optimize.starts import chained
+
+PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
+needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
+
+
+def flat_valley() -> Problem:
+    """A point whose ranges from afar leave it nearly free across: J^T J has little of the curvature there."""
+    names = ("a", "b", "p")
+    problem = Problem(names, x0=np.array([[-100.0, 0.0], [100.0, 0.0], [3.0, 4.0]]), dimension=2, fixed=("a", "b"))
+    return problem.add("range", [("a", "p"), ("b", "p")], [100.5, 100.5], std=0.1)
+
+
+@pytest.mark.parametrize(
+    ("backend", "options"), [("gauss-newton", {}), ("gtsam", {"optimizer": "elimination"}), ("osqp", {})]
+)
+def test_a_record_tells_every_iteration(backend: str, options: dict[str, str]) -> None:
+    found = solve(flat_valley(), backend, **options)
+    record = found.extras["record"]
+    assert record.shape == (found.iterations, 3)
+    assert np.diff(record[:, 0]).max() <= 0.0
+    assert record[0, 0] == pytest.approx(flat_valley().cost(flat_valley().x0))
+
+
+def test_a_newton_step_promises_the_square_of_its_decrement() -> None:
+    """Against the dense Hessian by differences of the gradient."""
+    problem = from_graph(random_graph(11, steps=8, landmarks=2, ranges=12, seen=8, loops=3), start="file")
+    local = LocalProblem(problem, problem.x0)
+
+    def gradient(v: np.ndarray) -> np.ndarray:
+        return local.jacobian(v).T @ local.residual(v)
+
+    step = 1e-5 * np.eye(local.size)
+    H = np.array([(gradient(e) - gradient(-e)) / 2e-5 for e in step])
+    g = gradient(np.zeros(local.size))
+    assert np.linalg.eigvalsh(H).min() > 0
+    assert newton_decrease(problem, problem.x0) == pytest.approx(0.5 * g @ np.linalg.solve(H, g), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", [101, 102])
+def test_what_is_solved_is_scipys_minimum(seed: int) -> None:
+    problem = from_graph(random_graph(seed, steps=30, ranges=60))
+    found = solve(problem)
+    local = LocalProblem(problem, found.x)
+    theirs = least_squares(
+        lambda v: local.residual(v), np.zeros(local.size), lambda v: local.jacobian(v).toarray(), xtol=1e-14, ftol=1e-15
+    )
+    assert found.status is Status.SOLVED
+    assert theirs.cost == pytest.approx(found.cost, rel=1e-9)
+    assert np.abs(theirs.x).max() < 1e-5
+
+
+def test_a_step_that_stops_early_is_not_solved() -> None:
+    problem = from_graph(random_graph(103, steps=30, ranges=60, turn_std=0.1), start="odometry")
+    assert solve(problem, throw=False, max_iterations=2).status is Status.MAX_ITERATIONS
+
+
+def without_noise(seed: int, dimension: int) -> Graph:
+    graph = random_graph(seed, dimension, loops=30, seen=60, ranges=0, turn_std=1e-6, step_std=1e-6)
+    exact = from_graph(graph, start="file")
+    assert exact.cost(exact.x0) < 1e4  # landmarks are seen with 0.2 m
+    return graph
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_linear_solves_find_the_truth_whatever_the_odometry_was(dimension: int) -> None:
+    graph = replace(without_noise(201, dimension), relative_point=PointEdges())
+    truth = Space(dimension, has_rotation=True).join(graph.position, graph.rotation)
+    poses = np.flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
+    found = linear_start(graph, chained(graph))
+    assert found[poses] == pytest.approx(truth[poses], abs=1e-3)
+
+
+def test_matrices_project_to_the_nearest_rotations() -> None:
+    rng = np.random.default_rng(202)
+    for d in (2, 3):
+        matrix = rng.normal(size=(50, d, d))
+        found = project(matrix)
+        left, _, right = np.linalg.svd(matrix)
+        left[:, :, -1] *= np.linalg.det(left @ right)[:, None]
+        assert found == pytest.approx(left @ right, abs=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("seed", [203, 204, 205])
+def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> None:
+    """Odometry of 6 degrees a step, which loops and landmarks correct: to the minimum that the truth leads to."""
+    graph = random_graph(seed, dimension, steps=150, turn_std=0.1, loops=80, seen=120)
+    found = solve(from_graph(graph))
+    assert found.status is Status.SOLVED
+    assert found.extras["start"] in ("odometry", "tree", "linear")
+    assert found.cost <= solve(from_graph(graph, start="file")).cost * (1 + 1e-9)
+
+
+def test_a_tree_goes_the_way_of_least_variance() -> None:
+    """A pose that is reached by a bad edge or by two good ones: the spanning tree takes the good."""
+    cov = np.array([np.eye(3), 1e-4 * np.eye(3), 1e-4 * np.eye(3)])
+    edges = PoseEdges([[0, 2], [0, 1], [1, 2]], [[9, 9], [1, 0], [1, 0]], np.zeros((3, 1)), cov)
+    graph = Graph(2, ("A0", "A1", "A2"), [True] * 3, np.zeros((3, 2)), np.zeros((3, 1)), relative_pose=edges)
+    assert from_graph(graph, start="tree").x0[2, :2] == pytest.approx([2, 0])
+
+
+def test_landmarks_start_at_their_priors_and_poses_at_theirs() -> None:
+    graph = random_graph(206, priors=True)
+    moved = replace(graph, position=graph.position + 100.0)
+    x0 = from_graph(moved, start="odometry").x0
+    assert x0[~graph.is_pose, :2] == pytest.approx(graph.point_prior.position)
+    prior = PoseEdges([[3]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)])
+    held = from_graph(replace(graph, pose_prior=prior), start="odometry").x0[3]
+    assert held == pytest.approx([7.0, 8.0, np.cos(0.5), -np.sin(0.5), np.sin(0.5), np.cos(0.5)])
+
+
+@needs_files
+@pytest.mark.parametrize(
+    ("name", "best"), [("mrclam5a", 69.10354), ("mrclam6", 3144.2732), ("plaza1", 1332.7948), ("tiers", 2050.1013)]
+)
+def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> None:
+    found = solve(read_graph(PYFG / f"{name}.pyfg"))
+    assert found.status is Status.SOLVED
+    assert found.cost == pytest.approx(best, rel=1e-6)
+
+
+@pytest.mark.parametrize("objective", ["chordal", "geodesic"])
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
+def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str | None) -> None:
+    """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences."""
+    graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
+    problem = from_graph(graph, objective, start="file")
+    rho = None if loss is None else Loss(loss, 2.0)
+    problem = replace(problem, factors=tuple(replace(f, loss=rho) for f in problem.factors))
+    small = replace(problem, separator=())
+    system, x = _made(small), problem.x0
+    assert system is not None
+    movable = problem.movable.ravel()
+    r, J = problem.whiten(x)
+    J = J[:, np.flatnonzero(movable)]
+    cost, gradient, values = system.quadratic(x, "gauss-newton")
+    assert cost == pytest.approx(problem.cost(x), rel=1e-12)
+    assert system.cost(x) == pytest.approx(cost, rel=1e-12)
+    assert gradient == pytest.approx(J.T @ r, abs=1e-9 * np.abs(J.T @ r).max())
+    dense = (J.T @ J).toarray()
+    assert system.matrix(values).toarray() == pytest.approx(np.triu(dense), abs=1e-9 * np.abs(dense).max())
+    values = system.quadratic(x, "newton")[2]
+    if loss != "truncated":  # its differences jump at the kink
+        scheme = structure(problem)[0]
+        exact = matrix(scheme, true_blocks(problem, problem.linearise(x[None]))).toarray()[np.ix_(movable, movable)]
+        assert system.matrix(values).toarray() == pytest.approx(np.triu(exact), abs=3e-6 * np.abs(exact).max())
+
+
+def test_a_formula_that_casadi_cannot_run_takes_the_plain_way() -> None:
+    @measurement("half_range_of_test", arity=2, components=("coordinate",), plane=(0,))
+    def half_range(dx, dy, dz, m=np):  # type: ignore[no-untyped-def]
+        if not isinstance(dx, np.ndarray | Dual):
+            raise TypeError("numbers of another library")
+        return (0.5 * m.sqrt(dx * dx + dy * dy),)
+
+    rng = np.random.default_rng(208)
+    at = rng.uniform(-50, 50, (80, 2))
+    names = tuple(f"n{k}" for k in range(80))
+    problem = Problem(names, x0=at + rng.normal(size=at.shape), dimension=2).add("position", names, at, std=1.0)
+    pairs = [(names[k], names[(k + 1) % 80]) for k in range(80)]
+    gap = 0.5 * np.linalg.norm(np.roll(at, -1, 0) - at, axis=1)
+    try:
+        problem = problem.add("half_range_of_test", pairs, gap[:, None], std=0.1)
+        assert sparse(problem) is None
+        assert solve(problem).status is Status.SOLVED
+    finally:
+        del MEASUREMENTS["half_range_of_test"]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_marginals_by_selected_inversion_are_the_inverse(dimension: int) -> None:
+    problem = from_graph(random_graph(209, dimension, steps=40))
+    found = solve(problem)
+    J = problem.whiten(found.x)[1].toarray()
+    movable = problem.movable.ravel()
+    cov = np.zeros((movable.size, movable.size))
+    cov[np.ix_(movable, movable)] = np.linalg.inv(J[:, movable].T @ J[:, movable])
+    own = cov.reshape(len(found.x), problem.space.dof, len(found.x), -1)
+    own = own[np.arange(len(found.x)), :, np.arange(len(found.x))]
+    assert found.covariance == pytest.approx(own, rel=1e-6, abs=1e-9 * own.max())
+
+
+def test_single_measurements_are_the_same_problem_as_arrays() -> None:
+    """Cost, nodes and covariance of a problem grown one by one, and of every form of noise."""
+    rng = np.random.default_rng(210)
+    names, at = [f"n{k}" for k in range(70)], np.cumsum(rng.normal(size=(70, 2)), axis=0)
+    whole = Problem(names, x0=at + 0.1, dimension=2)
+    single = whole
+    z = np.diff(at, axis=0) + 0.1 * rng.normal(size=(69, 2))
+    std = rng.uniform(0.1, 0.3, (69, 2))
+    pairs = list(pairwise(names))
+    root = np.tril(rng.uniform(1, 2, (5, 2, 2)))
+    whole = whole.add("displacement", pairs, z, std=std).add("position", names[:5], at[:5], sqrt_information=root)
+    whole = whole.add("range", pairs[:20], np.linalg.norm(z[:20], axis=1)[:, None], std=0.1, loss=Loss("huber", 1.0))
+    for k in range(69):
+        single = single.add("displacement", pairs[k], z[k], std=std[k])
+        if k < 5:
+            single = single.add("position", names[k], at[k], sqrt_information=root[k])
+        if k < 20:
+            single = single.add("range", pairs[k], [np.linalg.norm(z[k])], std=0.1, loss=Loss("huber", 1.0))
+    assert repr(fused(single)) == "Problem(70 points in the plane; 69 displacement, 5 position, 20 range)"
+    ours, theirs = solve(single), solve(whole)
+    assert single.cost(at) == pytest.approx(whole.cost(at), rel=1e-12)
+    assert ours.cost == pytest.approx(theirs.cost, rel=1e-12)
+    assert ours.x == pytest.approx(theirs.x, abs=1e-9)
+    assert ours.covariance == pytest.approx(theirs.covariance, abs=1e-12)
+
+
+def test_an_add_checks_what_is_added() -> None:
+    problem = Problem(("a", "b"), dimension=2)
+    with pytest.raises(InputError, match="must be a pose"):
+        problem.add("bearing", ("a", "b"), [0.1], std=0.1)
+    with pytest.raises(InputError, match="dimensions"):
+        problem.add("position", "a", [0.0, 0.0, 0.0], std=1.0)
+    batch = problem.add("position", "a", np.zeros((3, 1, 2)), std=1.0)
+    assert batch.batch == 3
+    with pytest.raises(InputError, match="must agree"):
+        batch.add("position", "b", np.zeros((4, 1, 2)), std=1.0)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_marginals_are_those_of_gtsams_bayes_tree(dimension: int) -> None:
+    problem = from_graph(random_graph(211, dimension, steps=60))
+    found = solve(problem)
+    theirs = bayes_tree_marginals(problem.whiten(found.x)[1], ~problem.movable, len(problem.names), problem.space.dof)
+    still = ~problem.movable
+    theirs[still[:, :, None] | still[:, None, :]] = 0.0
+    assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
+
+
+@pytest.mark.parametrize("seed", [212, 213, 214])
+def test_no_minimum_lies_above_gtsams(seed: int) -> None:
+    """From the same chained odometry, bad enough to matter, on graphs that GTSAM has every factor of."""
+    graph = random_graph(seed, steps=120, seen=0, loops=40, ranges=120, turn_std=0.05)
+    problem = from_graph(graph, start="odometry")
+    native = native_graph(problem, forms(problem)).graph
+    fix_nodes(problem, native)
+    at = values(problem.space, which_turn(problem), problem.x0, range(len(problem.names)))
+    theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams()).optimize()
+    found = solve(from_graph(graph))
+    assert found.status is Status.SOLVED
+    assert found.cost <= native.error(theirs) * (1 + 1e-9)
+
+
+def test_what_is_kept_of_a_problem_goes_with_it() -> None:
+    problem = from_graph(random_graph(215))
+    solve(problem)
+    here = weakref.ref(problem)
+    del problem
+    gc.collect()
+    assert here() is None
+
+
+def test_threads_do_not_share_factors() -> None:
+    problem = from_graph(random_graph(216, 3, steps=60), start="odometry")
+    with ThreadPoolExecutor(4) as pool:
+        costs = {found.cost for found in pool.map(lambda _: solve(problem), range(8))}
+    assert len(costs) == 1
