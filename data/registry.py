@@ -128,6 +128,18 @@ def _made(found: Any, name: str) -> Fleet:
     return fleet
 
 
+def kind_of(name_or_path: str | Path) -> str:
+    """Format of a name or path, "" for a name and for what is made by code.
+
+    >>> kind_of("town10")
+    ''
+    """
+    name, options = split(name_or_path)
+    if name in DATASETS or in_file(name) or not Path(name).exists():
+        return ""
+    return str(options.get("format") or detect(Path(name)))
+
+
 def _truth(path: Path, log: Log) -> Fleet:
     if log.truth is None:
         raise InputError(
@@ -145,11 +157,7 @@ def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable
     >>> recorder("town10") is None
     True
     """
-    name, options = split(name_or_path)
-    path = Path(name)
-    if name in DATASETS or not path.exists():
-        return None
-    chosen = format or options.pop("format", None) or detect(path)
+    chosen = format or kind_of(name_or_path)
     return real_recorder(name_or_path, chosen) if chosen in REAL else None
 
 

@@ -137,7 +137,7 @@ class Recording:
         """
         (col,) = columns("vehicle", [vehicle], self.ids)
         there = np.isfinite(self.velocity[0, :, col, 0])
-        fixed = np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)
+        fixed: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0))
         edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0)).reshape(-1, 2)
         firsts = [(start + int(np.argmax(fixed[start:stop])), stop, fixed[start:stop].any()) for start, stop in edges]
         return tuple((int(a), int(b)) for a, b, any_fix in firsts if any_fix and b - a >= shortest)

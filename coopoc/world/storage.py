@@ -99,7 +99,7 @@ def digest(recording: Recording) -> str:
 
 
 def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording, Fleet | None]:
-    noise = {name: tuple(v) if isinstance(v, list) else v for name, v in words["sensors"].items()}
+    noise: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in words["sensors"].items()}
     ids, t = tuple(words["ids"]), arrays["t"]
     recording = Recording(
         ids=ids,
