@@ -1,4 +1,4 @@
-"""A log of one's own -> Recording: tables of what was measured, NMEA files, and truth where there is some."""
+"""A log of one's own -> Recording: tables of what was measured, NMEA, ROS bags, and truth where there is some."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from . import log_sensors
+from .bag import is_bag, read_bag
 from .geodetic import to_enu
 from .kinds import KINDS
 from .log_links import linked
@@ -65,7 +66,7 @@ def read_log(
     sensors: Sensors | None = None,
     any_scale: bool = False,
 ) -> Log:
-    """Read a file or a folder of logged measurements: tables (CSV, Parquet, Excel) and NMEA.
+    """Read a file or a folder of logged measurements: tables (CSV, Parquet, Excel), NMEA, or a ROS bag.
 
     docs/your_data.md describes the tables. A file named truth in a folder holds the truth.
 
@@ -88,7 +89,7 @@ def read_log(
 
     Raises:
         InputError: names file, row, column, value, what is allowed and how to mend it.
-        MissingLibraryError: pynmeagps is not installed, and there is NMEA.
+        MissingLibraryError: pynmeagps or rosbags is not installed, and there is NMEA or a bag.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "drive.csv"
@@ -98,13 +99,17 @@ def read_log(
     """
     path, tally = Path(path), Tally()
     _check_options(dt, max_gap, clock)
-    files, true = _files(path, None if truth is None else Path(truth))
-    rows = stacked([_rows_of_file(file, tally, columns, kinds, ignore) for file in files])
+    if is_bag(path):
+        rows, actual = read_bag(path, tally)
+        true = None if truth is None else Path(truth)
+    else:
+        files, true = _files(path, None if truth is None else Path(truth))
+        rows, actual = stacked([_rows_of_file(file, tally, columns, kinds, ignore) for file in files]), None
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
     rows = _on_one_clock(rows, clock or {}, path.name)
     check_arrivals(rows)
-    actual = _rows_of_file(true, Tally(), columns, kinds, ()) if true else None
+    actual = _rows_of_file(true, Tally(), columns, kinds, ()) if true else actual
     origin = _origin(rows, origin)
     rows, given = local(rows, origin), log_sensors.stds(rows)
     planar = not (rows.kind == "z").any()
@@ -184,11 +189,13 @@ def _rows_of_file(
 
 
 def log_files(path: Path) -> bool:
-    """Whether a path is a log: a folder with tables or NMEA, an NMEA file, or a table with a column of a log.
+    """Whether a path is a log: a bag, NMEA, a folder with such files or tables, or a table with a column of a log.
 
     >>> log_files(Path("drive.nmea"))
     True
     """
+    if is_bag(path):
+        return True
     if path.is_dir():
         return any(file.suffix.lower() in (*TABLES, *NMEA) for file in path.iterdir())
     if path.suffix.lower() in NMEA:

@@ -64,19 +64,20 @@ def read_nmea(path: Path, tally: Tally) -> Rows:
     if not found.t:
         hint = "Check that it holds GGA sentences with a fix."
         raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA", hint)
-    return found.rows(path)
+    return found.rows(path, clock.first_day)
 
 
 class _Clock:
     """Seconds since 1970 if a date was seen, else seconds of the first day; times of day go on after midnight."""
 
     def __init__(self) -> None:
-        self.day, self.last = 0.0, -np.inf
+        self.day, self.last, self.first_day = 0.0, -np.inf, 0.0
 
     def at(self, time: Any, date: Any = None) -> float:
         seconds = time.hour * 3600 + time.minute * 60 + time.second + time.microsecond / 1e6
         if isinstance(date, datetime.date):
             self.day = (date - datetime.date(1970, 1, 1)).days * DAY
+            self.first_day = self.first_day or self.day
         elif self.day + seconds < self.last - DAY / 2:
             self.day += DAY
         self.last = self.day + seconds
@@ -133,15 +134,14 @@ class _Found:
         if course not in ("", None) and speed > SLOW:
             self.add(t, "compass_deg", course, row)
 
-    def rows(self, path: Path) -> Rows:
+    def rows(self, path: Path, first_day: float) -> Rows:
         place = {"latitude": 0, "longitude": 1, "height": 2}
         std = [
             self.deviation.get(t, (np.nan,) * 3)[place[kind]] if kind in place else np.nan
             for t, kind in zip(self.t, self.kind, strict=True)
         ]
         positive = np.where(np.array(std) > 0, std, np.nan)
-        day = np.array(self.t)
-        # sentences before the first date belong to the same day
-        day = np.where(day < DAY, day + (day.max() // DAY) * DAY, day) if day.max() > 3650 * DAY else day
+        t = np.array(self.t)
+        day = np.where(t < first_day, t + first_day, t)  # sentences before the first date are of its day
         names = [path.stem] * len(day)
         return rows_of(path.name, day, names, self.kind, np.array(self.value), np.array(self.row), std=positive)

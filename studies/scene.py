@@ -203,7 +203,8 @@ def conditions(p: Params) -> str:
     who = egos(p["data"], str(p["egos"]))
     log = _log(p["data"])
     alike = log is not None and (log.messages or not channel(p).loss)
-    size = f"{_count(log.recording.runs if log and alike else p['runs'], 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
+    runs = log.recording.runs if log is not None and alike else p["runs"]
+    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
     trained = f", {_count(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."
 
