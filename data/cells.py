@@ -142,7 +142,11 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
         if len(given) and dates.notna().all() and not pd.to_numeric(given, errors="coerce").notna().any():
             given, kind = dates, "M"
     if kind not in "mM":
-        return numeric(frame, column, file)
+        try:
+            return numeric(frame, column, file)
+        except InputError as error:
+            allowed = "must be seconds, or a date as 2024-05-01T12:00:00Z"
+            raise InputError(error.field, error.value, allowed, "Mend the cell, or remove the row.") from None
     missing = np.flatnonzero(given.isna().to_numpy())
     if len(missing):
         where = f"{file}: row {missing[0] + 1}, column {column}"

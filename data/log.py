@@ -26,7 +26,7 @@ from .log_vehicle import Vehicle, samples, vehicle
 from .motion import Signal
 from .nmea import read_nmea
 from .rows import backward_difference, interpolate
-from .scale import check_scale, check_size
+from .scale import check_scale, check_size, check_time
 
 TABLES, NMEA = (".csv", ".parquet", ".xlsx"), (".nmea", ".nme")
 TRUTH = "truth"
@@ -108,6 +108,7 @@ def read_log(
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
     rows = _on_one_clock(rows, clock or {}, path.name)
+    check_time(rows.t, path.name)
     check_arrivals(rows)
     actual = _rows_of_file(true, Tally(), columns, kinds, ()) if true else actual
     origin = _origin(rows, origin)
@@ -294,7 +295,7 @@ def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
     t = rows.t[moving]
     count = (t.max() - t.min()) / step + 1.5
     check_size(count, len(set(rows.vehicle.tolist())), len(rows), step, name)
-    if count < 3:
+    if count < 2:
         raise InputError(
             "dt", f"{step:g} s", f"must be well below the {np.ptp(t):g} s of the log", "Take a shorter dt."
         )

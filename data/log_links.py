@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,7 +91,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     rank = np.arange(len(key)) - np.maximum.accumulate(np.where(first, np.arange(len(key)), 0))
     kept = near[rank < v2x.max_neighbours]
     fewer = Links(links.step[kept], links.observer[kept], links.neighbour[kept])
-    parts: dict[str, Floats | Ints | Bools] = {
+    parts: dict[str, Any] = {
         "gnss": recording.gnss,
         "velocity": recording.velocity,
         "relative": recording.relative[:, kept],
@@ -107,7 +107,7 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
         broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
         if times:
             parts = {name: np.broadcast_to(part, (runs, *part.shape[1:])) for name, part in parts.items()}
-    return replace(recording, links=fewer, broadcasts=broadcasts, v2x=v2x, **parts)  # type: ignore[arg-type]
+    return replace(recording, links=fewer, broadcasts=broadcasts, v2x=v2x, **parts)
 
 
 def _measured(

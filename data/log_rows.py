@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 LOST = ("lost", "-1")
+USUAL = {
+    "t": ("time", "timestamp", "stamp", "time_s", "seconds", "sec", "datetime", "utc", "rostime"),
+    "value": ("measurement", "val", "data"),
+    "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
+}
+"""Headers that others give to the columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,5 +329,9 @@ def _no_column(file: str, column: str, frame: pd.DataFrame) -> InputError:
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)}); the file has {', '.join(headers)}"
     else:
         allowed = f"is needed; the file has {', '.join(headers)}"
-    hint = suggestion(column, headers, f'Add it, or name it: columns={{"{column}": "..."}}.')
+    near = [h for h in headers if h.lower() in USUAL.get(column, ())]
+    wanted = f'columns={{"{column}": "{near[0] if near else "..."}"}}'
+    hint = (
+        f"Did you mean {near[0]}? Pass {wanted}." if near else suggestion(column, headers, f"Add it, or pass {wanted}.")
+    )
     return InputError(f"{file}: column {column}", "missing", allowed, hint)

@@ -149,8 +149,8 @@ def _motion(
         known = np.isfinite(turned)
         if not known.all():
             tally.refuse("speeds without a heading", int((~known).sum()), rows.place(first[~known][0]))
-        way = np.column_stack([np.cos(turned), np.sin(turned), 0 * turned])[known]
-        velocity = Signal(speed.t[known], speed.value[known] * way)
+        ahead = np.column_stack([np.cos(turned), np.sin(turned), 0 * turned])[known]
+        velocity = Signal(speed.t[known], speed.value[known] * ahead)
         if course:
             tally.assume(COURSE.format("{}", course), name)
         return velocity, heading, f"{len(velocity.t)} speeds, {source}", course

@@ -61,14 +61,16 @@ def step_means(signal: Signal, grid: Floats) -> Floats:
     """
     dt = grid[1] - grid[0]
     edges = np.append(grid[0] - dt, grid)
-    return np.diff(_integral(signal, edges), axis=0) / dt
+    means: Floats = np.diff(_integral(signal, edges), axis=0) / dt
+    return means
 
 
 def _integral(signal: Signal, at: Floats) -> Floats:
     """(G, C) integral from the first sample, which holds before it, as the last one does behind it."""
     t, v = signal
     if len(t) == 1:
-        return (at - t[0])[:, None] * v
+        constant: Floats = (at - t[0])[:, None] * v
+        return constant
     whole = np.vstack([0 * v[:1], np.cumsum(np.diff(t)[:, None] * (v[1:] + v[:-1]) / 2, axis=0)])
     k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     inside = np.clip(at, t[0], t[-1])

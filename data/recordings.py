@@ -35,11 +35,13 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """
     word, given = split(name_or_path)
     path, options = Path(word), {**given, **options}
+    read: Callable[..., Log] = read_log
     if path.suffix == ".npz" and is_recording(path):
-        return _with(_of_file, path, options)
-    if (path / "Barcodes.dat").is_file():
-        return _with(_of_mrclam, path, options)
-    return _with(read_log, path, options)
+        read = _of_file
+    elif (path / "Barcodes.dat").is_file():
+        read = _of_mrclam
+    found: Log = _with(read, path, options)
+    return found
 
 
 def format_of(path: Path) -> str:

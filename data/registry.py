@@ -23,7 +23,8 @@ from .carla import read_carla
 from .fcd import read_fcd
 from .log import Log
 from .mrclam import read_mrclam
-from .recordings import format_of, load_log
+from .recordings import format_of
+from .recordings import load_log as load_log
 from .recordings import recorder as real_recorder
 from .rows import assemble
 from .source import split

@@ -11,6 +11,8 @@ from coopoc.errors import InputError
 
 SLOWEST, FASTEST = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
+LATEST = 1e11
+"""s since 1970, the year 5138."""
 LONGEST_ID = 200
 """Characters."""
 CELLS, PER_ROW = 2_000_000, 200
@@ -18,7 +20,7 @@ CELLS, PER_ROW = 2_000_000, 200
 
 
 def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: str) -> None:
-    """InputError where rows look like degrees, or move too fast for metres and seconds.
+    """InputError where rows look like degrees or milliseconds, or move too fast for metres and seconds.
 
     The typical speed of a vehicle is the median of |dx| / dt over the pairs of rows between which it moves, that of a
     file the largest of its vehicles. A file in which nothing moves has none.
@@ -35,6 +37,7 @@ def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: s
     coopoc.errors.InputError: drive.csv: columns x, y = 11.58..11.5801, 48.14..48.1401: look like degrees, must be \
 metres in a local frame. Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True.
     """
+    check_time(t, file)
     speeds = [_typical_speed(t[rows], position[rows]) for rows in by_vehicle]
     speed = max([0.0, *speeds])
     (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
@@ -51,6 +54,21 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
             f"a typical speed of {speed:.4g} m/s",
             f"must be below {FASTEST:g} m/s",
             "Check the units (seconds, metres) and that no two vehicles share an id, or pass any_scale=True.",
+        )
+
+
+def check_time(t: Floats, file: str) -> None:
+    """InputError where times (L,) s are beyond any date.
+
+    >>> check_time(np.array([1.7e9]), "drive.csv")
+    """
+    late = np.flatnonzero(np.abs(t) > LATEST)
+    if len(late):
+        raise InputError(
+            f"{file}: column t",
+            f"{t[late[0]]:.15g}",
+            "must be seconds: it looks like milliseconds or nanoseconds since 1970",
+            "Divide it by 1e3 or 1e9, or store dates.",
         )
 
 
