@@ -32,7 +32,7 @@ class Check:
         x: (T, N, 3) m, solo Kalman filter of each vehicle, NaN where it is absent.
         variance: (T, N, 3) m^2.
         fix: (T, N, 3) m, innovations of the fixes.
-        normalised: (T, N), 3 on average if the assumed noise is right.
+        normalised: (T, N), 1 on average if the assumed noise is right.
         relative: (L, 3) m, rad, rad: measured less computed from the two filters, which use no relative measurement.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
@@ -100,10 +100,10 @@ def _vehicles(log: Log, fix: Floats, normalised: Floats) -> tuple[list[dict[str,
 
 def _of_vehicle(name: str, row: Mapping[str, Any], distance: float | None, turn: float | None, count: int) -> list[str]:
     found = []
-    if row["nis"] is not None and count >= ENOUGH and not 0.5 <= row["nis"] <= 6:
-        word = "larger" if row["nis"] > 6 else "smaller"
+    if row["nis"] is not None and count >= ENOUGH and not 0.2 <= row["nis"] <= 2:
+        word = "larger" if row["nis"] > 2 else "smaller"
         found.append(
-            f"{name}: NIS is {row['nis']:.3g}, not 3: the errors of fixes and odometry are {word} than stated, "
+            f"{name}: NIS is {row['nis']:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "
             "or correlated in time. Give std columns or sensors=."
         )
     if distance is not None and not 0.8 <= distance <= 1.25:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc.evaluate.innovations import dimensions
 from coopoc.world.recording import Recording
 
 from .log import Log
@@ -128,16 +129,16 @@ def _time(axes: Axes, rec: Recording) -> None:
 def _fixes(axes: Axes, rec: Recording, found: Check) -> None:
     from scipy.stats import chi2
 
-    top = 14.0
+    size, top = dimensions(rec), 14.0
     bins = np.linspace(0, top, 36)
     for column, name in enumerate(rec.ids):
-        each = found.normalised[np.isfinite(found.normalised[:, column]), column]
+        each = size * found.normalised[np.isfinite(found.normalised[:, column]), column]
         if len(each) > 1 and not _stands(rec, column):
             heights, _ = np.histogram(np.minimum(each, top - 1e-9), bins, density=True)
             label = f"{name}: mean {each.mean():.3g}"
             axes.stairs(heights, bins, color=_color(column), lw=1.4, label=label)
     line = np.linspace(0, top, 200)
-    axes.plot(line, chi2(3).pdf(line), color=INK, lw=1.8, ls=(0, (4, 2)), label=r"$\chi^2_3$: mean 3")
+    axes.plot(line, chi2(size).pdf(line), color=INK, lw=1.8, ls=(0, (4, 2)), label=f"$\\chi^2_{size}$: mean {size}")
     axes.set_xlim(0, top)
     axes.set_ylim(0, 0.6)
     axes.set_title("Normalised innovations of the fixes")

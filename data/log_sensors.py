@@ -17,7 +17,7 @@ from .log_summary import Tally
 PLANE_STD = 0.01
 """m, how well z = 0 is known where no height was logged; rad, the inclination that goes with it."""
 VARIED = 1.5
-"""Ratio of the largest to the smallest standard deviation beyond which one for all is worth a word."""
+"""Ratio of large to small standard deviations (98 and 2 %) beyond which one for all is worth a word."""
 
 
 def stds(rows: Rows) -> Mapping[str, Floats]:
@@ -48,8 +48,9 @@ def assumed(given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, pl
         if parts:
             every = np.concatenate(parts)
             level = float(np.sqrt(np.mean(every**2)))
-            if every.max() > VARIED * every.min():
-                what = f"{every.min():.3g} to {every.max():.3g} {unit}"
+            low, high = np.percentile(every, [2, 98])
+            if high > VARIED * low:
+                what = f"{low:.3g} to {high:.3g} {unit}"
                 tally.assume(f"one standard deviation of {names[0]} for all, {level:.3g} {unit}; the log has {what}")
             return level
         if used & set(names):

@@ -91,7 +91,7 @@ STUDY = lineup.study(
         "nis": partial(
             _table,
             value="nis",
-            text="NIS of the fixes against K (3 is consistent).",
+            text="NIS of the fixes per dimension against K (1 is consistent).",
             best=None,
             intervals=False,
         ),

@@ -80,7 +80,7 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     assert "rt_le_m" not in rows or rows["rt_le_m"].isna().all()
     means = rows[rows["method"] != "bound"].groupby("method")["innovation_m"].mean()
     assert means["kalman"] < means["gnss"]
-    assert 2.5 < rows.query("method == 'kalman'")["nis"].mean() < 3.5
+    assert 0.8 < rows.query("method == 'kalman'")["nis"].mean() < 1.2
     tables = sorted(file.stem for file in (tmp_path / "side_by_side").rglob("*.md"))
     assert {"innovation", "nis"} <= set(tables)
 
@@ -149,7 +149,7 @@ def test_innovations_are_filterpys(folders: Path) -> None:
         kf.predict(u=rec.velocity[0, t, 0], Q=np.diag(q[t]))
         kf.update(rec.gnss[0, t, 0])
         np.testing.assert_allclose(found[0, t, 0], kf.y, atol=1e-9)
-        assert squares[0, t, 0] == pytest.approx(kf.y @ kf.SI @ kf.y, rel=1e-6)
+        assert squares[0, t, 0] == pytest.approx(kf.y @ kf.SI @ kf.y / 3, rel=1e-6)
     columns = innovation_columns(track, rec)
     assert columns["fixes"].tolist() == [[199.0]]
     assert columns["nis"] == pytest.approx(np.nanmean(squares, axis=1))
@@ -158,7 +158,7 @@ def test_innovations_are_filterpys(folders: Path) -> None:
 def test_the_check_finds_nothing_wrong_where_nothing_is(folders: Path) -> None:
     found = check(read_log(folders / "with"))
     assert found.doubts == ()
-    assert all(2 < row["nis"] < 4 for row in found.vehicles)
+    assert all(0.7 < row["nis"] < 1.3 for row in found.vehicles)
     (ranges,) = [row for row in found.measurements if row["measurement"] == "range"]
     assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
 
@@ -235,3 +235,11 @@ def test_a_part_of_a_recording_is_one(folders: Path) -> None:
     late = replace(rec, arrival=rec.arrival + 30)
     assert (late.between(20, 80).arrival < 60).all()
     assert rec.stretches("car2", shortest=100) == ()
+
+
+def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:
+    """Without heights NIS is per two degrees of freedom: 1, and not 2/3."""
+    frame = long(seen(drive(4, steps=600, gap=15.0)), messages=False)
+    frame = frame[~frame["kind"].isin(["z", "vz", "inclination"])]
+    found = check(read_log(write(frame, tmp_path / "log.csv")))
+    assert np.mean([row["nis"] for row in found.vehicles]) == pytest.approx(1.0, abs=0.1)

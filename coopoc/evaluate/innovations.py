@@ -29,9 +29,10 @@ def fix_innovations(track: Track, recording: Recording) -> Floats:
 
 
 def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
-    """d^T S^-1 d of the innovations d, (R, T, E): 3 on average if the assumed noise is right and white.
+    """d^T S^-1 d / n of the innovations d, (R, T, E): 1 on average if the assumed noise is right and white.
 
-    S = P_{t-1} + dt^2 diag(sigma_u^2) + diag(sigma_fix^2), with the standard deviations that the recording states.
+    S = P_{t-1} + dt^2 diag(sigma_u^2) + diag(sigma_fix^2), with the standard deviations that the recording states and
+    its `dimensions` n.
 
     Returns:
         None for a method without a covariance.
@@ -51,13 +52,24 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     found = np.full(innovation.shape[:3], np.nan)
     d = np.where(there[..., None], innovation[:, 1:], 0.0)
     square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
-    found[:, 1:] = np.where(there, square, np.nan)
+    found[:, 1:] = np.where(there, square / dimensions(recording), np.nan)
     return found
+
+
+def dimensions(recording: Recording) -> int:
+    """Degrees of freedom of a fix: 3, or 2 where every fix has the same height, which was not measured then.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> dimensions(observe(Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3))), Sensors()))
+    3
+    """
+    height = recording.gnss[..., 2]
+    return 3 if np.nanmax(height) > np.nanmin(height) else 2
 
 
 def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
     """Columns (R, E): `innovation_m`, the root mean square of the fixes' innovations, m; `fixes`, their number; `nis`,
-    the mean of the normalised ones, 3 if consistent, of a method with a covariance. NaN where there is no second fix.
+    the mean of the normalised ones, 1 if consistent, of a method with a covariance. NaN where there is no second fix.
     """
     innovation = fix_innovations(track, recording)
     there = np.isfinite(innovation[..., 0])
