@@ -117,21 +117,38 @@ def check(
     print(f"picture: {draw(log, found, out)}", file=sys.stderr)
 
 
-def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fleets"), seed: int | None = None) -> None:
+def make(
+    recipe: tyro.conf.Positional[str],
+    *,
+    maps: Path,
+    out: Path = Path("fleets"),
+    seed: int | None = None,
+    tries: int = 1,
+    map: str | None = None,
+    vehicles: int | None = None,
+    cutoff: float | None = None,
+) -> None:
     """Make a fleet with SUMO from an OpenDRIVE map: the same seed gives the same bytes.
 
     Example: coopoc data make town10 --maps carla_maps
 
     Args:
-        recipe: name of a bundled fleet.
+        recipe: name of a bundled fleet, or FILE.py:NAME of a Recipe of your own.
         maps: folder with the .xodr files of CARLA.
         out: folder for the fleet and its card.
         seed: instead of the recipe's.
+        tries: seeds to try, one after the other, until all vehicles drive and none jumps.
+        map: file in the folder of maps, instead of the recipe's.
+        vehicles: their number, instead of the recipe's.
+        cutoff: Hz, of the smoother, instead of the recipe's.
     """
     from .generate import make as generate
 
-    print(generate(recipe, maps, out, seed).render())
-    print(f"written to {out}", file=sys.stderr)
+    given = {"map": map, "vehicles": vehicles, "cutoff": cutoff}
+    changes = {name: value for name, value in given.items() if value is not None}
+    card = generate(recipe, maps, out, seed, tries=tries, **changes)
+    print(card.render())
+    print(f"written to {out}. Use it: --data {out / f'{card.name}.npz'}", file=sys.stderr)
 
 
 def convert_(
