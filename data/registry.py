@@ -191,7 +191,7 @@ def detect(path: Path) -> str:
         raise InputError(
             "data",
             path.name,
-            "must end in .csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea or .npz, or be a folder of TUM, MR.CLAM "
+            "must end in .csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag or .npz, or be a folder of TUM, MR.CLAM "
             "or log files",
             f"Pass format= one of {', '.join(READERS)}.",
         )
