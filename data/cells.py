@@ -164,7 +164,7 @@ def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
     bad = np.flatnonzero((given.isna() | (given.astype(str).str.strip() == "")).to_numpy())
     if len(bad):
         raise InputError(f"{file}: row {bad[0] + 1}, column {column}", "empty", "must be a name", "Fill it in.")
-    return [str(v).strip() for v in given]
+    return [str(v).strip() for v in given.tolist()]
 
 
 def _checked_rows(path: Path) -> list[str]:

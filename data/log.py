@@ -282,10 +282,13 @@ def _ids(rows: Rows) -> list[str]:
 def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
     """Steps over all fixes and odometry."""
     intervals: dict[str, list[float]] = {"odometry": [], "fix": []}
-    moving = np.isin(rows.group, ["odometry", "fix"])
+    groups = rows.group
+    moving = (groups == "odometry") | (groups == "fix")
+    of_group = {group: groups == group for group in intervals}
     for one in dict.fromkeys(rows.vehicle.tolist()):
+        mine = rows.vehicle == one
         for group, found in intervals.items():
-            gaps = np.diff(np.unique(np.round(rows.t[(rows.vehicle == one) & (rows.group == group)], 6)))
+            gaps = np.diff(np.unique(np.round(rows.t[mine & of_group[group]], 6)))
             if len(gaps):
                 found.append(float(np.median(gaps)))
     densest = min(intervals["odometry"] or intervals["fix"] or [0.0])

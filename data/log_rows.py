@@ -70,7 +70,10 @@ class Rows:
     @property
     def group(self) -> AnyArray:
         """(L,) group of each kind."""
-        return np.array([KINDS[kind].group for kind in self.kind.tolist()], dtype=object)
+        found = np.empty(len(self), dtype=object)
+        for kind in set(self.kind.tolist()):
+            found[self.kind == kind] = KINDS[kind].group
+        return found
 
 
 def stacked(parts: Sequence[Rows]) -> Rows:
