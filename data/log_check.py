@@ -19,8 +19,8 @@ from .mrclam import robust_std
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE, NARROW = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
-SPAN = 2.0
-"""s, over which fixes and odometry are compared."""
+FAR = 10.0
+"""Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ENOUGH = 20
 
 
@@ -118,29 +118,29 @@ def _of_vehicle(name: str, row: Mapping[str, Any], distance: float | None, turn:
 
 
 def _against_odometry(rec: Recording, column: int) -> tuple[float | None, float | None]:
-    """Distance of fixes over distance of odometry, over spans in which both move far, and the angle between, rad."""
+    """Distance of fixes over distance of odometry, over spans in which the odometry (if that stands still, the fixes)
+    moves far, with the fixes' noise taken off; and the angle between the two, rad. None where too little moves."""
     z, u = rec.gnss[0, :, column, :2], rec.velocity[0, :, column, :2]
-    fixed = np.flatnonzero(np.isfinite(z[:, 0]))
     path = np.cumsum(np.nan_to_num(u) * rec.dt, axis=0)
     gone = np.cumsum(np.isnan(u[:, 0]))
-    noise = 2 * float(np.hypot(*rec.sensors.fix_std[:2]))
-    pairs, last = [], None
-    for step in fixed.tolist():
-        if last is None or gone[step] != gone[last]:
-            last = step
-        elif (step - last) * rec.dt >= SPAN and max(
-            np.linalg.norm(z[step] - z[last]), np.linalg.norm(path[step] - path[last])
-        ) > noise:
-            pairs.append((last, step))
-            last = step
-    if len(pairs) < 3:
+    variance = float(np.square(rec.sensors.fix_std[:2]).sum())
+    for goes, far in ((path, FAR), (z, 2 * FAR)):
+        pairs, last = [], None
+        for step in np.flatnonzero(np.isfinite(z[:, 0])).tolist():
+            if last is None or gone[step] != gone[last]:
+                last = step
+            elif np.linalg.norm(goes[step] - goes[last]) > far * np.sqrt(variance):
+                pairs.append((last, step))
+                last = step
+        if len(pairs) >= 3:
+            break
+    else:
         return None, None
     a, b = np.array(pairs).T
     moved, driven = z[b] - z[a], path[b] - path[a]
-    length = np.linalg.norm(driven, axis=1)
-    distance = float(np.linalg.norm(moved, axis=1).sum() / length.sum()) if length.sum() > 0 else float("inf")
-    turn = moved[:, 0] + 1j * moved[:, 1]
-    whole = complex((turn * (driven[:, 0] - 1j * driven[:, 1])).sum())
+    length, driven2 = (moved**2).sum() - 2 * variance * len(pairs), (driven**2).sum()
+    distance = float(np.sqrt(max(length, 0.0) / driven2)) if driven2 > 0 else float("inf")
+    whole = complex(((moved[:, 0] + 1j * moved[:, 1]) * (driven[:, 0] - 1j * driven[:, 1])).sum())
     return distance, float(np.angle(whole)) if abs(whole) > 0 else None
 
 

@@ -199,6 +199,19 @@ def test_methods_run_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
     assert error < 2.2, "a fix is 2.2 m off"
 
 
+WHOLE = ("gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother", "mds", "qcqp-relaxation")
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_methods_of_a_fleet_run_on_ranges_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
+    fleet = drive(4, gap=24.0)
+    frame = thinned(long(seen(fleet), messages=False))
+    frame = frame[~frame["kind"].isin(["azimuth", "inclination"])]
+    rec = read_log(write(frame, tmp_path / "log.csv")).recording
+    error = float(co.rt_le(METHODS[name]("nominal")(rec, ["car1"]), fleet).mean())
+    assert error < 3.0
+
+
 @pytest.mark.parametrize("name", [*COOPERATIVE, *WINDOWS])
 def test_methods_run_while_others_come_and_go(tmp_path: Path, name: str) -> None:
     frame = thinned(long(seen(drive(4), rate=2.0, loss=0.3)))
