@@ -12,6 +12,8 @@ from .evaluate.metrics import nees as nees
 from .evaluate.metrics import rt_le as rt_le
 from .evaluate.statistics import paired_difference as paired_difference
 from .fleets import load_fleet as load_fleet
+from .fleets import load_recording as load_recording
+from .fleets import read_log as read_log
 from .methods.adaptive import AdaptiveKalman as AdaptiveKalman
 from .methods.admm import ConsensusADMM as ConsensusADMM
 from .methods.batch_smoother import BatchSmoother as BatchSmoother

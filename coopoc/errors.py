@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+LONGEST = 1500
+"""Characters of each part of a message."""
+
 
 class InputError(ValueError):
     """A value that cannot be used: names the field, the value, what is allowed, and a hint.
@@ -12,10 +15,16 @@ class InputError(ValueError):
 
     def __init__(self, field: str, value: object, allowed: str, hint: str) -> None:
         self.field, self.value, self.allowed, self.hint = field, value, allowed, hint
-        super().__init__(f"{field} = {value}: {allowed.rstrip('.')}. {hint}")
+        super().__init__(f"{_cut(field)} = {_cut(value)}: {_cut(allowed).rstrip('.')}. {_cut(hint)}")
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, object, str, str]]:
         return type(self), (self.field, self.value, self.allowed, self.hint)
+
+
+def _cut(text: object) -> str:
+    """What a file holds may be of any length."""
+    shown = str(text)
+    return shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}..."
 
 
 class MissingLibraryError(ImportError):

@@ -1,4 +1,4 @@
-"""load_fleet: a bundled fleet by name, or the user's own file."""
+"""load_fleet: a bundled fleet by name, or the user's own file; load_recording: the user's own measurements."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 from .plugins import find
 from .world.fleet import Fleet
+from .world.recording import Recording
 
 
 def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
@@ -24,3 +25,32 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
     """
     fleet: Fleet = find("coopoc.readers", "load")(name_or_path, **options)
     return fleet
+
+
+def load_recording(path: str | Path, **options: Any) -> Recording:
+    """Recording of one's own measurements: tables (CSV, Parquet, Excel), NMEA, ROS bags, an MR.CLAM folder.
+
+    docs/your_data.md describes the tables. `read_log` gives the truth and the summary, too.
+
+    Args:
+        path: a file, or a folder whose files belong to one drive.
+        options: of `read_log`, such as dt in seconds and columns.
+
+    Raises:
+        InputError: names file, row, column, value, what is allowed and how to mend it.
+    """
+    recording: Recording = read_log(path, **options).recording
+    return recording
+
+
+def read_log(path: str | Path, **options: Any) -> Any:
+    """`coopoc.data.log.Log` of one's own measurements: recording, truth (None without one), summary.
+
+    Args:
+        path: as in `load_recording`.
+        options: of the reader, see `coopoc.data.log.read_log`.
+
+    Raises:
+        InputError: as `load_recording`.
+    """
+    return find("coopoc.readers", "log")(path, **options)

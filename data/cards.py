@@ -85,14 +85,14 @@ class Card:
         return "\n".join([self.name, *(f"  {key:<13}{value}" for key, value in self.fields().items())])
 
 
-def card_of(fleet: Fleet, recipe: Recipe) -> Card:
-    """The card of a fleet that `recipe` made."""
+def card_of(fleet: Fleet, recipe: Recipe, command: str) -> Card:
+    """The card of a fleet that `recipe` made by a command."""
     lengths = sorted(set(recipe.lengths))
     return Card(
         name=recipe.name,
         map=recipe.map,
         map_licence=MAP_LICENCE,
-        command=f"coopoc data make {recipe.name} --maps FOLDER --seed {recipe.seed}",
+        command=command,
         sumo=version("eclipse-sumo"),
         sha256=fleet.digest,
         recipe=asdict(recipe),

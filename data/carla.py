@@ -11,19 +11,17 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from zipfile import BadZipFile
 
 import numpy as np
-from tqdm import tqdm
 
 from coopoc.arrays import Floats
-from coopoc.errors import InputError, MissingLibraryError
+from coopoc.errors import InputError
 from coopoc.plugins import suggestion, unknown
 from coopoc.world.fleet import Fleet
 
+from .cells import numeric, read_frame, seconds
 from .conventions import INTERVALS, disagreement, frame, interval, row_order
 from .rows import assemble
-from .table import numeric, read_csv
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -62,9 +60,11 @@ def read_carla(
             names the option to pass.
     """
     _check_options(order, handedness, dt)
-    table = _xlsx(path) if path.suffix == ".xlsx" else read_csv(path)
+    table = read_frame(path)
     names = _columns(table, dict(columns or {}), path.name)
-    rows = {key: numeric(table, name, path.name) for key, name in names.items() if key != "id"}
+    rows = {
+        key: (seconds if key == "t" else numeric)(table, name, path.name) for key, name in names.items() if key != "id"
+    }
     ids = [str(v) for v in table[names["id"]]] if "id" in names and vehicles is None else None
     if "t" in rows:
         if ids is None:
@@ -182,20 +182,3 @@ def _check_options(order: str | None, handedness: str | None, dt: float | None) 
             raise unknown(name, value, allowed, "Or leave it out to have it detected.")
     if dt is not None and not dt > 0:
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
-
-
-def _xlsx(path: Path) -> pd.DataFrame:
-    import pandas as pd
-
-    try:
-        from openpyxl import load_workbook
-    except ImportError:
-        raise MissingLibraryError("openpyxl", "reading a spreadsheet", "'coopoc[excel]'") from None
-    try:
-        book = load_workbook(path, read_only=True, data_only=True)
-    except BadZipFile as error:
-        raise InputError(path.name, error, "must be an .xlsx spreadsheet", "Export it again.") from None
-    sheet = book.worksheets[0]
-    header, *rows = [*tqdm(sheet.iter_rows(values_only=True), total=sheet.max_row, desc=path.name, leave=False)] or [()]
-    book.close()
-    return pd.DataFrame(rows, columns=[f"column {k}" if h is None else str(h) for k, h in enumerate(header)])

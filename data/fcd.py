@@ -10,12 +10,20 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.formats.lines import LARGEST
 from coopoc.world.fleet import Fleet
 
 from .rows import assemble
 
 
-def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0) -> Fleet:
+def read_fcd(
+    path: Path,
+    *,
+    dt: float | None = None,
+    max_gap: float | None = None,
+    any_scale: bool = False,
+    vehicle_length: float = 5.0,
+) -> Fleet:
     """Fleet of a SUMO FCD file: positions are moved from the front bumper to the middle of the vehicle.
 
     centre = front - length/2 (sin a cos s, cos a cos s, sin s), with the angle a in degrees clockwise from north
@@ -24,6 +32,8 @@ def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0
     Args:
         path: XML with id, x, y, angle, speed, and z and slope if the network has elevation.
         dt: s, resample; None keeps SUMO's steps.
+        max_gap: s, as in `assemble`.
+        any_scale: True accepts positions that do not look like metres and seconds.
         vehicle_length: m, of every vehicle (5.0 is SUMO's default; the file does not hold it).
 
     Raises:
@@ -37,6 +47,8 @@ def read_fcd(path: Path, *, dt: float | None = None, vehicle_length: float = 5.0
         position,
         velocity,
         dt=dt,
+        max_gap=max_gap,
+        any_scale=any_scale,
         file=path.name,
         name=path.stem,
         source=f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long",
@@ -56,10 +68,10 @@ def centre(numbers: Floats, vehicle_length: float) -> tuple[Floats, Floats]:
 
 def _finite(row: Sequence[str | int], place: str) -> tuple[float, ...]:
     try:
-        numbers = tuple(map(float, row))
+        numbers = tuple(float(word) if str(word).isascii() and "_" not in str(word) else np.nan for word in row)
     except ValueError:
         numbers = (np.nan,)
-    if not np.isfinite(numbers).all():
+    if not (np.abs(numbers) <= LARGEST).all():
         allowed = "must be seven finite numbers: time, x, y, z, angle, slope, speed"
         raise InputError(place, " ".join(map(str, row)), allowed, "Mend the numbers or remove the vehicle.")
     return numbers

@@ -1,4 +1,4 @@
-"""Reader of UTIAS MR.CLAM: five real robots with wheel odometry, range and bearing, and Vicon truth."""
+"""Reader of UTIAS MR.CLAM: up to five real robots with wheel odometry, range and bearing, and Vicon truth."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
+from . import mrclam_files as files
 from .rows import backward_difference, interpolate
+from .scale import check_size
 
-ROBOTS = 5
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
 PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8) 2011"
@@ -21,7 +22,7 @@ PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mappin
 
 @dataclass(frozen=True, eq=False)
 class MrclamLog:
-    """Measurements of five robots, and Vicon's truth.
+    """Measurements of N robots, and Vicon's truth.
 
     Args:
         fleet: Vicon truth on the steps, z = 0, NaN in gaps of Vicon.
@@ -39,6 +40,7 @@ class MrclamLog:
         observer_heading: (M,) rad, Vicon at `time`.
         landmarks: number of measurements of landmarks, which are not among the M.
         unknown: number of measurements of barcodes in no list, which are not among the M.
+        absent: number of measurements of robots whose files are not in the folder, which are not among the M.
     """
 
     fleet: Fleet
@@ -56,6 +58,7 @@ class MrclamLog:
     observer_heading: Floats
     landmarks: int
     unknown: int
+    absent: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,37 +110,44 @@ def innovations(log: MrclamLog) -> Innovations:
     return Innovations((log.range - log.true_range)[seen], _wrap(log.bearing - log.true_bearing)[seen])
 
 
-def read_mrclam(folder: str | Path, *, dt: float = 0.1) -> MrclamLog:
-    """Read RobotN_Groundtruth, _Odometry, _Measurement (N = 1..5) and Barcodes.dat.
+def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP) -> MrclamLog:
+    """Read RobotN_Groundtruth, _Odometry, _Measurement (of the robots that are there) and Barcodes.dat.
 
-    The fleet covers the interval in which every robot has truth and odometry. The second column of a measurement
-    file is a barcode although its header says subject: Barcodes.dat translates.
+    The fleet covers the interval in which every robot has truth and odometry. Gaps of truth up to `max_gap` are
+    interpolated.
 
     Args:
         folder: with the .dat files.
         dt: s, step of the fleet.
+        max_gap: s without truth that is interpolated; in longer gaps a robot is absent.
 
     Raises:
-        InputError: a missing file, a line that is not numbers, dt <= 0.
+        InputError: a missing file; with the line, words that are not numbers, times out of order, and what
+            `mrclam_files.measurements` refuses; robots that share no interval; dt <= 0.
 
     Source: Leung, Halpern, Barfoot, Liu, IJRR 30(8) 2011.
     """
     if not dt > 0:
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
     folder = Path(folder)
-    truths = [_read(folder / f"Robot{n}_Groundtruth.dat", 4) for n in range(1, ROBOTS + 1)]
-    wheels = [_read(folder / f"Robot{n}_Odometry.dat", 3) for n in range(1, ROBOTS + 1)]
-    for truth in truths:
-        truth[:, 3] = np.unwrap(truth[:, 3])
+    numbers = files.robots(folder)
+    truths = [files.truth(folder, n) for n in numbers]
+    wheels = [files.odometry(folder, n) for n in numbers]
     start, end = max(a[0, 0] for a in truths + wheels), min(a[-1, 0] for a in truths + wheels)
+    if not end - start >= dt:
+        allowed = "must share an interval with truth and odometry"
+        raise InputError("folder", folder.name, f"the robots' files {allowed}", "Check the times in the .dat files.")
+    rows = sum(map(len, truths + wheels))
+    check_size((end - start) / dt, len(numbers), rows, dt, folder.name)
     t = dt * np.arange(int((end - start) / dt) + 1)
-    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, MAX_GAP) for a in truths], axis=1)
+    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], axis=1)
     odometry = np.stack([_step_means(a[:, 0] - start, a[:, 1:], t) for a in wheels], axis=1)
-    seen, landmarks, unknown = _robot_measurements(folder, start)
+    found = files.measurements(folder, numbers)
+    seen = found.rows - [start, 0, 0, 0, 0]
     step = np.rint(seen[:, 0] / dt).astype(np.int64)
-    true_range, true_bearing, heading = _true(seen, truths, start)
+    true_range, true_bearing, heading = _true(seen, truths, start, max_gap)
     return MrclamLog(
-        fleet=_fleet(folder, t, poses[..., :2]),
+        fleet=_fleet(folder, numbers, t, poses[..., :2]),
         heading=poses[..., 2],
         speed=odometry[..., 0],
         turn_rate=odometry[..., 1],
@@ -150,13 +160,14 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1) -> MrclamLog:
         true_range=true_range,
         true_bearing=true_bearing,
         observer_heading=heading,
-        landmarks=landmarks,
-        unknown=unknown,
+        landmarks=found.landmarks,
+        unknown=found.unknown,
+        absent=found.absent,
     )
 
 
-def _fleet(folder: Path, t: Floats, xy: Floats) -> Fleet:
-    ids = tuple(f"robot{n}" for n in range(1, ROBOTS + 1))
+def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, xy: Floats) -> Fleet:
+    ids = tuple(f"robot{n}" for n in numbers)
     position = np.concatenate([xy, np.where(np.isnan(xy[..., :1]), np.nan, 0.0)], axis=2)
     return Fleet(
         ids,
@@ -169,22 +180,6 @@ def _fleet(folder: Path, t: Floats, xy: Floats) -> Fleet:
     )
 
 
-def _read(file: Path, columns: int) -> Floats:
-    import pandas as pd
-
-    if not file.is_file():
-        raise InputError(
-            "folder", file.parent, f"has no {file.name}", "Point at a folder MRCLAM_DatasetN with all its .dat files."
-        )
-    try:
-        table = pd.read_csv(file, sep=r"\s+", comment="#", header=None, dtype=float).to_numpy()
-    except ValueError as error:
-        raise InputError(file.name, error, f"must hold {columns} numbers a line", "Unpack the set again.") from None
-    if table.shape[1] != columns or not np.isfinite(table).all():
-        raise InputError(file.name, table.shape, f"must hold {columns} numbers a line", "Unpack the set again.")
-    return np.array(table)
-
-
 def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
     """(T, C) mean over the step that ends at each instant: difference of the trapezoidal integral."""
     integral = np.vstack([0 * values[:1], np.cumsum(np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2, axis=0)])
@@ -193,21 +188,8 @@ def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
     return np.vstack([mean[:1], mean])
 
 
-def _robot_measurements(folder: Path, start: float) -> tuple[Floats, int, int]:
-    """(M, 5) time s, observer, subject, range m, bearing rad between robots by time; numbers of the other ones."""
-    subject_of = {int(barcode): int(subject) for subject, barcode in _read(folder / "Barcodes.dat", 2)}
-    rows = [_read(folder / f"Robot{n}_Measurement.dat", 4) for n in range(1, ROBOTS + 1)]
-    table = np.vstack([np.insert(a, 1, n, axis=1) for n, a in enumerate(rows)])
-    table[:, 0] -= start
-    subject = np.array([subject_of.get(int(barcode), 0) for barcode in table[:, 2]])
-    table[:, 2] = subject - 1
-    robots = table[(subject > 0) & (subject <= ROBOTS)]
-    robots = robots[np.argsort(robots[:, 0], kind="stable")]
-    return robots, int((subject > ROBOTS).sum()), int((subject == 0).sum())
-
-
-def _true(seen: Floats, truths: list[Floats], start: float) -> tuple[Floats, Floats, Floats]:
-    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], seen[:, 0], MAX_GAP) for a in truths])
+def _true(seen: Floats, truths: list[Floats], start: float, max_gap: float) -> tuple[Floats, Floats, Floats]:
+    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], seen[:, 0], max_gap) for a in truths])
     rows = np.arange(len(seen))
     here, there = poses[seen[:, 1].astype(int), rows], poses[seen[:, 2].astype(int), rows]
     dx, dy = (there - here)[:, :2].T

@@ -6,7 +6,6 @@ import inspect
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,13 @@ from . import store
 from .cards import Card
 from .carla import read_carla
 from .fcd import read_fcd
+from .log import Log
 from .mrclam import read_mrclam
-from .mrclam_recording import recording
+from .recordings import format_of
+from .recordings import load_log as load_log
+from .recordings import recorder as real_recorder
 from .rows import assemble
+from .source import split
 from .table import NEEDED, VELOCITY, read_table, write_table
 from .tum import read_tum, tum_files, write_tum
 
@@ -50,6 +53,8 @@ class Dataset:
         return replace(fleet, name=card.name, source=card.source, licence=card.map_licence)
 
 
+REAL = ("mrclam", "log", "recording")
+"""Formats that hold real measurements."""
 FLEETS = Path(__file__).parent / "fleets"
 DATASETS: Mapping[str, Dataset] = {
     n: Dataset(FLEETS / f"{n}.npz") for n in sorted(f.stem for f in FLEETS.glob("*.npz"))
@@ -61,6 +66,9 @@ READERS: Mapping[str, Callable[..., Fleet]] = {
     "fcd": read_fcd,
     "carla": read_carla,
     "mrclam": lambda path, **options: read_mrclam(path, **options).fleet,
+    "fleet": lambda path: store.load(path, path.stem),
+    "log": lambda path, **options: _truth(path, load_log(path, **options)),
+    "recording": lambda path: _truth(path, load_log(path)),
 }
 
 
@@ -70,9 +78,10 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     Args:
         name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
-            CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder.
-        format: table, tum, fcd, carla or mrclam, instead of the one found from name and contents.
-        options: of the reader, for example dt (s), columns, vehicle_length, handedness.
+            CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
+            (`load_log`). Options may stand behind a question mark, as in "drive.csv?dt=0.1&columns=t:time".
+        format: one of READERS, instead of the one found from name and contents.
+        options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness.
 
     Raises:
         InputError: an unknown name (the message lists all), an unknown format or option, or a file with a fault.
@@ -80,10 +89,12 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
-    name = str(name_or_path)
+    name, given = split(name_or_path)
+    options = {**given, **options}
+    format = options.pop("format", format)
     if format is None and (in_file(name) or name in names("coopoc.datasets")):
         return _resampled(_made(find("coopoc.datasets", name), name), **options)
-    path = Path(name_or_path)
+    path = Path(name)
     if not path.exists():
         raise InputError(
             "data",
@@ -118,16 +129,37 @@ def _made(found: Any, name: str) -> Fleet:
     return fleet
 
 
+def kind_of(name_or_path: str | Path) -> str:
+    """Format of a name or path, "" for a name and for what is made by code.
+
+    >>> kind_of("town10")
+    ''
+    """
+    name, options = split(name_or_path)
+    if name in DATASETS or in_file(name) or not Path(name).exists():
+        return ""
+    return str(options.get("format") or detect(Path(name)))
+
+
+def _truth(path: Path, log: Log) -> Fleet:
+    if log.truth is None:
+        raise InputError(
+            path.name,
+            "no truth",
+            "is a log without one: there is nothing to score against",
+            "Add a table truth.csv to its folder, pass truth=, or take co.load_recording.",
+        )
+    return log.truth
+
+
 def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable[..., Recording] | None:
     """For data with real measurements: (v2x, *, runs, seed) -> Recording; None where `observe` has to simulate them.
 
     >>> recorder("town10") is None
     True
     """
-    path = Path(name_or_path)
-    if str(name_or_path) in DATASETS or not path.exists() or (format or detect(path)) != "mrclam":
-        return None
-    return partial(recording, read_mrclam(path))
+    chosen = format or kind_of(name_or_path)
+    return real_recorder(name_or_path, chosen) if chosen in REAL else None
 
 
 def detect(path: Path) -> str:
@@ -141,8 +173,14 @@ def detect(path: Path) -> str:
     if path.is_dir():
         if (path / "Barcodes.dat").is_file():
             return "mrclam"
+        if format_of(path) and not any(path.glob("*.tum")):
+            return "log"
         if tum_files(path):
             return "tum"
+    if path.suffix == ".npz":
+        return format_of(path) or "fleet"
+    if format_of(path):
+        return "log"
     known = {".parquet": "table", ".xml": "fcd", ".xlsx": "carla", ".tum": "tum", ".txt": "tum"}
     if path.suffix == ".csv":
         with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -153,7 +191,8 @@ def detect(path: Path) -> str:
         raise InputError(
             "data",
             path.name,
-            "must end in .csv, .parquet, .tum, .txt, .xml or .xlsx, or be a folder of TUM or MR.CLAM files",
+            "must end in .csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag or .npz, or be a folder of TUM, MR.CLAM "
+            "or log files",
             f"Pass format= one of {', '.join(READERS)}.",
         )
     return known[path.suffix]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from coopoc.arrays import Floats
 
@@ -24,6 +23,8 @@ def smooth(position: Floats, dt: float, cutoff: float) -> Floats:
     >>> bool(np.allclose(smooth(np.arange(9.0) ** 2, 0.1, 0.5), np.arange(9.0) ** 2))
     True
     """
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
     steps = len(position)
     if steps < 4:
         return np.array(position, dtype=float)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -55,11 +57,22 @@ def save(fleet: Fleet, path: Path) -> None:
 
 
 def load(path: Path, name: str = "") -> Fleet:
-    """The fleet that `save` wrote, bit by bit."""
-    with np.load(path) as stored:
-        ids, steps = tuple(map(str, stored["ids"])), stored["steps"]
-        second = stored["second"].transpose(2, 0, 1).astype(np.int64)
-        start, dt = stored["start"].astype(np.int64), float(stored["dt"])
+    """The fleet that `save` wrote, bit by bit.
+
+    Raises:
+        InputError: a file that is damaged, or that `save` did not write.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            ids, steps = tuple(map(str, stored["ids"])), stored["steps"].astype(np.int64)
+            second = stored["second"].transpose(2, 0, 1).astype(np.int64)
+            start, dt = stored["start"].astype(np.int64), float(stored["dt"])
+        fits = second.shape[1:] == start.shape[1:] == (len(ids), 3) and len(start) == 2 and steps.shape == (len(ids),)
+        if not (fits and np.isfinite(dt) and dt > 0):
+            raise ValueError("arrays that do not fit each other")
+    except (OSError, EOFError, KeyError, ValueError, TypeError, BadZipFile, zlib.error, NotImplementedError) as error:
+        found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise InputError(path.name, found, "must be a fleet of coopoc data make", "Make it again.") from None
     speed = np.concatenate([np.diff(start, axis=0), second]).cumsum(axis=0)
     units = np.concatenate([start[:1], speed]).cumsum(axis=0)
     return _fleet(ids, units, np.arange(len(units))[:, None] < steps, dt, name)

@@ -2,41 +2,45 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.plugins import suggestion
+from coopoc.plugins import suggestion, unknown
 from coopoc.world.fleet import Fleet
 
+from .cells import numeric, read_frame, seconds, words
 from .rows import assemble
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
 
 
-def read_table(path: Path, *, dt: float | None = None, columns: Mapping[str, str] | None = None) -> Fleet:
+def read_table(
+    path: Path,
+    *,
+    dt: float | None = None,
+    max_gap: float | None = None,
+    any_scale: bool = False,
+    columns: Mapping[str, str] | None = None,
+) -> Fleet:
     """Fleet of a CSV or Parquet file; without vx, vy, vz the velocity is the backward difference.
 
     Args:
         path: .csv or .parquet; s, m, m/s in a local east-north-up frame; a missing row means absent.
         dt: s, resample; None keeps the stamps.
+        max_gap: s, as in `assemble`.
+        any_scale: True accepts positions that do not look like metres and seconds.
         columns: names in the file, as {"id": "vehicle"}, where they differ from id, t, x, y, z, vx, vy, vz.
 
     Raises:
         InputError: a missing column, text or NaN in a cell (with its row, the header not counted), or stamps that no
             filter can use.
     """
-    import pandas as pd
-
     names = dict(columns or {})
-    frame = pd.read_parquet(path) if path.suffix == ".parquet" else read_csv(path, names.get("id", "id"))
+    unknown_keys(names, (*NEEDED, *VELOCITY), path.name)
+    frame = read_frame(path, names.get("id", "id"))
     given = [c for c in VELOCITY if names.get(c, c) in frame.columns]
     wanted = [*NEEDED, *(VELOCITY if given else ())]
     for column in wanted:
@@ -49,18 +53,26 @@ def read_table(path: Path, *, dt: float | None = None, columns: Mapping[str, str
                 f"the file has {', '.join(headers)}",
                 suggestion(names.get(column, column), headers, f'Add it, or name it: columns={{"{column}": "..."}}.'),
             )
-    numbers = np.column_stack([numeric(frame, names.get(c, c), path.name) for c in wanted[1:]])
-    vehicle = _ids(frame, names.get("id", "id"), path.name)
+    numbers = np.column_stack([numeric(frame, names.get(c, c), path.name) for c in wanted[2:]])
     return assemble(
-        vehicle,
-        numbers[:, 0],
-        numbers[:, 1:4],
-        numbers[:, 4:] if given else None,
+        words(frame, names.get("id", "id"), path.name),
+        seconds(frame, names.get("t", "t"), path.name),
+        numbers[:, :3],
+        numbers[:, 3:] if given else None,
         dt=dt,
+        max_gap=max_gap,
+        any_scale=any_scale,
         file=path.name,
         name=path.stem,
         source=f"table {path.name}" + ("" if given else ", velocity by backward difference"),
     )
+
+
+def unknown_keys(columns: Mapping[str, str], known: Sequence[str], file: str) -> None:
+    """InputError for a key of `columns` that is none of the known ones."""
+    for key in columns:
+        if key not in known:
+            raise unknown(f"{file}: key of columns", key, known, 'Give columns={"t": "name in the file"}.')
 
 
 def write_table(fleet: Fleet, path: Path) -> None:
@@ -75,47 +87,3 @@ def write_table(fleet: Fleet, path: Path) -> None:
         frame.to_parquet(path, index=False)
     else:
         frame.to_csv(path, index=False, lineterminator="\n")
-
-
-def numeric(frame: pd.DataFrame, column: str, file: str) -> Floats:
-    """A column as finite numbers; InputError with the row of the first cell that is none."""
-    import pandas as pd
-
-    values = pd.to_numeric(frame[column], errors="coerce").to_numpy(dtype=float)
-    bad = np.flatnonzero(~np.isfinite(values))
-    if len(bad):
-        raise InputError(
-            f"{file}: row {bad[0] + 1}, column {column}",
-            frame[column].iloc[int(bad[0])],
-            "must be a finite number",
-            "Interpolate the value, or remove the row: a missing row means that the vehicle is absent.",
-        )
-    return values
-
-
-def read_csv(path: Path, text: str = "") -> pd.DataFrame:
-    """Table of a CSV file whose column `text`, if it has one, is kept as it is written: "007" stays "007".
-
-    Raises:
-        InputError: no commas, no header, or rows that are longer than the header (pandas would shift the columns).
-    """
-    import pandas as pd
-
-    allowed, hint = "must be comma separated text with a header", "Export it again, with commas and decimal points."
-    try:
-        frame = pd.read_csv(path, skipinitialspace=True, converters={text: str.strip})
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise InputError(path.name, error, allowed, hint) from None
-    if len(frame.columns) == 1:
-        raise InputError(path.name, repr(frame.columns[0]), allowed, hint)
-    if len(frame) and not isinstance(frame.index, pd.RangeIndex):
-        longer = f"{frame.index.nlevels + len(frame.columns)} cells under {len(frame.columns)} names"
-        raise InputError(path.name, longer, "must have one name per column", "Name every column in the header.")
-    return frame
-
-
-def _ids(frame: pd.DataFrame, column: str, file: str) -> list[str]:
-    bad = np.flatnonzero((frame[column].isna() | (frame[column] == "")).to_numpy())
-    if len(bad):
-        raise InputError(f"{file}: row {bad[0] + 1}, column {column}", "empty", "must be a name", "Fill it in.")
-    return [str(v) for v in frame[column]]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -27,12 +28,22 @@ def tum_files(path: Path) -> list[Path]:
     return []
 
 
-def read_tum(path: Path, *, dt: float | None = None) -> Fleet:
+def read_tum(
+    path: Path,
+    *,
+    dt: float | None = None,
+    max_gap: float | None = None,
+    any_scale: bool = False,
+    repeats: Literal["refuse", "drop"] = "refuse",
+) -> Fleet:
     """Fleet of a TUM file or a folder of them; ids are file names, velocity is the backward difference.
 
     Args:
         path: file or folder; s and m; orientation is checked for a unit quaternion and not kept (a Fleet has none).
         dt: s, resample: needed when the vehicles' stamps differ.
+        max_gap: s, as in `assemble`.
+        any_scale: True accepts positions that do not look like metres and seconds.
+        repeats: "drop" leaves out a pose whose stamp is that of the pose before, "refuse" raises.
 
     Raises:
         InputError: no file, or what `coopoc.formats.tum.read_tum` raises.
@@ -40,12 +51,14 @@ def read_tum(path: Path, *, dt: float | None = None) -> Fleet:
     files = tum_files(path)
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
-    poses = [tum.read_tum(file) for file in files]
+    poses = [tum.read_tum(file, repeats=repeats) for file in files]
     return assemble(
         [file.stem for file, one in zip(files, poses, strict=True) for _ in range(len(one))],
         np.concatenate([one.stamps for one in poses]),
         np.concatenate([one.position for one in poses]),
         dt=dt,
+        max_gap=max_gap,
+        any_scale=any_scale,
         file=path.name,
         name=path.stem,
         source=f"TUM {path.name}, velocity by backward difference",

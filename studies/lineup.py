@@ -28,6 +28,7 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import FIX_AND_VELOCITY, V2X
 
 from . import scene, weights
+from .presence import complete, scored_where_present
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 BOUND = ("bound", "bound")
@@ -136,6 +137,8 @@ def start(p: Params) -> Floats | None:
     if scene.start(p) == "gnss":
         return None
     drive = scene.fleet(p["data"])
+    if not complete(scene.recording(p), scene.egos(p["data"], str(p["egos"])), drive):
+        raise InputError("start", "'true'", "needs egos that are there throughout", "Take start=gnss.")
     return drive.position[0, [drive.index(i) for i in scene.egos(p["data"], str(p["egos"]))]]
 
 
@@ -157,7 +160,8 @@ def rows(
     who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
     found: list[Row] = []
     for seed, method in made or methods(p, recording):
-        columns = scored(method, recording, who, drive, quantiles, metric)
+        score = scored if complete(recording, who, drive) else scored_where_present
+        columns = score(method, recording, who, drive, quantiles, metric)
         found += rows_of(columns, who, **({} if seed is None else {"train_seed": seed}))
     return found
 
@@ -165,7 +169,9 @@ def rows(
 def bound_rows(p: Params, bound: Callable[[Fleet, Sensors, int, V2X], Floats] = posterior_bound) -> list[Row]:
     """The bound of each ego over an ideal channel, which needs no draws, with the bytes that the ego would receive."""
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
-    acting, rate = scene.sensors(p), min(v2x.rate or np.inf, 1 / drive.dt)
+    if not drive.present.any():  # a bound is of a geometry that is known
+        return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
+    acting, rate = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt)
     found: list[Row] = []
     for ego in scene.egos(p["data"], str(p["egos"])):
         column = drive.index(ego)

@@ -5,13 +5,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from coopoc.data.registry import load_fleet, recorder
+from coopoc.arrays import Bools
+from coopoc.data.log import Log
+from coopoc.data.log_links import under
+from coopoc.data.registry import kind_of, load_fleet, load_log, recorder
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.environment import revision
@@ -22,6 +25,7 @@ from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import spoofed
+from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
 
 if TYPE_CHECKING:
@@ -39,8 +43,19 @@ TOWN: Mapping[str, Any] = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velo
 
 @lru_cache(maxsize=4)
 def fleet(data: str) -> Fleet:
-    """The fleet of a bundled name or a path."""
-    return load_fleet(data)
+    """The fleet of a bundled name or a path: of a log its truth, NaN where it is unknown."""
+    log = _log(data)
+    if log is None:
+        return load_fleet(data)
+    seen = log.recording
+    nothing = np.full((len(seen.t), len(seen.ids), 3), np.nan)
+    return log.truth or Fleet(seen.ids, seen.t, nothing, nothing, name=Path(data).stem, source="a log without truth")
+
+
+@lru_cache(maxsize=2)
+def _log(data: str) -> Log | None:
+    """The log of a name or a path that holds one; None for anything else, MR.CLAM included."""
+    return load_log(data) if kind_of(data) in ("log", "recording") else None
 
 
 def is_real(data: str) -> bool:
@@ -50,7 +65,8 @@ def is_real(data: str) -> bool:
 
 @lru_cache(maxsize=4)
 def _recorder(data: str) -> Callable[..., Recording] | None:
-    return recorder(data)
+    log = _log(data)
+    return recorder(data) if log is None else partial(under, log.recording, logged=log.messages)
 
 
 @lru_cache(maxsize=4)
@@ -62,25 +78,42 @@ def measured(data: str) -> Recording | None:
 
 @lru_cache(maxsize=4)
 def egos(data: str, wanted: str) -> tuple[str, ...]:
-    """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+".
+    """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+" or ",".
 
-    "auto" is five of them, or all where there are fewer.
+    "auto" is five of them, or all where there are fewer. Where not enough are present throughout, they are taken from
+    all that are there at two steps in a row; `presence` scores them where they are.
 
     >>> egos("town10", "3")
     ('town10-00', 'town10-20', 'town10-40')
     """
     drive = fleet(data)
-    throughout = [i for column, i in enumerate(drive.ids) if drive.present[:, column].all()]
-    if wanted == "auto":
-        wanted = str(min(5, len(throughout)))
-    if not wanted.isdigit():
-        return tuple(drive.ids[drive.index(i)] for i in wanted.split("+"))
-    count = int(wanted)
+    if wanted in drive.ids:
+        return (wanted,)
+    if wanted != "auto" and not wanted.isdigit():
+        return tuple(drive.ids[drive.index(i.strip())] for i in wanted.replace(",", "+").split("+"))
+    there = _there(data)
+    throughout = [i for column, i in enumerate(drive.ids) if there[:, column].all()]
+    somewhere = [i for column, i in enumerate(drive.ids) if (there[1:, column] & there[:-1, column]).any()]
+    if len(throughout) < (1 if wanted == "auto" else int(wanted)):
+        throughout = somewhere
+    count = min(5, len(throughout)) if wanted == "auto" else int(wanted)
     if not 1 <= count <= len(throughout):
-        raise InputError(
-            "egos", wanted, f"must be 1..{len(throughout)}, vehicles that are present throughout", "Take fewer."
-        )
+        raise InputError("egos", wanted, f"must be 1..{len(throughout)}, vehicles that are there", "Take fewer.")
     return tuple(throughout[k] for k in np.arange(count) * len(throughout) // count)
+
+
+def _there(data: str) -> Bools:
+    """(T, N) where vehicles may be followed: of a log where it has odometry and, if there is a truth, that, too."""
+    log = _log(data)
+    if log is None:
+        return fleet(data).present
+    moving: Bools = np.isfinite(log.recording.velocity[0, :, :, 0])
+    started = np.maximum.accumulate(np.isfinite(log.recording.gnss[0, :, :, 0]), axis=0)
+    there = moving & started
+    standing = (np.nan_to_num(log.recording.velocity[0]) == 0).all(axis=(0, 2))
+    if not standing.all():
+        there &= ~standing  # a road-side unit knows where it is
+    return there if log.truth is None else np.asarray(there & log.truth.present)
 
 
 LASTING = ("own_share", "common_share")
@@ -168,7 +201,10 @@ def conditions(p: Params) -> str:
     real = measured(p["data"])
     labels = "" if real is None else f" ({'; '.join(real.notes)})"
     who = egos(p["data"], str(p["egos"]))
-    size = f"{_count(p['runs'], 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
+    log = _log(p["data"])
+    alike = log is not None and (log.messages or not channel(p).loss)
+    runs = log.recording.runs if log is not None and alike else p["runs"]
+    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
     trained = f", {_count(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."
 
@@ -219,6 +255,9 @@ def _digests(data: str) -> Mapping[str, str]:
     real = measured(data)
     if real is None:
         return {"fleet": fleet(data).digest}
+    log = _log(data)
+    if log is not None:
+        return {"fleet": fleet(data).digest, "recording": digest(log.recording)}
     links, sha = real.links, hashlib.sha256(repr(real.sensors).encode())
     for array in (real.gnss, real.velocity, real.relative, links.step, links.observer, links.neighbour):
         sha.update(np.ascontiguousarray(array).tobytes())

@@ -83,6 +83,18 @@ STUDY = lineup.study(
     tables={
         "rt_le": partial(_table, value="rt_le_m", text="RT-LE [m] against K."),
         "nees": partial(_table, value="nees", text="NEES against K (3 is consistent).", best=None, intervals=False),
+        "innovation": partial(
+            _table,
+            value="innovation_m",
+            text="RMS innovation of the fixes [m] against K: how well a method predicts the next fix.",
+        ),
+        "nis": partial(
+            _table,
+            value="nis",
+            text="NIS of the fixes per dimension against K (1 is consistent).",
+            best=None,
+            intervals=False,
+        ),
         "bytes": partial(
             _table, value="bytes_per_second", text="Received per ego [B/s].", best=None, intervals=False, decimals=0
         ),

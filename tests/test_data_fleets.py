@@ -118,12 +118,14 @@ def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Pat
         load_fleet("town11")
     with pytest.raises(InputError, match=r"data = 'town10-client'.* Did you mean town10-clients\?"):
         load_fleet("town10-client")
-    with pytest.raises(InputError, match=r"must be one of table, tum, fcd, carla, mrclam\. Or leave it out"):
+    with pytest.raises(
+        InputError, match=r"must be one of table, tum, fcd, carla, mrclam, fleet, log, recording\. Or leave it out"
+    ):
         load_fleet(tmp_path, format="bag")
     with pytest.raises(InputError, match=r"format = 'tabel': .* Did you mean table\?"):
         load_fleet(tmp_path, format="tabel")
     with pytest.raises(InputError, match=r"must end in \.csv"):
-        detect(tmp_path / "drive.bag")
+        detect(tmp_path / "drive.doc")
     with pytest.raises(InputError, match=r"options = \['columns'\]: town10 is bundled"):
         load_fleet("town10", columns={})
     convert("town10-clients", tmp_path / "a.csv")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib.metadata import version
@@ -13,13 +15,15 @@ import pytest
 from scipy import signal
 from scipy.spatial import cKDTree
 
-from coopoc.data import traffic
+from coopoc import Fleet, load_fleet
+from coopoc.data import generate, traffic
 from coopoc.data.generate import make
 from coopoc.data.recipes import RECIPES, Recipe
-from coopoc.data.registry import DATASETS
+from coopoc.data.registry import DATASETS, convert
 from coopoc.data.smooth import smooth
 from coopoc.data.store import load
 from coopoc.errors import InputError, MissingLibraryError
+from coopoc.study.run import run_study
 
 MAPS = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "carla_maps"
 TINY = Recipe("tiny", "Town10HD.xodr", vehicles=6, steps=(60, 60, 60, 60, 60, 40), seed=1, warmup=10, platoon=2)
@@ -136,3 +140,58 @@ def test_without_sumo_the_pip_line_is_shown(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingLibraryError, match=r"pip install 'coopoc\[sumo\]'"):
         traffic.program("sumo")
+
+
+@with_sumo
+def test_what_was_made_is_loaded_converted_and_made_again_by_its_card(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text(
+        "from coopoc.data.recipes import Recipe\n"
+        "TINY = Recipe('tiny', 'Town10HD.xodr', vehicles=4, steps=60, seed=1, warmup=10)\n"
+    )
+    command = [sys.executable, "-W", "error", "-m", "coopoc.cli", "data"]
+    words = ["make", "own.py:TINY", "--maps", str(MAPS), "--cutoff", "0.4", "--out", "one"]
+    done = subprocess.run([*command, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    line = next(text for text in done.stdout.splitlines() if "made by" in text)
+    again = line.split("made by")[1].split("(SUMO")[0].split()[2:]
+    done = subprocess.run([*command, *again, "--out", "two"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    one, two = tmp_path / "one" / "tiny.npz", tmp_path / "two" / "tiny.npz"
+    assert one.read_bytes() == two.read_bytes()
+    fleet = load_fleet(one)
+    assert load_fleet(str(one) + "?format=fleet").digest == fleet.digest
+    assert convert(one, tmp_path / "a.csv").digest == load_fleet(tmp_path / "a.csv").digest
+    shown = subprocess.run([*command, "show", str(one)], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "4 vehicles x 60 steps of 0.1 s" in shown.stdout
+    settings = {"data": str(one), "method": "kalman", "max_neighbours": "0", "runs": 1}
+    assert not run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False).failed
+
+
+@with_sumo
+def test_seeds_are_tried_until_one_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = []
+    real = generate.simulate
+
+    def simulate(recipe: Recipe, folder: Path) -> Fleet:
+        seeds.append(recipe.seed)
+        if recipe.seed < 3:
+            raise InputError("acceleration", "9 m/s^2", "must stay below 8", "Try more seeds (--tries 20).")
+        return real(recipe, folder)
+
+    monkeypatch.setattr(generate, "simulate", simulate)
+    assert make(TINY, MAPS, tmp_path, tries=5).recipe["seed"] == 3
+    assert seeds == [1, 2, 3]
+    with pytest.raises(InputError, match="--tries 20"):
+        make(TINY, MAPS, tmp_path, tries=2)
+
+
+def test_a_damaged_fleet_is_named(tmp_path: Path) -> None:
+    whole = DATASETS["town10-clients"].path.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        at = int(rng.integers(len(whole)))
+        (tmp_path / "a.npz").write_bytes(whole[:at] + bytes([int(rng.integers(256))]) + whole[at + 1 :])
+        try:
+            load_fleet(tmp_path / "a.npz")
+        except InputError as error:
+            assert error.hint  # noqa: PT017

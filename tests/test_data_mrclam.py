@@ -134,3 +134,82 @@ def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
 def test_dt_must_be_positive() -> None:
     with pytest.raises(InputError, match="must be > 0"):
         read_mrclam(FOLDER, dt=-1)
+
+
+def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:
+    """Robots that drive side by side for 3 s at unix time, 1 m apart, and measure the next one."""
+    folder.mkdir(exist_ok=True)
+    t = 1248272272.8 + np.arange(31) / 10
+    (folder / "Barcodes.dat").write_text("# Subject Barcode\n" + "".join(f"{n} {10 * n}\n" for n in range(1, 8)))
+    for k, n in enumerate(robots):
+        truth = "".join(f"{s:.3f} {0.1 * j:.4f} {k:.1f} 0.0\n" for j, s in enumerate(t))
+        (folder / f"Robot{n}_Groundtruth.dat").write_text("# Time x y theta\n" + truth)
+        (folder / f"Robot{n}_Odometry.dat").write_text("# Time v w\n" + "".join(f"{s:.3f} 1.0 0.0\n" for s in t))
+        other = robots[(k + 1) % len(robots)]
+        turn = np.pi / 2 if robots.index(other) > k else -np.pi / 2
+        seen = "".join(f"{s:.3f} {10 * other} {abs(robots.index(other) - k)}.0 {turn:.5f}\n" for s in t[2:20])
+        (folder / f"Robot{n}_Measurement.dat").write_text("# Time code r b\n" + seen)
+    return folder
+
+
+@pytest.mark.parametrize("robots", [(1, 2), (2, 4, 5), (1, 2, 3, 4)])
+def test_a_folder_with_fewer_robots_is_one(tmp_path: Path, robots: tuple[int, ...]) -> None:
+    log = read_mrclam(small(tmp_path, robots))
+    assert log.fleet.ids == tuple(f"robot{n}" for n in robots)
+    np.testing.assert_allclose(log.range, log.true_range, atol=1e-9)
+    np.testing.assert_allclose(log.bearing, log.true_bearing, atol=1e-4)
+    rec = recording(log, V2X(max_neighbours=4))
+    assert len(rec.links) == 18 * len(robots)
+    assert log.absent == 0
+
+
+def test_a_robot_without_files_is_counted(tmp_path: Path) -> None:
+    small(tmp_path, (1, 2, 3))
+    for file in tmp_path.glob("Robot3_*"):
+        file.unlink()
+    assert (read_mrclam(tmp_path).absent, len(read_mrclam(tmp_path).range)) == (18, 18)
+
+
+BAD = {
+    "a stamp that is late": ("Robot1_Groundtruth.dat", 10, "1248272573.9 0 0 0", r"lines 11 and 12, column time"),
+    "a stamp that repeats": ("Robot1_Groundtruth.dat", 10, "1248272273.6 0 0 0", r"lines 10 and 11, column time"),
+    "odometry backwards": ("Robot2_Odometry.dat", 10, "1248272272.8 1 0", r"Robot2_Odometry\.dat: lines 10 and 11"),
+    "a measurement backwards": ("Robot2_Measurement.dat", 9, "1248272272.8 10 1 0", r"must not decrease"),
+    "itself": ("Robot2_Measurement.dat", 1, "1248272273.0 20 1 0", r"line 2 = .*a robot does not measure itself"),
+    "a negative range": ("Robot2_Measurement.dat", 1, "1248272273.0 10 -1 0", r"line 2 = .*must have a range > 0 m"),
+    "degrees": ("Robot2_Measurement.dat", 1, "1248272273.0 10 1 90", r"line 2 = .*within a turn"),
+    "a barcode twice": ("Barcodes.dat", 3, "9 20", r"Barcodes\.dat: line 4 = 9 20: must give each barcode once"),
+    "a subject twice": ("Barcodes.dat", 3, "2 77", r"Barcodes\.dat: line 4 = 2 77: must give each subject once"),
+    "half a barcode": ("Barcodes.dat", 3, "9 7.5", r"whole number as barcode"),
+    "a word": ("Robot1_Odometry.dat", 5, "1248272273.2 fast 0", r"Robot1_Odometry\.dat: line 6 = .* fast 0"),
+    "a word too few": ("Robot1_Odometry.dat", 5, "1248272273.2 1", r"Robot1_Odometry\.dat: line 6 = "),
+    "underscores": ("Robot1_Odometry.dat", 5, "1248272273.2 1_0 0", r"line 6 = 1248272273\.2 1_0 0"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_line_is_named(tmp_path: Path, case: str) -> None:
+    name, line, text, message = BAD[case]
+    lines = (small(tmp_path) / name).read_text().split("\n")
+    (tmp_path / name).write_text("\n".join([*lines[:line], text, *lines[line + 1 :]]))
+    with pytest.raises(InputError, match=message):
+        load_fleet(tmp_path)
+
+
+def test_robots_share_an_interval(tmp_path: Path) -> None:
+    small(tmp_path)
+    for kind in ("Groundtruth", "Odometry"):
+        file = tmp_path / f"Robot2_{kind}.dat"
+        file.write_text(file.read_text().replace("12482722", "12492722"))
+    with pytest.raises(InputError, match="must share an interval"):
+        load_fleet(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"has no Robot1_Groundtruth\.dat"):
+        load_fleet(tmp_path / "empty", format="mrclam")
+
+
+def test_a_longer_gap_of_truth_is_bridged_if_asked(tmp_path: Path) -> None:
+    lines = (small(tmp_path) / "Robot1_Groundtruth.dat").read_text().split("\n")
+    (tmp_path / "Robot1_Groundtruth.dat").write_text("\n".join(lines[:6] + lines[16:]))
+    absent = [int((~load_fleet(tmp_path, **gap).present[:, 0]).sum()) for gap in ({}, {"max_gap": 1.2})]
+    assert absent == [10, 0]

@@ -192,3 +192,49 @@ def _assert_refused(call: Any, *parts: str) -> None:
         call()
     for part in parts:
         assert part in str(error.value)
+
+
+@pytest.mark.parametrize("word", ["1_0", "١", "１", "1e308", "nan"])
+def test_a_number_is_one_as_c_writes_it(tmp_path: Path, word: str) -> None:
+    """Python's float takes underscores and the digits of any script; no other program does."""
+    for name, text in (
+        ("a.tum", f"0 {word} 0 0 0 0 0 1\n"),
+        ("a.g2o", f"VERTEX_SE2 0 {word} 0 0\n"),
+        ("a.pyfg", f"VERTEX_SE2 0.0 A0 {word} 0 0\n"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=rf"{name}: line 1 = .*all finite numbers"):
+            read_tum(tmp_path / name) if name == "a.tum" else load_graph(tmp_path / name)
+    (tmp_path / "a.g2o").write_text("VERTEX_SE2 ١ 0 0 0\n")
+    with pytest.raises(InputError, match=r"a\.g2o: line 1"):
+        load_graph(tmp_path / "a.g2o")
+
+
+def test_an_information_matrix_is_positive_definite(tmp_path: Path) -> None:
+    """By eigenvalues, over random symmetric matrices: those with a negative one are refused, the others read."""
+    rng = np.random.default_rng(0)
+    indefinite = 0
+    for _ in range(60):
+        matrix = rng.normal(size=(3, 3)) * rng.choice([1e-3, 1.0, 1e3], 3)
+        matrix = matrix + matrix.T + np.diag(np.abs(matrix).sum(1)) * rng.choice([0.5, 1.0, 3.0])
+        upper = " ".join(map(repr, matrix[np.triu_indices(3)].tolist()))
+        text = f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 {upper}\n"
+        (tmp_path / "a.g2o").write_text(text)
+        if np.linalg.eigvalsh(matrix)[0] > 0:
+            read = load_graph(tmp_path / "a.g2o").relative_pose.covariance[0]
+            np.testing.assert_allclose(read @ matrix, np.eye(3), atol=1e-6)
+        else:
+            indefinite += 1
+            with pytest.raises(InputError, match=r"a\.g2o: line 3 = information .*positive definite"):
+                load_graph(tmp_path / "a.g2o")
+    assert 10 < indefinite < 50
+
+
+def test_a_repeated_stamp_is_shown_with_all_digits_and_may_be_dropped(tmp_path: Path) -> None:
+    stamps = ("1311868230.100001", "1311868230.100002", "1311868230.100002", "1311868230.2")
+    (tmp_path / "a.tum").write_text("".join(f"{t} {k} 0 0 0 0 0 1\n" for k, t in enumerate(stamps)))
+    with pytest.raises(InputError, match=r"line 3, column t = 1311868230\.100002 s after 1311868230\.100002 s.*drop"):
+        read_tum(tmp_path / "a.tum")
+    assert read_tum(tmp_path / "a.tum", repeats="drop").position[:, 0].tolist() == [0, 1, 3]
+    with pytest.raises(InputError, match=r"repeats = 'dropp': .*Did you mean drop\?"):
+        read_tum(tmp_path / "a.tum", repeats="dropp")  # type: ignore[arg-type]

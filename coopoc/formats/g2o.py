@@ -19,7 +19,7 @@ OFFSET = "PARAMS_SE3OFFSET id x y z qx qy qz qw"
 
 def _name(word: str, kind: str) -> str:
     """17 is the pose A17 or the point L17; a GTSAM symbol key carries its own letter."""
-    letter, number = divmod(int(word) if word.isdecimal() else -1, 1 << 56)
+    letter, number = divmod(int(word) if word.isascii() and word.isdecimal() and len(word) < 20 else -1, 1 << 56)
     name = f"{chr(letter) if letter > 0 else 'A' if kind == 'pose' else 'L'}{number}"
     return name if letter >= 0 and NAME.fullmatch(name) else ""
 

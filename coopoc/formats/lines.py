@@ -10,6 +10,9 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..errors import InputError
 
+LARGEST = 1e100
+"""Numbers beyond it are none that was measured, and their squares overflow."""
+
 
 def read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
     """(line number, words) of every line that is neither blank nor a comment, which starts with #.
@@ -20,7 +23,7 @@ def read_words(path: Path) -> Iterator[tuple[int, list[str]]]:
     if not path.is_file():
         raise InputError("path", path, "must be a file", "Check the path.")
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = path.read_text("utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         raise InputError(path.name, error, "must be text", "Check that this is the file you meant.") from None
     for number, line in enumerate(lines, 1):
@@ -47,19 +50,25 @@ def to_numbers(file: str, lines: Sequence[int], words: Sequence[Sequence[str]], 
     values = np.empty((len(words), columns))
     for row, line in enumerate(words):
         try:
-            values[row] = [float(word) for word in line] if len(line) == columns else np.nan
+            values[row] = [_number(word) for word in line] if len(line) == columns else np.nan
         except ValueError:
             values[row] = np.nan
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(values) <= LARGEST).all(axis=1))
     if len(bad):
         row = int(bad[0])
         raise wrong(file, lines[row], words[row], form)
     return values
 
 
+def _number(word: str) -> float:
+    """A number as C writes it: Python's float takes digits of any script and underscores, too."""
+    return float(word) if word.isascii() and "_" not in word else float("nan")
+
+
 def wrong(file: str, line: int, words: Sequence[str], form: str) -> InputError:
     """The error of a line that does not have its form."""
-    found = " ".join(words[:40]) + (" ..." if len(words) > 40 else "")
+    shown = [word if len(word) <= 40 else f"{word[:40]}..." for word in words[:40]]
+    found = " ".join(shown) + (" ..." if len(words) > 40 else "")
     allowed = f"must be {form}, all finite numbers"
     return InputError(f"{file}: line {line}", f"{found} ({len(words)} words)", allowed, "Mend or remove the line.")
 

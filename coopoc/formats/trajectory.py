@@ -63,8 +63,10 @@ def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
         raise InputError(place(bad[0]), poses.position[bad[0]], "must be finite numbers", "Remove the pose.")
     late = 1 + np.flatnonzero(np.diff(stamps) <= 0)
     if len(late):
-        found = f"{stamps[late[0]]:.9g} s after {stamps[late[0] - 1]:.9g} s"
-        raise InputError(f"{place(late[0])}, column t", found, "must increase", "Sort the poses; remove repeated ones.")
+        found = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
+        twice = stamps[late[0]] == stamps[late[0] - 1]
+        hint = 'Remove the repeated pose, or read with repeats="drop".' if twice else "Sort the poses by time."
+        raise InputError(f"{place(late[0])}, column t", found, "must increase", hint)
     off = np.abs(poses.rotation @ poses.rotation.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(poses.rotation) < 0))
     if len(bad):

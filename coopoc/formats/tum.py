@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from ..errors import InputError
+from ..plugins import unknown
 from .lines import read_table, to_text
 from .rotations import UNIT, to_orientation, to_rotation
 from .trajectory import Trajectory
 
 
-def read_tum(path: str | Path) -> Trajectory:
+def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse") -> Trajectory:
     """Trajectory of a TUM file: unit quaternions with the scalar last; lines that start with # are comments.
 
     Args:
         path: s, m; a quaternion whose length is within 1 % of 1 was rounded and is normalised.
+        repeats: what happens to a pose whose stamp is that of the pose before: "refuse" raises, "drop" leaves it out.
 
     Raises:
         InputError: with the line, another number of words, one that is no finite number, stamps that do not increase, a
@@ -30,6 +33,8 @@ def read_tum(path: str | Path) -> Trajectory:
     >>> read_tum(file).stamps
     array([0. , 0.1])
     """
+    if repeats not in ("refuse", "drop"):
+        raise unknown("repeats", repeats, ("refuse", "drop"))
     path = Path(path)
     lines, table = read_table(path, "t x y z qx qy qz qw")
     off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > UNIT)
@@ -40,6 +45,9 @@ def read_tum(path: str | Path) -> Trajectory:
             f"must have length 1 to within {UNIT:g}",
             "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
         )
+    if repeats == "drop":
+        first = np.append(True, np.diff(table[:, 0]) != 0)
+        lines, table = lines[first], table[first]
     rotation = to_rotation(table[:, 4:])
     return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
 

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Floats
+from .batched import choose
 from .compile import inner, inside, storage
 from .elimination import eliminate, substitute
 from .lanes import LANES
-from .messages import MOVED, POSITION, PROCESS, RELATIVE, ROW, Star, clear
+from .messages import MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
 from .relative import completed, converted, exact, incomplete, vector
 from .small import (
     add,
@@ -37,6 +38,8 @@ from .small import (
     zeros,
 )
 
+LEAST_KNOWN = 1e-4
+"""1/m^2, information along x below which nothing is known of where a member is."""
 LEAST_PROCESS = 1e-90
 """m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
 
@@ -103,7 +106,8 @@ def block_of(k: int, n: int) -> int:
 
 @inner
 def predict_state(star: Star, joint: Joint, n: int, old: int, row: Any) -> None:
-    """Move the members that stay; one that joins is put where the ego measures it, the ego where its first fix is.
+    """Move the members that stay; the ego starts where its first fix is, one that joins where the ego measures it, or,
+    if the ego does not measure all three components, where its own message puts it.
 
     Fills the inverse process noise of the positions, in the order of the last star: zero for members that left.
     """
@@ -124,8 +128,35 @@ def predict_state(star: Star, joint: Joint, n: int, old: int, row: Any) -> None:
             first = load(star.motion, row_of + POSITION, ROW)
             store(joint.state, k, with_first3(zeros(first[0], row), first))
         else:
-            at = add(first3(load(joint.state, 0, row)), vector(load(star.relative, k, RELATIVE)))
+            at = first_place(star, k, first3(load(joint.state, 0, row)))
             store(joint.state, k, with_first3(zeros(at[0], row), at))
+
+
+@inside
+def first_place(star: Star, k: int, ego: Any) -> Any:
+    """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
+    seen = load(star.relative, k, RELATIVE)
+    measured = add(ego, vector(seen))
+    if not incomplete(seen):
+        return measured
+    lacks = seen[5] + seen[6] + seen[7] - (0.0 * seen[0] + 1e300)
+    new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
+    x, y, z = load(star.motion, 4 * k + POSITION, ROW)
+    near = seen[0] + 1.0
+    return (
+        choose(lacks, choose(new, x, ego[0] + near), measured[0]),
+        choose(lacks, choose(new, y, ego[1] + near), measured[1]),
+        choose(lacks, choose(new, z, ego[2] + 0.1 * near), measured[2]),
+    )
+
+
+@inside
+def placed(joint: Joint, k: int, seen: Any, row: Any) -> Any:
+    """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
+    own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
+    whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
+    one = 0.0 * own + 1.0
+    return choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
 
 
 @inside
@@ -180,12 +211,21 @@ def relative_information(star: Star, joint: Joint, k: int, std: AnyArray, least:
     lacking = incomplete(seen)
     if len(std) or lacking:
         weight = converted(x, y, z, deviations(seen, gap, len(std) == 0), least)
+        if lacking:
+            weight = times_all(weight, placed(joint, k, seen, row))
     else:
         o, one = 0.0 * x, 0.0 * x + 1.0
         weight = one, o, o, one, o, one
     found = vector(completed(seen, gap)) if lacking else vector(seen)
     full = from_upper(weight)
     return full, apply(full, subtract(found, gap))
+
+
+@inside
+def times_all(six: Any, factor: Any) -> Any:
+    """All six numbers times one."""
+    a, b, c, d, e, f = six
+    return a * factor, b * factor, c * factor, d * factor, e * factor, f * factor
 
 
 @inside
@@ -205,6 +245,10 @@ def exact_information(star: Star, joint: Joint, k: int, n: int, least: float, ro
     gap = subtract(first3(load(joint.state, k, row)), first3(load(joint.state, 0, row)))
     x, y, z = add(gap, ahead)
     xx, xy, xz, yy, yz, zz, p, q, r = exact(x, y, z, seen, (seen[5], seen[6], seen[7]), least)
+    if incomplete(seen):
+        known = placed(joint, k, seen, row)
+        xx, xy, xz, yy, yz, zz = times_all((xx, xy, xz, yy, yz, zz), known)
+        p, q, r = p * known, q * known, r * known
     weight = from_upper((xx, xy, xz, yy, yz, zz))
     return weight, plus_applied((p, q, r), weight, ahead)
 

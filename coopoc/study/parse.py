@@ -31,7 +31,8 @@ def assignments(texts: Sequence[str]) -> Mapping[str, str]:
 
 
 def parse(name: str, value: Any, default: Any) -> Any:
-    """`value` as the type of `default`: text is read, numbers are checked; a tuple is split at commas.
+    """`value` as the type of `default`: text is read, numbers are checked; a tuple is split at commas, and a list of
+    words for one word is joined by "+".
 
     Raises:
         InputError: it cannot be read as that type.
@@ -45,6 +46,8 @@ def parse(name: str, value: Any, default: Any) -> Any:
     if value is None or default is None:
         return None if value is None or str(value).lower() == "none" else _guess(value)
     kind = type(default)
+    if kind is str and isinstance(value, list | tuple):
+        return "+".join(map(str, value))
     try:
         if kind is bool:
             return _BOOLS[str(value).lower()]

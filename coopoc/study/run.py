@@ -17,6 +17,7 @@ from . import store
 from .cell import Cell
 from .cluster import Cluster, connected
 from .compute import Outcome, compute, schedule
+from .data_path import data_path
 from .environment import environment
 from .file_study import file_study
 from .lock import locked, one_at_a_time
@@ -47,7 +48,8 @@ def run_study(
         study: a Study, the name of one that an installed distribution registers, or "folder/mine.py:STUDY".
         out: folder of all studies.
         jobs: worker processes; 1 computes here. Results do not depend on it.
-        settings: changes of the study's settings or axes, see `Study.override`.
+        settings: changes of the study's settings or axes, see `Study.override`. A Recording, a Log of `read_log`, or
+            (Recording, Fleet of its truth) is stored in `out/data` and its path taken.
         progress: show a bar on stderr.
         shard: "i/n" computes the i-th of n parts and publishes nothing, see `Shard.of`. Shards of the same settings may
             share a folder at the same time. A run without it completes and publishes what they have computed.
@@ -179,7 +181,7 @@ def _keep(folder: Path, outcome: Outcome) -> bool:
 
 def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:
     found = find_study(study) if isinstance(study, str) else study
-    found = found.override(settings or {})
+    found = found.override({name: data_path(name, value, out) for name, value in (settings or {}).items()})
     return found, found.cells(), Path(out) / found.name
 
 

@@ -101,6 +101,48 @@ class Recording:
         parts = {name: getattr(self, name)[runs] for name in ("gnss", "velocity", "relative", "arrival")}
         return replace(self, **parts)
 
+    def between(self, start: int, stop: int) -> Recording:
+        """Steps start..stop-1 of the drive; a message that arrives later is lost.
+
+        >>> from coopoc import Fleet, Sensors, observe
+        >>> fleet = Fleet(("a",), [0, 0.1, 0.2], np.zeros((3, 1, 3)), np.zeros((3, 1, 3)))
+        >>> len(observe(fleet, Sensors()).between(1, 3).t)
+        2
+        """
+        kept = np.flatnonzero((self.links.step >= start) & (self.links.step < stop))
+        links, arrival = self.links, self.arrival[:, kept]
+        return replace(
+            self,
+            t=self.t[start:stop],
+            gnss=self.gnss[:, start:stop],
+            velocity=self.velocity[:, start:stop],
+            links=Links(links.step[kept] - start, links.observer[kept], links.neighbour[kept]),
+            relative=self.relative[:, kept],
+            broadcasts=self.broadcasts[start:stop],
+            arrival=np.where((arrival >= 0) & (arrival < stop), arrival - start, -1),
+        )
+
+    def stretches(self, vehicle: int | str, shortest: int = 2) -> tuple[tuple[int, int], ...]:
+        """(start, stop) of the steps at which a vehicle is there without a break, each from a fix in all runs on.
+
+        `recording.between(start, stop)` is what a method takes that follows it.
+
+        Args:
+            vehicle: index or id.
+            shortest: number of steps.
+
+        >>> from coopoc import Fleet, Sensors, observe
+        >>> fleet = Fleet(("a",), [0, 0.1, 0.2], np.zeros((3, 1, 3)), np.zeros((3, 1, 3)))
+        >>> observe(fleet, Sensors()).stretches("a")
+        ((0, 3),)
+        """
+        (col,) = columns("vehicle", [vehicle], self.ids)
+        there = np.isfinite(self.velocity[0, :, col, 0])
+        fixed: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0))
+        edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0)).reshape(-1, 2)
+        firsts = [(start + int(np.argmax(fixed[start:stop])), stop, fixed[start:stop].any()) for start, stop in edges]
+        return tuple((int(a), int(b)) for a, b, any_fix in firsts if any_fix and b - a >= shortest)
+
     @cached_property
     def complete(self) -> bool:
         """Whether every vehicle has a fix wherever it is."""
@@ -150,7 +192,9 @@ class Recording:
         fixes: Bools = np.asarray(seen.all(axis=(0, 3)))
         for ego, present, fix in zip(egos, there, fixes.T, strict=True):
             if not present:
-                hint = "Choose another ego or cut the drive with fleet.between(...)."
+                hint = (
+                    "Cut it with recording.between(...), recording.stretches(ego) names its parts, or choose another."
+                )
                 raise InputError("egos", repr(ego), "is absent at some steps", hint)
             if not (fix[0] if missing else fix.all()):
                 step = int(np.argmin(fix))

@@ -11,8 +11,7 @@ import numpy as np
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
 from coopoc.methods.star import FORGOTTEN
-from coopoc.world.spherical import to_vector
-from oracles.joint import EAST, converted, whitened
+from oracles.joint import converted, first_place, placed, whitened
 from oracles.messages import Member
 
 
@@ -53,8 +52,7 @@ def predict(
     new = f @ x + move
     for k, one in enumerate(star):
         if one.before is None:
-            seen = one.position if k == 0 else new[:3] + to_vector(np.where(np.isnan(one.relative), EAST, one.relative))
-            new[6 * k : 6 * k + 3] = seen
+            new[6 * k : 6 * k + 3] = one.position if k == 0 else first_place(one, new[:3])
     return new, f @ p @ f.T + np.diag(q)
 
 
@@ -70,7 +68,7 @@ def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel, white: F
                 weight = np.diag(1 / (one.variance + white))
                 information += h.T @ weight @ h
                 eta += h.T @ weight @ (one.position - h @ x)
-            if k:
+            if k and placed(one, information[6 * k, 6 * k]):
                 b = np.zeros((3, len(x)))
                 b[:, 6 * k : 6 * k + 3], b[:, :3] = np.eye(3), -np.eye(3)
                 if model is converted:

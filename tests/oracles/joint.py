@@ -36,14 +36,22 @@ def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
             pick[3 * k : 3 * k + 3, 3 * one.before : 3 * one.before + 3] = np.eye(3)
             new[k] = x[one.before] + one.moved
         else:
-            new[k] = (
-                one.position if k == 0 else new[0] + to_vector(np.where(np.isnan(one.relative), EAST, one.relative))
-            )
+            new[k] = one.position if k == 0 else first_place(one, new[0])
     return new, pick @ p @ pick.T + np.diag(q)
 
 
-EAST = np.array([0.0, 0.0, np.pi / 2])
-"""Stands for a missing component where a vehicle joins."""
+def first_place(one: Member, ego: Floats) -> Floats:
+    """As measured; if a component is missing, as broadcast; without a fix somewhere near."""
+    if np.isfinite(one.relative).all():
+        return ego + to_vector(one.relative)
+    if one.new:
+        return np.array(one.position)
+    return ego + np.array([1.0, 1.0, 0.1]) * (1.0 + (0.0 if np.isnan(one.relative[0]) else one.relative[0]))
+
+
+def placed(one: Member, information: Floats) -> bool:
+    """Whether an incomplete measurement has a known geometry: 1e-4 /m^2 and more along x."""
+    return bool(np.isfinite(one.relative).all() or information > 1e-4)
 
 
 def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel, exact: bool) -> tuple[Floats, Floats]:
@@ -56,14 +64,15 @@ def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel, exact: b
             information[at, at] += np.diag(1 / one.variance)
             eta[at] += (one.position - x[k]) / one.variance
     linear, linear_eta = information.copy(), eta.copy()
-    for k in range(1, n):
+    used = [k for k in range(1, n) if placed(star[k], information[3 * k, 3 * k])]
+    for k in used:
         h, r, z = converted(star[k].relative, x[k] - x[0], known)
         add(linear, linear_eta, k, h.T @ r @ h, h.T @ r @ z)
     move = np.linalg.solve(linear, linear_eta)
     if not exact:
         return x + move.reshape(-1, 3), np.linalg.inv(linear)
     at = x + move.reshape(-1, 3)
-    for k in range(1, n):
+    for k in used:
         jacobian, residual = whitened(star[k].relative, at[k] - at[0], known)
         ahead = move[3 * k : 3 * k + 3] - move[:3]
         add(information, eta, k, jacobian.T @ jacobian, jacobian.T @ (residual + jacobian @ ahead))

@@ -1,0 +1,114 @@
+"""A Recording, and its truth if there is one, as an .npz file: numbers and names only, nothing in it is ever run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+import zlib
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from .fleet import Fleet
+from .links import Links
+from .recording import Recording
+from .sensors import Sensors
+from .v2x import V2X
+
+ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers")
+LINKS = ("step", "observer", "neighbour")
+LARGEST = 2**32
+"""Bytes of one unpacked file."""
+
+
+def save_recording(recording: Recording, path: str | Path, truth: Fleet | None = None) -> None:
+    """Write a recording; the same one gives the same bytes.
+
+    Args:
+        recording: in any number of runs.
+        path: .npz file.
+        truth: of the same vehicles at the same steps.
+
+    Raises:
+        InputError: a truth of other vehicles or steps.
+    """
+    if truth is not None and (truth.ids != recording.ids or len(truth.t) != len(recording.t)):
+        hint = "Give the fleet on the steps of the recording."
+        raise InputError("truth", repr(truth), "must hold the vehicles and steps of the recording", hint)
+    settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
+    words = {"ids": recording.ids, "notes": recording.notes, **settings}
+    arrays: dict[str, Any] = {name: np.asarray(getattr(recording, name)) for name in ARRAYS}
+    arrays |= {f"links_{name}": getattr(recording.links, name) for name in LINKS}
+    if truth is not None:
+        words["truth"] = {"name": truth.name, "source": truth.source, "licence": truth.licence}
+        arrays |= {"truth_position": truth.position, "truth_velocity": truth.velocity}
+    np.savez_compressed(path, coopoc_recording=np.array(json.dumps(words)), **arrays)
+
+
+def is_recording(path: str | Path) -> bool:
+    """Whether a file is one that `save_recording` wrote."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            return "coopoc_recording.npy" in packed.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
+def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
+    """What `save_recording` wrote, bit by bit.
+
+    Raises:
+        InputError: a file that is damaged, too large, or no recording.
+    """
+    path = Path(path)
+    try:
+        with zipfile.ZipFile(path) as packed:
+            if sum(part.file_size for part in packed.infolist()) > LARGEST:
+                raise InputError(path.name, "more than 4 GB unpacked", "must be smaller", "Save fewer runs.")
+        with np.load(path, allow_pickle=False) as stored:
+            words = json.loads(str(stored["coopoc_recording"]))
+            arrays = {name: stored[name] for name in stored.files if name != "coopoc_recording"}
+        return _recording(words, arrays)
+    except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError) as error:
+        if isinstance(error, InputError) and error.field == path.name:
+            raise
+        found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, MemoryError) as error:
+        found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+    raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
+
+
+def digest(recording: Recording) -> str:
+    """SHA-256 of all that a recording holds.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> digest(observe(fleet, Sensors(), seed=1)) == digest(observe(fleet, Sensors(), seed=2))
+    False
+    """
+    sha = hashlib.sha256(repr((recording.ids, recording.notes, recording.sensors, recording.v2x)).encode())
+    for name in ARRAYS:
+        sha.update(np.ascontiguousarray(getattr(recording, name)).tobytes())
+    for name in LINKS:
+        sha.update(np.ascontiguousarray(getattr(recording.links, name)).tobytes())
+    return sha.hexdigest()
+
+
+def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording, Fleet | None]:
+    noise: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in words["sensors"].items()}
+    ids, t = tuple(words["ids"]), arrays["t"]
+    recording = Recording(
+        ids=ids,
+        links=Links(*(arrays[f"links_{name}"] for name in LINKS)),
+        sensors=Sensors(**noise),
+        v2x=V2X(**words["v2x"]),
+        notes=tuple(words["notes"]),
+        **{name: arrays[name] for name in ARRAYS},
+    )
+    if "truth" not in words:
+        return recording, None
+    return recording, Fleet(ids, t, arrays["truth_position"], arrays["truth_velocity"], **words["truth"])

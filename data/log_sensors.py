@@ -1,0 +1,73 @@
+"""Noise that methods may assume of a log: the standard deviations in it, as Sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from coopoc.arrays import Floats
+from coopoc.world.sensors import Sensors
+
+from .kinds import KINDS
+from .log_rows import Rows
+from .log_summary import Tally
+
+PLANE_STD = 0.01
+"""m, how well z = 0 is known where no height was logged; rad, the inclination that goes with it."""
+VARIED = 1.5
+"""Ratio of large to small standard deviations (98 and 2 %) beyond which one for all is worth a word."""
+
+
+def stds(rows: Rows) -> Mapping[str, Floats]:
+    """Kind in SI units -> standard deviations of the rows that have one, in SI units; those of degrees in metres."""
+    found: dict[str, list[Floats]] = {}
+    names = {"longitude": "x", "latitude": "y", "height": "z"}
+    for kind in dict.fromkeys(rows.kind.tolist()):
+        one = KINDS[kind]
+        given = rows.std[(rows.kind == kind) & np.isfinite(rows.std)] * one.scale
+        if len(given):
+            found.setdefault(names.get(one.name, one.name), []).append(given)
+    return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def assumed(given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, planar: bool, tally: Tally) -> Sensors:
+    """Sensors of a log: those that are given, else the root mean square of the logged standard deviations of each kind.
+
+    A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and said.
+    """
+    flat = PLANE_STD if planar else None
+    if sensors is not None:
+        return sensors
+    base = Sensors()
+    used = set(rows.kind.tolist())
+
+    def of(*names: str, default: float, unit: str) -> float:
+        parts = [given[name] for name in names if name in given]
+        if parts:
+            every = np.concatenate(parts)
+            level = float(np.sqrt(np.mean(every**2)))
+            low, high = np.percentile(every, [2, 98])
+            if high > VARIED * low:
+                what = f"{low:.3g} to {high:.3g} {unit}"
+                tally.assume(f"one standard deviation of {names[0]} for all, {level:.3g} {unit}; the log has {what}")
+            return level
+        if used & set(names):
+            tally.assume(f"a standard deviation of {names[0]} of {default:.3g} {unit}: none was logged")
+        return default
+
+    z = flat or of("z", default=base.gnss_std[2], unit="m")
+    speed = of("vx", "vy", "speed", default=0.0, unit="m/s") if set(given) & {"vx", "vy", "speed"} else None
+    if speed is None:
+        tally.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")
+    found = replace(
+        base,
+        gnss_std=(of("x", default=base.gnss_std[0], unit="m"), of("y", default=base.gnss_std[1], unit="m"), z),
+        range_std=of("range", default=base.range_std, unit="m"),
+        azimuth_std=of("azimuth", "bearing", default=base.azimuth_std, unit="rad"),
+        inclination_std=of("inclination", default=flat or base.inclination_std, unit="rad"),
+        heading_std=of("heading", default=0.0, unit="rad") if "heading" in given and "bearing" in used else 0.0,
+        min_range=0.0,
+    )
+    return found if speed is None else replace(found, velocity_std_ratio=0.0, velocity_floor=speed)

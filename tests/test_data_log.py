@@ -1,0 +1,233 @@
+"""Logs of one's own: what is read is what was measured, whatever the units, rates, clocks and gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from logs import NOISE, drive, long, seen, write
+
+import coopoc as co
+from coopoc.data.geodetic import to_enu
+from coopoc.data.log import read_log
+from coopoc.methods.catalogue import METHODS
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> None:
+    """Fixes, velocities, relative measurements and messages; late and lost ones, too. Velocities are means over steps
+    of samples joined by lines, so those of the rows are made such that their means are the recording's."""
+    fleet = drive(start=1.7e9)
+    true = seen(fleet, rate=5.0, latency=0.25, loss=0.2)
+    frame = long(true)
+    log = read_log(write(frame, tmp_path / f"log.{suffix}"))
+    found = log.recording
+    assert found.ids == true.ids
+    np.testing.assert_allclose(found.t, true.t, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.gnss, true.gnss, atol=1e-5)
+    means = true.velocity.copy()
+    means[:, 1:] = (means[:, 1:] + means[:, :-1]) / 2  # trapezoids between samples at the steps
+    np.testing.assert_allclose(found.velocity, means, atol=1e-4)  # stamps have 7 digits behind the point
+    for name in ("step", "observer", "neighbour"):
+        one = pd.DataFrame({k: getattr(true.links, k) for k in ("step", "observer", "neighbour")})
+        other = pd.DataFrame({k: getattr(found.links, k) for k in ("step", "observer", "neighbour")})
+        order, back = (f.sort_values(["step", "observer", "neighbour"]).index for f in (one, other))
+        np.testing.assert_array_equal(one.loc[order, name], other.loc[back, name])
+    np.testing.assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
+    sent = true.broadcasts[true.links.step, true.links.neighbour]
+    wanted = np.where(sent, true.arrival[0], -1)
+    np.testing.assert_array_equal(found.arrival[0, back], wanted[order])
+    assert found.sensors == replace(NOISE, min_range=0.0, velocity_floor=found.sensors.velocity_floor)
+    assert found.sensors.velocity_floor == pytest.approx(0.1)
+    assert log.messages
+    assert not log.summary.refused
+    assert log.summary.read["fixes"] == 200 * 4
+
+
+def test_geodetic_positions_agree_with_pymap3d() -> None:
+    """Independent reference: pymap3d, over 200 km and at the poles and the date line."""
+    pymap3d = pytest.importorskip("pymap3d")
+    rng = np.random.default_rng(2)
+    for origin in ((48.14, 11.58, 520.0), (-33.9, 179.9999, 0.0), (89.9, 10.0, 100.0), (0.0, 0.0, -30.0)):
+        at = np.array(origin) + rng.uniform(-1, 1, (50, 3)) * [1.0, 1.5, 500.0]
+        at[:, 0] = np.clip(at[:, 0], -90, 90)
+        wanted = np.column_stack(pymap3d.geodetic2enu(*at.T, *origin))
+        np.testing.assert_allclose(to_enu(at, origin), wanted, atol=1e-6)
+
+
+def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
+    pymap3d = pytest.importorskip("pymap3d")
+    fleet = drive(1)
+    origin = (48.14, 11.58, 520.0)
+    lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, 0].T, *origin)
+    frame = pd.DataFrame({"time": fleet.t, "lat": lat, "lon": lon, "alt": h, "speed_kmh": 8 * 3.6, "yaw": 0.0})
+    course = np.degrees(np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0]))
+    frame["yaw"] = (90 - course) % 360
+    write(frame, tmp_path / "car7.csv")
+    names = {"t": "time", "latitude": "lat", "longitude": "lon", "height": "alt", "compass_deg": "yaw"}
+    log = read_log(tmp_path / "car7.csv", columns=names, origin=origin)
+    assert log.recording.ids == ("car7",)
+    np.testing.assert_allclose(log.recording.gnss[0, :, 0], fleet.position[:, 0], atol=1e-6)
+    np.testing.assert_allclose(log.recording.velocity[0, 5:, 0], fleet.velocity[5:, 0], atol=0.05)
+    free = read_log(tmp_path / "car7.csv", columns=names)
+    assert free.origin == pytest.approx((lat[0], lon[0], h[0]))
+    np.testing.assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
+
+
+def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path: Path) -> None:
+    """The observer turns at 0.5 rad/s and measures a road-side unit between the steps; closed form."""
+    t = np.arange(0, 10, 0.1)
+    heading = 0.3 + 0.5 * t
+    x = np.column_stack([np.sin(heading), -np.cos(heading)]) * 6 - np.array([np.sin(0.3), -np.cos(0.3)]) * 6
+    wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x[:, 0], "y": x[:, 1], "speed": 3.0, "yaw_rate": 0.5})
+    wide.loc[::50, "heading"] = np.arctan2(np.sin(heading[::50]), np.cos(heading[::50]))
+    at = t[10:90:5] + 0.04
+    h = 0.3 + 0.5 * at
+    own = np.column_stack([np.sin(h), -np.cos(h)]) * 6 - np.array([np.sin(0.3), -np.cos(0.3)]) * 6
+    gap = np.array([20.0, 5.0]) - own
+    azimuth = np.arctan2(gap[:, 1], gap[:, 0])
+    body = np.arctan2(np.sin(azimuth - h), np.cos(azimuth - h))
+    radio = pd.DataFrame({"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": np.degrees(body)})
+    (tmp_path / "log").mkdir()
+    write(wide, tmp_path / "log" / "car.csv")
+    write(radio, tmp_path / "log" / "camera.csv")
+    write(pd.DataFrame({"t": [0.0], "vehicle": "rsu", "x": 20.0, "y": 5.0}), tmp_path / "log" / "rsu.csv")
+    log = read_log(tmp_path / "log")
+    rec, col = log.recording, log.recording.ids.index("car")
+    np.testing.assert_allclose(rec.relative[0, :, 1], azimuth, atol=1e-9)
+    assert np.isnan(rec.relative[0, :, [0, 2]]).all()
+    true = 3 * np.column_stack([np.cos(heading), np.sin(heading)])
+    np.testing.assert_allclose(rec.velocity[0, 1:, col, :2], (true[1:] + true[:-1]) / 2, atol=2e-3)
+    assert (rec.gnss[0, :, rec.ids.index("rsu")] == [20.0, 5.0, 0.0]).all()
+    assert "stands at" in log.summary.vehicles["rsu"]
+
+
+def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path: Path) -> None:
+    """1 Hz fixes 0.03 s beside the steps of 10 Hz odometry: without the motion they were 0.24 m off."""
+    fleet = drive(1)
+    velocity = pd.DataFrame(
+        {"t": fleet.t, "vehicle": "a", "vx": fleet.velocity[:, 0, 0], "vy": fleet.velocity[:, 0, 1]}
+    )
+    at = np.arange(3, 190, 10) * 0.1 + 0.03
+    x = np.column_stack([np.interp(at, fleet.t, fleet.position[:, 0, k]) for k in range(2)])
+    (tmp_path / "log").mkdir()
+    write(velocity, tmp_path / "log" / "odometry.csv")
+    write(pd.DataFrame({"t": at, "vehicle": "a", "x": x[:, 0], "y": x[:, 1]}), tmp_path / "log" / "gnss.csv")
+    log = read_log(tmp_path / "log")
+    fixed = np.isfinite(log.recording.gnss[0, :, 0, 0])
+    assert np.flatnonzero(fixed).tolist() == list(range(3, 190, 10))
+    np.testing.assert_allclose(log.recording.gnss[0, fixed, 0], fleet.position[fixed, 0], atol=0.01)
+    assert log.recording.stretches("a") == ((3, 200),)
+    assert log.summary.refused["steps of a before its first fix"][0] == 3
+
+
+def test_a_clock_that_is_ahead_is_set_back(tmp_path: Path) -> None:
+    true = seen(drive(2, start=100.0), k=1, latency=0.2)
+    frame = long(true)
+    late = frame["vehicle"] == "car1"
+    received = (frame["kind"] == "message") & (frame["partner"] == "car1")
+    frame.loc[late, "t"] += 0.37
+    frame.loc[received, "arrival"] = [f"{float(a) + 0.37:.6f}" for a in frame.loc[received, "arrival"]]
+    log = read_log(write(frame, tmp_path / "log.csv"), clock={"car1": 0.37}, dt=0.1)
+    np.testing.assert_allclose(log.recording.gnss, true.gnss, atol=1e-5)
+    np.testing.assert_array_equal(np.sort(log.recording.arrival), np.sort(true.arrival))
+    with pytest.raises(co.InputError, match=r"clock = 'car9'.*car0, car1"):
+        read_log(tmp_path / "log.csv", clock={"car9": 1.0})
+
+
+def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path: Path) -> None:
+    frame = long(seen(drive(3)), messages=False)
+    gone = (frame["vehicle"] == "car2") & (frame["t"] > 5.02) & (frame["t"] < 12.02)
+    odometry = frame["kind"].isin(["vx", "vy", "vz"])
+    log = read_log(write(frame[~(gone & odometry)], tmp_path / "log.csv"))
+    rec, refused = log.recording, log.summary.refused
+    absent = np.isnan(rec.velocity[0, :, 2, 0])
+    assert np.flatnonzero(absent)[[0, -1]].tolist() == [52, 119]
+    assert not np.isfinite(rec.gnss[0, absent, 2]).any()
+    assert refused["fixes in gaps of the odometry"][0] == absent.sum()
+    one = [why for why in refused if "one of the two is absent" in why]
+    kept = np.isfinite(rec.relative).sum()
+    assert refused[one[0]][0] + kept == frame["kind"].isin(["range", "azimuth", "inclination"]).sum()
+    assert rec.stretches("car2") == ((0, 52), (120, 200))
+    bridged = read_log(tmp_path / "log.csv", max_gap=8.0).recording
+    assert bridged.stretches("car2") == ((0, 200),)
+
+
+def test_numbers_are_counted_once(tmp_path: Path) -> None:
+    """Rows are read, refused, or stand in the file: the counts add up."""
+    frame = long(seen(drive(2), k=1), messages=False)
+    double = pd.concat([frame, frame[frame["kind"] == "range"].iloc[:7], frame[frame["kind"] == "x"].iloc[:5]])
+    summary = read_log(write(double, tmp_path / "log.csv")).summary
+    assert summary.read["ranges"] == (frame["kind"] == "range").sum()
+    assert summary.refused["relative measurements beside a nearer one of the same pair, kind and step"][0] == 7
+    assert summary.refused["repeated rows (same time, vehicle and kind)"][0] == 5
+    assert "log.csv: row" in str(summary)
+
+
+@pytest.mark.parametrize("parts", [("range",), ("azimuth",), ("range", "azimuth"), ("range", "azimuth", "inclination")])
+def test_any_subset_of_a_relative_measurement_is_used(tmp_path: Path, parts: tuple[str, ...]) -> None:
+    fleet = drive(4)
+    true = seen(fleet)
+    frame = long(true, messages=False)
+    others = [kind for kind in ("range", "azimuth", "inclination") if kind not in parts]
+    rec = read_log(write(frame[~frame["kind"].isin(others)], tmp_path / "log.csv")).recording
+    solo = float(co.rt_le(co.Kalman()(rec, [1]), fleet).mean())
+    joint = float(co.rt_le(co.JointFilter()(rec, [1]), fleet).mean())
+    assert joint < solo
+
+
+def thinned(frame: pd.DataFrame, every: int = 10) -> pd.DataFrame:
+    """Fixes at a tenth of the rate."""
+    fix = frame["kind"].isin(["x", "y", "z"])
+    return frame[~fix | ((frame["t"] * 10).round().astype(int) % every == 0)]
+
+
+COOPERATIVE = ("joint", "lkf-sa", "lkf-sa-edge", "split-ci", "ci", "drift", "msmv-r")
+WINDOWS = ("cooperative-map", "cooperative-map-5", "mhe", "fixed-lag")
+
+
+@pytest.mark.parametrize("name", ["kalman", "kalman-adaptive", *COOPERATIVE, *WINDOWS])
+def test_methods_run_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
+    fleet = drive(4)
+    frame = thinned(long(seen(fleet)))
+    rec = read_log(write(frame, tmp_path / "log.csv")).recording
+    assert np.isfinite(rec.gnss[0, :, 0, 0]).sum() == 20
+    error = float(co.rt_le(METHODS[name]("nominal")(rec, ["car1"]), fleet).mean())
+    assert error < 2.2, "a fix is 2.2 m off"
+
+
+WHOLE = ("gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother", "mds", "qcqp-relaxation")
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_methods_of_a_fleet_run_on_ranges_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
+    fleet = drive(4, gap=24.0)
+    frame = thinned(long(seen(fleet), messages=False))
+    frame = frame[~frame["kind"].isin(["azimuth", "inclination"])]
+    rec = read_log(write(frame, tmp_path / "log.csv")).recording
+    error = float(co.rt_le(METHODS[name]("nominal")(rec, ["car1"]), fleet).mean())
+    assert error < 3.0
+
+
+@pytest.mark.parametrize("name", [*COOPERATIVE, *WINDOWS])
+def test_methods_run_while_others_come_and_go(tmp_path: Path, name: str) -> None:
+    frame = thinned(long(seen(drive(4), rate=2.0, loss=0.3)))
+    away = (frame["vehicle"] == "car2") & frame["t"].between(5, 12)
+    rec = read_log(write(frame[~away], tmp_path / "log.csv")).recording
+    track = METHODS[name]("nominal")(rec, ["car1"])
+    assert float(co.rt_le(track, drive(4)).mean()) < 2.2
+
+
+def test_ranges_alone_run_through_the_cooperative_methods(tmp_path: Path) -> None:
+    """A UWB log: fixes at 1 Hz, odometry and ranges; no angle, no message. Ranges help each kind of method."""
+    fleet = drive(4, gap=24.0)
+    frame = thinned(long(seen(fleet), messages=False))
+    frame = frame[~frame["kind"].isin(["azimuth", "inclination"])]
+    rec = read_log(write(frame, tmp_path / "log.csv")).recording
+    alone = replace(rec, relative=np.full_like(rec.relative, np.nan))
+    for method in (co.JointFilter(), co.CooperativeMAP(window=5), co.MovingHorizon(), METHODS["drift"]("nominal")):
+        with_ranges, without = (float(co.rt_le(method(one, [1]), fleet).mean()) for one in (rec, alone))
+        assert with_ranges < without, method.name

@@ -1,0 +1,245 @@
+"""Logs of one's own from file to table and picture: the check, studies, and a Recording as a setting."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from filterpy.kalman import KalmanFilter
+from logs import drive, long, seen, write
+
+import coopoc as co
+from coopoc.data.log import read_log
+from coopoc.data.log_check import check
+from coopoc.data.registry import load_fleet, load_log
+from coopoc.evaluate.innovations import fix_innovations, innovation_columns, normalised_innovations
+from coopoc.world.storage import digest, read_recording, save_recording
+
+FEW = {"method": "gnss,kalman,joint,bound", "max_neighbours": "0,2"}
+
+
+def truth(fleet: co.Fleet) -> pd.DataFrame:
+    steps, vehicles = np.indices(fleet.present.shape)
+    frame = pd.DataFrame({"t": fleet.t[steps.ravel()], "vehicle": np.array(fleet.ids)[vehicles.ravel()]})
+    frame[["x", "y", "z"]] = fleet.position.reshape(-1, 3)
+    return frame
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A log without and one with a truth; car2 is away for seven seconds."""
+    out = tmp_path_factory.mktemp("logs")
+    fleet = drive(4, gap=15.0)
+    frame = long(seen(fleet), messages=False)
+    frame = frame[~((frame["vehicle"] == "car2") & frame["t"].between(5, 12))]
+    for name in ("without", "with"):
+        (out / name).mkdir()
+        write(frame, out / name / "measurements.csv")
+    write(truth(fleet), out / "with" / "truth.csv")
+    return out
+
+
+def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
+    log = read_log(folders / "with")
+    assert log.truth is not None
+    np.testing.assert_allclose(log.truth.position, drive(4, gap=15.0).position, atol=1e-9)
+    assert load_fleet(folders / "with").digest == log.truth.digest
+    assert co.load_recording(folders / "with").ids == log.recording.ids
+    with pytest.raises(co.InputError, match=r"without = no truth: .*truth\.csv"):
+        load_fleet(folders / "without")
+
+
+def test_a_study_scores_vehicles_where_they_are(folders: Path, tmp_path: Path) -> None:
+    """The row of a vehicle that was away is the root mean square over its two stretches."""
+    settings = {**FEW, "data": str(folders / "with"), "egos": ["car1", "car2"]}
+    rows = co.run_study("side_by_side", tmp_path, settings=settings, progress=False).frame
+    rec, fleet = co.load_recording(folders / "with"), load_fleet(folders / "with")
+    errors = []
+    for start, stop in rec.stretches("car2"):
+        track = co.Kalman()(rec.between(start, stop), ["car2"])
+        errors.append(np.linalg.norm(track.x[0, :, 0] - fleet.position[start:stop, 2], axis=-1))
+    assert len(errors) == 2
+    wanted = np.sqrt(np.mean(np.concatenate(errors) ** 2))
+    got = rows.query("method == 'kalman' and ego == 'car2' and max_neighbours == 0")["rt_le_m"]
+    assert got.tolist() == pytest.approx([wanted])
+    mean = rows.groupby(["method", "max_neighbours"])["rt_le_m"].mean()
+    assert mean["joint", 2] < mean["kalman", 2] < mean["gnss", 2]
+    assert (mean["bound"] < 1.3 * mean["joint"]).all()  # one run of two egos
+
+
+def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> None:
+    settings = {**FEW, "data": str(folders / "without")}
+    results = co.run_study("side_by_side", tmp_path, settings=settings, progress=False)
+    assert not results.failed
+    rows = results.frame
+    assert "rt_le_m" not in rows or rows["rt_le_m"].isna().all()
+    means = rows[rows["method"] != "bound"].groupby("method")["innovation_m"].mean()
+    assert means["kalman"] < means["gnss"]
+    assert 0.8 < rows.query("method == 'kalman'")["nis"].mean() < 1.2
+    tables = sorted(file.stem for file in (tmp_path / "side_by_side").rglob("*.md"))
+    assert {"innovation", "nis"} <= set(tables)
+
+
+def test_a_recording_is_a_setting(folders: Path, tmp_path: Path) -> None:
+    log = load_log(folders / "with")
+    paths = []
+    for data in (log, (log.recording, log.truth), log.recording):
+        results = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": data}, progress=False)
+        paths.append(results.settings["data"])
+        assert not results.failed
+    assert paths[0] == paths[1] != paths[2]
+    again = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": paths[0]}, progress=False)
+    by_path = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": str(folders / "with")}, progress=False)
+    one, other = (r.frame.query("method == 'joint' and max_neighbours == 2")["rt_le_m"] for r in (again, by_path))
+    assert one.tolist() == pytest.approx(other.tolist())
+    with pytest.raises(co.InputError, match="must be a name or a path, or a Recording"):
+        co.run_study("side_by_side", tmp_path, settings={"data": log.truth})
+
+
+def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:
+    fleet = drive(3)
+    recording = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(2, loss=0.3), runs=4, seed=1)
+    save_recording(recording, tmp_path / "a.npz", fleet)
+    read, true = read_recording(tmp_path / "a.npz")
+    assert digest(read) == digest(recording)
+    assert true is not None
+    assert true.digest == fleet.digest
+    save_recording(read, tmp_path / "b.npz", true)
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert load_fleet(tmp_path / "a.npz").digest == fleet.digest
+    with pytest.raises(co.InputError, match="must hold the vehicles and steps"):
+        save_recording(recording, tmp_path / "c.npz", fleet.between(0, 50))
+
+
+def test_a_damaged_recording_is_named(tmp_path: Path) -> None:
+    fleet = drive(2, steps=20)
+    save_recording(co.observe(fleet, co.Sensors(), co.V2X(1), runs=1), tmp_path / "a.npz")
+    whole = (tmp_path / "a.npz").read_bytes()
+    rng = np.random.default_rng(0)
+    ended = {"read": 0, "refused": 0}
+    for _ in range(150):
+        at = int(rng.integers(len(whole)))
+        (tmp_path / "b.npz").write_bytes(whole[:at] + bytes([int(rng.integers(256))]) + whole[at + 1 :])
+        try:
+            read_recording(tmp_path / "b.npz")
+            ended["read"] += 1
+        except co.InputError as error:
+            assert "b.npz" in str(error)  # noqa: PT017
+            ended["refused"] += 1
+    assert ended["refused"] > 50
+
+
+def test_innovations_are_filterpys(folders: Path) -> None:
+    """Independent reference: filterpy's y and S, step by step."""
+    rec = co.load_recording(folders / "with")
+    track = co.Kalman()(rec, ["car0"])
+    found, squares = fix_innovations(track, rec), normalised_innovations(track, rec)
+    assert squares is not None
+    q = (rec.dt * rec.sensors.assumed_velocity_std(rec.velocity[0, :, 0])) ** 2
+    kf = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    kf.x, kf.F, kf.H, kf.B = rec.gnss[0, 0, 0], np.eye(3), np.eye(3), rec.dt * np.eye(3)
+    kf.R = np.diag(np.square(rec.sensors.gnss_std))
+    kf.P = kf.R.copy()
+    for t in range(1, 100):
+        kf.predict(u=rec.velocity[0, t, 0], Q=np.diag(q[t]))
+        kf.update(rec.gnss[0, t, 0])
+        np.testing.assert_allclose(found[0, t, 0], kf.y, atol=1e-9)
+        assert squares[0, t, 0] == pytest.approx(kf.y @ kf.SI @ kf.y / 3, rel=1e-6)
+    columns = innovation_columns(track, rec)
+    assert columns["fixes"].tolist() == [[199.0]]
+    assert columns["nis"] == pytest.approx(np.nanmean(squares, axis=1))
+
+
+def test_the_check_finds_nothing_wrong_where_nothing_is(folders: Path) -> None:
+    found = check(read_log(folders / "with"))
+    assert found.doubts == ()
+    assert all(0.7 < row["nis"] < 1.3 for row in found.vehicles)
+    (ranges,) = [row for row in found.measurements if row["measurement"] == "range"]
+    assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
+
+
+def _changed(frame: pd.DataFrame, kinds: list[str], change: object) -> pd.DataFrame:
+    here = frame["kind"].isin(kinds)
+    return frame.assign(value=np.where(here, change(frame["value"]), frame["value"]))  # type: ignore[operator]
+
+
+WRONG = {
+    "speeds in km/h": (["vx", "vy"], lambda v: 3.6 * v, r"fixes travel 0\.2\d times as far.*speed_kmh"),
+    "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
+    "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
+    "ranges in feet": (["range"], lambda v: v / 0.3048, r"ranges miss the positions by \d+"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
+    kinds, change, message = WRONG[case]
+    frame = _changed(long(seen(drive(4, gap=15.0)), messages=False), kinds, change)
+    doubts = check(read_log(write(frame, tmp_path / "log.csv"))).doubts
+    assert any(pd.Series([doubt]).str.contains(message, regex=True)[0] for doubt in doubts), doubts
+
+
+def test_velocities_clockwise_from_north_are_found(tmp_path: Path) -> None:
+    frame = long(seen(drive(4, gap=15.0)), messages=False)
+    x, y = (frame["kind"] == "vx").to_numpy(), (frame["kind"] == "vy").to_numpy()
+    swapped = frame.assign(kind=np.where(x, "vy", np.where(y, "vx", frame["kind"])))
+    doubts = check(read_log(write(swapped, tmp_path / "log.csv"))).doubts
+    assert any("anticlockwise of the odometry" in doubt for doubt in doubts)
+
+
+def shell(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "error", "-m", "coopoc.cli", *words]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def test_the_commands_take_a_log_and_options(folders: Path, tmp_path: Path) -> None:
+    done = shell("data", "check", str(folders / "with"), "--picture", "a.png", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "not used: 621 relative measurements while one of the two is absent" in done.stdout
+    assert "nothing looks wrong" in done.stdout
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    word = f"{folders / 'with'}?dt=0.2&max_gap=10"
+    options = ("method=kalman", "max_neighbours=0", "egos=car2")
+    done = shell("run", "side_by_side", "--data", word, "--set", *options, "--out", "runs", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "1 ego of with" in done.stdout
+    shown = shell("data", "show", str(folders / "with"), cwd=tmp_path)
+    assert "speed" in shown.stdout
+    assert shell("data", "check", "nowhere", cwd=tmp_path).returncode == 2
+
+
+def test_a_gap_of_a_csv_does_not_stop_a_study(tmp_path: Path) -> None:
+    """One missing instant of each vehicle, in a file of drives whose measurements are simulated."""
+    fleet = drive(3, steps=60)
+    frame = truth(fleet).rename(columns={"vehicle": "id"})
+    gone = (frame.index % 61) == 60
+    write(frame[~gone], tmp_path / "drive.csv")
+    settings = {"data": str(tmp_path / "drive.csv"), "method": "kalman,joint", "max_neighbours": "0,2", "runs": 2}
+    results = co.run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False)
+    assert not results.failed
+    assert results.frame["rt_le_m"].notna().all()
+
+
+def test_a_part_of_a_recording_is_one(folders: Path) -> None:
+    rec = co.load_recording(folders / "with")
+    part = rec.between(20, 80)
+    np.testing.assert_array_equal(part.gnss, rec.gnss[:, 20:80])
+    kept = (rec.links.step >= 20) & (rec.links.step < 80)
+    np.testing.assert_array_equal(part.links.step + 20, rec.links.step[kept])
+    np.testing.assert_array_equal(part.relative, rec.relative[:, kept])
+    late = replace(rec, arrival=rec.arrival + 30)
+    assert (late.between(20, 80).arrival < 60).all()
+    assert rec.stretches("car2", shortest=100) == ()
+
+
+def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:
+    """Without heights NIS is per two degrees of freedom: 1, and not 2/3."""
+    frame = long(seen(drive(4, steps=600, gap=15.0)), messages=False)
+    frame = frame[~frame["kind"].isin(["z", "vz", "inclination"])]
+    found = check(read_log(write(frame, tmp_path / "log.csv")))
+    assert np.mean([row["nis"] for row in found.vehicles]) == pytest.approx(1.0, abs=0.1)

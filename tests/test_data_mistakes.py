@@ -1,0 +1,130 @@
+"""Typical mistakes in logs: each ends in the message that docs/your_data.md shows, with file, row and column."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import coopoc as co
+from coopoc.data.log import read_log
+from coopoc.data.recordings import load_log
+
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
+GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(
+    f"{k / 10},red,x,,{0.8 * k:.1f},1.5,\n{k / 10},red,y,,0.0,1.5,\n"
+    f"{k / 10},red,vx,,8.0,0.1,\n{k / 10},red,vy,,0.0,0.1,\n"
+    f"{k / 10},red,range,blue,12.0,0.3,\n{k / 10},blue,x,,{0.8 * k + 12:.1f},1.5,\n{k / 10},blue,y,,0.5,1.5,\n"
+    f"{k / 10},blue,vx,,8.0,0.1,\n{k / 10},blue,vy,,0.0,0.1,\n{k / 10},blue,message,red,,,{k / 10 + 0.1:.1f}\n"
+    for k in range(20)
+)
+WIDE = "t,vehicle,x,y,speed,heading\n" + "".join(f"{k / 10},red,{0.8 * k:.1f},0,8.0,0.0\n" for k in range(20))
+STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.0\n" for k in range(20))
+
+
+def swap(old: str, new: str, text: str = GOOD, count: int = 1) -> str:
+    assert old in text
+    return text.replace(old, new, count)
+
+
+def nanoseconds(text: str) -> str:
+    return re.sub(r"(?m)^([\d.]+),", lambda m: f"{1_700_000_000_000_000_000 + int(float(m[1]) * 1e9)},", text)
+
+
+ROW3 = "0.0,red,vx,,8.0,0.1,"
+DEGREES = "t,vehicle,x,y\n" + "".join(f"{k},red,{11.58 + 1e-5 * k},{48.14 + 2e-5 * k}\n" for k in range(20))
+SWAPPED = "t,vehicle,latitude,longitude\n0,red,116.39,39.9\n1,red,116.3901,39.9\n"
+MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
+    "semicolons between cells": (GOOD.replace(",", ";"), {}, ""),
+    "decimal commas": (swap(ROW3, "0.0,red,vx,,8,0,0.1,"), {}, "row 3"),
+    "no column of time": (swap("t,vehicle", "time,vehicle"), {}, "log.csv: column t"),
+    "a header twice": (swap("std", "value"), {}, "log.csv: header"),
+    "an unknown kind": (swap("range", "dist"), {}, "row 5, column kind"),
+    "a word for a number": (swap(ROW3, "0.0,red,vx,,eight,0.1,"), {}, "row 3, column value"),
+    "an empty value": (swap(ROW3, "0.0,red,vx,,,0.1,"), {}, "row 3, column value"),
+    "a time of day without a date": (swap(ROW3, "12:00:01,red,vx,,8.0,0.1,"), {}, "row 3, column t"),
+    "nanoseconds for seconds": (nanoseconds(GOOD), {}, "column t"),
+    "degrees as x and y": (DEGREES, {}, "columns x, y"),
+    "latitude and longitude swapped": (SWAPPED, {}, "row 1, latitude"),
+    "degrees in both frames": (GOOD + "0.0,blue,latitude,,48.1,1,\n0.0,blue,longitude,,11.5,1,\n", {}, "row 1, x"),
+    "a bearing in degrees": (swap("range,blue,12.0", "bearing,blue,45"), {}, "row 5, bearing"),
+    "a compass in radians' column": (swap(",0.0\n", ",270\n", WIDE), {}, "row 1, heading"),
+    "a negative range": (swap("range,blue,12.0", "range,blue,-3.2"), {}, "row 5, range"),
+    "a range to nobody": (swap("range,blue", "range,"), {}, "row 5, column partner"),
+    "a vehicle that measures itself": (swap("range,blue", "range,red"), {}, "row 5, column partner"),
+    "a standard deviation of zero": (swap("x,,0.0,1.5", "x,,0.0,0"), {}, "row 1, standard deviation of x"),
+    "a message that arrives before it is sent": (swap("red,,,0.1", "red,,,-0.5"), {}, "row 10, column arrival"),
+    "speed without a heading": (STILL, {}, "row 1, speed"),
+    "one fix and no motion but a yaw rate": (
+        "t,vehicle,x,y,yaw_rate\n0,red,0,0,0.1\n1,red,,,0.1\n2,red,,,0.1\n",
+        {},
+        "vehicle red",
+    ),
+    "no fix at all": ("t,vehicle,vx,vy\n0,red,8,0\n1,red,8,0\n", {}, "fixes"),
+    "a truth of other vehicles": (GOOD, {"truth": "t,vehicle,x,y\n0,rot,0,0\n1,rot,8,0\n"}, "column vehicle"),
+    "a clock of an unknown vehicle": (GOOD, {"clock": {"bleu": 0.1}}, ""),
+    "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
+    "steps longer than the log": (GOOD, {"dt": 5.0}, "dt"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_as_the_page_says(tmp_path: Path, mistake: str) -> None:
+    text, options, place = MISTAKES[mistake]
+    (tmp_path / "log.csv").write_text(text)
+    if "truth" in options:
+        (tmp_path / "truth.csv").write_text(options["truth"])
+        options = {"truth": tmp_path / "truth.csv"}
+    with pytest.raises(co.InputError) as error:
+        load_log(tmp_path / "log.csv", **options)
+    (shown,) = re.findall(rf"^\| {re.escape(mistake)} \| `(.*)` \|$", PAGE, flags=re.MULTILINE)
+    message, at = str(error.value), 0
+    for part in shown.split(" ... "):
+        assert part in message[at:], message
+        at = message.index(part, at)
+    assert place in message
+    assert error.value.hint
+
+
+def test_every_mistake_of_the_page_is_tested() -> None:
+    table = PAGE[PAGE.index("| mistake |") : PAGE.index("What is possible but unlikely")]
+    assert {row.split(" | ")[0][2:] for row in table.splitlines()[2:] if row} == set(MISTAKES)
+    assert len(MISTAKES) >= 20
+
+
+def test_the_good_file_is_good(tmp_path: Path) -> None:
+    for text in (GOOD, WIDE):
+        (tmp_path / "log.csv").write_text(text)
+        assert not read_log(tmp_path / "log.csv").summary.refused
+
+
+KEPT: dict[str, tuple[Callable[[str], str], str]] = {
+    "a partner that is misspelt": (
+        lambda text: text.replace("range,blue", "range,bleu", 1),
+        "relative measurements of members without a position",
+    ),
+    "a receiver that is misspelt": (
+        lambda text: text.replace("message,red", "message,rde", 1),
+        "messages to a receiver that is absent or has no position",
+    ),
+    "a row twice": (lambda text: text + text.splitlines()[1] + "\n", "repeated rows (same time, vehicle and kind)"),
+    "a bearing of a vehicle that stands": (
+        lambda text: text + "0.0,rsu,x,,5,1,\n0.0,rsu,y,,5,1,\n0.3,rsu,bearing,red,0.1,0.1,\n",
+        "bearings at times without a heading",
+    ),
+    "half a fix": (lambda text: text.replace("0.0,red,y,,0.0,1.5,\n", "", 1), "incomplete rows, without all of x, y"),
+}
+
+
+@pytest.mark.parametrize("case", KEPT)
+def test_what_does_not_fit_is_counted_with_its_place(tmp_path: Path, case: str) -> None:
+    change, reason = KEPT[case]
+    (tmp_path / "log.csv").write_text(change(GOOD))
+    refused = read_log(tmp_path / "log.csv").summary.refused
+    (found,) = [why for why in refused if why.startswith(reason)]
+    number, place = refused[found]
+    assert number == 1
+    assert place.startswith("log.csv: row ")

@@ -1,0 +1,233 @@
+"""NMEA and ROS bags: logs of receivers and robots, checked against pynmeagps, pymap3d and what the test wrote."""
+
+from __future__ import annotations
+
+import builtins
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from logs import drive
+
+import coopoc as co
+from coopoc.data.log import read_log
+
+
+def sentence(text: str) -> str:
+    check = 0
+    for letter in text:
+        check ^= ord(letter)
+    return f"${text}*{check:02X}\r\n"
+
+
+def degrees(value: float, wide: int) -> str:
+    whole = int(abs(value))
+    return f"{whole:0{wide}d}{60 * (abs(value) - whole):011.8f}"
+
+
+def nmea(fleet: co.Fleet, column: int, start: datetime, rmc: bool = True) -> str:
+    """A vehicle of a fleet, driven in Munich."""
+    pymap3d = pytest.importorskip("pymap3d")
+    lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, column].T, 48.14, 11.58, 560.0)
+    lines = []
+    for k, t in enumerate(fleet.t - fleet.t[0]):
+        at = start + timedelta(seconds=float(round(t, 3)))
+        clock = at.strftime("%H%M%S.%f")[:-4]
+        place = f"{degrees(lat[k], 2)},N,{degrees(lon[k], 3)},E"
+        lines.append(sentence(f"GNGGA,{clock},{place},4,20,0.6,{h[k] - 46.0:.4f},M,46.0,M,,"))
+        lines.append(sentence(f"GNGST,{clock},,,,,0.020,0.010,0.050"))
+        if rmc:
+            vx, vy, _ = fleet.velocity[k, column]
+            knots, course = np.hypot(vx, vy) * 3600 / 1852, np.degrees(np.arctan2(vx, vy)) % 360
+            lines.append(sentence(f"GNRMC,{clock},A,{place},{knots:.4f},{course:.3f},{at.strftime('%d%m%y')},,,R"))
+    return "".join(lines)
+
+
+def test_nmea_is_fixes_speed_and_course(tmp_path: Path) -> None:
+    """Written through midnight by hand and pymap3d, whose positions come back; stamps are seconds since 1970."""
+    pytest.importorskip("pynmeagps")
+    fleet = drive(2, steps=100)
+    start = datetime(2024, 2, 28, 23, 59, 55)
+    for column, name in enumerate(("a", "b")):
+        (tmp_path / f"{name}.nmea").write_text(nmea(fleet, column, start))
+    log = read_log(tmp_path, origin=(48.14, 11.58, 560.0))
+    rec = log.recording
+    np.testing.assert_allclose(rec.gnss[0], fleet.position, atol=1e-3)
+    np.testing.assert_allclose(rec.velocity[0, 2:], fleet.velocity[2:], atol=0.05)
+    assert rec.t[0] == pytest.approx((start - datetime(1970, 1, 1)).total_seconds())
+    assert rec.sensors.gnss_std == pytest.approx((0.01, 0.02, 0.05))
+    without = tmp_path / "gga"
+    without.mkdir()
+    (without / "a.nmea").write_text(nmea(fleet, 0, start, rmc=False))
+    rec = read_log(without, origin=(48.14, 11.58, 560.0)).recording
+    assert len(rec.t) == 100
+    assert np.linalg.norm(rec.velocity[0, 5:-5, 0], axis=-1) == pytest.approx(8.0, abs=0.2)
+
+
+def test_damaged_sentences_are_counted(tmp_path: Path) -> None:
+    pytest.importorskip("pynmeagps")
+    lines = nmea(drive(1, steps=60), 0, datetime(2024, 1, 1)).splitlines(keepends=True)
+    lines[6] = lines[6].replace("N", "S", 1).replace("GSGGA", "GNGGA")[:-4] + "00\r\n"
+    lines[9] = lines[9][:30] + "\r\n"
+    lines[12] = sentence("GNGGA,000000.40,,,,,0,00,,,M,,M,,")
+    lines.insert(20, "hello\r\n")
+    lines.insert(30, sentence("GNGSA,A,3,01,,,,,,,,,,,,1.0,0.6,0.8,1"))
+    (tmp_path / "a.nmea").write_text("".join(lines))
+    summary = read_log(tmp_path).summary
+    assert summary.refused["damaged NMEA sentences"][0] == 2
+    assert summary.refused["fixes of quality 0"][0] == 1
+    assert summary.refused["lines of NMEA files that are no sentence"] == (1, "a.nmea: line 21")
+    assert summary.unused["NMEA sentences GSA"] == 1
+    assert summary.read["fixes"] == 57
+    (tmp_path / "a.nmea").write_text("hello\n")
+    with pytest.raises(co.InputError, match=r"a\.nmea = 0 fixes"):
+        read_log(tmp_path)
+
+
+def test_without_pynmeagps_the_pip_line_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.nmea").write_text("x")
+    (tmp_path / "a.bag").write_text("x")
+    real = builtins.__import__
+
+    def without(name: str, *rest: Any) -> Any:
+        if name.split(".")[0] in ("pynmeagps", "rosbags"):
+            raise ImportError(name)
+        return real(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    for file, extra in (("a.nmea", "nmea"), ("a.bag", "ros")):
+        with pytest.raises(co.MissingLibraryError, match=rf"pip install 'coopoc\[{extra}\]'"):
+            read_log(tmp_path / file)
+
+
+def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d(shared: Path) -> None:
+    """Real data: 100 positions of the first car, parsed and converted by the libraries alone."""
+    pynmeagps, pymap3d = pytest.importorskip("pynmeagps"), pytest.importorskip("pymap3d")
+    log = read_log(shared / "cats_nmea" / "AV_veh1.nmea", dt=0.1)
+    lines = (shared / "cats_nmea" / "AV_veh1.nmea").read_bytes().splitlines()[:100]
+    parsed = [pynmeagps.NMEAReader.parse(line + b"\r\n") for line in lines]
+    assert log.origin is not None
+    at = np.array([(m.lat, m.lon, float(m.alt) + float(m.sep)) for m in parsed])
+    np.testing.assert_allclose(at[0], log.origin)
+    wanted = np.column_stack(pymap3d.geodetic2enu(*at.T, *log.origin))
+    np.testing.assert_allclose(log.recording.gnss[0, :100, 0], wanted, atol=1e-5)
+
+
+def test_the_gap_of_the_third_cats_car_is_one(shared: Path) -> None:
+    """Stated for this set: one gap of 221.5 s in car 3."""
+    pytest.importorskip("pynmeagps")
+    rec = co.load_recording(shared / "cats_nmea", dt=0.5)
+    stretches = [rec.stretches(f"AV_veh{k}") for k in (1, 2, 3, 4)]
+    assert [len(one) for one in stretches] == [1, 1, 2, 1]
+    (_, left), (back, _) = stretches[2]
+    assert (back - left) * rec.dt == pytest.approx(221.5, abs=1.1)
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
+    """Written here: fixes, odometry and imu of two vehicles, a truth by PoseStamped, and a topic of another kind."""
+    pytest.importorskip("rosbags")
+    pymap3d = pytest.importorskip("pymap3d")
+    fleet = drive(2, steps=80, start=1.7e9)
+    path = tmp_path / ("drive.bag" if ros == 1 else "drive")
+    write_bag(path, fleet, pymap3d, ros)
+    log = read_log(path, origin=(48.14, 11.58, 560.0), dt=0.1)
+    rec = log.recording
+    assert rec.ids == ("car0", "car1")
+    np.testing.assert_allclose(rec.gnss[0], fleet.position, atol=1e-6)
+    np.testing.assert_allclose(rec.velocity[0, 2:], fleet.velocity[2:], atol=0.05)
+    assert rec.sensors.gnss_std == pytest.approx((0.5, 0.5, 2.0))
+    assert log.truth is not None
+    np.testing.assert_allclose(log.truth.position[:, 0], fleet.position[:, 0], atol=1e-6)
+    assert np.isnan(log.truth.position[:, 1]).all()
+    assert any("/car0/note" in what for what in log.summary.unused)
+    assert float(co.rt_le(co.Kalman()(rec, [0]), log.truth)[0, 0]) < 0.05
+    assert load_and_check(path) == 80 * 2
+
+
+def load_and_check(path: Path) -> int:
+    return int(np.isfinite(co.load_recording(path, dt=0.1).gnss[0, :, :, 0]).sum())
+
+
+def write_bag(path: Path, fleet: co.Fleet, pymap3d: Any, ros: int) -> None:
+    from rosbags.rosbag1 import Writer as Writer1
+    from rosbags.rosbag2 import Writer as Writer2
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    kind = store.types
+    time_type = kind["builtin_interfaces/msg/Time"]
+
+    def header(t: float) -> Any:
+        stamp = time_type(int(t), round((t - int(t)) * 1e9))
+        words = {"stamp": stamp, "frame_id": "map", **({"seq": 0} if ros == 1 else {})}
+        return kind["std_msgs/msg/Header"](**words)
+
+    def vector(x: float, y: float, z: float) -> Any:
+        return kind["geometry_msgs/msg/Vector3"](x, y, z)
+
+    point, turned = kind["geometry_msgs/msg/Point"], kind["geometry_msgs/msg/Quaternion"]
+    writer: Any = Writer1(path) if ros == 1 else Writer2(path, version=9)
+    names = {
+        "fix": "sensor_msgs/msg/NavSatFix",
+        "odom": "nav_msgs/msg/Odometry",
+        "imu": "sensor_msgs/msg/Imu",
+        "truth": "geometry_msgs/msg/PoseStamped",
+        "note": "std_msgs/msg/String",
+    }
+    with writer:
+        topics = {
+            (column, what): writer.add_connection(f"/{one}/{what}", name, typestore=store)
+            for column, one in enumerate(fleet.ids)
+            for what, name in names.items()
+            if what in ("fix", "odom", "imu") or column == 0
+        }
+        for step, t in enumerate(fleet.t):
+            for column in range(len(fleet.ids)):
+                x, u = fleet.position[step, column], fleet.velocity[step, column]
+                lat, lon, h = pymap3d.enu2geodetic(*x, 48.14, 11.58, 560.0)
+                yaw = float(np.arctan2(u[1], u[0]))
+                quaternion = turned(0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2))
+                status = kind["sensor_msgs/msg/NavSatStatus"](0, 1)
+                pose = kind["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turned(0.0, 0.0, 0.0, 1.0))
+                twist = kind["geometry_msgs/msg/Twist"](
+                    vector(float(np.hypot(*u[:2])), 0.0, 0.0), vector(0.0, 0.0, 0.0)
+                )
+                flat = np.zeros(36)
+                flat[0] = 0.01
+                messages = {
+                    "fix": kind[names["fix"]](header(t), status, lat, lon, h, np.diag([0.25, 0.25, 4.0]).ravel(), 2),
+                    "odom": kind[names["odom"]](
+                        header(t),
+                        "base",
+                        kind["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
+                        kind["geometry_msgs/msg/TwistWithCovariance"](twist, flat),
+                    ),
+                    "imu": kind[names["imu"]](
+                        header(t),
+                        quaternion,
+                        np.diag([0.01, 0.01, 0.01]).ravel(),
+                        vector(0.0, 0.0, 0.06 * float(np.cos(0.15 * (t - fleet.t[0])))),
+                        np.zeros(9),
+                        vector(0.0, 0.0, 9.8),
+                        np.zeros(9),
+                    ),
+                }
+                if column == 0:
+                    messages["truth"] = kind[names["truth"]](
+                        header(t), kind["geometry_msgs/msg/Pose"](point(*x.tolist()), quaternion)
+                    )
+                    messages["note"] = kind[names["note"]]("hello")
+                for what, message in messages.items():
+                    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+                    raw = serialize(message, names[what])
+                    writer.write(topics[column, what], round(t * 1e9), raw)
+
+
+def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    (tmp_path / "a.bag").write_bytes(b"no bag")
+    with pytest.raises(co.InputError, match=r"a\.bag = .*must be a ROS bag"):
+        read_log(tmp_path / "a.bag")

@@ -1,0 +1,87 @@
+"""docs/your_data.md as it stands: its script, its commands and its Python run one by one in an empty folder."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import coopoc as co
+from coopoc.data.kinds import KINDS
+
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
+COOPOC = [sys.executable, "-W", "error", "-m", "coopoc.cli"]
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, flags=re.DOTALL)
+
+
+def words(line: str) -> list[str]:
+    """Words of a command, with its quotes taken off."""
+    return [a or b for a, b in re.findall(r'"([^"]*)"|(\S+)', line)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("page")
+    (script,) = [text for text in blocks("python") if text.startswith("# make_log.py\n")]
+    (out / "make_log.py").write_text(script)
+    subprocess.run([sys.executable, "-W", "error", "make_log.py"], cwd=out, check=True)
+    return out
+
+
+def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
+    (tmp_path / "measurements.csv").write_text(blocks("csv")[0])
+    log = co.read_log(tmp_path)
+    assert log.recording.ids == ("red", "blue")
+    assert log.recording.arrival.tolist() == [[1]]
+    assert log.recording.sensors.range_std == 0.3
+
+
+def test_every_command_runs(folder: Path) -> None:
+    commands = [line for block in blocks("sh") for line in block.splitlines()]
+    assert len(commands) == 5
+    for command in commands[1:]:
+        done = subprocess.run([*COOPOC, *words(command)[1:]], cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        if "data check" in command:
+            assert "nothing looks wrong" in done.stdout
+            assert "stands at (180.0, -20.0, 0.0) m" in done.stdout
+    assert (folder / "mylog-check.png").is_file()
+    assert (folder / "coarse.png").is_file()
+    rows = pd.read_parquet(folder / "runs" / "side_by_side" / "results.parquet")
+    level = rows.groupby(["method", "max_neighbours"])["rt_le_m"].mean()
+    assert level["mhe", 3] < level["kalman", 3] < level["gnss", 3]
+
+
+def test_every_block_of_python_runs(folder: Path) -> None:
+    code = "\n".join(text for text in blocks("python") if not text.startswith("# make_log"))
+    script = folder / "page.py"
+    script.write_text(code)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "not used" not in done.stdout
+    assert "read: 180 fixes, 2700 ranges" in done.stdout
+    error = float(re.findall(r"\[\[([\d.]+)\]\]", done.stdout)[0])
+    assert error < 1.0
+
+
+def test_every_kind_is_on_the_page() -> None:
+    table = PAGE[PAGE.index("| kinds |") : PAGE.index("A relative measurement may")]
+    for kind in KINDS:
+        assert f"`{kind}`" in table or kind.endswith("_deg"), kind
+
+
+def test_egos_are_a_number_a_list_or_a_name(folder: Path, tmp_path: Path) -> None:
+    settings = {"data": str(folder / "mylog"), "method": "kalman", "max_neighbours": "0"}
+    for egos, wanted in ((2, 2), (["red", "blue"], 2), ("green", 1), ("red,blue", 2), ("auto", 3)):
+        frame = co.run_study("side_by_side", tmp_path, settings={**settings, "egos": egos}, progress=False).frame
+        assert len(np.unique(frame["ego"])) == wanted
