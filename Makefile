@@ -1,5 +1,7 @@
 # make paper   the environment, the training, the studies, the report in runs/paper/
 # make test    the environment, then style, types and tests
+# make test-quick   a part of the tests, in a minute once the kernels are compiled
+# make test-slow   the tests that make test leaves out: federations on nodes of their own, over TLS
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
 # make clean   forget the environment (results in runs/ stay)
@@ -14,7 +16,11 @@ READY := $(VENV)/.ready
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
-.PHONY: paper test test-bounds benchmark clean
+PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile
+QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_small formats formats_errors data_readers data_log \
+	optimize_problem optimize_agreement statistics study_tables study_grid layering)
+
+.PHONY: paper test test-quick test-slow test-bounds benchmark clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -22,7 +28,13 @@ paper: $(READY)
 test: $(VENV)/.ready-dev
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile
+	$(PYTEST) -m "not slow"
+
+test-quick: $(VENV)/.ready-dev
+	$(PYTEST) $(QUICK)
+
+test-slow: $(VENV)/.ready-dev
+	$(PYTEST) -m slow tests
 
 test-bounds: $(VENV)/.ready-dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \

@@ -16,12 +16,12 @@ from .compile import compiled
 LANES = 32
 """Measurements side by side: the rows of a tape's slots then stay in the nearest cache."""
 
-OPERATIONS = (
-    "INPUT", "OUTPUT", "CONST", "ASSIGN", "ADD", "SUB", "MUL", "DIV", "NEG", "SQ", "TWICE", "INV", "SQRT", "SIN", "COS",
-    "TAN", "ASIN", "ACOS", "ATAN", "ATAN2", "EXP", "EXPM1", "LOG", "LOG1P", "POW", "CONSTPOW", "SINH", "COSH", "TANH",
-    "FABS", "SIGN", "FMIN", "FMAX", "FLOOR", "CEIL", "FMOD", "REMAINDER", "HYPOT", "LT", "LE", "EQ", "NE", "NOT", "AND",
-    "OR", "IF_ELSE_ZERO",
-)  # fmt: skip
+_NAMES = """
+    INPUT OUTPUT CONST ASSIGN ADD SUB MUL DIV NEG SQ TWICE INV SQRT SIN COS TAN ASIN ACOS ATAN ATAN2 EXP EXPM1 LOG
+    LOG1P POW CONSTPOW SINH COSH TANH FABS SIGN FMIN FMAX FLOOR CEIL FMOD REMAINDER HYPOT LT LE EQ NE NOT AND OR
+    IF_ELSE_ZERO
+"""
+OPERATIONS = tuple(_NAMES.split())
 """Names of what a tape can hold, CasADi's without "OP_"; the kernel knows them by their place here."""
 
 

@@ -11,7 +11,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..kernels.graph_tape import accumulate
 from .factor import Factor
 from .ldl import LDL
 from .problem import Problem
@@ -172,6 +171,8 @@ class Sparse:
         return self.space.retract(x, wide)
 
     def _sum(self, x: Floats, model: Model, size: int) -> Floats:
+        from ..kernels.graph_tape import accumulate
+
         total = np.zeros(size)
         with np.errstate(all="ignore"):
             for k, factor in enumerate(self.factors):

@@ -7,16 +7,18 @@ which the kernel in kernels/graph_tape.py runs for all measurements.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..kernels.graph_tape import OPERATIONS, Tape
 from .factor import Factor
 from .losses import Loss
 from .measurements import Measurement
 from .space import Space
+
+if TYPE_CHECKING:
+    from ..kernels.graph_tape import Tape
 
 Model = Literal["cost", "gauss-newton", "newton"]
 
@@ -124,6 +126,8 @@ def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
 def _tape(function: Any) -> Tape:
     """The operations of a CasADi function of one vector."""
     import casadi as ca
+
+    from ..kernels.graph_tape import OPERATIONS, Tape
 
     known = {getattr(ca, f"OP_{name}"): k for k, name in enumerate(OPERATIONS)}
     count = function.n_instructions()

@@ -43,9 +43,10 @@ class NetNoise(NoiseModel):
     @classmethod
     def by(cls, model: NoiseNet, recording: Recording, egos: Sequence[int] | None = None) -> NetNoise:
         """By the same net on board of every vehicle, or of the egos and of whom they ever measure."""
-        links = recording.links
-        stars = None if egos is None else [*egos, *(links.neighbour[links.of(ego)] for ego in egos)]
-        fix, process = estimate_noise(model, recording, None if stars is None else np.unique(np.hstack(stars)))
+        links, members = recording.links, None
+        if egos is not None:
+            members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+        fix, process = estimate_noise(model, recording, members)
         return cls("net", recording.sensors, fix=fix, process=process)
 
     def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:

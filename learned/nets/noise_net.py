@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.methods.star import FORGOTTEN
 from coopoc.methods.track import Method, Track
@@ -245,7 +245,7 @@ class NoiseFilter:
 
 
 def estimate_noise(
-    model: NoiseNet, recording: Recording, vehicles: Sequence[int] | None = None
+    model: NoiseNet, recording: Recording, vehicles: Sequence[int] | Ints | None = None
 ) -> tuple[Floats, Floats]:
     """Variances of fixes and of motion (R, T, N, 3) m^2 by the net on board of each vehicle, default all; run by run.
 
@@ -254,8 +254,9 @@ def estimate_noise(
     columns = np.arange(recording.gnss.shape[2]) if vehicles is None else np.asarray(vehicles, dtype=np.int64)
     theta, (fix, process) = flatten([model]).double(), np.full((2, *recording.gnss.shape), np.nan)
     with one_core(), torch.inference_mode():
-        for run, own in enumerate(zip(recording.gnss, recording.velocity, strict=True)):
-            noise = model.variances(theta, *(lanes(a[None, :, columns]) for a in own), recording.dt)
+        for run in range(recording.runs):
+            gnss, velocity = (lanes(a[run][None, :, columns]) for a in (recording.gnss, recording.velocity))
+            noise = model.variances(theta, gnss, velocity, recording.dt)
             for found, part in zip((fix, process), noise, strict=True):
                 found[run, :, columns] = np.moveaxis(runs(part, 1)[0], 1, 0)
     return fix, process
