@@ -1,7 +1,7 @@
 # make paper   the environment, the training, the studies, the report in runs/paper/
-# make test    the environment, then style, types and tests
+# make test    the environment, then style and tests
 # make test-quick   a part of the tests, in a minute once the kernels are compiled
-# make test-slow   the tests that make test leaves out: federations on nodes of their own, over TLS
+# make test-slow   the tests that make test leaves out: strict types, deployments over TLS, clusters, kills, trainings
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
 # make clean   forget the environment (results in runs/ stay)

@@ -161,6 +161,7 @@ def test_a_failed_cell_is_repeated_when_asked(tmp_path: Path) -> None:
     assert coopoc(*words, "--retry-failed", cwd=tmp_path).returncode == 0
 
 
+@pytest.mark.slow
 def test_shards_are_merged_and_two_runs_compared(tmp_path: Path) -> None:
     for index in (1, 2):
         done = coopoc("run", "small", "--shard", f"{index}/2", "--out", f"m{index}", "--set", "runs=2", cwd=tmp_path)

@@ -50,6 +50,7 @@ print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in
     assert "town10: 60 vehicles" in out
 
 
+@pytest.mark.slow
 def test_installed_package_is_strictly_typed(site: Path, tmp_path: Path) -> None:
     config = str(ROOT / "pyproject.toml")
     outside(site, tmp_path, sys.executable, "-m", "mypy", "--strict", "--config-file", config, "-p", "coopoc")

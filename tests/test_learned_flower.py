@@ -284,6 +284,7 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         client_app()
 
 
+@pytest.mark.slow
 def test_train_with_flower_is_train(tmp_path: Path) -> None:
     """`coopoc train fedkalmannet --flower` writes the weights of `federate`; a second call finds them."""
     fleet = drives(2, steps=1010)

@@ -63,6 +63,7 @@ def train(message, context):
     return reply
 """
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(importlib.util.find_spec("flwr") is None, reason="flwr is not installed: coopoc[flower]"),
     pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="no /proc: processes cannot be counted or searched"),
     pytest.mark.filterwarnings("ignore:'click.utils:DeprecationWarning"),
@@ -170,7 +171,6 @@ def script(folder: Path, *options: object) -> list[str]:
     return [str(word) for word in words]
 
 
-@pytest.mark.slow
 def test_the_script_survives_the_death_of_a_node(tmp_path: Path, mark: str) -> None:
     """Four vehicles, TLS, keys, three rounds; the second vehicle is killed in the second."""
     fleet = drives(4)
@@ -196,7 +196,6 @@ def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path: Path, mark: st
     assert "must be >= 5 for Krum" in (tmp_path / "site" / "run.log").read_text()
 
 
-@pytest.mark.slow
 def test_a_killed_superlink_continues_after_its_last_round(tmp_path: Path, mark: str, example: Any) -> None:
     """SIGKILL of the SuperLink and all that it started, after round 1; new ones end at the weights of `federate`."""
     fleet, out = drives(2), tmp_path / "fedkalmannet.safetensors"
@@ -226,7 +225,6 @@ def test_the_script_stops_everything_on_ctrl_c(tmp_path: Path, mark: str) -> Non
         assert process.wait(60) != 0
 
 
-@pytest.mark.slow
 def test_only_registered_keys_over_tls_come_in(tmp_path: Path, mark: str, example: Any) -> None:
     """Two known nodes make the weights of `federate`; those who lack the key, TLS or the right server stay out."""
     fleet = drives(2)
@@ -278,7 +276,6 @@ def test_the_search_finds_a_drive_in_any_form(kind: str, audit: Any) -> None:
     assert kind in secret.found(noise + fixes.astype(kind).tobytes())
 
 
-@pytest.mark.slow
 def test_no_drive_leaves_its_client(tmp_path: Path, mark: str, example: Any, audit: Any) -> None:
     """Without TLS, so that the wire can be read: an honest run, then one that gives the drive away."""
     with subprocess.Popen(["sleep", "60"]) as child:

@@ -116,6 +116,7 @@ def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
         load_method("kalmannet9")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("quick")
 def test_train_all_makes_every_recipe_and_resumes(tmp_path: Path) -> None:
     fleet = drives()
@@ -201,6 +202,7 @@ def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
     assert len(card["limits"]) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fedokf", "recursive"])
 def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
     """To 1e-5 with the versions and the kind of machine that the card names, a few last bits of float32 after thousands

@@ -57,6 +57,7 @@ def program(*given: str, **env: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_every_method_reads_any_memory_layout_and_survives_odd_recordings() -> None:
     """Views, Fortran order, unaligned and swapped bytes give the digits of the valid recording; none crashes."""
     assert program("odd", *KERNELS) == ""

@@ -523,6 +523,7 @@ def test_osqp_is_silent(dense: Recording, capfd: pytest.CaptureFixture[str]) -> 
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.slow
 def test_the_platoon_example() -> None:
     """Each thing that is known lowers the error, and osqp and casadi agree on the lane."""
     script = Path(__file__).resolve().parents[1] / "examples" / "platoon.py"

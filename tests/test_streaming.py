@@ -369,6 +369,7 @@ def test_learned_methods_start_their_streams() -> None:
             np.testing.assert_array_equal(filter.step(Z + 1.0, U, 0.1)[0], stream.step(Z + 1.0, U, 0.1)[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", ["bundled", "KITTI 00"])
 def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
     arguments = []

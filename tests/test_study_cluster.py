@@ -18,6 +18,8 @@ from coopoc.study.compute import WorkerDiedError
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Study
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("distributed")
 
 DISTRIBUTION = Path(__file__).parent / "distribution"

@@ -138,6 +138,7 @@ def test_the_command_says_what_is_worse(tmp_path: Path, capsys: pytest.CaptureFi
     assert "worse" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_every_study_that_names_metrics_has_numbers_of_its_own_settings() -> None:
     for name in names("coopoc.studies"):
         study: Study = find("coopoc.studies", name)

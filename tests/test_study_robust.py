@@ -39,6 +39,7 @@ def cells(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.glob("cells/*.parquet")}
 
 
+@pytest.mark.slow
 def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path) -> None:
     """Thirty cells; each process goes on where the one before was killed: at its start, in a cell, or in a file."""
     settings = {"max_neighbours": ",".join(map(str, range(10)))}
@@ -119,6 +120,7 @@ def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
     return (done.stdout + done.stderr).splitlines()
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterwards(study: Study, tmp_path: Path) -> None:
     table = " ".join([*COMMAND[:-2], "table", "disk/small"])
     said = in_a_small_disk(

@@ -83,6 +83,7 @@ def test_three_shards_in_one_folder_make_the_tables_of_one_run(study: Study, tmp
     assert tables(tmp_path / "small") == tables(tmp_path / "whole/small")
 
 
+@pytest.mark.slow
 def test_shards_work_in_one_folder_at_the_same_time(study: Study, tmp_path: Path) -> None:
     run_study(study, tmp_path / "whole", settings={"pause": 0.1}, progress=False)
     shards = [start(tmp_path, "--shard", f"{i}/2", "--set", "pause=0.1") for i in (1, 2)]
@@ -194,6 +195,7 @@ def test_every_environment_that_worked_on_the_same_cells_is_named(
     assert run_study(study, tmp_path, settings={"runs": 2}, progress=False).environment["processor"] == "another one"
 
 
+@pytest.mark.slow
 def test_what_shards_share_is_prepared_by_one_at_a_time(study: Study, tmp_path: Path) -> None:
     """The second shard waits while the first prepares, and then finds what is there."""
     began = tmp_path / "began"

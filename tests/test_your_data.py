@@ -44,6 +44,7 @@ def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
     assert log.recording.sensors.range_std == 0.3
 
 
+@pytest.mark.slow
 def test_every_command_runs(folder: Path) -> None:
     commands = [line for block in blocks("sh") for line in block.splitlines()]
     assert len(commands) == 5
