@@ -29,6 +29,10 @@ from .rows import backward_difference, interpolate
 from .scale import check_scale, check_size, check_time
 
 TABLES, NMEA = (".csv", ".parquet", ".xlsx"), (".nmea", ".nme")
+OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
+"""Columns of a table of drives."""
+OF_LOGS = {"kind", "partner", "arrival", *KINDS} - OF_FLEETS - {"speed", "heading", "height"}
+"""Columns that no table of drives has."""
 TRUTH = "truth"
 """Stem of the file of a folder that holds the truth."""
 
@@ -189,11 +193,15 @@ def _rows_of_file(
     return read_rows(file, tally, columns, kinds, ignore)
 
 
-def log_files(path: Path) -> bool:
+def log_files(path: Path, columns: Mapping[str, str] | None = None) -> bool:
     """Whether a path is a log: a bag, NMEA, a folder with such files or tables, or a table with a column of a log.
 
-    >>> log_files(Path("drive.nmea"))
-    True
+    Args:
+        path: of a file or folder.
+        columns: names in the file, as `read_log` takes them; a key that only a log has makes it one.
+
+    >>> log_files(Path("drive.nmea")), log_files(Path("drive.parquet"), {"latitude": "lat"})
+    (True, True)
     """
     if is_bag(path):
         return True
@@ -201,10 +209,23 @@ def log_files(path: Path) -> bool:
         return any(file.suffix.lower() in (*TABLES, *NMEA) for file in path.iterdir())
     if path.suffix.lower() in NMEA:
         return True
-    return path.suffix.lower() in TABLES[:1] and path.is_file() and bool({"kind", "latitude"} & set(_header(path)))
+    if path.suffix.lower() not in TABLES:
+        return False
+    return bool(set(columns or ()) - OF_FLEETS) or bool(OF_LOGS & set(_header(path)))
 
 
 def _header(path: Path) -> list[str]:
+    """Column names of a table, none where the file cannot be read (its reader will name the fault)."""
+    if path.suffix.lower() == ".parquet":
+        from pyarrow import ArrowException
+        from pyarrow.parquet import read_schema
+
+        try:
+            return [str(name).lower() for name in read_schema(path).names]
+        except (OSError, ArrowException):
+            return []
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return []
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         return [word.strip().strip('"').lower() for word in file.readline(10_000).split(",")]
 

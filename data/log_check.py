@@ -22,6 +22,13 @@ WIDE, NARROW = 2.0, 0.4
 FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ENOUGH = 20
+MISTAKEN = (
+    (0.0, 3e-3, "Is t in ms, or finer? Divide it: stamps are in s."),
+    (5e-3, 2e-2, "Is speed in cm/s? Speeds are in m/s."),
+    (0.2, 0.4, "Is speed in km/h? Name it speed_kmh."),
+    (0.42, 0.55, "Is speed in miles an hour, or in knots? Speeds are in m/s."),
+)
+"""Ratios of the distance of fixes to that of odometry (least, largest), and the unit that explains them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +114,7 @@ def _of_vehicle(name: str, row: Mapping[str, Any], distance: float | None, turn:
             "or correlated in time. Give std columns or sensors=."
         )
     if distance is not None and not 0.8 <= distance <= 1.25:
-        hint = "Is speed in km/h? Name it speed_kmh." if 0.2 < distance < 0.4 else "Check the units of both."
+        hint = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
         found.append(f"{name}: fixes travel {distance:.2f} times as far as the odometry says. {hint}")
     if turn is not None and abs(turn) > np.radians(20):
         found.append(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -44,11 +44,11 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     return found
 
 
-def format_of(path: Path) -> str:
+def format_of(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """ "log" or "recording" for measurements, "" for anything else; MR.CLAM is found before."""
     if path.suffix == ".npz":
         return "recording" if is_recording(path) else ""
-    return "log" if log_files(path) else ""
+    return "log" if log_files(path, columns) else ""
 
 
 def recorder(name_or_path: str | Path, format: str) -> Callable[..., Recording]:

@@ -106,7 +106,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
                 "List the bundled fleets with coopoc data list, or check the path.",
             ),
         )
-    chosen = detect(path) if format is None else format
+    chosen = detect(path, options.get("columns")) if format is None else format
     if chosen not in READERS:
         raise unknown("format", chosen, READERS, "Or leave it out.")
     try:
@@ -138,7 +138,7 @@ def kind_of(name_or_path: str | Path) -> str:
     name, options = split(name_or_path)
     if name in DATASETS or in_file(name) or not Path(name).exists():
         return ""
-    return str(options.get("format") or detect(Path(name)))
+    return str(options.get("format") or detect(Path(name), options.get("columns")))
 
 
 def _truth(path: Path, log: Log) -> Fleet:
@@ -162,10 +162,14 @@ def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable
     return real_recorder(name_or_path, chosen) if chosen in REAL else None
 
 
-def detect(path: Path) -> str:
+def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """Format of a file or folder by its name and, for CSV and folders, by its contents.
 
     A CSV file is CARLA's if it has yaw and velocities, whose frame must be found out, or many columns of other names.
+
+    Args:
+        path: of the file or folder.
+        columns: names in the file; a key that only a log has makes it one.
 
     >>> detect(Path("drive.parquet"))
     'table'
@@ -179,7 +183,7 @@ def detect(path: Path) -> str:
             return "tum"
     if path.suffix == ".npz":
         return format_of(path) or "fleet"
-    if format_of(path):
+    if format_of(path, columns):
         return "log"
     known = {".parquet": "table", ".xml": "fcd", ".xlsx": "carla", ".tum": "tum", ".txt": "tum"}
     if path.suffix == ".csv":

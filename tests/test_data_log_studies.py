@@ -16,7 +16,7 @@ from logs import drive, long, seen, write
 import coopoc as co
 from coopoc.data.log import read_log
 from coopoc.data.log_check import check
-from coopoc.data.registry import load_fleet, load_log
+from coopoc.data.registry import kind_of, load_fleet, load_log
 from coopoc.evaluate.innovations import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.world.storage import digest, read_recording, save_recording
 
@@ -170,6 +170,7 @@ def _changed(frame: pd.DataFrame, kinds: list[str], change: object) -> pd.DataFr
 
 WRONG = {
     "speeds in km/h": (["vx", "vy"], lambda v: 3.6 * v, r"fixes travel 0\.2\d times as far.*speed_kmh"),
+    "speeds in miles an hour": (["vx", "vy"], lambda v: v / 0.44704, r"fixes travel 0\.4\d times as far.*miles an hour"),
     "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
     "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
     "ranges in feet": (["range"], lambda v: v / 0.3048, r"ranges miss the positions by \d+"),
@@ -182,6 +183,30 @@ def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
     frame = _changed(long(seen(drive(4, gap=15.0)), messages=False), kinds, change)
     doubts = check(read_log(write(frame, tmp_path / "log.csv"))).doubts
     assert any(pd.Series([doubt]).str.contains(message, regex=True)[0] for doubt in doubts), doubts
+
+
+def test_stamps_in_milliseconds_are_found(tmp_path: Path) -> None:
+    frame = long(seen(drive(4, gap=15.0)), messages=False)
+    file = write(frame.assign(t=1000 * frame["t"]), tmp_path / "log.csv")
+    assert any("Is t in ms" in doubt for doubt in check(read_log(file, dt=100, max_gap=1e4)).doubts)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_columns_of_a_log_make_a_table_one(tmp_path: Path, ending: str) -> None:
+    """A wide table with headers of its own is a log for every command, and its parts of a fleet are no drives."""
+    t = np.arange(100) / 10
+    frame = pd.DataFrame({"zeit": t, "auto": "a", "lat": 48 + 1e-6 * t, "lon": 11 + 1e-4 * t, "h": 500.0})
+    file = tmp_path / f"drive.{ending}"
+    frame.to_csv(file, index=False) if ending == "csv" else frame.to_parquet(file)
+    columns = "t:zeit,vehicle:auto,latitude:lat,longitude:lon,height:h"
+    assert kind_of(f"{file}?columns={columns}") == "log"
+    settings = {"method": "gnss,kalman", "max_neighbours": "0", "data": f"{file}?columns={columns}"}
+    results = co.run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False)
+    assert not results.failed
+    assert results.frame["innovation_m"].notna().any()
+    assert kind_of(f"{file}?columns=t:zeit,id:auto,x:lat,y:lon,z:h") == "table"
+    frame.rename(columns={"lat": "latitude", "lon": "longitude"}).to_parquet(tmp_path / "a.parquet")
+    assert kind_of(tmp_path / "a.parquet") == "log"
 
 
 def test_velocities_clockwise_from_north_are_found(tmp_path: Path) -> None:

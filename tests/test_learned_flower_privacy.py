@@ -146,7 +146,7 @@ def test_what_a_client_sends_is_masked() -> None:
 
 
 def test_the_masks_of_this_flower_have_32_bits() -> None:
-    """Seeds of 32 bytes whose words have the same exclusive or give the same mask: docs/privacy.md says so."""
+    """Seeds of 32 bytes whose words have the same exclusive or give the same mask: see docs/privacy.md."""
     seed = bytes(range(32))
     folded = seed[4:8] + seed[:4] + seed[8:]
     (one,), (two,) = (pseudo_rand_gen(s, 2**32, [(50,)]) for s in (seed, folded))

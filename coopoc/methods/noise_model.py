@@ -127,8 +127,8 @@ class NoiseModel:
 
 
 FINEST = 1e-5
-"""Least std that is assumed of a relative measurement, over the largest of a fix: 1 / FINEST^2 = 1e10 of the 1e16 that
-double precision tells apart, so that what fixes say of a star as a whole is not lost beside what holds it together."""
+"""Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
+beside 1 leaves the fixes six of double precision's sixteen digits."""
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
@@ -156,7 +156,7 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
 
 
 def _resolvable(known: NoiseModel) -> NoiseModel:
-    """With relative noise of at least FINEST of a fix's, angles at a distance of 1 m; a note says so."""
+    """With relative noise of at least FINEST of a fix's, angles at a distance of 1 m; a note names the floor."""
     least = FINEST * max(known.gnss_std)
     if known.sensors is None or min(known.sensors.relative_std) >= least:
         return known

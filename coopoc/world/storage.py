@@ -23,6 +23,20 @@ ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observe
 LINKS = ("step", "observer", "neighbour")
 LARGEST = 2**32
 """Bytes of one unpacked file."""
+DAMAGES = (
+    OSError,
+    EOFError,
+    KeyError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    zipfile.BadZipFile,
+    zlib.error,
+    NotImplementedError,
+    RuntimeError,
+    MemoryError,
+)
+"""What zipfile, zlib and NumPy raise on a damaged file."""
 
 
 def save_recording(recording: Recording, path: str | Path, truth: Fleet | None = None) -> None:
@@ -73,11 +87,9 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
             words = json.loads(str(stored["coopoc_recording"]))
             arrays = {name: stored[name] for name in stored.files if name != "coopoc_recording"}
         return _recording(words, arrays)
-    except (OSError, EOFError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except DAMAGES as error:
         if isinstance(error, InputError) and error.field == path.name:
             raise
-        found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, MemoryError) as error:
         found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 
