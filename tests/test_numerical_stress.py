@@ -12,23 +12,9 @@ import coopoc as co
 from coopoc.methods.catalogue import METHODS
 
 STEPS = 15
-COOPERATIVE = (
-    "lkf-sa",
-    "lkf-sa-edge",
-    "msmv-r",
-    "joint",
-    "drift",
-    "ci",
-    "split-ci",
-    "cooperative-map",
-    "cooperative-map-5",
-    "cooperative-map-gnc",
-    "fixed-lag",
-    "mhe",
-    "gbp",
-    "central-filter",
-    "batch-smoother",
-)
+ITERATIVE = ("admm", "diffusion", "diffusion-anchored", "mds", "qcqp-relaxation")
+"""Methods that claim no accuracy beside an exact one: unfinished consensus, and points without weights."""
+COOPERATIVE = [name for name, make in METHODS.items() if make("nominal").cooperative and name not in ITERATIVE]
 
 
 def in_line(count: int, gap: float, offset: float = 0.0) -> co.Fleet:
