@@ -1,0 +1,199 @@
+"""Mutation testing on a seeded sample: how many small faults do the tests that touch a file find?
+
+    python benchmarks/mutants.py --count 40 --seed 1 coopoc/world coopoc/evaluate --out mutants.csv
+
+A mutant is one change of one node of a file's syntax tree: a sign, a comparison, an operator, a constant, a term or a
+check that is left out. Tests that mention what the file defines run until the first fails. The file is put back after
+each; the tree must be clean. A mutant that survives is equivalent or shows a missing test.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import csv
+import random
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parents[1]
+COMPARISONS = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+}
+OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
+MOST_TESTS = 6
+"""Files of tests, those that mention the file's names most."""
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A changed file.
+
+    Args:
+        file: relative to the project.
+        line: of the change.
+        change: in words.
+        text: of the whole file.
+    """
+
+    file: str
+    line: int
+    change: str
+    text: str
+
+
+def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """Every change of one node, with what it does."""
+    match node:
+        case ast.Compare(ops=[op]) if type(op) in COMPARISONS:
+            other = COMPARISONS[type(op)]
+            changed = copy.deepcopy(node)
+            changed.ops = [other()]
+            yield f"{type(op).__name__} -> {other.__name__}", changed
+        case ast.BoolOp(op=op):
+            changed = copy.deepcopy(node)
+            changed.op = COMPARISONS[type(op)]()
+            yield f"{type(op).__name__} -> {type(changed.op).__name__}", changed
+        case ast.BinOp(op=op) if type(op) in OPERATORS and not isinstance(node.right, ast.Constant | ast.JoinedStr):
+            changed = copy.deepcopy(node)
+            changed.op = OPERATORS[type(op)]()
+            yield f"{type(op).__name__} -> {type(changed.op).__name__}", changed
+            if isinstance(op, ast.Add | ast.Sub):
+                yield "second term left out", copy.deepcopy(node.left)
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            yield "sign left out", copy.deepcopy(operand)
+        case ast.Constant(value=value) if isinstance(value, int | float) and not isinstance(value, bool):
+            other = value + 1 if isinstance(value, int) else value * 10 if value else 1.0
+            yield f"{value} -> {other}", ast.Constant(other)
+        case ast.If(body=[ast.Raise()], orelse=[]):
+            yield "check left out", ast.Pass()
+
+
+def mutants(file: Path) -> Iterator[Mutant]:
+    """All mutants of a file, whose annotations and docstrings stay."""
+    text = file.read_text()
+    tree = ast.parse(text)
+    for node in list(_inside_functions(tree)):
+        for change, other in changes(node):
+            changed = _Replaced(node.lineno, node.col_offset, type(node), other).visit(ast.parse(text))
+            words = ast.unparse(ast.fix_missing_locations(changed))
+            yield Mutant(str(file.relative_to(ROOT)), node.lineno, change, words)
+
+
+def _inside_functions(tree: ast.Module) -> Iterator[ast.expr | ast.stmt]:
+    """Nodes of the statements of all functions, but for what words an error."""
+    waiting: list[ast.AST] = [node for outer in tree.body for node in _bodies(outer)]
+    while waiting:
+        node = waiting.pop(0)
+        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.arguments):
+            continue
+        if isinstance(node, ast.expr | ast.stmt):
+            yield node
+        waiting += [node.value] if isinstance(node, ast.AnnAssign) and node.value else ast.iter_child_nodes(node)
+
+
+def _bodies(outer: ast.AST) -> list[ast.stmt]:
+    if isinstance(outer, ast.FunctionDef):
+        return outer.body
+    return [part for inner in outer.body for part in _bodies(inner)] if isinstance(outer, ast.ClassDef) else []
+
+
+class _Replaced(ast.NodeTransformer):
+    def __init__(self, line: int, column: int, kind: type[ast.AST], other: ast.AST) -> None:
+        self.key, self.other = (line, column, kind), other
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        if (getattr(node, "lineno", None), getattr(node, "col_offset", None), type(node)) == self.key:
+            return self.other
+        return self.generic_visit(node)
+
+
+def tests_of(file: str) -> list[str]:
+    """Files of tests that mention the names which a file defines, most mentions first."""
+    tree = ast.parse((ROOT / file).read_text())
+    defined = [
+        n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) and not n.name.startswith("_")
+    ]
+    words = re.compile("|".join(rf"\b{re.escape(word)}\b" for word in [*defined, Path(file).stem]))
+    counts = {str(t.relative_to(ROOT)): len(words.findall(t.read_text())) for t in (ROOT / "tests").glob("test_*.py")}
+    found = sorted((t for t in counts if counts[t]), key=lambda t: -counts[t])
+    return [*found[:MOST_TESTS], file]
+
+
+def survives(mutant: Mutant, limit: float, more: list[str]) -> bool:
+    """Whether all tests of the file, and `more`, pass with the mutant in its place; one that runs too long is found."""
+    file = ROOT / mutant.file
+    original = file.read_text()
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
+    try:
+        file.write_text(mutant.text)
+        done = subprocess.run(
+            [*command, *dict.fromkeys([*tests_of(mutant.file), *more])],
+            cwd=ROOT,
+            capture_output=True,
+            timeout=limit,
+            check=False,
+        )
+        return done.returncode == 0
+    except subprocess.TimeoutExpired:
+        return False
+    finally:
+        file.write_text(original)
+
+
+def main() -> None:
+    """Try a sample, print survivors and the share that was found."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", help="folders or files, relative to the project")
+    parser.add_argument("--count", type=int, default=300, help="mutants (default 300)")
+    parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
+    parser.add_argument("--limit", type=float, default=600.0, help="s for the tests of one mutant (default 600)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("mutants.csv"), help="one row per mutant (default mutants.csv)"
+    )
+    given = parser.parse_args()
+    if subprocess.run(["git", "status", "--porcelain"], cwd=ROOT, capture_output=True, text=True, check=True).stdout:
+        parser.error("the tree has changes: commit them first, for files are changed and put back")
+    named = [ROOT / name for name in given.folders]
+    files = sorted(file for name in named for file in ([name] if name.is_file() else name.rglob("*.py")))
+    drawn = random.Random(given.seed)
+    found = 0
+    with given.out.open("w", newline="") as out:
+        table = csv.writer(out)
+        table.writerow(["file", "line", "change", "found"])
+        for k in (bar := tqdm(range(given.count), unit="mutant")):
+            mutant = _drawn(files, drawn)
+            alive = survives(mutant, given.limit, given.tests)
+            found += not alive
+            bar.set_postfix(found=f"{found}/{k + 1}")
+            table.writerow([mutant.file, mutant.line, mutant.change, not alive])
+            out.flush()
+            if alive:
+                tqdm.write(f"survives: {mutant.file}:{mutant.line}: {mutant.change}", file=sys.stdout)
+    print(f"{found} of {given.count} mutants were found.")
+
+
+def _drawn(files: list[Path], drawn: random.Random) -> Mutant:
+    """A mutant of a file that is drawn by its size."""
+    while True:
+        (file,) = drawn.choices(files, [file.stat().st_size for file in files])
+        if all_ := list(mutants(file)):
+            return drawn.choice(all_)
+
+
+if __name__ == "__main__":
+    main()
