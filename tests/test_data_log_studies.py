@@ -170,7 +170,11 @@ def _changed(frame: pd.DataFrame, kinds: list[str], change: object) -> pd.DataFr
 
 WRONG = {
     "speeds in km/h": (["vx", "vy"], lambda v: 3.6 * v, r"fixes travel 0\.2\d times as far.*speed_kmh"),
-    "speeds in miles an hour": (["vx", "vy"], lambda v: v / 0.44704, r"fixes travel 0\.4\d times as far.*miles an hour"),
+    "speeds in miles an hour": (
+        ["vx", "vy"],
+        lambda v: v / 0.44704,
+        r"fixes travel 0\.4\d times as far.*miles an hour",
+    ),
     "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
     "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
     "ranges in feet": (["range"], lambda v: v / 0.3048, r"ranges miss the positions by \d+"),

@@ -1,0 +1,37 @@
+"""The README's table by a simulation that shares no code with the toolkit, on the fleet's arrays alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from oracles.paper_scenario import simulate
+
+import coopoc as co
+
+REFERENCE = Path(__file__).resolve().parents[1] / "studies" / "reference" / "neighbours.json"
+METHODS = (("gnss", "none"), ("lkf-sa", "identity"), ("joint", "nominal"))
+
+
+def published(most: int, method: str, noise_model: str) -> tuple[float, float]:
+    """Mean RT-LE m of the five egos, and its standard deviation from run to run."""
+    for number in json.loads(REFERENCE.read_text())["numbers"]:
+        where = number["where"] | {"metric": number["metric"]}
+        wanted = {"max_neighbours": most, "method": method, "noise_model": noise_model, "metric": "rt_le_m"}
+        if where | wanted | {"rate_hz": 10.0, "cap_bytes_per_second": 0.0} == where:
+            return number["value"], number["run_std"]
+    raise AssertionError((most, method, noise_model))
+
+
+@pytest.mark.parametrize(
+    "most", [0, 1, pytest.param(4, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)]
+)
+def test_an_independent_simulation_gives_the_published_errors(most: int) -> None:
+    fleet = co.load_fleet("town10")
+    draws = [np.random.default_rng([most, ego]) for ego in range(0, 60, 12)]
+    errors = [simulate(fleet.position, fleet.velocity, 12 * k, most, rng) for k, rng in enumerate(draws)]
+    for found, (method, noise_model) in zip(np.mean(errors, axis=0), METHODS, strict=True):
+        mean, std = published(most, method, noise_model)
+        assert abs(found - mean) < 4.0 * std + 0.005 * mean, (method, found, mean, std)
