@@ -161,6 +161,7 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", help="folders or files, relative to the project")
     parser.add_argument("--count", type=int, default=300, help="mutants (default 300)")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
+    parser.add_argument("--tests", nargs="*", default=[], help="files of tests that run for every mutant, too")
     parser.add_argument("--limit", type=float, default=600.0, help="s for the tests of one mutant (default 600)")
     parser.add_argument(
         "--out", type=Path, default=Path("mutants.csv"), help="one row per mutant (default mutants.csv)"
