@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.evaluate.innovations import dimensions
+from coopoc.pictures import COLORS, INK
 from coopoc.world.recording import Recording
 
 from .log import Log
@@ -16,9 +17,7 @@ from .log_check import UNITS, Check
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#5B3A1E", "#4D4D4D")
-"""Okabe and Ito's, then brown and grey; vehicles beyond them begin again."""
-INK, PALE = "#2B2F36", "#D8DEE6"
+PALE = "#D8DEE6"
 STYLE: dict[str, Any] = {
     "font.size": 9.5,
     "axes.edgecolor": "#9AA3AF",

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Floats, checked
+from ..arrays import Floats, checked, instance, number
 from ..errors import InputError
 from ..world.axes import texts
+from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.v2x import Message
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +71,46 @@ class Track:
                 "an estimate must be finite",
                 "The method diverged: lower its gain, or check the assumed standard deviations.",
             )
+
+    def plot(
+        self, ax: Axes | None = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None
+    ) -> Axes:
+        """Estimated paths of one run with 95 % ellipses, and the truth if a fleet is given.
+
+        Args:
+            ax: of matplotlib; None makes a figure, `plot().figure.savefig(...)` writes it.
+            fleet: that was observed, on the steps of the track.
+            run: 0..R-1.
+            every: steps from one ellipse to the next; None: a fortieth of the drive.
+
+        Raises:
+            InputError: a run that is not there, or a fleet of other steps.
+
+        >>> import coopoc as co
+        >>> fleet = co.Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+        >>> len(co.Kalman()(co.observe(fleet, co.Sensors())).plot(fleet=fleet).lines)
+        2
+        """
+        from ..pictures import COLORS, PALE, axes, ellipses, finish
+
+        run = number("run", run, 0, len(self.x) - 1, kind=int, allowed=f"in 0..{len(self.x) - 1}")
+        fair = max(len(self.t) // 40, 1)
+        every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
+        if fleet is not None and instance("fleet", fleet, Fleet).position.shape[0] != len(self.t):
+            raise InputError(
+                "fleet", repr(fleet), f"must have {len(self.t)} steps", "Give the fleet that was observed."
+            )
+        ax = axes(ax)
+        for k, ego in enumerate(self.egos):
+            color = COLORS[k % len(COLORS)]
+            if fleet is not None:
+                label = "truth" if k == 0 else None
+                ax.plot(*fleet.position[:, ego, :2].T, color=PALE, lw=4, zorder=1, label=label)
+            name = f"vehicle {ego}" if fleet is None else fleet.ids[ego]
+            ax.plot(*self.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=name)
+            if self.covariance is not None:
+                ellipses(ax, self.x[run, ::every, k, :2], self.covariance[run, ::every, k, :2, :2], color)
+        return finish(ax)
 
 
 @runtime_checkable
