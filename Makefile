@@ -3,6 +3,7 @@
 # make test-quick   a part of the tests, in a minute once the kernels are compiled
 # make test-slow   the tests that make test leaves out: strict types, deployments over TLS, clusters, kills, trainings
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
+# make docs    the site in build/site, tutorials executed; a warning is an error
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
 # make clean   forget the environment (results in runs/ stay)
 #
@@ -20,7 +21,7 @@ PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadf
 QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_small formats formats_errors data_readers data_log \
 	optimize_problem optimize_agreement statistics study_tables study_grid layering)
 
-.PHONY: paper test test-quick test-slow test-bounds benchmark clean
+.PHONY: paper test test-quick test-slow test-bounds docs benchmark help clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -40,6 +41,12 @@ test-bounds: $(VENV)/.ready-dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \
 		-n $(JOBS) --dist loadfile tests/test_memory_safety.py $(wildcard tests/test_kernels_s*.py)
 
+docs: $(VENV)/.ready-docs
+	NO_MKDOCS_2_WARNING=1 OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
+
+help:
+	@sed -n 's/^# \(make [a-z-]* .*\)/\1/p' Makefile
+
 benchmark: $(VENV)/.ready-dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py --gate
 
@@ -55,6 +62,11 @@ $(READY): pyproject.toml constraints.txt
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
 	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,nmea,ros,flower,privacy,export,cluster]'
+	@touch $@
+
+$(VENV)/.ready-docs: $(READY)
+	@echo "Installing the tools of the site." >&2
+	$(PIP) --no-build-isolation --editable '.[docs]'
 	@touch $@
 
 clean:

@@ -94,7 +94,7 @@ class AdaptiveKalman(NoiseAdaptive):
 
     References:
         Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
-    `town10-validation` (docs/methods.md).
+        `town10-validation` (docs/methods.md).
 
     >>> from coopoc import Fleet, observe
     >>> fleet = Fleet(("a",), np.arange(400) / 10, np.zeros((400, 1, 3)), np.zeros((400, 1, 3)))

@@ -1,0 +1,191 @@
+"""Pages that are made from the code when the site is built: a page per method, the gallery of studies, the API."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+import coopoc as co
+from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.plugins import find, names
+from coopoc.study import style
+
+matplotlib.use("Agg")
+DOCS = Path(__file__).parent
+STEPS, RUNS, EGO, NEIGHBOURS = 200, 10, 24, 4
+SECTIONS = {
+    "world": ("Worlds and measurements", "Fleets, sensors, V2X, recordings."),
+    "methods": ("Methods", "Recording → Track."),
+    "optimize": ("Problems and solvers", "Problems, factors, `solve`."),
+    "evaluate": ("Evaluation", "Metrics, bounds, statistics."),
+    "study": ("Studies", "Grids of cells, results, views."),
+    "fleets": ("Files", "Drives, graphs and logs from files."),
+    "errors": ("Errors", "What is raised on bad input."),
+}
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Give the made pages their place: empty lists of the navigation."""
+    places = {
+        "Each method": ["methods/index.md", *({style.look(name).label: f"methods/{name}.md"} for name in METHODS)],
+        "API": ["api/index.md", *({title: f"api/{room}.md"} for room, (title, _) in SECTIONS.items())],
+    }
+    _place(config.nav, places)
+    return config
+
+
+def _place(entries: Any, places: dict[str, list[Any]]) -> None:
+    for entry in entries:
+        for title, value in entry.items() if isinstance(entry, dict) else ():
+            if title in places:
+                entry[title] = places[title]
+            elif isinstance(value, list):
+                _place(value, places)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made."""
+    made = {**dict(_methods()), "gallery.md": _gallery(), **dict(_api())}
+    for path, content in made.items():
+        files.append(File.generated(config, path, content=content))
+    return files
+
+
+def _methods() -> Iterator[tuple[str, str | bytes]]:
+    """A page for each method: what it is, what it sends, how it does on one drive."""
+    fleet = co.load_fleet("town10").between(0, STEPS)
+    sensors = co.Sensors.paper_scenario2()
+    everyone = co.observe(fleet, sensors, co.V2X(NEIGHBOURS), runs=RUNS, seed=0)
+    bounds = dict(_bounds(fleet, sensors))
+    solo = _error(co.Kalman("nominal")(everyone, [EGO]), fleet)
+    table = _rows((DOCS / "methods.md").read_text())
+    lines = []
+    for name, make in METHODS.items():
+        method = make("nominal")
+        kind, look = type(method), style.look(name)
+        track = method(everyone, [EGO])
+        bound = "fleet, smoothing" if name == "batch-smoother" else "fleet" if name in WHOLE_FLEET else "star"
+        curves = (solo, _error(track, fleet), bounds[bound if method.cooperative else "solo"])
+        yield f"methods/{name}.png", _picture(fleet.t, curves, look, bound if method.cooperative else "solo")
+        what, sends, covariance = table.get(name, ("", "", ""))
+        size = method.message.payload if method.cooperative else 0
+        facts = [
+            f"| does | {what} |",
+            f"| sends | {sends or 'nothing'}{f' ({size} B payload)' if size else ''} |",
+            f"| covariance | {covariance} |",
+            f"| RT-LE in the picture | {_rms(track, fleet):.2f} m; Kalman filter {np.sqrt((solo**2).mean()):.2f} m |",
+        ]
+        notes = [f"- {note}" for note in track.notes]
+        yield (
+            f"methods/{name}.md",
+            "\n".join(
+                [
+                    f"# {look.label}",
+                    "",
+                    f"`{name}`, `coopoc.{kind.__name__}`" if hasattr(co, kind.__name__) else f"`{name}`",
+                    "",
+                    "| | |",
+                    "|---|---|",
+                    *facts,
+                    "",
+                    f"![Error of {look.label} over time]({name}.png)",
+                    "",
+                    f"Root mean square error of one ego over {RUNS} noise draws, `town10`, scenario 2, "
+                    f"{NEIGHBOURS} neighbours, ideal channel, nominal noise model.",
+                    "",
+                    *(["Notes on its Track:", "", *notes, ""] if notes else []),
+                    f"::: {kind.__module__}.{kind.__name__}",
+                    "",
+                ]
+            ),
+        )
+        lines.append(f"| [{look.label}]({name}.md) | `{name}` | {what} | {_rms(track, fleet):.2f} |")
+    head = ["# Each method", "", "| method | name | what it does | RT-LE [m] |", "|---|---|---|---|"]
+    yield "methods/index.md", "\n".join([*head, *lines, ""])
+
+
+def _bounds(fleet: Any, sensors: Any) -> Iterator[tuple[str, Any]]:
+    """Root of the bound's trace over time, m, by information set."""
+    v2x = co.V2X(NEIGHBOURS)
+    yield "solo", _root(co.posterior_bound(fleet, sensors, EGO))
+    yield "star", _root(co.posterior_bound(fleet, sensors, EGO, v2x))
+    yield "fleet", _root(co.posterior_bound(fleet, sensors, EGO, v2x, information="fleet"))
+    yield "fleet, smoothing", _root(co.posterior_bound(fleet, sensors, EGO, v2x, smoothing=True, information="fleet"))
+
+
+def _root(bound: Any) -> Any:
+    return np.sqrt(np.trace(bound, axis1=-2, axis2=-1))
+
+
+def _rows(page: str) -> dict[str, tuple[str, str, str]]:
+    """Name -> what it does, sends and claims, from the first table of the overview."""
+    found = {}
+    for line in page.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 5 and cells[0].startswith("`"):
+            own, others = (re.findall(r"`([\w-]+)`", cells[k]) for k in (0, 2))
+            found |= dict.fromkeys(own, (cells[2], cells[3], cells[4]))
+            found |= {name: (cells[2], cells[3], cells[4]) for name in others if name not in found}
+    return found
+
+
+def _error(track: Any, fleet: Any) -> Any:
+    gap = track.x[:, :, 0] - fleet.position[None, :, EGO]
+    return np.sqrt((gap**2).sum(axis=-1).mean(axis=0))
+
+
+def _rms(track: Any, fleet: Any) -> float:
+    return float(np.sqrt((_error(track, fleet) ** 2).mean()))
+
+
+def _picture(t: Any, curves: tuple[Any, Any, Any], look: Any, information: str) -> bytes:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.2, 3.0), dpi=130, layout="constrained")
+    ax = figure.add_subplot()
+    solo, error, bound = curves
+    ax.plot(t, solo, color="#E69F00", lw=1.0, label="Kalman filter, alone")
+    ax.plot(t, error, color=look.color, lw=1.6, label=look.label)
+    ax.plot(t, bound, color="black", ls="--", lw=1.0, label=f"bound, {information}")
+    ax.set(xlabel="Time [s]", ylabel="RMS error [m]", yscale="log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter("{x:g}")
+    ax.grid(True, color="#E3E7EC")
+    ax.legend(fontsize=8, frameon=False)
+    out = io.BytesIO()
+    figure.savefig(out, format="png")
+    return out.getvalue()
+
+
+def _gallery() -> str:
+    """Every study with its question, its figure and its page."""
+    lines = ["# Studies", "", "`coopoc run NAME` repeats each; [how](studies.md).", ""]
+    for name in names("coopoc.studies"):
+        study = find("coopoc.studies", name)
+        page = f"[{name}]({name}.md)" if (DOCS / f"{name}.md").is_file() else name
+        lines += [f"## {page}", "", f"*{study.question}*", ""]
+        if (DOCS / f"{name}.md").is_file():
+            finding = re.search(r"\*\*.+?\*\*.*?\.(?=\s)", (DOCS / f"{name}.md").read_text(), re.DOTALL)
+            lines += [" ".join(finding.group(0).split()), ""] if finding else []
+        if (DOCS / f"{name}.png").is_file():
+            lines += [f"![{name}]({name}.png)" + "{ .gallery }", ""]
+    return "\n".join(lines)
+
+
+def _api() -> Iterator[tuple[str, str]]:
+    """A page for each room, with the public names that live there."""
+    homes = re.findall(r"from \.([\w.]+) import (\w+)", (DOCS.parent / "coopoc" / "__init__.pyi").read_text())
+    lines = ["# API reference", "", "Public names of `import coopoc as co`; each is one page's entry.", ""]
+    for room, (title, words) in SECTIONS.items():
+        mine = [(module, name) for module, name in homes if module.split(".")[0] == room]
+        yield f"api/{room}.md", "\n".join([f"# {title}", "", *(f"::: coopoc.{m}.{n}\n" for m, n in mine)])
+        lines.append(f"- [{title}]({room}.md): {words} " + ", ".join(f"`{name}`" for _, name in mine))
+    yield "api/index.md", "\n".join([*lines, ""])

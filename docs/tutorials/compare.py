@@ -1,0 +1,81 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+# ---
+
+# %% [markdown]
+# # Compare methods on a drive
+#
+# Sixty vehicles drive through a town. One of them, the ego, is followed by filters that know nothing of the others, by
+# filters that exchange messages with their neighbours, and by a net that was trained on four other vehicles. All meet
+# the same noise, and the posterior Cramér-Rao bound says how good any of them could be.
+
+# %%
+import coopoc as co
+from coopoc.learned import load_method
+
+fleet = co.load_fleet("town10")
+sensors, v2x, ego = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=4), "town10-24"
+seen = co.observe(fleet, sensors, v2x, runs=20, seed=0, observers=[ego])
+seen
+
+# %% [markdown]
+# A `Recording` holds what vehicles may see, in 20 noise draws, and no truth. Dots are fixes; lines are what the ego
+# measures at one step.
+
+# %%
+seen.between(0, 300).plot(step=150).figure
+
+# %% [markdown]
+# ## Six methods
+#
+# RT-LE is the root of the time-averaged squared error. The noise model is what a method assumes: `identity` is what
+# the paper's baselines do, `nominal` knows the acting standard deviations.
+
+# %%
+methods = {
+    "GNSS": co.GNSS(),
+    "Kalman filter, identity": co.Kalman("identity"),
+    "Kalman filter, nominal": co.Kalman("nominal"),
+    "FedKalmanNet": load_method("fedkalmannet"),
+    "LKF-SA, identity": co.LKFSA("identity"),
+    "joint filter, nominal": co.JointFilter("nominal"),
+}
+tracks = {name: method(seen, [ego]) for name, method in methods.items()}
+for name, track in tracks.items():
+    rate = track.received_bytes.mean() / (len(track.t) * seen.dt)
+    print(f"{name:25s}{co.rt_le(track, fleet).mean():6.2f} m {rate:8.0f} B/s")
+bound = co.bound_rt_le(co.posterior_bound(fleet, sensors, ego, v2x))
+print(f"{'bound of the star':25s}{bound:6.2f} m")
+
+# %% [markdown]
+# ## Is the difference real?
+#
+# Draws are paired: method A and method B meet the same noise, so that the interval of their difference is narrow.
+
+# %%
+solo, joint = (co.rt_le(tracks[name], fleet) for name in ("Kalman filter, nominal", "joint filter, nominal"))
+print(co.paired_difference(joint, solo))
+
+# %% [markdown]
+# ## Does it know how wrong it is?
+#
+# NEES, the squared error in units of the claimed covariance, should be 3 for a position in space.
+
+# %%
+for name in ("Kalman filter, identity", "Kalman filter, nominal", "joint filter, nominal"):
+    print(f"{name:25s} NEES {co.nees(tracks[name], fleet).mean():6.2f}")
+
+# %%
+tracks["joint filter, nominal"].plot(fleet=fleet, every=45).figure
+
+# %% [markdown]
+# ## Over neighbours, with tables and figures
+#
+# A study does this over a grid, resumes after Ctrl-C, and writes tables and figures for a paper:
+#
+#     coopoc run neighbours --set runs=30
+#     coopoc table runs/neighbours --format latex

@@ -1,0 +1,47 @@
+"""The site: every page has a place, and the tutorials run as they stand."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
+
+
+def test_every_page_has_a_place() -> None:
+    placed = set(re.findall(r"[\w/]+\.(?:md|py)", (ROOT / "mkdocs.yml").read_text().split("\nnav:\n")[1]))
+    pages = {str(p.relative_to(ROOT / "docs")) for p in [*(ROOT / "docs").glob("*.md"), *TUTORIALS]}
+    assert pages - placed == set()
+    assert placed - pages == {"gallery.md"}
+
+
+@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-W", "error", tutorial], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def test_the_ten_lines_of_the_start_run(tmp_path: Path) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "index.md").read_text(), flags=re.DOTALL)
+    (tmp_path / "start.py").write_text(block)
+    command = [sys.executable, "-W", "error", tmp_path / "start.py"]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    errors = [float(found) for found in re.findall(r" ([\d.]+) m", out)]
+    assert errors[0] > 5 > errors[2] > 2 > errors[1] > errors[3] > 0.9 * errors[4]
+
+
+def test_doctests_of_pages_are_fenced() -> None:
+    """The extension of the API pages, which the package does not contain."""
+    pytest.importorskip("griffe")
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        from doctests import fenced
+    finally:
+        sys.path.pop(0)
+    assert fenced("Words.\n\n>>> 1 + 1\n2") == "Words.\n\n```pycon\n>>> 1 + 1\n2\n```"
