@@ -11,7 +11,7 @@ from coopoc.world.channels import CHANNELS
 
 from . import budget_tables, lineup, scene, weights
 from .budget_tables import AXES, CAPS, SCHEDULED, SCHEDULES, SHARED, TRAINED, under, way
-from .lineup import BOUND, of
+from .lineup import PAST, of
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -40,10 +40,10 @@ def _grid() -> list[dict[str, Any]]:
     rates = [way("ideal", 10, rate_hz=rate) for rate in RATES]
     caps = [way("ideal", 10, cap_bytes_per_second=cap) for cap in CAPS]
     return [
-        *(of(*pair, **way("ideal", 0)) for pair in (*SOLO, BOUND)),
+        *(of(*pair, **way("ideal", 0)) for pair in (*SOLO, PAST)),
         *(of(*pair, **each) for each in (*channels, *rates, *caps) for pair in SHARED),
         *(under(cap, each, *pair) for cap in CAPS for each in SCHEDULES[1:] for pair in SCHEDULED),
-        *(of(*BOUND, **way("ideal", k)) for k in NEIGHBOURS),
+        *(of(*PAST, **way("ideal", k)) for k in NEIGHBOURS),
     ]
 
 
@@ -65,7 +65,7 @@ def _pareto(results: Results) -> Plot | None:
             else:
                 level = [Line(of(*pair), error, {"alpha": 0.75})]
                 drawn += draw(left, level) and draw(right, level)
-        for pair in (*SHARED, BOUND):
+        for pair in (*SHARED, PAST):
             found = sorted((one.size, one.error) for one in ran if _pair(one) == pair and one.size)
             if found:
                 right.plot(*zip(*found, strict=True), **{**strokes(of(*pair), thin=True), "linestyle": "none"})
@@ -81,8 +81,8 @@ def _pareto(results: Results) -> Plot | None:
     text = (
         "RT-LE against bytes. Left: what each vehicle sends and receives in training, spread over 1, 10 and 100 hours "
         "of driving (right to left). Right: payload that an ego receives over a channel that loses nothing, at each K, "
-        "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound forgets "
-        "what newcomers did before; estimates and sums carry it."
+        "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound counts "
+        "what newcomers did before, which estimates and sums carry."
     )
     return Plot(figure, scene.caption(results, text))
 
@@ -119,12 +119,12 @@ def choices(results: Results) -> list[Choice]:
         where = dict(zip(names, each, strict=True))
         if where["channel"] == "ideal" and (error := mean(results, where)) is not None:
             found.append(Choice(error, mean(results, where, PAYLOAD) or 0.0, where))
-    return [one for one in found if _pair(one) in (*SOLO, *SHARED, BOUND)]
+    return [one for one in found if _pair(one) in (*SOLO, *SHARED, PAST)]
 
 
 def best_under(found: Sequence[Choice], limit: float) -> Choice | None:
     """The best method of them within `limit` bytes per second."""
-    able = [one for one in found if one.size <= limit and _pair(one) != BOUND]
+    able = [one for one in found if one.size <= limit and _pair(one) != PAST]
     return min(able, key=lambda one: one.error, default=None)
 
 

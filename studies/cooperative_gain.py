@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.evaluate.bounds import past_bound, posterior_bound
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.plugins import find
@@ -40,7 +39,7 @@ LINES = (
     ("joint", "fitted"),
     ("lkf-sa", "identity"),
 )
-BOUNDS = (("bound", "star"), ("bound", "with its past"))
+BOUNDS = (("bound", "star"), lineup.PAST)
 RECEIVERS = ("mixed", "changing")
 """Two receivers in five are POOR and the others GOOD; all are POOR in the middle third of the drive and else GOOD."""
 GOOD, POOR = 1.5, 5.0
@@ -85,7 +84,7 @@ def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
 def cell(p: Params) -> list[Row]:
     """Rows of one method, K and loss, per training seed, ego and run; of a bound, one row per ego."""
     if p["method"] == "bound":
-        return lineup.bound_rows(p, past_bound if p["noise_model"] == "with its past" else posterior_bound)
+        return lineup.bound_rows(p)
     seen = recording(p)
     return lineup.rows(p, made=_methods(p, seen), seen=seen)
 

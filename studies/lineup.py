@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
+from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
 from coopoc.evaluate.scores import rows_of, scored
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.cooperative_map import CooperativeMAP
@@ -21,17 +21,17 @@ from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
-from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
-from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import FIX_AND_VELOCITY, V2X
+from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
 from .presence import complete, scored_where_present
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 BOUND = ("bound", "bound")
+PAST = ("bound", "with its past")
+"""The bound of a star whose newcomers bring what they did before, as messages with estimates or sums do."""
 """The bound as (method, noise model)."""
 
 
@@ -166,8 +166,12 @@ def rows(
     return found
 
 
-def bound_rows(p: Params, bound: Callable[[Fleet, Sensors, int, V2X], Floats] = posterior_bound) -> list[Row]:
-    """The bound of each ego over an ideal channel, which needs no draws, with the bytes that the ego would receive."""
+def bound_rows(p: Params) -> list[Row]:
+    """The bound of each ego over an ideal channel, which needs no draws, with the bytes that the ego would receive.
+
+    The noise model of PAST makes it the bound with the past of newcomers.
+    """
+    bound = past_bound if (p["method"], p.get("noise_model")) == PAST else posterior_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if not drive.present.any():  # a bound is of a geometry that is known
         return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]

@@ -88,9 +88,12 @@ def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
     2.0
     """
     links = find_links(fleet, [ego], v2x.max_neighbours, v2x.radius, sensors.min_range)
-    own = slice(3 * ego, 3 * ego + 3)
-    stages = stages_of(fleet, sensors, links, [np.arange(len(fleet.ids))] * len(fleet.t))
-    return np.stack([cov[own, own] for _, cov in covariances(stages, smoothing=False)])
+    members = [np.flatnonzero(row) for row in fleet.present]
+    out = np.empty((len(fleet.t), 3, 3))
+    for t, cov in _recursion(fleet, sensors, links, members, smoothing=False):
+        own = 3 * int(np.searchsorted(members[t], ego)) + np.arange(3)
+        out[t] = cov[np.ix_(own, own)]
+    return out
 
 
 def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoothing: bool = False) -> Floats:
