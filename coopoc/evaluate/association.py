@@ -29,13 +29,19 @@ def associated(estimate: Floats, truth: Floats, max_diff: float = 0.01, offset: 
     max_diff, x = number("max_diff", max_diff), x + number("offset", offset, -np.inf)
     swap = len(x) > len(y)
     short, long = (y, x) if swap else (x, y)
-    after = np.clip(np.searchsorted(long, short), 1, max(len(long) - 1, 1)) if len(long) > 1 else np.zeros(len(short), int)
+    after = (
+        np.clip(np.searchsorted(long, short), 1, max(len(long) - 1, 1)) if len(long) > 1 else np.zeros(len(short), int)
+    )
     before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(long[before] - short) <= np.abs(long[after] - short), before, after) if len(long) else after
+    nearest = (
+        np.where(np.abs(long[before] - short) <= np.abs(long[after] - short), before, after) if len(long) else after
+    )
     kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff) if len(long) else np.zeros(0, int)
     if not len(kept):
         span = f"{_span(x)} and {_span(y)}"
-        raise InputError("stamps", span, f"must agree within {max_diff:g} s somewhere", "Check the clocks: offset=, max_diff=.")
+        raise InputError(
+            "stamps", span, f"must agree within {max_diff:g} s somewhere", "Check the clocks: offset=, max_diff=."
+        )
     pair = (kept.astype(np.int64), nearest[kept].astype(np.int64))
     return (pair[1], pair[0]) if swap else pair
 

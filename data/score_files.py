@@ -1,0 +1,143 @@
+"""coopoc score: trajectories of other people's programs against a truth."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path as File
+from typing import Annotated, Any
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+from coopoc.errors import InputError
+from coopoc.evaluate.relative_error import Unit
+from coopoc.evaluate.score import Aligned, Path, Score, scores
+from coopoc.formats.kitti import read_kitti
+from coopoc.formats.lines import read_words
+from coopoc.formats.rotations import to_rotation
+from coopoc.formats.tum import read_tum
+
+from .cells import numeric, read_frame, seconds, words
+from .source import split
+
+COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
+QUATERNION = ("qx", "qy", "qz", "qw")
+
+
+def read_paths(name: str) -> dict[str, Path]:
+    """Trajectories of a file, by vehicle: TUM and KITTI hold one, named after the file, a table several.
+
+    A table has columns t, x, y, z (m; without z in the plane), and as known id, qx, qy, qz, qw, and cxx, cxy, cxz, cyy,
+    cyz, czz (m^2). KITTI files have no stamps: poses are numbered, or `?times=FILE` gives them.
+
+    Raises:
+        InputError: a file with a fault, named with its line or row.
+    """
+    word, options = split(name)
+    file = File(word)
+    if not file.is_file():
+        raise InputError("file", str(file), "must be a file", "Check the path.")
+    if file.suffix.lower() in (".csv", ".parquet", ".xlsx"):
+        return _of_table(file, dict(options.get("columns", {})))
+    if len(next(read_words(file), (0, []))[1]) == 12:
+        poses = read_kitti(file, options.get("times"))
+        stamps = np.arange(len(poses), dtype=float) if poses.stamps is None else poses.stamps
+        return {file.stem: Path(stamps, poses.position, poses.rotation)}
+    poses = read_tum(file, repeats="drop" if options.get("repeats") == "drop" else "refuse")
+    assert poses.stamps is not None
+    return {file.stem: Path(poses.stamps, poses.position, poses.rotation)}
+
+
+def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
+    frame = read_frame(file, columns.get("id", "id")).rename(columns={header: key for key, header in columns.items()})
+    for column in ("t", "x", "y"):
+        if column not in frame.columns:
+            headers = ", ".join(map(str, frame.columns))
+            hint = f'Name it behind the file: "{file.name}?columns={column}:HEADER".'
+            raise InputError(f"{file.name}: column {column}", "missing", f"must be there; the file has {headers}", hint)
+    t = seconds(frame, "t", file.name)
+    ids = words(frame, "id", file.name) if "id" in frame.columns else [file.stem] * len(frame)
+    heights = numeric(frame, "z", file.name) if "z" in frame.columns else np.zeros(len(frame))
+    at = np.column_stack([numeric(frame, "x", file.name), numeric(frame, "y", file.name), heights])
+    turned = covariance = None
+    if set(QUATERNION) <= set(frame.columns):
+        turned = to_rotation(np.column_stack([numeric(frame, column, file.name) for column in QUATERNION]))
+    if set(COVARIANCE) <= set(frame.columns):
+        xx, xy, xz, yy, yz, zz = (numeric(frame, column, file.name) for column in COVARIANCE)
+        covariance = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
+    found = {}
+    for name in dict.fromkeys(ids):
+        rows = np.flatnonzero(np.array(ids, dtype=object) == name)
+        rows = rows[np.argsort(t[rows], kind="stable")]
+        twice = np.flatnonzero(np.diff(t[rows]) == 0)
+        if len(twice):
+            where, stamp = f"{file.name}: row {rows[twice[0] + 1] + 1}", f"{t[rows[twice[0]]]:.17g} s"
+            raise InputError(where, stamp, f"is there twice for {name}", "Leave one of them out.")
+        parts = (None if part is None else part[rows] for part in (turned, covariance))
+        found[name] = Path(t[rows], at[rows], *parts)
+    return found
+
+
+def score(
+    estimates: Annotated[Positional[tuple[str, ...]], arg(metavar="ESTIMATE")],
+    /,
+    truth: Annotated[tuple[str, ...], arg(metavar="FILE")] = (),
+    align: Aligned = "none",
+    max_diff: float = 0.01,
+    delta: float = 1.0,
+    unit: Unit = "steps",
+    output: Annotated[File | None, arg(metavar="FILE")] = None,
+) -> int:
+    """Score trajectories of any program against a truth: RT-LE, APE, RPE and NEES, with intervals over blocks of time.
+
+    Example: coopoc score orb.txt --truth truth.txt --align each
+
+    Example: coopoc score team.csv --truth truth.csv --align team --output scores.json
+
+    Args:
+        estimates: TUM, KITTI, CSV, Parquet; of several vehicles by several files or a column id.
+        truth: the same kinds of files; vehicles are matched by file name or id.
+        align: none compares in the frame given, each aligns every vehicle, team moves all by one motion.
+        max_diff: s, how far stamps that belong together may be apart.
+        delta: between the poses of the relative error.
+        unit: of delta, steps or m.
+        output: the scores as JSON.
+    """
+    if not truth:
+        raise InputError("truth", "()", "must name a file", "Add --truth FILE.")
+    made: list[dict[str, Path]] = [{}, {}]
+    for paths, files in zip(made, (estimates, truth), strict=True):
+        for name in files:
+            for vehicle, path in read_paths(name).items():
+                if vehicle in paths:
+                    raise InputError("vehicle", repr(vehicle), "is in two files", "Name the files, or ids, apart.")
+                paths[vehicle] = path
+    rows = scores(*made, aligned=align, max_diff=max_diff, delta=delta, unit=unit)
+    print(table(rows, delta, unit))
+    if output is not None:
+        output.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        print(f"coopoc: scores are in {output}", file=sys.stderr)
+    return 0
+
+
+def table(rows: list[Score], delta: float, unit: Unit) -> str:
+    """The scores as a Markdown table."""
+    from tabulate import tabulate
+
+    relative = f"RPE, {delta:g} {unit} [m]"
+    shown: list[dict[str, Any]] = [
+        {
+            "vehicle": row.vehicle,
+            "poses": row.poses,
+            "without truth": row.missed,
+            "RT-LE [m]": str(row.rt_le_m),
+            "APE [m]": str(row.ape_m),
+            "largest [m]": f"{row.ape_max_m:.3g}",
+            relative: "" if row.rpe_m is None else f"{row.rpe_m:.3g}",
+            "NEES": "" if row.nees is None else f"{row.nees:.3g}",
+        }
+        for row in rows
+    ]
+    return str(tabulate(shown, headers="keys", tablefmt="github", disable_numparse=True))

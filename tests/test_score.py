@@ -1,0 +1,159 @@
+"""Scores of foreign trajectories: evo's figures, its association, and laws of alignment and covariance."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coopoc.data.score_files import read_paths, score
+from coopoc.errors import InputError
+from coopoc.evaluate.association import associated
+from coopoc.evaluate.relative_error import relative_error
+from coopoc.evaluate.score import Path as Track
+from coopoc.evaluate.score import rms_interval, scores
+from coopoc.formats.kitti import read_kitti
+from coopoc.formats.tum import write_tum
+
+EVO = {(1, "steps"): (0.028120377, 4540), (10, "steps"): (0.194007758, 454), (100, "m"): (1.193975925, 36)}
+"""evo 1.38.1, `metrics.RPE`, translation part, of KITTI 00 and ORB-SLAM: rmse m, and number of pairs."""
+
+
+@pytest.mark.parametrize(("delta", "unit"), EVO)
+def test_relative_errors_are_evos(shared: Path, delta: float, unit: str) -> None:
+    """Independent check: evo's rmse and pairs, measured with evo 1.38.1."""
+    truth, estimate = (read_kitti(shared / "evo_oracle" / f"KITTI_00_{name}.txt") for name in ("gt", "ORB"))
+    both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
+    error = relative_error(*both, delta, unit)  # type: ignore[arg-type]
+    rmse, pairs = EVO[delta, unit]
+    assert len(error) == pairs
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(rmse, rel=1e-6)
+
+
+def test_stamps_are_paired_as_evo_pairs_them() -> None:
+    """Independent check: indices of evo 1.38.1, `sync.associate_trajectories` with max_diff 0.05 s."""
+    rng = np.random.default_rng(0)
+    a, b = np.sort(rng.uniform(0, 10, 50)), np.sort(rng.uniform(0, 10, 80))
+    i = [1, 2, 4, 6, 9, 10, 11, 14, 19, 21, 22, 23, 27, 28, 32, 35, 36, 37, 42, 43, 44, 46, 47, 48, 49]
+    j = [1, 2, 3, 11, 16, 22, 24, 25, 30, 40, 41, 41, 44, 45, 47, 49, 50, 50, 61, 64, 64, 70, 70, 78, 79]
+    assert [found.tolist() for found in associated(a, b, 0.05)] == [i, j]
+    assert [found.tolist() for found in associated(b, a, 0.05)] == [j, i]
+    assert [found.tolist() for found in associated(a - 3.0, b, 0.05, offset=3.0)] == [i, j]
+    with pytest.raises(InputError, match=r"must agree within 0\.01 s somewhere"):
+        associated(a, b + 100.0)
+    with pytest.raises(InputError, match="no stamps"):
+        associated(a, np.zeros(0))
+
+
+def team(seed: int = 0, std: float = 0.3) -> tuple[dict[str, Track], dict[str, Track]]:
+    """Two vehicles, estimated in a frame that is turned and moved, with the covariance that acts there."""
+    rng, t = np.random.default_rng(seed), np.arange(400) / 10
+    turn = Rotation.from_euler("z", 0.7).as_matrix()
+    cov = np.diag([std, 2 * std, std]) ** 2
+    truths, estimates = {}, {}
+    for k, name in enumerate(("red", "blue")):
+        at = np.column_stack([10 * t, 5 * np.sin(t / 5) + 8 * k, 0.1 * np.cos(t)])
+        error = rng.multivariate_normal(np.zeros(3), cov, len(t))
+        truths[name] = Track(t, at)
+        estimates[name] = Track(
+            t, (at + error) @ turn.T + [5, -3, 1], None, np.tile(turn @ cov @ turn.T, (len(t), 1, 1))
+        )
+    return estimates, truths
+
+
+def test_a_team_is_moved_as_one_and_its_covariances_with_it() -> None:
+    estimates, truths = team()
+    for row in scores(estimates, truths, aligned="team"):
+        assert row.ape_m.mean == pytest.approx(0.3 * np.sqrt(6), rel=0.05)
+        assert row.ape_m.low < 0.3 * np.sqrt(6) < row.ape_m.high
+        assert row.nees == pytest.approx(3.0, rel=0.1)
+        assert row.rt_le_m.mean > 100
+    swapped = {"red": estimates["blue"], "blue": estimates["red"]}
+    apart, together = (scores(swapped, truths, aligned=how) for how in ("each", "team"))  # type: ignore[arg-type]
+    assert max(row.ape_m.mean for row in apart) < 1.0 < 6.0 < min(row.ape_m.mean for row in together)
+
+
+def test_intervals_over_blocks_hold_the_rms_of_correlated_errors() -> None:
+    """Errors with a correlation time of a second in a drive of 200 s: 95 % intervals hold in most of 100 drives."""
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(100):
+        error, white = np.zeros(2000), rng.normal(size=2000)
+        for k in range(1, 2000):
+            error[k] = 0.9 * error[k - 1] + np.sqrt(1 - 0.81) * white[k]
+        interval = rms_interval(error)
+        held += interval.low <= 1.0 <= interval.high
+    assert held >= 85
+
+
+def test_the_command_gives_evos_figures_from_files(
+    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """evo's published APE of KITTI 00, aligned, read from KITTI files and from the same poses as TUM and as CSV."""
+    folder = shared / "evo_oracle"
+    times = folder / "KITTI_00_gt_times.txt"
+    truth = (f"{folder / 'KITTI_00_gt.txt'}?times={times}",)
+    poses = read_kitti(folder / "KITTI_00_ORB.txt", times)
+    write_tum(poses, tmp_path / "orb.tum")
+    frame = pd.DataFrame(poses.position, columns=["x", "y", "z"]).assign(zeit=poses.stamps)
+    frame.to_csv(tmp_path / "orb.csv", index=False)
+    names = (
+        f"{folder / 'KITTI_00_ORB.txt'}?times={times}",
+        tmp_path / "orb.tum",
+        f"{tmp_path / 'orb.csv'}?columns=t:zeit",
+    )
+    for name in names:
+        assert score((str(name),), truth, "each", output=tmp_path / "scores.json") == 0
+        (row,) = json.loads((tmp_path / "scores.json").read_text())
+        assert row["ape_m"]["mean"] == pytest.approx(1.303450, abs=5e-6)
+        assert row["ape_max_m"] == pytest.approx(3.587949, abs=5e-6)
+        assert (row["rpe_m"] is None) == (str(name).endswith("zeit"))
+    assert "APE [m]" in capsys.readouterr().out
+
+
+def test_tables_hold_vehicles_and_covariances(tmp_path: Path) -> None:
+    estimates, truths = team()
+    parts = []
+    for name, track in estimates.items():
+        assert track.covariance is not None
+        frame = pd.DataFrame(track.position, columns=["x", "y", "z"]).assign(id=name, t=track.t)
+        for k, column in enumerate(("cxx", "cxy", "cxz", "cyy", "cyz", "czz")):
+            i, j = np.triu_indices(3)
+            frame[column] = track.covariance[:, i[k], j[k]]
+        parts.append(frame)
+    pd.concat(parts).sample(frac=1, random_state=0).to_parquet(tmp_path / "team.parquet")
+    read = read_paths(str(tmp_path / "team.parquet"))
+    assert set(read) == {"red", "blue"}
+    wanted, found = (scores(each, truths, aligned="team") for each in (estimates, read))
+    assert {row.vehicle: row.nees for row in found} == pytest.approx({row.vehicle: row.nees for row in wanted})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,x\n0,1\n", r"a\.csv: column y = missing: must be there; the file has t, x"),
+        ("t,x,y\n0,1,2\n0,3,4\n", r"a\.csv: row 2 = 0 s: is there twice for a"),
+        ("t,x,y\n0,1,two\n", r"row 1, column y"),
+    ],
+)
+def test_a_bad_table_is_named(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_paths(str(tmp_path / "a.csv"))
+
+
+def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
+    estimates, truths = team()
+    with pytest.raises(InputError, match=r"vehicle = 'green': has no truth among red, blue"):
+        scores({"green": estimates["red"]}, truths)
+    with pytest.raises(InputError, match="must be a file"):
+        read_paths(str(tmp_path / "nowhere.tum"))
+    with pytest.raises(InputError, match="must fit into the drive once"):
+        relative_error(
+            (np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1))), (np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1))), 5
+        )
+    with pytest.raises(InputError, match="must name a file"):
+        score(("a.tum",))
