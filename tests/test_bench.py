@@ -1,0 +1,113 @@
+"""CL-Bench: its tasks stay apart from those on which parameters are chosen, its cards say what was measured."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.errors import InputError
+from coopoc.studies import bench, bench_tasks
+from coopoc.studies.bench_tasks import TASKS, VALIDATION, VERSION
+
+ROOT = Path(__file__).resolve().parents[1]
+CARDS = sorted((ROOT / "benchmarks" / "cards").glob("*.json"))
+PAPER = next(task for task in TASKS if task.name == "paper")
+
+OWN = """
+from dataclasses import dataclass, replace
+import coopoc as co
+
+@dataclass(frozen=True)
+class Own:
+    noise_model: object = "nominal"
+    name: str = "own"
+    cooperative: bool = False
+    message: co.Message = co.Message("nothing", 0)
+
+    def __call__(self, recording, egos=(0,)):
+        if recording.sensors.gnss_bias != (0.0, 0.0) or recording.v2x.max_neighbours == 0:
+            raise ValueError("neighbours are missing")
+        return co.GNSS()(recording, egos)
+"""
+
+
+@pytest.fixture
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks with two runs and two egos."""
+    few = tuple(replace(task, runs=2, egos=2) for task in TASKS if task.name in ("alone", "paper", "spoofed"))
+    monkeypatch.setattr(bench, "TASKS", few)
+
+
+def test_parameters_are_chosen_on_other_drives_and_draws() -> None:
+    for task, other in zip(TASKS, VALIDATION, strict=True):
+        assert (task.name, task.sensors, task.v2x) == (other.name, other.sensors, other.v2x)
+        assert task.seed != other.seed
+    used = {co.load_fleet(task.data).digest for task in TASKS}
+    chosen = {co.load_fleet(name).digest for name in ("town10-validation", "town10-clients")}
+    assert not used & chosen
+    assert {task.data for task in VALIDATION} == {"town10-validation"}
+
+
+def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> None:
+    assert bench.benchmark(("joint", "kalman"), out=tmp_path) == 0
+    card = json.loads((tmp_path / "joint.json").read_text())
+    assert (card["benchmark"], card["method"], card["source"]) == (VERSION, "joint", "")
+    row = {row["task"]: row for row in card["tasks"]}["paper"]
+    task = replace(PAPER, runs=2, egos=2)
+    fleet, egos = co.load_fleet("town10"), list(task.columns)
+    seen = co.observe(fleet, task.sensors, task.v2x, runs=2, seed=task.seed, observers=egos)
+    error = co.rt_le(co.JointFilter("nominal")(seen, egos), fleet)
+    assert row["rt_le_m"][0] == pytest.approx(error.mean(), abs=1e-4)
+    least = np.sqrt(np.mean([co.bound_rt_le(co.posterior_bound(fleet, task.sensors, e, task.v2x)) ** 2 for e in egos]))
+    assert row["bound_m"] == pytest.approx(least, abs=1e-4)
+    assert row["over_bound"] == pytest.approx(np.sqrt((error**2).mean()) / least, abs=1e-3)
+    solo = {row["task"]: row for row in json.loads((tmp_path / "kalman.json").read_text())["tasks"]}
+    assert solo["spoofed"]["rt_le_m"] == solo["paper"]["rt_le_m"]
+    assert solo["paper"]["received_bytes_per_second"] == 0
+
+
+def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None, tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN)
+    name = f"{tmp_path / 'mine.py'}:Own"
+    assert bench.benchmark((name,), out=tmp_path) == 1
+    (file,) = tmp_path.glob("*.json")
+    card = json.loads(file.read_text())
+    assert len(card["source"]) == 64
+    rows = {row["task"]: row for row in card["tasks"]}
+    assert rows["alone"]["failed"] == "ValueError: neighbours are missing"
+    assert rows["paper"]["rt_le_m"][0] == pytest.approx(6.06, abs=0.1)
+    assert "failed" in bench.page([card])
+
+
+def test_wrong_words_are_named(tmp_path: Path) -> None:
+    for given, message in (
+        (((), {}), "must name a method"),
+        ((("joint",), {"tasks": ("papr",)}), "must be of alone, paper"),
+        (((), {"table": True, "out": tmp_path}), "holds no card"),
+    ):
+        with pytest.raises(InputError, match=message):
+            bench.benchmark(given[0], **given[1])  # type: ignore[arg-type]
+
+
+def test_no_committed_card_lies_below_its_bound() -> None:
+    assert len(CARDS) > 20
+    for file in CARDS:
+        card = json.loads(file.read_text())
+        assert card["benchmark"] == VERSION
+        for row in card["tasks"]:
+            assert row.get("over_bound", 1.0) > 0.96, (card["method"], row)
+
+
+def test_the_page_shows_the_committed_cards() -> None:
+    """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
+    assert bench.page([json.loads(file.read_text()) for file in CARDS]) in (ROOT / "docs" / "benchmark.md").read_text()
+
+
+def test_the_bound_with_the_past_is_least() -> None:
+    levels = [bench_tasks.bound(PAPER, each) for each in ("solo", "star", "past")]
+    assert levels == sorted(levels, reverse=True)
