@@ -210,6 +210,21 @@ def test_a_number_is_one_as_c_writes_it(tmp_path: Path, word: str) -> None:
         load_graph(tmp_path / "a.g2o")
 
 
+@pytest.mark.parametrize("share", [-1e-3, -1e-6, 1e-3])
+def test_a_covariance_with_a_small_negative_eigenvalue_is_refused(tmp_path: Path, share: float) -> None:
+    """Rounding is 1e-9 of the largest eigenvalue; what is a thousand times more was written so."""
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    covariance = turn @ np.diag([1.0, 0.5, share]) @ turn.T
+    upper = " ".join(map(repr, covariance[np.triu_indices(3)].tolist()))
+    text = f"VERTEX_SE2 0.0 A0 0 0 0\nVERTEX_SE2 1.0 A1 1 0 0\nEDGE_SE2 1.0 A0 A1 1 0 0 {upper}\n"
+    (tmp_path / "a.pyfg").write_text(text)
+    if share > 0:
+        np.testing.assert_allclose(load_graph(tmp_path / "a.pyfg").relative_pose.covariance[0], covariance, atol=1e-15)
+    else:
+        with pytest.raises(InputError, match=r"a\.pyfg: line 3"):
+            load_graph(tmp_path / "a.pyfg")
+
+
 def test_an_information_matrix_is_positive_definite(tmp_path: Path) -> None:
     """By eigenvalues, over random symmetric matrices: those with a negative one are refused, the others read."""
     rng = np.random.default_rng(0)

@@ -245,3 +245,31 @@ def test_what_one_recording_drew_another_shares_and_nobody_keeps(crossing: Fleet
     assert np.array_equal(few.relative, apart)
     other = observe(crossing, Sensors(), V2X(max_neighbours=2), runs=2, seed=1)
     assert not np.array_equal(other.gnss, wide.gnss)
+
+
+def test_a_message_is_held_until_it_is_too_old() -> None:
+    """By the definition, link by link: the newest message of the sender that has arrived, unless older than max_age."""
+    fleet = Fleet(("a", "b", "c"), np.arange(40) / 10, *np.moveaxis(np.zeros((2, 40, 3, 3)), 0, 0))
+    fleet = replace(fleet, position=fleet.position + np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0]]))
+    channel = V2X(2, loss=0.6, latency=0.2, max_age=0.5)
+    recording = observe(fleet, Sensors(), channel, runs=3, seed=1, observers=[0])
+    held, links = inbox(recording, 0, FIX_AND_VELOCITY), recording.links
+    forgotten = 0
+    for run in range(3):
+        for k, link in enumerate(held.link.tolist()):
+            step, sender = int(links.step[link]), int(links.neighbour[link])
+            same = (links.neighbour == sender) & (recording.arrival[run] >= 0) & (recording.arrival[run] <= step)
+            newest = links.step[same & (links.step <= step)].max(initial=-1)
+            too_old = newest >= 0 and step - newest > 5
+            forgotten += too_old
+            assert held.newest[run, k] == (-1 if too_old else newest)
+    assert forgotten > 3
+
+
+def test_a_range_that_would_be_negative_is_reflected() -> None:
+    """|d + n| at 3 m with a noise of 10 m: never negative, and its mean is that of a folded normal (SciPy)."""
+    fleet = Fleet(("a", "b"), np.arange(2000) / 10, np.zeros((2000, 2, 3)), np.zeros((2000, 2, 3)))
+    fleet = replace(fleet, position=fleet.position + np.array([[0.0, 0, 0], [3, 0, 0]]))
+    seen = observe(fleet, Sensors(range_std=10.0), V2X(1), runs=5, seed=2, observers=[0])
+    assert (seen.relative[..., 0] >= 0).all()
+    assert seen.relative[..., 0].mean() == pytest.approx(stats.foldnorm(0.3, scale=10.0).mean(), rel=0.03)
