@@ -68,6 +68,24 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
         assert found.cost >= verdict.lower_bound * (1 - 1e-9)
 
 
+def test_a_point_beside_the_optimum_is_refused_by_default_and_certified_if_asked() -> None:
+    """A gap of 1e-5 to 1e-3 of the cost is none of rounding: the tolerance of 1e-6 refuses, one of a tenth does not."""
+    problem = anchored(1)
+    best = minima(problem)[0]
+    away = np.random.default_rng(0).normal(size=best.x.shape)
+    gaps = []
+    for step in 10.0 ** np.arange(-12.0, -4.0, 0.25):
+        x = best.x + step * away
+        beside = replace(best, x=x, cost=0.5 * float((problem.whiten(x)[0] ** 2).sum()))
+        verdict = certify(problem, beside)
+        share = verdict.gap / max(beside.cost, 1.0)
+        assert verdict.certified == (share <= 1e-6)
+        if 1e-5 < share < 1e-3:
+            gaps.append(share)
+            assert certify(problem, beside, tolerance=0.1).certified
+    assert gaps
+
+
 @pytest.mark.parametrize("d", [2, 3])
 def test_bounds_hold_and_certificates_agree_with_the_relaxation(d: int) -> None:
     """Certified means tight, with the relaxation's bound; what is not certified still has a bound below every cost."""
