@@ -8,6 +8,7 @@ import pytest
 from coopoc.optimize import Loss, Problem, pose, solve
 from coopoc.optimize.assess import assess
 from coopoc.optimize.dense import NUMBERS, damped_step, diagonal_blocks, is_small, normal_matrix
+from coopoc.optimize.descend import _damping
 
 
 def plane() -> Problem:
@@ -77,3 +78,12 @@ def test_one_matrix_and_blocks_assess_alike(monkeypatch: pytest.MonkeyPatch) -> 
         assert whole.covariance == pytest.approx(blocks.covariance, rel=1e-9, abs=1e-12)
         assert (whole.cost, whole.gradient_norm) == pytest.approx((blocks.cost, blocks.gradient_norm), abs=1e-9)
         assert whole.remaining == pytest.approx(blocks.remaining, abs=1e-9)
+
+
+def test_damping_follows_the_share_of_the_promise_that_came_true() -> None:
+    """Marquardt's rule (Marquardt 1963; Nocedal and Wright 2006, algorithm 4.1): less where the model was good, as it
+    was where it was fair, more where it was poor although the cost fell, ten times where it rose."""
+    mu = np.array([1e-2, 1e-2, 1e-2, 0.0, 1e-2, 0.0])
+    share = np.array([0.9, 0.5, 0.1, 0.1, -1.0, -1.0])
+    better = np.array([True, True, True, True, False, False])
+    assert _damping(mu, better, share) == pytest.approx([2e-3, 1e-2, 4e-2, 1e-2, 1e-1, 1e-3])
