@@ -49,8 +49,10 @@ from .optimize.space import pose as pose
 from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
+from .world.body import Body as Body
 from .world.channel_load import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
+from .world.frames import in_world as in_world
 from .world.links import Links as Links
 from .world.recording import Recording as Recording
 from .world.sensing import observe as observe
