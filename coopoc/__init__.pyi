@@ -10,6 +10,8 @@ from .evaluate.ledger import break_even as break_even
 from .evaluate.metrics import max_error as max_error
 from .evaluate.metrics import nees as nees
 from .evaluate.metrics import rt_le as rt_le
+from .evaluate.pose_metrics import heading_error as heading_error
+from .evaluate.pose_metrics import pose_nees as pose_nees
 from .evaluate.statistics import paired_difference as paired_difference
 from .fleets import load_fleet as load_fleet
 from .fleets import load_recording as load_recording
@@ -31,6 +33,7 @@ from .methods.mds import MDS as MDS
 from .methods.moving_horizon import MovingHorizon as MovingHorizon
 from .methods.msmv import MSMV as MSMV
 from .methods.noise_model import NoiseModel as NoiseModel
+from .methods.pose_filter import PoseFilter as PoseFilter
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
 from .methods.track import Method as Method
