@@ -71,11 +71,11 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
     if d > 4:
         scale, bias = 1.0 / (1.0 + vector[X, block + 4]), vector[X, block + 5]
     heading = vector[X, block + HEADING] + 0.5 * dt * (rate - bias)
-    cos, sin = dt * math.cos(heading), dt * math.sin(heading)
-    east, north = scale * (cos * forward - sin * left), scale * (sin * forward + cos * left)
+    cos, sin, up = dt * scale * math.cos(heading), dt * scale * math.sin(heading), dt * scale * up
+    east, north = cos * forward - sin * left, sin * forward + cos * left
     vector[X, block] += east
     vector[X, block + 1] += north
-    vector[X, block + 2] += dt * scale * up
+    vector[X, block + 2] += up
     vector[X, block + HEADING] += dt * (rate - bias)
     if d > 4:
         vector[X, block + 4] *= noise.keep
@@ -88,7 +88,7 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
                 ds = -scale * (cov[block + 4, j] if side == 0 else cov[j, block + 4])
                 db = -dt * (cov[block + 5, j] if side == 0 else cov[j, block + 5])
             turn += 0.5 * db
-            moves = (east * ds - north * turn, north * ds + east * turn, dt * scale * up * ds, db)
+            moves = (east * ds - north * turn, north * ds + east * turn, up * ds, db)
             for i in range(4):
                 if side == 0:
                     cov[block + i, j] += moves[i]
@@ -107,7 +107,7 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
     cov[block + 1, block + 1] += sin * sin * qf + cos * cos * ql
     cov[block, block + 1] += cos * sin * (qf - ql)
     cov[block + 1, block] += cos * sin * (qf - ql)
-    cov[block + 2, block + 2] += dt * dt * qu
+    cov[block + 2, block + 2] += (dt * scale) ** 2 * qu
     effect = (-0.5 * dt * north, 0.5 * dt * east, 0.0, dt)
     for i in range(4):
         for j in range(4):
