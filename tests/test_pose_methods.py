@@ -69,7 +69,7 @@ def test_joint_is_best_intersection_is_cautious_and_naive_is_not() -> None:
     assert error["joint"] < error["naive"]
     assert nees["naive"] > 6.0
     assert nees["intersection"] < 3.3
-    assert nees["joint"] == pytest.approx(3.0, abs=0.4)
+    assert nees["joint"] == pytest.approx(3.0, abs=0.8)  # errors that all share: about 120 independent values
 
 
 def test_scale_and_bias_are_found_where_they_act() -> None:

@@ -142,6 +142,8 @@ def add_relative(
         for k in range(begin, end):
             place = (seen.place[k, 0], seen.place[k, 1], seen.place[k, 2])
             ends = (d * seen.observer[k], d * seen.other[k], left_out[k])
+            if max(poses.cov[ends[0], ends[0]], poses.cov[max(ends[1], 0), max(ends[1], 0)]) > 0.5 * noise.flat:
+                continue  # nothing is known of the place of one of the two
             found = (seen.relative[run, k, 0], seen.relative[run, k, 1], seen.relative[run, k, 2])
             left_out[k] = update_relative(poses, size, ends, place, found, (noise.relative, noise.gate))
     if options.invariant:

@@ -88,6 +88,8 @@ def pose_filter(seen, noise, begin, spread, options, run):  # type: ignore[no-un
         P += block_diag(*[block[1] for block in blocks])
         x, P = own(x, P, seen, noise, (run, t, d))
         links = range(seen.first[t], seen.first[t + 1])
+        known = [P[d * k, d * k] < FLAT / 2 for k in range(len(now))]
+        links = [k for k in links if known[seen.observer[k]] and (seen.other[k] < 0 or known[seen.other[k]])]
         if len(links):
             x, P = relative(x, P, seen, noise, (run, links, d), options.passes)
         rows = {seen.member[i]: np.arange(d * k, d * k + d) for k, i in enumerate(now)}
