@@ -153,7 +153,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     sightings[:, 2] = [row.get(subject, -1) for subject in sightings[:, 2].tolist()]
     true_range, true_bearing, heading = _true(seen, truths, start, max_gap)
     return MrclamLog(
-        fleet=_fleet(folder, numbers, t, poses[..., :2]),
+        fleet=_fleet(folder, numbers, t, poses),
         heading=poses[..., 2],
         speed=odometry[..., 0],
         turn_rate=odometry[..., 1],
@@ -173,8 +173,9 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     )
 
 
-def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, xy: Floats) -> Fleet:
+def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, poses: Floats) -> Fleet:
     ids = tuple(f"robot{n}" for n in numbers)
+    xy = poses[..., :2]
     position = np.concatenate([xy, np.where(np.isnan(xy[..., :1]), np.nan, 0.0)], axis=2)
     return Fleet(
         ids,
@@ -184,6 +185,7 @@ def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, xy: Floats) -> Fle
         name=folder.name.lower(),
         source=f"UTIAS MR.CLAM, Vicon truth, z = 0 ({PAPER})",
         licence="none stated: read, not redistributed",
+        heading=poses[..., 2],
     )
 
 

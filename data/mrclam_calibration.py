@@ -19,6 +19,8 @@ LAGS = np.arange(0.0, 0.525, 0.025)
 """s, that are tried."""
 WINDOW = 20.0
 """s, over which errors are summed: longer than they are correlated."""
+PLANE_STD = 0.01
+"""rad, assumed for the inclination, which is pi/2 since the robots drive on one floor."""
 LASTING = 60.0
 """s, after which scale and bias of odometry are taken as others."""
 FEWEST = 100
@@ -78,6 +80,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
         yaw_rate_std=_summed(turned_off, window),
         range_std=ranges,
         azimuth_std=bearings,
+        inclination_std=PLANE_STD,
         compass=False,
         speed_scale_std=_in_blocks(ahead, speed * wheel, log.fleet.dt),
         yaw_rate_bias_std=_in_blocks(turned_off, np.ones(rate.shape), log.fleet.dt),
@@ -112,7 +115,7 @@ def _summed(error: Floats, window: int) -> float:
 
 
 def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
-    """Standard deviations m and rad of white noise as informative as ranges and bearings of robots and landmarks are."""
+    """Standard deviations m and rad of white noise as informative as the ranges and bearings are."""
     marks = log.sightings[log.sightings[:, 2] >= 0]
     place = log.landmarks[marks[:, 2].astype(np.int64), 1:]
     own = _poses(log, marks[:, 0], marks[:, 1].astype(np.int64))

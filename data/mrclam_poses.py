@@ -1,4 +1,4 @@
-"""MR.CLAM -> Recording in body frames, with nothing simulated: wheel odometry, and robots and landmarks that are seen."""
+"""MR.CLAM -> Recording in body frames, with nothing simulated: odometry, and robots and landmarks that are seen."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from .mrclam_recording import changes, kept
 
 
 def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
-    """Recording of the robots' own measurements, one run: speed and yaw rate, range and bearing of robots and landmarks.
+    """Recording of the robots' own measurements, one run: odometry, range and bearing of robots and landmarks.
 
-    There are no fixes and no compass. Of several measurements of a subject in a step the one nearest to the step's
+    There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of a subject in a step the one nearest to the step's
     instant is kept; at most K robots, nearest first by measured range, and all landmarks.
 
     Args:
@@ -48,7 +48,7 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
     table = np.vstack([_robots(log, v2x), _landmarks(log, n)])
     table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
     links = Links(*table[:, :3].astype(np.int64).T)
-    relative = np.column_stack([table[:, 3:], np.full(len(table), np.nan)])[None]
+    relative = np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None]
     still = np.zeros((steps, len(ids), 3))
     broadcasts, arrival = schedule(Fleet(ids, log.fleet.t, still, still), links, v2x, 1, 0)
     arrival[:, links.neighbour >= n] = -1
@@ -65,7 +65,10 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
         sensors=known.sensors,
         v2x=v2x,
         observers=tuple(range(len(ids))),
-        notes=("odometry, ranges and bearings are real; no fix, no compass, nothing simulated",),
+        notes=(
+            "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
+            "inclination was not measured: pi/2 by the constraint z = 0",
+        ),
         body=Body(rate, np.full(rate.shape, np.nan)),
         landmarks=tuple(range(n, len(ids))),
     )

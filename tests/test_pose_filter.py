@@ -89,7 +89,8 @@ def test_with_a_perfect_heading_it_is_the_position_filter(formation: co.Fleet, n
     drive = formation.between(0, 200)
     exact = co.Sensors(gnss_std=(3.5,) * 3, heading_std=0.0, yaw_rate_std=0.0, velocity_reading="speed")
     body = co.observe(drive, exact, co.V2X(max_neighbours=neighbours), runs=8, frame="body", observers=[0])
-    here, there = (co.rt_le(m(r), drive).mean() for m, r in ((co.PoseFilter(), body), (co.JointFilter(), in_world(body))))
+    here = co.rt_le(co.PoseFilter()(body), drive).mean()
+    there = co.rt_le(co.JointFilter()(in_world(body)), drive).mean()
     assert here == pytest.approx(there, rel=0.01)
 
 

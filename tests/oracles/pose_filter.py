@@ -56,7 +56,9 @@ def pose_filter(seen, noise, begin, spread, options, run):  # type: ignore[no-un
             u = np.append(seen.velocity[run, sent, n], seen.yaw_rate[run, sent, n])
             if n not in old:
                 fix, compass = np.nan_to_num(seen.gnss[run, sent, n]), np.nan_to_num(seen.heading[run, sent, n])
-                state = np.concatenate([fix if sent >= 0 else [0, 0, 0], [compass if sent >= 0 else 0], np.zeros(d - 4)])
+                state = np.concatenate(
+                    [fix if sent >= 0 else [0, 0, 0], [compass if sent >= 0 else 0], np.zeros(d - 4)]
+                )
                 wide = np.array([FLAT] * 3 + [UNKNOWN] + list(noise.lasting[: d - 4]))
                 if t == 0:
                     given = np.isfinite(begin[run, n])
