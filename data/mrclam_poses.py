@@ -23,8 +23,9 @@ from .mrclam_recording import changes, kept
 def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
     """Recording of the robots' own measurements, one run: odometry, range and bearing of robots and landmarks.
 
-    There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of a subject in a step the one nearest to the step's
-    instant is kept; at most K robots, nearest first by measured range, and all landmarks.
+    There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of
+    a subject in a step the one nearest to the step's instant is kept; at most K robots, nearest first by measured
+    range, and all landmarks.
 
     Args:
         log: of read_mrclam.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..arrays import Floats, number
+from ..arrays import Floats, Ints, number
 from ..errors import InputError
 from ..world.frames import turned
 from ..world.recording import Recording, check_recording
@@ -25,8 +25,8 @@ def pose_start(
 ) -> Floats:
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
 
-    With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the odometry
-    until then its pose at the first step. A solo filter starts from each of some headings around the circle; the one
+    With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
+    odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle; the one
     whose innovations have the largest likelihood over the first seconds is kept. Vehicles with a compass have it.
 
     Args:
@@ -77,9 +77,7 @@ def _spread(sensors: Sensors) -> tuple[float, float, float]:
     return 2 * x, 2 * y, 2 * z
 
 
-def _hypotheses(
-    recording: Recording, run: int, column: int, links: np.typing.NDArray[np.int64], angles: Floats
-) -> Floats:
+def _hypotheses(recording: Recording, run: int, column: int, links: Ints, angles: Floats) -> Floats:
     """(headings, 4) poses at the first step that the first fix, or the first landmark seen, leaves for each heading."""
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
