@@ -35,9 +35,7 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
     Raises:
         InputError: a folder without positions of landmarks.
     """
-    if not len(log.landmarks):
-        raise InputError("folder", log.fleet.name, "has no Landmark_Groundtruth.dat", "Unpack the set again.")
-    robots, marks = log.fleet.ids, log.landmarks
+    robots, marks = log.fleet.ids, surveyed(log)
     ids = (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0]))
     steps, n = len(log.fleet.t), len(robots)
     place = np.column_stack([marks[:, 1:], np.zeros(len(marks))])
@@ -73,6 +71,13 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
         body=Body(rate, np.full(rate.shape, np.nan)),
         landmarks=tuple(range(n, len(ids))),
     )
+
+
+def surveyed(log: MrclamLog) -> Floats:
+    """(M, 3) subject, x m, y m of the landmarks; InputError if there is none."""
+    if not len(log.landmarks):
+        raise InputError("folder", log.fleet.name, "has no Landmark_Groundtruth.dat", "Unpack the set again.")
+    return log.landmarks
 
 
 def thinned(recording: Recording, landmarks: int, start: int) -> Recording:

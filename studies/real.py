@@ -13,7 +13,7 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.data.mrclam import MrclamLog, read_mrclam
 from coopoc.data.mrclam_calibration import Calibration, calibrate
-from coopoc.data.mrclam_poses import pose_recording, thinned
+from coopoc.data.mrclam_poses import pose_recording, surveyed, thinned
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors
@@ -21,7 +21,7 @@ from coopoc.evaluate.pose_metrics import heading_error, pose_nees
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.study.environment import revision
-from coopoc.study.numbers import Number, mean, present, sentence
+from coopoc.study.numbers import Number, interval, mean, present, sentence
 from coopoc.study.pivot import crossed, pivot
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
@@ -76,7 +76,8 @@ def key(p: Params) -> dict[str, str]:
     """
     if p["method"] not in METHODS:
         raise InputError("method", p["method"], f"must be among {list(METHODS)}", "Name one of them.")
-    log(str(p["data"]), float(p["calibrate_s"])), channel(p)
+    found, _ = log(str(p["data"]), float(p["calibrate_s"]))
+    surveyed(found), channel(p)
     sha = hashlib.sha256()
     for file in sorted(Path(str(p["data"])).glob("*.dat")):
         sha.update(file.name.encode() + file.read_bytes())
@@ -155,7 +156,7 @@ def _figure(results: Results) -> Plot | None:
     """Left: a line per number of neighbours over the landmarks. Right: the ways of fusion at the largest K."""
     from matplotlib import colormaps
 
-    from coopoc.study.plot import Plot, canvas
+    from coopoc.study.plot import Plot, canvas, plain_log
 
     if present(results, FLEET) is None:
         return None
@@ -166,15 +167,18 @@ def _figure(results: Results) -> Plot | None:
         others = [(look(name).label, {"method": name, **most}, look(name).color) for name in METHODS]
         for axis, shown in ((left, lines), (right, others)):
             for label, where, color in shown:
-                each = {n: mean(results, {**where, "landmarks": n}) for n in LANDMARKS}
+                each = {n: interval(results, {**where, "landmarks": n}) for n in LANDMARKS}
                 ran = {at[n]: value for n, value in each.items() if value is not None}
                 if ran:
-                    axis.plot(list(ran), list(ran.values()), color=color, label=label, marker="o")
+                    axis.plot(list(ran), [one.mean for one in ran.values()], color=color, label=label, marker="o")
+                    ends = [one.low for one in ran.values()], [one.high for one in ran.values()]
+                    axis.fill_between(list(ran), *ends, alpha=0.12, color=color, linewidth=0)
             axis.set(xticks=list(at.values()), xticklabels=list(at), xlabel="Landmarks", yscale="log")
+            plain_log(axis.yaxis)
             axis.legend()
         left.set(ylabel="RT-LE [m]", title="One state, K neighbours")
         right.set(title=f"Ways of fusion, K = {max(NEIGHBOURS)}")
-    return Plot(figure, _caption(results, "RT-LE against the number of landmarks."))
+    return Plot(figure, _caption(results, "RT-LE against the number of landmarks; bands: 95 % intervals."))
 
 
 def _findings(results: Results) -> dict[str, str]:

@@ -26,8 +26,8 @@ def pose_start(
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
-    odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle; the one
-    whose innovations have the largest likelihood over the first seconds is kept. Vehicles with a compass have it.
+    odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle;
+    the one whose innovations have the largest likelihood over the first seconds is kept. A compass leaves one.
 
     Args:
         recording: in body frames.
