@@ -190,7 +190,7 @@ def _findings(results: Results) -> dict[str, str]:
         together = of(k, 0)
         alone = {n: of(0, n) for n in LANDMARKS}
         better = [n for n, value in alone.items() if together is not None and value is not None and value < together]
-        worth = f"fewer than {min(better)} landmarks" if better else "more than all landmarks"
+        worth = f"fewer than {min(better)} landmarks" if better else "more than all of them"
         template = "K = {k} without a landmark: {together:.2f} m; alone {none:.2f} m, with 4 landmarks {four:.2f} m."
         text = sentence(template, k=k, together=together, none=alone[0], four=alone[4])
         found[f"worth, K = {k}"] = text and f"{text} It replaces {worth}."
@@ -228,5 +228,5 @@ STUDY = Study(
         "One drive: an interval over blocks of time does not hold for other robots or rooms.",
         "With one state a centre receives all that is measured, at its step; late messages are lost.",
     ),
-    minutes=2,
+    minutes=1,
 )

@@ -19,17 +19,21 @@ from .pose_pairs import fuse_pairs
 from .pose_update import (
     AT,
     KEPT,
+    PENDING,
     TOTAL,
     Poses,
     X,
     new_poses,
     retract,
+    settle,
     update_fix,
     update_heading,
     update_relative,
     wrapped,
 )
 
+UNPLACED = 7
+"""Bits of all components: nothing is known of the place of one of the two."""
 JOINT, NAIVE, INTERSECTION = range(3)
 """How two estimates are fused: in one state, as if their errors were independent, by covariance intersection."""
 
@@ -71,7 +75,7 @@ def follow(
     poses, uses = new_poses(max(most, 2) * d), np.zeros(2 * most)
     left_out = np.zeros(seen.relative.shape[1], dtype=np.int64)
     for run in range(runs):
-        poses.vector[TOTAL, 0] = poses.vector[TOTAL, 1] = 0.0
+        poses.vector[TOTAL, 0] = poses.vector[TOTAL, 1] = poses.vector[TOTAL, PENDING] = 0.0
         for t in range(len(seen.start) - 1):
             first, count = seen.start[t], seen.start[t + 1] - seen.start[t]
             arrange(poses, seen, noise, (run, t), d, uses)
@@ -79,6 +83,7 @@ def follow(
                 place_at(poses, seen, begin, spread, run, d)
             for k in range(count):
                 add_own(poses, seen, noise, (run, t, k), (d, count * d))
+            settle(poses, count * d)
             if options.fusion == JOINT:
                 add_relative(poses, seen, noise, (run, t), options, left_out)
             else:
@@ -125,12 +130,13 @@ def add_relative(
     begin, end = seen.first[t], seen.first[t + 1]
     if begin == end:
         return
-    for i in range(size):
+    for i in range(size if options.passes > 1 else 0):
         poses.vector[KEPT, i] = poses.vector[X, i]
         for j in range(size):
             poses.kept[i, j] = poses.cov[i, j]
     for k in range(begin, end):
-        left_out[k] = 0
+        i, j = d * seen.observer[k], d * max(seen.other[k], 0)
+        left_out[k] = UNPLACED if max(poses.cov[i, i], poses.cov[j, j]) > 0.5 * noise.flat else 0
     for again in range(options.passes):
         for i in range(size):
             poses.vector[AT, i] = poses.vector[X, i]
@@ -142,9 +148,8 @@ def add_relative(
         for k in range(begin, end):
             place = (seen.place[k, 0], seen.place[k, 1], seen.place[k, 2])
             ends = (d * seen.observer[k], d * seen.other[k], left_out[k])
-            if max(poses.cov[ends[0], ends[0]], poses.cov[max(ends[1], 0), max(ends[1], 0)]) > 0.5 * noise.flat:
-                continue  # nothing is known of the place of one of the two
             found = (seen.relative[run, k, 0], seen.relative[run, k, 1], seen.relative[run, k, 2])
             left_out[k] = update_relative(poses, size, ends, place, found, (noise.relative, noise.gate))
+        settle(poses, size)
     if options.invariant:
         retract(poses, size)

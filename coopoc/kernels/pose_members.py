@@ -68,7 +68,7 @@ def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int],
     for k in range(old):
         uses[len(uses) // 2 + k] = uses[k]
     for k in range(count):
-        came = previous(seen, before, old, first + k)
+        came = k if same else previous(seen, before, old, first + k)
         if not same:
             for m in range(count):
                 other = previous(seen, before, old, first + m)
@@ -84,7 +84,7 @@ def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int],
         if came < 0:
             join(poses, seen, noise, (run, t, k), d)
     for k in range(count):
-        if previous(seen, before, old, first + k) >= 0:
+        if same or previous(seen, before, old, first + k) >= 0:
             advance(poses, seen, noise, (run, t, k), (d, count * d), uses[k])
 
 

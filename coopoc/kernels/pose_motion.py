@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from ..arrays import Floats
 from .compile import part
 from .pose_update import HEADING, Poses, X
 
@@ -80,25 +81,12 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
     if d > 4:
         vector[X, block + 4] *= noise.keep
         vector[X, block + 5] *= noise.keep
-    for side in range(2):
-        for j in range(0 if side == 0 else block, size if side == 0 else block + d):
-            turn = cov[block + 3, j] if side == 0 else cov[j, block + 3]
-            ds, db = 0.0, 0.0
-            if d > 4:
-                ds = -scale * (cov[block + 4, j] if side == 0 else cov[j, block + 4])
-                db = -dt * (cov[block + 5, j] if side == 0 else cov[j, block + 5])
-            turn += 0.5 * db
-            moves = (east * ds - north * turn, north * ds + east * turn, up * ds, db)
-            for i in range(4):
-                if side == 0:
-                    cov[block + i, j] += moves[i]
-                else:
-                    cov[j, block + i] += moves[i]
-            for i in range(4, d):
-                if side == 0:
-                    cov[block + i, j] *= noise.keep
-                else:
-                    cov[j, block + i] *= noise.keep
+    effects = (east, north, up, scale, dt, noise.keep)
+    moved_rows(cov, (block, d), effects, (0, size))
+    for i in range(block, block + d):
+        for j in range(i + 1, block + d):
+            cov[i, j], cov[j, i] = cov[j, i], cov[i, j]
+    moved_rows(cov, (block, d), effects, (block, block + d))
     for i in range(size):
         if i < block or i >= block + d:
             for j in range(block, block + d):
@@ -114,3 +102,28 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
             cov[block + i, block + j] += effect[i] * effect[j] * qw
     for i in range(4, d):
         cov[block + i, block + i] += (1.0 - noise.keep * noise.keep) * noise.lasting[i - 4]
+
+
+@part
+def moved_rows(cov: Floats, member: tuple[int, int], effects: Any, columns: tuple[int, int]) -> None:
+    """F P of some columns in the rows of a member; the transposed of it, moved once more, is F P F^T.
+
+    Args:
+        cov: P.
+        member: its first number, and how many it has.
+        effects: displacement east, north and up m, 1 / (1 + s), dt s, and share of s and b that is left.
+        columns: first, and one past the last.
+    """
+    (block, d), (east, north, up, scale, dt, left), (begin, end) = member, effects, columns
+    for j in range(begin, end):
+        cov[block, j] -= north * cov[block + HEADING, j]
+        cov[block + 1, j] += east * cov[block + HEADING, j]
+    if d > 4:
+        for j in range(begin, end):
+            ds, db = -scale * cov[block + 4, j], -dt * cov[block + 5, j]
+            cov[block, j] += east * ds - 0.5 * north * db
+            cov[block + 1, j] += north * ds + 0.5 * east * db
+            cov[block + 2, j] += up * ds
+            cov[block + HEADING, j] += db
+            cov[block + 4, j] *= left
+            cov[block + 5, j] *= left

@@ -7,7 +7,7 @@ from typing import Any
 
 from .compile import part
 from .pose_motion import PoseNoise
-from .pose_update import AT, KEPT, Poses, X, update_relative
+from .pose_update import AT, KEPT, Poses, X, settle, update_relative
 
 TRIED = 10
 """Weights that covariance intersection tries."""
@@ -64,6 +64,7 @@ def fuse(poses: Poses, seen: Any, noise: PoseNoise, at: Any, sizes: Any, weight:
     place = (seen.place[k, 0], seen.place[k, 1], seen.place[k, 2])
     found = (seen.relative[run, k, 0], seen.relative[run, k, 1], seen.relative[run, k, 2])
     update_relative(poses, size, (observer, other, 0), place, found, (noise.relative, noise.gate))
+    settle(poses, size)
     return float(poses.cov[observer, observer] + poses.cov[observer + 1, observer + 1])
 
 
