@@ -20,7 +20,9 @@ def fuse_pairs(poses: Poses, seen: Any, noise: PoseNoise, at: tuple[int, int], o
 
     Their joint covariance is taken as block diagonal, each block over its weight: 1 and 1 if the errors were
     independent, w and 1 - w for a bound whatever their correlation (covariance intersection), with the w that
-    minimises the trace of the observer's position. What the measured member would learn is dropped.
+    minimises the sum of the observer's d variances, each over what it was: at most d, so that their product never grows
+    (a trace of the position alone would let headings grow without end). What the measured member would learn is
+    dropped.
 
     Args:
         poses: the state; covariances between members are zero.
@@ -51,7 +53,7 @@ def fuse_pairs(poses: Poses, seen: Any, noise: PoseNoise, at: tuple[int, int], o
 
 @part
 def fuse(poses: Poses, seen: Any, noise: PoseNoise, at: Any, sizes: Any, weight: float, weighs: bool) -> float:
-    """Weigh both blocks, add one relative measurement, and return the variance of the observer's position, m^2."""
+    """Weigh both blocks, add one relative measurement; sum of the observer's variances over those before."""
     (run, k), (d, size) = at, sizes
     observer, other = d * seen.observer[k], d * seen.other[k]
     if weighs:
@@ -65,7 +67,11 @@ def fuse(poses: Poses, seen: Any, noise: PoseNoise, at: Any, sizes: Any, weight:
     found = (seen.relative[run, k, 0], seen.relative[run, k, 1], seen.relative[run, k, 2])
     update_relative(poses, size, (observer, other, 0), place, found, (noise.relative, noise.gate))
     settle(poses, size)
-    return float(poses.cov[observer, observer] + poses.cov[observer + 1, observer + 1])
+    total = 0.0
+    for i in range(observer, observer + d):
+        if poses.kept[i, i] > 0.0:
+            total += poses.cov[i, i] / poses.kept[i, i]
+    return total
 
 
 @part

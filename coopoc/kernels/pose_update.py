@@ -112,7 +112,9 @@ def update_row(poses: Poses, size: int, ends: Any, row: Any, measured: Any, gate
 def along(vector: Floats, column: int, ends: Any, row: Any) -> float:
     """h^T v of a row and a column."""
     (k, o), (a, b, c, h) = ends, row
-    total = a * vector[column, k] + b * vector[column, k + 1] + c * vector[column, k + 2] + h * vector[column, k + 3]
+    total: float = (
+        a * vector[column, k] + b * vector[column, k + 1] + c * vector[column, k + 2] + h * vector[column, k + 3]
+    )
     if o >= 0:
         total -= a * vector[column, o] + b * vector[column, o + 1] + c * vector[column, o + 2]
     return total

@@ -185,8 +185,9 @@ class PoseFilter:
     def _fleet(self, recording: Recording, columns: Sequence[int], begin: Floats) -> Iterator[_Found]:
         """All vehicles at once; a relative measurement counts if the message that it needs arrives at its step."""
         links, members = recording.links, pose_unit.fleet(recording)
+        mine = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
         kept = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
-        x, cov, _ = self.follow(recording, members, np.arange(len(links)), begin, kept)
+        x, cov, _ = self.follow(recording, members, mine, begin, kept[:, mine])
         each: Floats = np.ones(recording.runs)
         met = centre(recording, self.message) if self.fusion == "joint" else None
         for ego in columns:
