@@ -31,6 +31,7 @@ BENCHMARKS = (
     "learned_gain",
     "backends",
     "peers",
+    "poses",
     "fleet",
     "growth",
 )

@@ -38,7 +38,9 @@ class MrclamLog:
         true_range: (M,) m, from Vicon at `time`; NaN in gaps.
         true_bearing: (M,) rad, from Vicon at `time`; NaN in gaps.
         observer_heading: (M,) rad, Vicon at `time`.
-        landmarks: number of measurements of landmarks, which are not among the M.
+        landmarks: (L, 3) subject, x m, y m of the landmarks.
+        sightings: (S, 5) time s on the fleet's clock, observer (column), landmark (row of `landmarks`, -1 if it has no
+            position), range m, bearing rad, of every measurement of a landmark.
         unknown: number of measurements of barcodes in no list, which are not among the M.
         absent: number of measurements of robots whose files are not in the folder, which are not among the M.
     """
@@ -56,7 +58,8 @@ class MrclamLog:
     true_range: Floats
     true_bearing: Floats
     observer_heading: Floats
-    landmarks: int
+    landmarks: Floats
+    sightings: Floats
     unknown: int
     absent: int = 0
 
@@ -145,9 +148,12 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     found = files.measurements(folder, numbers)
     seen = found.rows - [start, 0, 0, 0, 0]
     step = np.rint(seen[:, 0] / dt).astype(np.int64)
+    marks, sightings = files.landmarks(folder), found.landmarks - [start, 0, 0, 0, 0]
+    row = {subject: k for k, subject in enumerate(marks[:, 0].tolist())}
+    sightings[:, 2] = [row.get(subject, -1) for subject in sightings[:, 2].tolist()]
     true_range, true_bearing, heading = _true(seen, truths, start, max_gap)
     return MrclamLog(
-        fleet=_fleet(folder, numbers, t, poses[..., :2]),
+        fleet=_fleet(folder, numbers, t, poses),
         heading=poses[..., 2],
         speed=odometry[..., 0],
         turn_rate=odometry[..., 1],
@@ -160,14 +166,16 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         true_range=true_range,
         true_bearing=true_bearing,
         observer_heading=heading,
-        landmarks=found.landmarks,
+        landmarks=marks,
+        sightings=sightings,
         unknown=found.unknown,
         absent=found.absent,
     )
 
 
-def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, xy: Floats) -> Fleet:
+def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, poses: Floats) -> Fleet:
     ids = tuple(f"robot{n}" for n in numbers)
+    xy = poses[..., :2]
     position = np.concatenate([xy, np.where(np.isnan(xy[..., :1]), np.nan, 0.0)], axis=2)
     return Fleet(
         ids,
@@ -177,6 +185,7 @@ def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, xy: Floats) -> Fle
         name=folder.name.lower(),
         source=f"UTIAS MR.CLAM, Vicon truth, z = 0 ({PAPER})",
         licence="none stated: read, not redistributed",
+        heading=poses[..., 2],
     )
 
 

@@ -24,13 +24,13 @@ class Seen(NamedTuple):
 
     Attributes:
         rows: (M, 5) unix time s, observer, subject (both columns of `robots`), range m, bearing rad, by time.
-        landmarks: number of measurements of landmarks, which are not among the M.
+        landmarks: (S, 5) unix time s, observer, subject (its number), range m, bearing rad, by time.
         absent: number of measurements of robots that have no files, which are not among the M.
         unknown: number of measurements of barcodes in no list, which are not among the M.
     """
 
     rows: Floats
-    landmarks: int
+    landmarks: Floats
     absent: int
     unknown: int
 
@@ -65,6 +65,12 @@ def odometry(folder: Path, robot: int) -> Floats:
     return table
 
 
+def landmarks(folder: Path) -> Floats:
+    """(M, 3) subject, x m, y m of the landmarks; of no length where the folder has no file of them."""
+    file = folder / "Landmark_Groundtruth.dat"
+    return _read(file, 5)[:, :3] if file.is_file() else np.empty((0, 3))
+
+
 def measurements(folder: Path, numbers: tuple[int, ...]) -> Seen:
     """What the robots measured of each other. The second column of a file is a barcode, though its header says subject.
 
@@ -73,7 +79,7 @@ def measurements(folder: Path, numbers: tuple[int, ...]) -> Seen:
             not positive, a bearing beyond a turn, times that decrease.
     """
     subject_of = _barcodes(folder / "Barcodes.dat")
-    parts, landmarks, absent, unknown = [np.empty((0, 5))], 0, 0, 0
+    parts, marks, absent, unknown = [np.empty((0, 5))], [np.empty((0, 5))], 0, 0
     for column, robot in enumerate(numbers):
         file = folder / f"Robot{robot}_Measurement.dat"
         table = _read(file, 4)
@@ -85,13 +91,15 @@ def measurements(folder: Path, numbers: tuple[int, ...]) -> Seen:
         turn = "must have a bearing within a turn, in rad"
         _refuse(file, table, np.abs(table[:, 3]) > TURN, turn, "Convert degrees to radians.")
         here = np.isin(subject, numbers)
-        landmarks += int((subject > SUBJECTS).sum())
+        of_mark = subject > SUBJECTS
+        observer = np.full(len(subject), column)
+        marks.append(np.column_stack([table[:, 0], observer, subject, table[:, 2:]])[of_mark])
         unknown += int((subject == 0).sum())
         absent += int(((subject > 0) & (subject <= SUBJECTS) & ~here).sum())
         seen = np.searchsorted(numbers, subject[here])
         parts.append(np.column_stack([table[here, 0], np.full(len(seen), column), seen, table[here, 2:]]))
-    rows = np.vstack(parts)
-    return Seen(rows[np.argsort(rows[:, 0], kind="stable")], landmarks, absent, unknown)
+    rows, seen_marks = (table[np.argsort(table[:, 0], kind="stable")] for table in map(np.vstack, (parts, marks)))
+    return Seen(rows, seen_marks, absent, unknown)
 
 
 def _barcodes(file: Path) -> dict[float, int]:

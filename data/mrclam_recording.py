@@ -45,7 +45,7 @@ def recording(
     acting = Sensors(gnss_std=(gnss_std, gnss_std, 0.0), velocity_std_ratio=0.0)
     known = assumed or _calibrated(log, gnss_std)
     fixes = observe(log.fleet, acting, V2X(max_neighbours=0), runs=runs, seed=seed, assumed=known).gnss
-    index, lost_in_gaps, repeated = _kept(log, v2x)
+    index, lost_in_gaps, repeated = kept(log, v2x)
     links = Links(log.step[index], log.observer[index], log.subject[index])
     azimuth = log.bearing[index] + log.observer_heading[index]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
@@ -94,24 +94,30 @@ def _velocity(log: MrclamLog) -> Floats:
     return np.where(log.fleet.present[..., None], velocity, np.nan)
 
 
-def _kept(log: MrclamLog, v2x: V2X) -> tuple[Ints, int, int]:
-    """Measurements that become links, by step, observer and range; numbers left out in gaps and as repetitions."""
+def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> tuple[Ints, int, int]:
+    """Measurements that become links, by step, observer and range; numbers left out in gaps and as repetitions.
+
+    Args:
+        log: of read_mrclam.
+        v2x: K and radius.
+        gaps: whether those in gaps of Vicon stay.
+    """
     known = np.flatnonzero(log.step >= 0)
     present = log.fleet.present
     visible = present[log.step, log.observer] & present[log.step, log.subject] & np.isfinite(log.observer_heading)
-    index = known[visible[known]]
+    index = known[visible[known] | gaps]
     late = np.abs(log.time - log.fleet.t[log.step])[index]
     index = index[np.lexsort((late, log.subject[index], log.observer[index], log.step[index]))]
-    first = _changes(log.step[index], log.observer[index], log.subject[index])
+    first = changes(log.step[index], log.observer[index], log.subject[index])
     unique = index[first]
     near = unique[log.range[unique] <= v2x.radius]
     near = near[np.lexsort((log.range[near], log.observer[near], log.step[near]))]
-    groups = _changes(log.step[near], log.observer[near])
+    groups = changes(log.step[near], log.observer[near])
     rank = np.arange(len(near)) - np.maximum.accumulate(np.where(groups, np.arange(len(near)), 0))
     return near[rank < v2x.max_neighbours], int((~visible[known]).sum()), int((~first).sum())
 
 
-def _changes(*keys: Ints) -> Bools:
+def changes(*keys: Ints) -> Bools:
     """True at the first of each run of equal rows."""
     rows = np.column_stack(keys)
     first: Bools = np.append(True, (np.diff(rows, axis=0) != 0).any(axis=1))[: len(rows)]

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from coopoc.errors import InputError
+from coopoc.formats.pyfg import read_pyfg
 from coopoc.plugins import suggestion, unknown
 from coopoc.world.recording import Recording
 from coopoc.world.storage import is_recording, read_recording
@@ -19,6 +20,7 @@ from .log_links import under
 from .log_summary import Summary
 from .mrclam import read_mrclam
 from .mrclam_recording import recording
+from .pyfg_recording import graph_recording
 from .source import split
 
 
@@ -26,7 +28,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
-        name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, an .npz of `save_recording`; options may stand
+        name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of `save_recording`; options may stand
             behind a question mark, as in "drive?dt=0.1".
         options: of the reader.
 
@@ -38,6 +40,8 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     read: Callable[..., Log] = read_log
     if path.suffix == ".npz" and is_recording(path):
         read = _of_file
+    elif path.suffix == ".pyfg":
+        read = _of_pyfg
     elif (path / "Barcodes.dat").is_file():
         read = _of_mrclam
     found: Log = _with(read, path, options)
@@ -69,11 +73,18 @@ def _of_mrclam(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
     log = read_mrclam(path, dt=dt, max_gap=max_gap)
     seen = recording(log, V2X(max_neighbours=max(len(log.fleet.ids) - 1, 0), radius=float("inf")))
     grid = f"{len(seen.t)} steps of {seen.dt:g} s, {seen.t[-1]:.1f} s"
-    counts = {"landmarks": log.landmarks, "robots without files": log.absent, "barcodes in no list": log.unknown}
+    counts = {"landmarks": len(log.sightings), "robots without files": log.absent, "barcodes in no list": log.unknown}
     refused = {f"measurements of {what}": (number, "") for what, number in counts.items() if number}
     vehicles = dict.fromkeys(log.fleet.ids, "wheel odometry, range and bearing, Vicon")
     read = {"measurements between robots": len(log.range)}
     return Log(seen, log.fleet, Summary(path.name, grid, vehicles, read, refused, {}, seen.notes), False)
+
+
+def _of_pyfg(path: Path, *, dt: float = 0.1) -> Log:
+    seen, truth = graph_recording(read_pyfg(path), dt=dt)
+    grid = f"{len(seen.t)} steps of {seen.dt:g} s, {seen.t[-1]:.1f} s"
+    vehicles = {name: "landmark" if k in seen.landmarks else "odometry, ranges" for k, name in enumerate(seen.ids)}
+    return Log(seen, truth, Summary(path.name, grid, vehicles, {"ranges": len(seen.links)}, {}, {}, seen.notes), True)
 
 
 def _of_file(path: Path) -> Log:

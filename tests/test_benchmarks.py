@@ -155,6 +155,7 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     monkeypatch.setattr(fleet, "SHORT", 12)
     found |= {f"fleet: {job}: {each.words}" for job, _, rows in fleet.parts() for each in rows}
     found |= {f"fleet: neighbours, {vehicles} vehicles" for vehicles, _ in fleet.SEARCHED}
+    found |= {f"poses: poses, K = {neighbours}: compiled" for neighbours in load("poses").NEIGHBOURS}
     cliffs = load("cliffs")
     monkeypatch.setattr(cliffs, "STEPS", 4)
     monkeypatch.setattr(cliffs, "RUNS", 1)

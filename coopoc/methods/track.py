@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -34,6 +34,9 @@ class Track:
         neighbours: (R, L, 3) m estimate of each link's neighbour at the link's step, NaN where there is none; or None.
             The links are those of the egos, `recording.links.of(ego)` ego by ego, and no others of the fleet.
         notes: labels for tables and figures, such as "reconstruction".
+        heading: (R, T, E) rad in [-pi, pi), or None of a method that does not estimate it.
+        heading_covariance: (R, T, E, 4) of the heading with x, y, z and itself, m rad and rad^2; None as above.
+        extras: other states by name, (R, T, E) each, with their standard deviations under the name and "_std".
     """
 
     t: Floats
@@ -45,6 +48,9 @@ class Track:
     seconds: float
     neighbours: Floats | None = None
     notes: tuple[str, ...] = ()
+    heading: Floats | None = None
+    heading_covariance: Floats | None = None
+    extras: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)
@@ -58,11 +64,16 @@ class Track:
             "received_bytes": ("(R, E)", (runs, len(egos))),
             "sent_bytes": ("(R, E)", (runs, len(egos))),
             "neighbours": ("(R, L, 3)", (runs, -1, 3)),
+            "heading": ("(R, T, E)", x.shape[:3]),
+            "heading_covariance": ("(R, T, E, 4)", (*x.shape[:3], 4)),
         }
+        optional = ("covariance", "neighbours", "heading", "heading_covariance")
         for name, (axes, shape) in shapes.items():
-            if name not in ("covariance", "neighbours") or getattr(self, name) is not None:
+            if name not in optional or getattr(self, name) is not None:
                 object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
         object.__setattr__(self, "notes", texts("notes", self.notes))
+        extras = {name: checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3]) for name, v in self.extras.items()}
+        object.__setattr__(self, "extras", extras)
         if not np.isfinite(self.x).all():
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
             raise InputError(

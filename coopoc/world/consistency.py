@@ -32,7 +32,23 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     refuse("relative", relative[..., 0], relative[..., 0] < 0, "must be a range >= 0 m", "Reflect or drop it.")
 
 
-def check_links(links: Links, observers: tuple[int, ...], velocity: Floats, arrival: Ints, most: int) -> None:
+def check_landmarks(landmarks: tuple[int, ...], gnss: Floats, velocity: Floats) -> None:
+    """InputError unless landmarks stand at one position throughout.
+
+    Args:
+        landmarks: columns.
+        gnss: (R, T, N, 3) m.
+        velocity: (R, T, N, 3) m/s.
+    """
+    mine = list(landmarks)
+    place, moves = gnss[:, :, mine], velocity[:, :, mine]
+    allowed, hint = "must be one position throughout, with a velocity of 0", "A vehicle is no landmark."
+    refuse("landmarks", place, ~(place == place[:1, :1]) | (moves != 0), allowed, hint)
+
+
+def check_links(
+    links: Links, observers: tuple[int, ...], velocity: Floats, arrival: Ints, most: int, counted: Ints
+) -> None:
     """InputError unless links join present vehicles, at most `most` per step and observer, and messages take time.
 
     Args:
@@ -41,6 +57,7 @@ def check_links(links: Links, observers: tuple[int, ...], velocity: Floats, arri
         velocity: (R, T, N, 3) m/s, NaN where absent.
         arrival: (R, L) step of arrival, -1 for never.
         most: largest number of neighbours.
+        counted: indices of the links that count among them.
     """
     _, steps, vehicles, _ = velocity.shape
     columns = {"links.observer": links.observer, "links.neighbour": links.neighbour, "observers": np.array(observers)}
@@ -57,9 +74,10 @@ def check_links(links: Links, observers: tuple[int, ...], velocity: Floats, arri
         refuse(
             f"links.{name}", column, gone, "must be present at the link's step", "Drop the links of absent vehicles."
         )
-    many, first = np.zeros(len(links), dtype=bool), max(len(links) - most, 0)
-    many[most:] = np.logical_and.reduce([c[most:] == c[:first] for c in (links.step, links.observer)])
-    refuse("links.observer", links.observer, many, f"must have at most max_neighbours = {most} a step", "Raise it.")
+    many, first = np.zeros(len(counted), dtype=bool), max(len(counted) - most, 0)
+    step, observer = links.step[counted], links.observer[counted]
+    many[most:] = (step[most:] == step[:first]) & (observer[most:] == observer[:first])
+    refuse("links.observer", observer, many, f"must have at most max_neighbours = {most} a step", "Raise it.")
     early = (arrival < links.step) & (arrival != -1)
     refuse("arrival", arrival, early, "must be -1 (lost) or a step no earlier than the link's", "Count steps from 0.")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Bools, Floats, checked, number
+from ..arrays import Bools, Floats, checked, number, refuse
 from ..errors import InputError
 from .axes import clock, column, columns, interval, names
 
@@ -28,6 +28,7 @@ class Fleet:
         name: where it comes from, for cards and reports.
         source: where it comes from, for cards and reports.
         licence: where it comes from, for cards and reports.
+        heading: (T, N) rad from +x, anticlockwise, NaN where absent or unknown; None where it is the course.
 
     Raises:
         InputError: shapes, time steps, ids or NaN patterns that no filter could use.
@@ -43,6 +44,7 @@ class Fleet:
     name: str = ""
     source: str = ""
     licence: str = ""
+    heading: Floats | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ids", names(self.ids))
@@ -50,6 +52,10 @@ class Fleet:
         for field in ("position", "velocity"):
             values = checked(field, getattr(self, field), "(T, N, 3)", (len(self.t), len(self.ids), 3))
             object.__setattr__(self, field, values)
+        if self.heading is not None:
+            heading = checked("heading", self.heading, "(T, N)", self.position.shape[:2])
+            refuse("heading", heading, np.isinf(heading), "must be finite, or NaN where unknown", "Replace it by NaN.")
+            object.__setattr__(self, "heading", heading)
         _check_gaps(self)
 
     @property
@@ -66,7 +72,7 @@ class Fleet:
     def digest(self) -> str:
         """SHA-256 of ids, time and truth: the same numbers give the same digest."""
         sha = hashlib.sha256("\n".join(self.ids).encode())
-        for array in (self.t, self.position, self.velocity):
+        for array in (self.t, self.position, self.velocity, *(() if self.heading is None else (self.heading,))):
             sha.update(np.ascontiguousarray(array).tobytes())
         return sha.hexdigest()
 
@@ -77,17 +83,18 @@ class Fleet:
     def select(self, vehicles: Sequence[str | int]) -> Fleet:
         """The same drive with these vehicles only."""
         cols = columns("vehicles", vehicles, self.ids)
-        return replace(
-            self, ids=tuple(self.ids[c] for c in cols), position=self.position[:, cols], velocity=self.velocity[:, cols]
-        )
+        parts = {name: getattr(self, name)[:, cols] for name in self._arrays}
+        return replace(self, ids=tuple(self.ids[c] for c in cols), **parts)
 
     def between(self, start: int, stop: int) -> Fleet:
         """Steps start..stop-1 of the drive; negative ones count from the end. InputError if one is no whole number."""
         for name, step in (("start", start), ("stop", stop)):
             number(name, step, -(2**62), 2**62, kind=int, allowed="a step", hint="Count steps from 0.")
-        return replace(
-            self, t=self.t[start:stop], position=self.position[start:stop], velocity=self.velocity[start:stop]
-        )
+        return replace(self, t=self.t[start:stop], **{name: getattr(self, name)[start:stop] for name in self._arrays})
+
+    @property
+    def _arrays(self) -> tuple[str, ...]:
+        return ("position", "velocity", *(() if self.heading is None else ("heading",)))
 
     def __repr__(self) -> str:
         return f"Fleet({self.name or 'unnamed'}: {len(self.ids)} vehicles x {len(self.t)} steps, dt {self.dt:g} s)"

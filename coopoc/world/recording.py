@@ -12,7 +12,8 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, checked, instance, number, refuse
 from ..errors import InputError
 from .axes import clock, columns, interval, names, texts
-from .consistency import check_links, check_measurements
+from .body import Body
+from .consistency import check_landmarks, check_links, check_measurements
 from .links import Links
 from .sensors import Sensors
 from .v2x import V2X
@@ -37,6 +38,10 @@ class Recording:
         sensors: what a method may know (the bias is not among it).
         v2x: what a method may know (the bias is not among it).
         notes: labels that every table and figure carries (what is simulated, what uses truth).
+        body: yaw rates and headings of a recording in body frames: `velocity` is then forward, left and up, azimuths
+            count from the observer's heading; None for a recording in the world frame.
+        landmarks: columns of members that stand at their `gnss`, which is known exactly; they need no message, and
+            links to them count in no budget.
 
     Raises:
         InputError: arrays of other shapes or kinds, links of steps or columns that are not there, more of them than
@@ -55,6 +60,8 @@ class Recording:
     v2x: V2X
     observers: tuple[int, ...]
     notes: tuple[str, ...] = ()
+    body: Body | None = None
+    landmarks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
@@ -77,7 +84,12 @@ class Recording:
         for name, value in found.items():
             object.__setattr__(self, name, value)
         check_measurements(self.gnss, self.velocity, self.relative)
-        check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours)
+        object.__setattr__(self, "landmarks", tuple(columns("landmarks", self.landmarks, ids)))
+        check_landmarks(self.landmarks, self.gnss, self.velocity)
+        vehicles = np.flatnonzero(~np.isin(self.links.neighbour, self.landmarks))
+        check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
+        if self.body is not None:
+            instance("body", self.body, Body).check(self.velocity)
         self.sensors.check_assumed()
 
     @property
@@ -102,7 +114,8 @@ class Recording:
             runs = checked("runs", runs, "(number of runs,)", (-1,), int)
             refuse("runs", runs, (runs < 0) | (runs >= self.runs), f"must be in 0..{self.runs - 1}", "Count from 0.")
         parts = {name: getattr(self, name)[runs] for name in ("gnss", "velocity", "relative", "arrival")}
-        return replace(self, **parts)
+        body = None if self.body is None else Body(self.body.yaw_rate[runs], self.body.heading[runs])
+        return replace(self, body=body, **parts)
 
     def between(self, start: int, stop: int) -> Recording:
         """Steps start..stop-1 of the drive; a message that arrives later is lost.
@@ -113,7 +126,7 @@ class Recording:
         2
         """
         kept = np.flatnonzero((self.links.step >= start) & (self.links.step < stop))
-        links, arrival = self.links, self.arrival[:, kept]
+        links, arrival, body = self.links, self.arrival[:, kept], self.body
         return replace(
             self,
             t=self.t[start:stop],
@@ -123,6 +136,7 @@ class Recording:
             relative=self.relative[:, kept],
             broadcasts=self.broadcasts[start:stop],
             arrival=np.where((arrival >= 0) & (arrival < stop), arrival - start, -1),
+            body=body and Body(body.yaw_rate[:, start:stop], body.heading[:, start:stop]),
         )
 
     def stretches(self, vehicle: int | str, shortest: int = 2) -> tuple[tuple[int, int], ...]:
@@ -242,6 +256,22 @@ class Recording:
         )
 
 
-def check_recording(value: Any) -> Recording:
-    """The value if it is a Recording; InputError otherwise."""
-    return instance("recording", value, Recording, "co.observe(fleet, sensors) makes one of a fleet.")
+def check_recording(value: Any, body: bool = False) -> Recording:
+    """The value if it is a Recording in the frame that is asked for, the world or its vehicles' own.
+
+    Args:
+        value: any object.
+        body: whether it must be in body frames.
+
+    Raises:
+        InputError: anything else.
+    """
+    found = instance("recording", value, Recording, "co.observe(fleet, sensors) makes one of a fleet.")
+    if (found.body is None) == body:
+        hints = (
+            "Take a pose filter, or co.in_world(recording) where there is a compass.",
+            'observe(..., frame="body").',
+        )
+        frames = ("the world frame", "body frames")
+        raise InputError("recording", f"in {frames[not body]}", f"must be in {frames[body]} here", hints[body])
+    return found

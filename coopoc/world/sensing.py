@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal, get_args
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from ..arrays import AnyArray, Bools, Floats, Ints, instance, number
 from ..errors import InputError
+from ..plugins import unknown
 from .axes import columns
+from .body_sensing import body_measurements, gauss_markov, in_body
 from .fleet import Fleet
 from .links import Links
 from .noise import stream
@@ -19,6 +21,7 @@ from .sensors import Sensors
 from .spherical import spherical, wrap
 from .v2x import V2X, lost
 
+Frame = Literal["world", "body"]
 PAIRS = 2_000_000
 """Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
 GRID = 1000
@@ -38,6 +41,8 @@ def observe(
     seed: int = 0,
     observers: Sequence[int | str] | None = None,
     assumed: Sensors | None = None,
+    frame: Frame = "world",
+    landmarks: Sequence[int | str] = (),
 ) -> Recording:
     """Measurements of a drive in `runs` noise realisations.
 
@@ -53,9 +58,13 @@ def observe(
         seed: of all draws.
         observers: vehicles whose links are recorded (default all); fewer is faster and changes no other draws.
         assumed: what methods may know, default `sensors` without its bias.
+        frame: "world" for velocities and azimuths in the world; "body" for forward, left and up, azimuths from the
+            observer's heading, yaw rates, and headings by a compass if `sensors.compass`.
+        landmarks: vehicles that stand at known positions: all within the radius are measured, and none sends.
 
     Raises:
-        InputError: runs < 1, seed < 0, a rate above 1/dt, an unknown observer, or an assumed std of zero.
+        InputError: runs < 1, seed < 0, a rate above 1/dt, an unknown observer, an assumed std of zero, another frame,
+            or a landmark that moves.
 
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
     >>> observe(fleet, Sensors(), V2X(max_neighbours=1), runs=3)
@@ -67,33 +76,67 @@ def observe(
     seed = number("seed", seed, 0, 2**63, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
-    links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range)
+    if frame not in get_args(Frame):
+        raise unknown("frame", frame, get_args(Frame))
+    standing = columns("landmarks", landmarks, fleet.ids)
+    links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range, standing)
     broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
+    arrival[:, np.isin(links.neighbour, standing)] = -1
+    broadcasts[:, standing] = False
     drawn, key = (fleet, sensors, runs, seed), (fleet, repr(sensors), runs, seed)
+    gnss = _once(("gnss", *key), lambda: _gnss(*drawn))
+    if standing:
+        gnss = gnss.copy()
+        gnss[:, :, standing] = fleet.position[:, standing]
+    relative = _relative(links, (watching, tuple(standing)), v2x, *drawn)
+    body = None
+    if frame == "world":
+        velocity = _once(("velocity", *key), lambda: _velocity(*drawn))
+    else:
+        velocity, body = body_measurements(*drawn)
+        relative = in_body(relative, fleet, links, _heading(fleet, links, sensors, runs, seed))
     return Recording(
         ids=fleet.ids,
         t=fleet.t,
-        gnss=_once(("gnss", *key), lambda: _gnss(*drawn)),
-        velocity=_once(("velocity", *key), lambda: _velocity(*drawn)),
+        gnss=gnss,
+        velocity=velocity,
         links=links,
-        relative=_relative(links, watching, v2x, *drawn),
+        relative=relative,
         broadcasts=broadcasts,
         arrival=arrival,
         sensors=assumed or sensors.without_bias(),
         v2x=v2x,
         observers=watching,
+        body=body,
+        landmarks=tuple(standing),
     )
 
 
-def find_links(fleet: Fleet, observers: Sequence[int], most: int, radius: float, min_range: float = 0.0) -> Links:
+def find_links(
+    fleet: Fleet,
+    observers: Sequence[int],
+    most: int,
+    radius: float,
+    min_range: float = 0.0,
+    landmarks: Sequence[int] = (),
+) -> Links:
     """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance.
 
     Vehicles at one distance come by column. Near vehicles are looked up in a grid: linear in vehicles and steps.
+
+    Args:
+        fleet: the truth.
+        observers: columns.
+        most: K.
+        radius: m.
+        min_range: m.
+        landmarks: columns of members that are linked beside the `most`, and observe nothing.
     """
     found = [np.empty((0, 3), dtype=np.int64)]
     vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
+    columns, marks = np.setdiff1d(columns, landmarks), np.isin(np.arange(vehicles), landmarks)
     at_once = max(1, PAIRS // (vehicles * max(1, len(columns))))
-    for first in range(0, len(fleet.t), at_once) if most and len(columns) else ():
+    for first in range(0, len(fleet.t), at_once) if (most or marks.any()) and len(columns) else ():
         position = fleet.position[first : first + at_once]
         place, other = _near(position, columns, radius)
         gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[place], axis=1)
@@ -101,8 +144,10 @@ def find_links(fleet: Fleet, observers: Sequence[int], most: int, radius: float,
         place, other, gap = place[fits], other[fits], gap[fits]
         order = np.lexsort((other, gap, place))
         place, other = place[order], other[order]
-        rank = np.arange(len(place)) - np.searchsorted(place, place)
-        place, other = place[rank < most], other[rank < most]
+        passed = np.append(0, np.cumsum(~marks[other % vehicles]))  # vehicles before each
+        rank = passed[:-1] - passed[np.searchsorted(place, place)]
+        kept = (rank < most) | marks[other % vehicles]
+        place, other = place[kept], other[kept]
         found.append(np.column_stack([place // vehicles + first, place % vehicles, other % vehicles]))
     rows = np.concatenate(found)
     return Links(rows[:, 0], rows[:, 1], rows[:, 2])
@@ -171,23 +216,6 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
     return fixes
 
 
-def gauss_markov(normals: Floats, steps: float) -> Floats:
-    """Stationary e_t = a e_{t-1} + sqrt(1 - a^2) w_t of unit variance from normals w (T, ...), a = exp(-steps).
-
-    Args:
-        steps: time between samples over the correlation time.
-
-    >>> gauss_markov(np.ones((3, 1)), 0.0).ravel()
-    array([1., 1., 1.])
-    """
-    keep = np.exp(-steps)
-    fresh = np.sqrt(-np.expm1(-2.0 * steps))
-    error = normals.copy()
-    for t in range(1, len(error)):
-        error[t] = keep * error[t - 1] + fresh * normals[t]
-    return np.asarray(error)
-
-
 def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
     return _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
 
@@ -201,15 +229,22 @@ def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
 
 
 def _relative(
-    links: Links, columns: tuple[int, ...], v2x: V2X, fleet: Fleet, sensors: Sensors, runs: int, seed: int
+    links: Links,
+    who: tuple[Sequence[int], Sequence[int]],
+    v2x: V2X,
+    fleet: Fleet,
+    sensors: Sensors,
+    runs: int,
+    seed: int,
 ) -> Floats:
-    """(R, L, 3), from a recording of as many or more neighbours where one still exists."""
-    drawn, most = ("relative", fleet, repr(sensors), runs, seed, columns, v2x.radius), v2x.max_neighbours
+    """(R, L, 3) of observers and landmarks, from a recording of as many or more neighbours where one still exists."""
+    columns, landmarks = who
+    drawn, most = ("relative", fleet, repr(sensors), runs, seed, who, v2x.radius), v2x.max_neighbours
 
     def draw() -> Floats:
         for key, wider in list(_alive.items()):
             if key[:-1] == drawn and key[-1] > most:
-                whole = find_links(fleet, columns, key[-1], v2x.radius, sensors.min_range)
+                whole = find_links(fleet, columns, key[-1], v2x.radius, sensors.min_range, landmarks)
                 return wider.take(np.flatnonzero(np.isin(_code(fleet, whole), _code(fleet, links))), axis=1)
         return _relative_measurements(fleet, links, sensors, runs, seed)
 

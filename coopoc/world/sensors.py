@@ -54,6 +54,16 @@ class Sensors:
     """rad, noise of the observer's heading, new at every step: it turns all that is seen at the step alike."""
     heading_bias_std: float = 0.0
     """rad, of an error of the heading that each vehicle has for a whole run (mounting, magnetic declination)."""
+    compass: bool = True
+    """Whether a recording in body frames holds headings, with the two errors above."""
+    yaw_rate_std: float = 0.01
+    """rad/s, noise of a measured yaw rate, new at every step."""
+    yaw_rate_bias_std: float = 0.0
+    """rad/s, of an error of the yaw rate that lasts."""
+    speed_scale_std: float = 0.0
+    """Of an error that lasts and is a share of the speed (tyre radius)."""
+    odometry_error_time: float = 1e6
+    """s, correlation time of these two (Gauss-Markov); the default is one draw for a whole run."""
     min_range: float = 2.0
     """m, centres closer than a vehicle is wide are not measured (a range near zero makes angles seem exact)."""
 
@@ -65,6 +75,9 @@ class Sensors:
             if name in words:
                 if not isinstance(value, str) or value not in words[name]:
                     raise unknown(name, value, words[name])
+            elif isinstance(field.default, bool):
+                if not isinstance(value, bool):
+                    raise InputError(name, repr(value), "must be True or False", "Say whether there is one.")
             elif isinstance(field.default, tuple):
                 size = len(field.default)
                 if not isinstance(value, tuple | list | np.ndarray) or len(value) != size:
@@ -76,6 +89,8 @@ class Sensors:
             raise InputError("gnss_bias", self.gnss_bias, "must be (low, high) with low <= high", "Swap the two.")
         if self.gnss_drift_time <= 0:
             raise InputError("gnss_drift_time", self.gnss_drift_time, "must be > 0 s", "For white noise set the stds.")
+        if self.odometry_error_time <= 0:
+            raise InputError("odometry_error_time", self.odometry_error_time, "must be > 0 s", "1e6 is constant.")
         if self.azimuth_std > np.pi or self.inclination_std > np.pi:
             raise InputError(
                 "azimuth_std/inclination_std",

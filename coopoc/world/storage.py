@@ -13,14 +13,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from .body import Body
 from .fleet import Fleet
 from .links import Links
 from .recording import Recording
 from .sensors import Sensors
 from .v2x import V2X
 
-ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers")
+ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
 LINKS = ("step", "observer", "neighbour")
+BODY = ("yaw_rate", "heading")
 LARGEST = 2**32
 """Bytes of one unpacked file."""
 DAMAGES = (
@@ -57,9 +59,13 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
     words = {"ids": recording.ids, "notes": recording.notes, **settings}
     arrays: dict[str, Any] = {name: np.asarray(getattr(recording, name)) for name in ARRAYS}
     arrays |= {f"links_{name}": getattr(recording.links, name) for name in LINKS}
+    if recording.body is not None:
+        arrays |= {name: getattr(recording.body, name) for name in BODY}
     if truth is not None:
         words["truth"] = {"name": truth.name, "source": truth.source, "licence": truth.licence}
         arrays |= {"truth_position": truth.position, "truth_velocity": truth.velocity}
+        if truth.heading is not None:
+            arrays["truth_heading"] = truth.heading
     np.savez_compressed(path, coopoc_recording=np.array(json.dumps(words)), **arrays)
 
 
@@ -107,6 +113,8 @@ def digest(recording: Recording) -> str:
         sha.update(np.ascontiguousarray(getattr(recording, name)).tobytes())
     for name in LINKS:
         sha.update(np.ascontiguousarray(getattr(recording.links, name)).tobytes())
+    for name in BODY if recording.body is not None else ():
+        sha.update(np.ascontiguousarray(getattr(recording.body, name)).tobytes())
     return sha.hexdigest()
 
 
@@ -119,8 +127,11 @@ def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording
         sensors=Sensors(**noise),
         v2x=V2X(**words["v2x"]),
         notes=tuple(words["notes"]),
+        body=Body(arrays["yaw_rate"], arrays["heading"]) if "yaw_rate" in arrays else None,
         **{name: arrays[name] for name in ARRAYS},
     )
     if "truth" not in words:
         return recording, None
-    return recording, Fleet(ids, t, arrays["truth_position"], arrays["truth_velocity"], **words["truth"])
+    heading = arrays.get("truth_heading")
+    truth = Fleet(ids, t, arrays["truth_position"], arrays["truth_velocity"], heading=heading, **words["truth"])
+    return recording, truth

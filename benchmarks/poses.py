@@ -1,0 +1,148 @@
+"""Pose filters, alone and of a star of ten neighbours, beside filterpy's extended Kalman filter on the same work.
+
+    OMP_NUM_THREADS=1 python benchmarks/poses.py               # a Markdown table on stdout, half a minute
+
+One linearisation each, from the same measurements; filterpy's user gives it model and derivatives as NumPy arrays over
+all members at once. Times are this thread's own, medians of interleaved rounds, per step and run. A row counts only if
+its poses are those of filterpy to 1e-6 m.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import ExtendedKalmanFilter
+from tabulate import tabulate
+from timing import medians, timed
+
+import coopoc as co
+from coopoc.methods import pose_unit
+from coopoc.methods.pose_begin import body_of, first_poses
+from coopoc.world.inbox import inbox
+
+ROUNDS, STEPS, RUNS = 5, 101, 10
+NEIGHBOURS = {0: 3, 10: 1}
+"""K -> runs that filterpy follows."""
+SENSORS = co.Sensors(heading_std=0.05, yaw_rate_std=0.02, range_std=0.5, azimuth_std=0.03, inclination_std=0.03)
+FLAT, UNKNOWN = 1e6, np.pi**2 / 3
+
+
+def ring(neighbours: int) -> co.Recording:
+    """An ego that drives with neighbours around it."""
+    t = np.arange(STEPS) * 0.1
+    around, gap = 2 * np.pi * np.arange(neighbours) / max(neighbours, 1), np.linspace(12, 25, neighbours)
+    offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0.05 * gap], axis=1)])
+    path = np.stack([10 * t, 5 * np.sin(t / 5), 0 * t], axis=1)
+    position = path[:, None] + offset
+    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
+    fleet = co.Fleet(tuple(f"v{i}" for i in range(neighbours + 1)), t, position, velocity)
+    v2x = co.V2X(max_neighbours=neighbours)
+    return co.observe(fleet, SENSORS, v2x, runs=RUNS, observers=[0], frame="body")
+
+
+def ours(recording: co.Recording) -> Callable[[], Any]:
+    """The kernel over all runs; poses (R, T, 4) of the ego."""
+    method, box = co.PoseFilter(exact=False), inbox(recording, 0, co.PoseFilter().message)
+    members, begin = pose_unit.star(recording, 0, box), first_poses(recording, None, [0])
+    place = pose_unit.places_of(members, 0)
+    return lambda: method.follow(recording, members, box.link, begin)[0][:, place]
+
+
+def filterpys(recording: co.Recording, run: int) -> Any:
+    """Poses (T, 4) of the ego in one run by filterpy."""
+    body, links, dt = body_of(recording), recording.links, recording.dt
+    order = np.concatenate([[0], links.neighbour[links.step == 0]])
+    n, fixes = len(order), np.concatenate([recording.gnss[run], body.heading[run][..., None]], axis=2)
+    ekf = ExtendedKalmanFilter(4 * n, 4 * n)
+    ekf.x = fixes[0, order].ravel()
+    ekf.P = np.diag(np.tile([FLAT, FLAT, FLAT, UNKNOWN], n))
+    own = np.diag(np.tile([*np.square(SENSORS.fix_std), SENSORS.heading_std**2], n))
+    noise, same = np.diag(np.tile(np.square(SENSORS.relative_std), n - 1)), np.eye(4 * n)
+    block, found = 4 * np.arange(n), np.empty((len(recording.t), 4))
+    for t in range(len(recording.t)):
+        if t:
+            x, u, w = ekf.x.reshape(n, 4), recording.velocity[run, t, order], body.yaw_rate[run, t, order]
+            heading = x[:, 3] + dt * w / 2
+            c, s, zero, one = np.cos(heading), np.sin(heading), 0 * w, 1 + 0 * w
+            R = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=1).reshape(n, 3, 3)
+            moved = dt * (R @ u[..., None])[..., 0]
+            q = dt**2 * np.maximum(SENSORS.velocity_std_ratio * np.abs(u), SENSORS.velocity_floor) ** 2
+            effect = dt * np.stack([-moved[:, 1] / 2, moved[:, 0] / 2, zero, one], axis=1)
+            Q = SENSORS.yaw_rate_std**2 * effect[:, :, None] * effect[:, None]
+            Q[:, :3, :3] += (R * q[:, None]) @ R.transpose(0, 2, 1)
+            F, whole = same.copy(), np.zeros((4 * n, 4 * n))
+            F[block, block + 3], F[block + 1, block + 3] = -moved[:, 1], moved[:, 0]
+            for k in range(n):
+                whole[4 * k : 4 * k + 4, 4 * k : 4 * k + 4] = Q[k]
+            ekf.x = (x + np.column_stack([moved, dt * w])).ravel()
+            ekf.P = F @ ekf.P @ F.T + whole
+        z = fixes[t, order].ravel()
+        z[3::4] = ekf.x[3::4] + wrapped(z[3::4] - ekf.x[3::4])
+        ekf.update(z, lambda x: same, lambda x: x, own)
+        at = links.step == t
+        if n > 1:
+            place = np.searchsorted(np.sort(order), links.neighbour[at])
+            where = np.argsort(order)[place]
+            h, H = rows(ekf.x, where, n)
+            z = recording.relative[run, at]
+            z = (h + np.column_stack([z[:, 0] - h[:, 0], wrapped(z[:, 1:] - h[:, 1:])])).ravel()
+            ekf.update(z, lambda x, H=H: H, lambda x, h=h: h.ravel(), noise)
+        found[t] = ekf.x[:4]
+    return found
+
+
+def wrapped(angle: Any) -> Any:
+    """The same angles in [-pi, pi)."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi
+
+
+def rows(state: Any, others: Any, n: int) -> Any:
+    """Ranges, bearings and inclinations (n - 1, 3) of other members from the first, and their derivatives."""
+    x = state.reshape(n, 4)
+    (dx, dy, dz), count = (x[others, :3] - x[0, :3]).T, len(others)
+    flat2 = dx * dx + dy * dy
+    flat, r2 = np.sqrt(flat2), flat2 + dz * dz
+    r, zero = np.sqrt(r2), 0 * dx
+    h = np.stack([r, np.arctan2(dy, dx) - x[0, 3], np.arctan2(flat, dz)], axis=1)
+    a = np.stack([dx / r, -dy / flat2, dx * dz / (flat * r2)], axis=1)
+    b = np.stack([dy / r, dx / flat2, dy * dz / (flat * r2)], axis=1)
+    c = np.stack([dz / r, zero, -flat / r2], axis=1)
+    H, row = np.zeros((count, 3, 4 * n)), np.arange(count)
+    H[:, :, 0], H[:, :, 1], H[:, :, 2], H[:, 1, 3] = -a, -b, -c, -1.0
+    for axis, entry in enumerate((a, b, c)):
+        H[row, :, 4 * others + axis] = entry
+    return h, H.reshape(3 * count, 4 * n)
+
+
+def measured() -> list[dict[str, Any]]:
+    """Rows {name, us, ratio, right}: time per step and run, over that of filterpy."""
+    found = []
+    for neighbours, few in NEIGHBOURS.items():
+        seen = ring(neighbours)
+        call = ours(seen)
+        wanted = np.stack([filterpys(seen, run) for run in range(few)])
+        gap = call()[:few] - wanted
+        right = bool(max(np.abs(gap[..., :3]).max(), np.abs(wrapped(gap[..., 3])).max()) < 1e-6)
+        job = f"poses, K = {neighbours}"
+        spend = {
+            "filterpy": lambda seen=seen, few=few: timed(lambda: [filterpys(seen, r) for r in range(few)]) / few,
+            "compiled": lambda call=call: timed(call) / RUNS,
+        }
+        spent = {name: 1e6 * value / STEPS for name, value in medians(spend, ROUNDS).items()}
+        found += [
+            {"name": f"{job}: {name}", "us": us, "ratio": us / spent["filterpy"], "right": right}
+            for name, us in spent.items()
+        ]
+    return found
+
+
+def main() -> None:
+    """Print the table."""
+    lines = [[row["name"], row["us"], 1 / row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
+    print(tabulate(lines, ["", "us per step", "times filterpy", "same poses"], tablefmt="github", floatfmt=".3g"))
+
+
+if __name__ == "__main__":
+    main()

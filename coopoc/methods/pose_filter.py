@@ -1,0 +1,212 @@
+"""The pose filter: position and heading of a vehicle, its star or the whole fleet, from what is measured on board."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+
+from ..arrays import Bools, Floats, Ints, checked, number
+from ..errors import InputError
+from ..plugins import unknown
+from ..world.inbox import inbox
+from ..world.recording import Recording, check_recording
+from ..world.sensors import Sensors
+from ..world.spherical import wrap
+from ..world.v2x import NO_MESSAGE, Message
+from . import pose_unit
+from .central_filter import CENTRE, centre
+from .options import check_options
+from .pose_begin import check_compass, first_poses, pose_egos
+from .pose_unit import Members
+from .track import Track
+
+Unit = Literal["solo", "star", "fleet"]
+Fusion = Literal["joint", "naive", "intersection"]
+ODOMETRY = Message("fix, compass, velocity and yaw rate", 10)
+"""Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2)."""
+POSE = Message("pose and covariance", 16, cumulative=True)
+"""Position and heading (4), covariance (10), id and time (2)."""
+UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_neighbour=4)
+SPREAD = (1.0, 1.0, 1.0, 0.2)
+"""m and rad, standard deviations of poses at the first step that are given."""
+
+
+class _Found(NamedTuple):
+    """Ego, its places among the members, all members' states and covariances, its links, and bytes (R,)."""
+
+    ego: int
+    place: Ints
+    x: Floats
+    covariance: Floats
+    neighbours: Floats
+    received: Floats
+    sent: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFilter:
+    """Extended Kalman filter of (x, y, z, heading) driven by speed and yaw rate, with fixes, compass, ranges, bearings.
+
+    th' = th + dt w, p' = p + dt R(th + dt w / 2) u; range |p_j - p_i|, bearing atan2(p_j - p_i) - th_i; a component
+    that was not measured is no row. A landmark's position is known. With `exact` one more Gauss-Newton step on the
+    relative measurements follows, from the same prior.
+
+    Args:
+        unit: "solo", a vehicle and its landmarks; "star", an ego and its neighbours in one state, by what they
+            broadcast; "fleet", all vehicles.
+        fusion: of a fleet. "joint": one state with all cross-covariances, at a centre, the optimum. Decentralised, each
+            vehicle fuses the estimates that reach it in time: "naive" as if their errors were independent;
+            "intersection" by covariance intersection.
+        lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
+        exact: False is the plain extended Kalman filter.
+        invariant: the right-invariant filter of SE(2), of a solo vehicle: errors are those of the group.
+        gate: standard deviations of an innovation beyond which a component is left out; infinity keeps all.
+        begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
+        spread: (4,) standard deviations of these.
+        assumed: noise, default that of the recording.
+
+    References:
+        Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.4.
+        Roumeliotis, Bekey, Distributed multirobot localization, IEEE TRA 18(5), 2002 (the fleet's joint state).
+        Barrau, Bonnabel, The invariant extended Kalman filter as a stable observer, IEEE TAC 62(4), 2017.
+        Carrillo-Arce, Nerurkar, Gordillo, Roumeliotis, Decentralized multi-robot cooperative localization using
+        covariance intersection, IROS 2013.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 1], [[[0, 0, 0]], [[9, 0, 0]]], np.full((2, 1, 3), [9.0, 0, 0]))
+    >>> track = PoseFilter("solo")(observe(fleet, Sensors(), runs=3, frame="body"))
+    >>> track.x.shape, track.heading.shape
+    ((3, 2, 1, 3), (3, 2, 1))
+    """
+
+    unit: Unit = "star"
+    fusion: Fusion = "joint"
+    lasting: bool = False
+    exact: bool = True
+    invariant: bool = False
+    gate: float = np.inf
+    begin: Floats | None = None
+    spread: tuple[float, ...] = SPREAD
+    assumed: Sensors | None = None
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for field, words in (("unit", get_args(Unit)), ("fusion", get_args(Fusion))):
+            if getattr(self, field) not in words:
+                raise unknown(field, getattr(self, field), words)
+        if self.fusion != "joint" and self.unit != "fleet":
+            raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
+        if self.invariant and (self.unit != "solo" or self.exact):
+            hint = 'Take PoseFilter("solo", exact=False, invariant=True).'
+            raise InputError("invariant", True, "is for a solo vehicle and one linearisation", hint)
+        number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
+        spread = checked("spread", self.spread, "(4,)", (4,))
+        if not (spread > 0).all():
+            raise InputError("spread", self.spread, "must be > 0", "Give m, m, m and rad.")
+        if not self.name:
+            word = self.unit if self.fusion == "joint" else self.fusion
+            object.__setattr__(self, "name", f"pose-{'invariant' if self.invariant else word}")
+
+    @property
+    def cooperative(self) -> bool:
+        """Whether other vehicles take part."""
+        return self.unit != "solo"
+
+    @property
+    def message(self) -> Message:
+        """What each vehicle sends."""
+        if self.unit == "fleet":
+            return UPLOAD if self.fusion == "joint" else POSE
+        return ODOMETRY if self.cooperative else NO_MESSAGE
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos.
+
+        Raises:
+            InputError: a recording in the world frame, an ego that is unknown, absent at times or a landmark, one whose
+                first pose is not known, or a star whose neighbours send no compass.
+        """
+        began, recording = time.perf_counter(), check_recording(recording, body=True)
+        columns = pose_egos(recording, egos)
+        begin = first_poses(recording, self.begin, None if self.unit == "fleet" else columns)
+        units = self._fleet if self.unit == "fleet" else self._each
+        found = {one.ego: one for one in units(recording, columns, begin)}
+        each = [found[ego] for ego in columns]
+        x = np.stack([one.x[:, one.place] for one in each], axis=2)
+        cov = np.stack([one.covariance[:, one.place] for one in each], axis=2)
+        extras: dict[str, Floats] = {}
+        for k, name in enumerate(("speed_scale", "yaw_rate_bias") if self.lasting else (), 4):
+            extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
+        notes = (CENTRE,) if self.unit == "fleet" and self.fusion == "joint" else ()
+        return Track(
+            recording.t,
+            tuple(columns),
+            x[..., :3],
+            cov[..., :3, :3],
+            np.stack([one.received for one in each], axis=1),
+            np.stack([one.sent for one in each], axis=1),
+            time.perf_counter() - began,
+            np.concatenate([one.neighbours for one in each], axis=1),
+            notes,
+            wrap(x[..., 3]),
+            cov[..., 3, :4],
+            extras,
+        )
+
+    def _each(self, recording: Recording, columns: Sequence[int], begin: Floats) -> Iterator[_Found]:
+        """Egos one after the other."""
+        links = recording.links
+        none: Floats = np.zeros(recording.runs)
+        marks = np.isin(links.neighbour, recording.landmarks)
+        for ego in columns:
+            mine = links.of(ego)
+            if self.unit == "solo":
+                members = pose_unit.alone(recording, ego)
+                received = sent = none
+                x, cov, _ = self.follow(recording, members, mine[marks[mine]], begin)
+            else:
+                box = inbox(recording, ego, self.message)
+                members, received = pose_unit.star(recording, ego, box), box.received_bytes
+                check_compass(recording, np.unique(links.neighbour[mine[~marks[mine]]]))
+                x, cov, _ = self.follow(recording, members, mine, begin)
+                sent = none + box.sent_bytes
+            place = pose_unit.places_of(members, ego)
+            neighbours = np.full((recording.runs, len(mine), 3), np.nan)
+            if self.unit == "star":
+                others = np.setdiff1d(np.arange(len(members.column)), place)
+                neighbours[:, ~marks[mine]] = x[:, others, :3]
+            yield _Found(ego, place, x, cov, neighbours, received, sent)
+
+    def _fleet(self, recording: Recording, columns: Sequence[int], begin: Floats) -> Iterator[_Found]:
+        """All vehicles at once; a relative measurement counts if the message that it needs arrives at its step."""
+        links, members = recording.links, pose_unit.fleet(recording)
+        mine = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
+        kept = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
+        x, cov, _ = self.follow(recording, members, mine, begin, kept[:, mine])
+        each: Floats = np.ones(recording.runs)
+        met = centre(recording, self.message) if self.fusion == "joint" else None
+        for ego in columns:
+            neighbours = np.full((recording.runs, len(links.of(ego)), 3), np.nan)
+            if met is None:
+                box = inbox(recording, ego, self.message)
+                received, sent = box.received_bytes, each * box.sent_bytes
+            else:
+                received, sent = met.received_bytes[:, ego], met.sent_bytes[:, ego]
+            yield _Found(ego, pose_unit.places_of(members, ego), x, cov, neighbours, received, sent)
+
+    def follow(
+        self, recording: Recording, members: Members, links: Ints, begin: Floats, kept: Bools | None = None
+    ) -> tuple[Floats, Floats, Floats]:
+        """States, covariances, and cost and number of measurements of a unit, as of `kernels.pose_filter`."""
+        from ..kernels.pose_filter import PoseOptions, follow
+
+        noise = pose_unit.pose_noise(self.assumed or recording.sensors, recording.dt, self.gate)
+        fusion = get_args(Fusion).index(self.fusion)
+        options = PoseOptions(6 if self.lasting else 4, 1 + self.exact, self.invariant, fusion)
+        measured = pose_unit.seen(recording, members, links, kept)
+        return follow(measured, noise, begin, np.array(self.spread, dtype=float), options)

@@ -1,0 +1,148 @@
+"""PyFG -> Recording in body frames: odometry and ranges of several robots, on equal steps, with the file's truth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coopoc.arrays import Floats, Ints
+from coopoc.errors import InputError
+from coopoc.formats.graph import Graph
+from coopoc.world.body import Body
+from coopoc.world.fleet import Fleet
+from coopoc.world.frames import midway, turned
+from coopoc.world.links import Links
+from coopoc.world.recording import Recording
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
+
+from .mrclam_recording import changes
+from .rows import backward_difference
+
+FLAT = 0.01
+"""m and rad, of heights and inclinations in a plane, and m/s, least noise of a velocity."""
+
+
+def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]:
+    """Recording of the robots of a graph in the plane, in one run, and the truth that its vertices hold.
+
+    Odometry is chained and differenced over steps; a range belongs to the nearest step, to the robot that is named first.
+    Standard deviations are those of the file, brought to one step. Points are landmarks; all messages arrive at once.
+
+    Args:
+        graph: of `read_pyfg`, with stamps.
+        dt: s, of a step.
+
+    Raises:
+        InputError: a graph in space, poses without stamps, a robot whose odometry has a gap, robots that share no time.
+    """
+    if graph.dimension != 2 or np.isnan(graph.stamps[graph.is_pose]).any():
+        raise InputError(
+            "graph", repr(graph), "must be in the plane, with stamps", "Take formats and solve for others."
+        )
+    stamps = {name: graph.stamps[places] for name, places in graph.robots.items()}
+    begin, end = max(t[0] for t in stamps.values()), min(t[-1] for t in stamps.values())
+    if not end - begin >= 2 * dt:
+        raise InputError("graph", repr(graph), "must hold robots that share two steps", "Give a smaller dt.")
+    t = dt * np.arange(int((end - begin) / dt) + 1)
+    paths = [_chained(graph, name) for name in stamps]
+    poses = [np.column_stack([graph.position[p], np.unwrap(graph.orientation[p, 0])]) for p in graph.robots.values()]
+    path, truth = (
+        np.stack([_at(t + begin, s, each) for s, each in zip(stamps.values(), found, strict=True)], axis=1)
+        for found in (paths, poses)
+    )
+    marks = np.flatnonzero(~graph.is_pose & np.isfinite(graph.position).all(axis=1))
+    ids, robots = (*stamps, *(graph.names[k] for k in marks)), len(stamps)
+    place = np.broadcast_to(np.column_stack([graph.position[marks], 0 * marks]), (len(t), len(marks), 3))
+    moved = np.diff(path, axis=0, prepend=path[:1]) / dt
+    flat = np.concatenate([moved[..., :2], 0 * moved[..., :1]], axis=2)
+    velocity = np.concatenate([turned(flat, -midway(path[..., 2])), 0 * place], axis=1)[None]
+    rate = np.concatenate([moved[..., 2], 0 * place[..., 0]], axis=1)[None]
+    gnss = np.concatenate([np.full((len(t), robots, 3), np.nan), place], axis=1)[None]
+    table = _ranges(graph, (marks, robots), begin, t)
+    links = Links(*table[:, :3].astype(np.int64).T)
+    relative = np.column_stack([table[:, 3], np.full(len(table), np.nan), np.full(len(table), np.pi / 2)])[None]
+    position = np.concatenate([np.append(truth[..., :2], 0 * truth[..., :1], axis=2), place], axis=1)
+    fleet = Fleet(
+        ids,
+        t,
+        position,
+        backward_difference(t, position, ids),
+        name="pyfg",
+        heading=np.concatenate([truth[..., 2], 0 * place[..., 0]], axis=1),
+    )
+    recording = Recording(
+        ids=ids,
+        t=t,
+        gnss=gnss,
+        velocity=velocity,
+        links=links,
+        relative=relative,
+        broadcasts=np.broadcast_to(np.arange(len(ids)) < robots, (len(t), len(ids))),
+        arrival=np.where(links.neighbour < robots, links.step, -1)[None],
+        sensors=_sensors(graph, dt),
+        v2x=V2X(max_neighbours=max(robots - 1, 0), radius=float("inf")),
+        observers=tuple(range(len(ids))),
+        notes=("odometry and ranges are real; no fix, no compass", "inclinations are pi/2: all is in one plane"),
+        body=Body(rate, np.full(rate.shape, np.nan)),
+        landmarks=tuple(range(robots, len(ids))),
+    )
+    return recording, fleet
+
+
+def _chained(graph: Graph, robot: str) -> Floats:
+    """(n, 3) m, m, rad, poses of a robot by its odometry, the first at the origin."""
+    places, edges = graph.robots[robot], graph.relative_pose
+    after = {int(a): k for k, (a, b) in enumerate(edges.nodes.tolist()) if graph.names[a][0] == graph.names[b][0]}
+    path = np.zeros((len(places), 3))
+    for n, (place, then) in enumerate(zip(places[:-1].tolist(), places[1:].tolist(), strict=True)):
+        k = after.get(place, -1)
+        if k < 0 or edges.nodes[k, 1] != then:
+            given = f"no odometry from {graph.names[place]} to {graph.names[then]}"
+            raise InputError("graph", given, "must join all poses of a robot", "Cut the file at the gap.")
+        (x, y, heading), (dx, dy), turn = path[n], edges.position[k], edges.orientation[k, 0]
+        c, s = np.cos(heading), np.sin(heading)
+        path[n + 1] = x + c * dx - s * dy, y + s * dx + c * dy, heading + turn
+    return path
+
+
+def _at(t: Floats, stamps: Floats, values: Floats) -> Floats:
+    return np.column_stack([np.interp(t, stamps, column) for column in values.T])
+
+
+def _ranges(graph: Graph, who: tuple[Ints, int], begin: float, t: Floats) -> Floats:
+    """(L, 4) step, observer, neighbour, range m; of several of a pair at a step the nearest in time."""
+    marks, robots = who
+    column = np.full(len(graph.names), -1)
+    for k, places in enumerate(graph.robots.values()):
+        column[places] = k
+    column[marks] = robots + np.arange(len(marks))
+    ends = column[graph.ranges.nodes]
+    ends = np.where((ends[:, :1] >= robots) & (ends[:, :1] > ends[:, 1:]), ends[:, ::-1], ends)  # a robot observes
+    dt = t[1] - t[0]
+    step = np.rint((graph.ranges.stamps - begin) / dt)
+    late = np.abs(graph.ranges.stamps - begin - dt * step)
+    order = np.lexsort((late, ends[:, 1], ends[:, 0], step))
+    fits = (step >= 0) & (step < len(t)) & (ends >= 0).all(axis=1) & (ends[:, 0] < robots)
+    order = order[fits[order]]
+    order = order[changes(step[order], ends[order, 0], ends[order, 1])]
+    table = np.column_stack([step, ends, graph.ranges.distance])[order]
+    return table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
+
+
+def _sensors(graph: Graph, dt: float) -> Sensors:
+    """Noise that the file states; that of an odometry edge is white, so that its variance grows with its time."""
+    edges, stamps = graph.relative_pose, graph.stamps
+    lasts = stamps[edges.nodes[:, 1]] - stamps[edges.nodes[:, 0]]
+    one = (lasts > 0) & np.array([graph.names[a][0] == graph.names[b][0] for a, b in edges.nodes.tolist()])
+    share = dt / lasts[one]
+    move, turn = (np.mean(share * edges.covariance[one, k, k]) for k in (0, 2))
+    return Sensors(
+        gnss_std=(1.0, 1.0, FLAT),
+        velocity_std_ratio=0.0,
+        velocity_floor=max(float(np.sqrt(move)) / dt, FLAT),
+        yaw_rate_std=float(np.sqrt(turn)) / dt,
+        range_std=float(np.sqrt(np.mean(graph.ranges.variance))) if len(graph.ranges) else 1.0,
+        inclination_std=FLAT,
+        compass=False,
+        min_range=0.0,
+    )

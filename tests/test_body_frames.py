@@ -1,0 +1,102 @@
+"""Recordings in body frames: turned by the compass they are those of the world, draw by draw."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.world.frames import body_motion, in_world, true_heading, turned
+from coopoc.world.storage import read_recording, save_recording
+
+NOISE = co.Sensors(heading_std=0.02, heading_bias_std=0.03, velocity_reading="speed")
+
+
+@pytest.fixture
+def body(crossing: co.Fleet) -> co.Recording:
+    return co.observe(crossing, NOISE, co.V2X(max_neighbours=3), runs=3, frame="body")
+
+
+def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing: co.Fleet, body: co.Recording) -> None:
+    """Closed form: a bearing plus the compass is the azimuth, with the same errors; fixes and ranges are equal."""
+    world = co.observe(crossing, NOISE, co.V2X(max_neighbours=3), runs=3)
+    again = in_world(body)
+    assert np.array_equal(again.gnss, world.gnss)
+    assert np.array_equal(again.relative[..., [0, 2]], world.relative[..., [0, 2]])
+    gap = np.exp(1j * (again.relative[..., 1] - world.relative[..., 1]))
+    assert np.abs(np.angle(gap)).max() < 1e-12
+
+
+def test_exact_sensors_give_the_true_motion_back(crossing: co.Fleet) -> None:
+    exact = co.Sensors(velocity_std_ratio=0.0, yaw_rate_std=0.0)
+    seen = co.observe(crossing, exact, frame="body")
+    assert seen.body is not None
+    assert np.allclose(in_world(seen).velocity[0, 1:], crossing.velocity[1:], atol=1e-12)
+    heading = true_heading(crossing)
+    assert np.allclose(np.diff(heading, axis=0), crossing.dt * seen.body.yaw_rate[0, 1:], atol=1e-12)
+
+
+def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(crossing: co.Fleet) -> None:
+    plain, biased = (
+        co.observe(crossing, co.Sensors(**more), runs=400, frame="body")
+        for more in ({}, {"yaw_rate_bias_std": 0.05, "speed_scale_std": 0.1})
+    )
+    assert plain.body is not None
+    assert biased.body is not None
+    assert np.array_equal(plain.gnss, biased.gnss)
+    assert np.array_equal(plain.body.heading, biased.body.heading)
+    bias = biased.body.yaw_rate - plain.body.yaw_rate
+    assert np.ptp(bias, axis=1).max() < 1e-2  # one for a whole run
+    assert bias[:, 0].std() == pytest.approx(0.05, rel=0.1)
+    motion, _ = body_motion(crossing)
+    scale = (biased.velocity - plain.velocity)[:, 5, :, 0] / motion[5, :, 0]
+    assert scale.std() == pytest.approx(0.1, rel=0.1)
+
+
+def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing: co.Fleet) -> None:
+    still = co.Fleet(
+        (*crossing.ids, "mast"),
+        crossing.t,
+        np.append(crossing.position, np.full((60, 1, 3), 5.0), axis=1),
+        np.append(crossing.velocity, np.zeros((60, 1, 3)), axis=1),
+    )
+    v2x = co.V2X(max_neighbours=2, radius=40.0)
+    alone, seen = (
+        co.observe(one, co.Sensors(), v2x, landmarks=marks) for one, marks in ((crossing, ()), (still, ["mast"]))
+    )
+    assert (seen.gnss[:, :, 8] == 5.0).all()
+    of_mast = seen.links.neighbour == 8
+    assert of_mast.any()
+    assert not (seen.links.observer == 8).any()
+    assert (seen.arrival[:, of_mast] == -1).all()
+    assert np.array_equal(seen.relative[:, ~of_mast], alone.relative)  # neighbours and their draws are as without it
+    with pytest.raises(co.InputError, match="landmarks"):
+        co.observe(crossing, co.Sensors(), landmarks=["c0"])
+
+
+def test_position_methods_refuse_body_frames(body: co.Recording) -> None:
+    for method in (co.Kalman(), co.JointFilter(), co.CentralFilter(), co.CooperativeMAP()):
+        with pytest.raises(co.InputError, match=r"body frames: must be in the world frame here.*in_world"):
+            method(body)
+    nothing = co.observe(co.load_fleet("town10").between(0, 3), co.Sensors(compass=False), frame="body")
+    with pytest.raises(co.InputError, match="Take a pose filter"):
+        in_world(nothing)
+    with pytest.raises(co.InputError, match="must be in body frames"):
+        in_world(in_world(body))
+
+
+def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body: co.Recording, tmp_path: Path) -> None:
+    save_recording(body, tmp_path / "body.npz")
+    again, _ = read_recording(tmp_path / "body.npz")
+    assert again.body is not None
+    assert body.body is not None
+    assert np.array_equal(again.body.yaw_rate, body.body.yaw_rate)
+    part = body.between(10, 20).of_runs(slice(1, 3))
+    assert part.body is not None
+    assert np.array_equal(part.body.heading, body.body.heading[1:3, 10:20])
+
+
+def test_turning_is_a_rotation() -> None:
+    assert np.allclose(turned(np.array([3.0, 4.0, 1.0]), np.array(np.pi)), [-3.0, -4.0, 1.0])

@@ -1,0 +1,184 @@
+"""What pose filters promise: consistency, order of accuracy, bias states, gates, partial measurements, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.evaluate.metrics import nees_band, share_of_average
+
+WHITE = co.Sensors(
+    gnss_std=(1.5, 1.5, 1.5), heading_std=0.05, yaw_rate_std=0.02, range_std=0.3, azimuth_std=0.02, inclination_std=0.02
+)
+
+
+def convoy(vehicles: int = 5, steps: int = 200, masts: int = 0) -> co.Fleet:
+    """Vehicles that wind along at 10 m/s, 8 m apart, and masts beside their way."""
+    t = np.arange(steps) * 0.1
+    course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * np.arange(vehicles))
+    velocity = 10 * np.stack([np.cos(course), np.sin(course), 0 * course], axis=2)
+    start = np.stack([8.0 * np.arange(vehicles), 3.0 * (np.arange(vehicles) % 2), 0.0 * np.arange(vehicles)], axis=1)
+    position = start + np.cumsum(0.1 * velocity, axis=0)
+    stands = np.stack([60.0 * np.arange(masts), 12.0 + 0 * np.arange(masts), 4.0 + 0 * np.arange(masts)], axis=1)
+    places = np.broadcast_to(stands, (steps, masts, 3))
+    ids = tuple([f"v{k}" for k in range(vehicles)] + [f"m{k}" for k in range(masts)])
+    return co.Fleet(ids, t, np.append(position, places, axis=1), np.append(velocity, 0 * places, axis=1))
+
+
+def observed(fleet: co.Fleet, sensors: co.Sensors = WHITE, runs: int = 30, **more: Any) -> co.Recording:
+    marks = [name for name in fleet.ids if name[0] == "m"]
+    v2x = co.V2X(max_neighbours=more.pop("neighbours", 4), radius=60.0)
+    return co.observe(fleet, sensors, v2x, runs=runs, frame="body", landmarks=marks, **more)
+
+
+@pytest.mark.parametrize(
+    ("method", "masts"),
+    [
+        (co.PoseFilter("solo"), 0),
+        (co.PoseFilter("solo", exact=False, invariant=True), 3),
+        (co.PoseFilter("star"), 0),
+        (co.PoseFilter("star"), 3),
+        (co.PoseFilter("fleet"), 0),
+    ],
+    ids=lambda value: getattr(value, "name", value),
+)
+def test_white_noise_stays_inside_the_band(method: co.PoseFilter, masts: int) -> None:
+    """Chi-square of 3 degrees of freedom, run-averaged, on at least 95 % of the steps."""
+    fleet = convoy(masts=masts)
+    track = method(observed(fleet, replace(WHITE, velocity_reading="speed")), ["v1", "v2"])
+    found = co.pose_nees(track, fleet)
+    assert share_of_average(found.mean(axis=0), 30).min() >= 0.95
+    low, high = nees_band(30 * 20)  # about as many independent values as there are runs and correlation times
+    assert low < found.mean() < high
+
+
+def test_joint_is_best_intersection_is_cautious_and_naive_is_not() -> None:
+    """The optimum has all cross-covariances; without them estimates are used twice (Julier, Uhlmann, ACC 1997)."""
+    fleet = convoy()
+    seen = observed(fleet, runs=12)
+    makes = {"joint": {}, "naive": {"fusion": "naive"}, "intersection": {"fusion": "intersection"}}
+    tracks = {name: co.PoseFilter("fleet", **how)(seen, range(5)) for name, how in makes.items()}
+    tracks["solo"] = co.PoseFilter("solo")(seen, range(5))
+    error = {name: float(co.rt_le(track, fleet).mean()) for name, track in tracks.items()}
+    nees = {name: float(co.pose_nees(track, fleet).mean()) for name, track in tracks.items()}
+    assert error["joint"] < error["intersection"] < error["solo"]
+    assert error["joint"] < error["naive"]
+    assert nees["naive"] > 6.0
+    assert nees["intersection"] < 3.3
+    assert nees["joint"] == pytest.approx(3.0, abs=0.8)  # errors that all share: about 120 independent values
+
+
+def test_scale_and_bias_are_found_where_they_act() -> None:
+    """Closed form: the drawn errors, known from the exact odometry; ignoring them is over-confident."""
+    fleet, runs = convoy(2, 400), 20
+    wrong = replace(WHITE, yaw_rate_bias_std=0.05, speed_scale_std=0.05, gnss_std=(0.5,) * 3)
+    seen = observed(fleet, wrong, runs)
+    exact = observed(fleet, replace(wrong, yaw_rate_bias_std=0.0), runs)
+    assert seen.body is not None
+    assert exact.body is not None
+    bias = (seen.body.yaw_rate - exact.body.yaw_rate)[:, -1, 0]
+    track = co.PoseFilter("solo", lasting=True)(seen, [0])
+    found, std = (track.extras[name][:, -1, 0] for name in ("yaw_rate_bias", "yaw_rate_bias_std"))
+    assert std.max() < 0.01
+    assert np.abs((found - bias) / std).max() < 4.5
+    assert co.pose_nees(track, fleet).mean() == pytest.approx(3.0, abs=0.5)
+    ignored = co.PoseFilter("solo")(seen, [0])
+    assert co.pose_nees(ignored, fleet).mean() > 4.0
+    assert np.abs(co.heading_error(track, fleet)).mean() < np.abs(co.heading_error(ignored, fleet)).mean()
+
+
+def test_range_alone_and_bearing_alone_help_and_both_help_more() -> None:
+    fleet = convoy()
+    seen = observed(fleet, runs=10)
+
+    def error(*components: int) -> float:
+        relative = np.full(seen.relative.shape, np.nan)
+        relative[..., components] = seen.relative[..., components]
+        return float(co.rt_le(co.PoseFilter("fleet")(replace(seen, relative=relative), [1, 2]), fleet).mean())
+
+    nothing, ranges, bearings, both = error(), error(0), error(1), error(0, 1)
+    assert both < min(ranges, bearings)
+    assert max(ranges, bearings) < nothing
+
+
+def test_a_star_without_neighbours_is_a_solo_filter() -> None:
+    fleet = convoy(3, 40, masts=1)
+    seen = observed(fleet, runs=3, neighbours=0)
+    star, solo = (co.PoseFilter(unit)(seen, [1]) for unit in ("star", "solo"))
+    assert np.array_equal(star.x, solo.x)
+    assert np.array_equal(star.heading, solo.heading)  # type: ignore[arg-type]
+    assert (solo.received_bytes == 0).all()
+
+
+def test_the_gate_keeps_outliers_out() -> None:
+    """Every twentieth range is 20 m too long; without outliers the gate changes next to nothing."""
+    fleet = convoy(masts=2)
+    seen = observed(fleet, runs=6)
+    relative = seen.relative.copy()
+    relative[:, ::20, 0] += 20.0
+    wrong = replace(seen, relative=relative)
+
+    def error(recording: co.Recording, gate: float) -> float:
+        return float(co.rt_le(co.PoseFilter("fleet", gate=gate)(recording, [1, 2]), fleet).mean())
+
+    clean = error(seen, np.inf)
+    assert error(wrong, 5.0) < 1.1 * clean
+    assert error(wrong, np.inf) > 1.5 * clean
+    assert error(seen, 5.0) == pytest.approx(clean, rel=0.01)
+
+
+def test_turning_the_world_turns_the_estimate() -> None:
+    """Closed form: a rotation of fixes, compasses and landmarks about z rotates positions and headings."""
+    fleet = convoy(3, 60, masts=1)
+    seen, angle = observed(fleet, runs=2), 0.7
+    assert seen.body is not None
+    turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    body = co.Body(seen.body.yaw_rate, seen.body.heading + angle)
+    there = replace(seen, gnss=seen.gnss @ turn, body=body)
+    for unit in ("solo", "star", "fleet"):
+        here, turned = (co.PoseFilter(unit)(one, [1]) for one in (seen, there))
+        assert np.allclose(turned.x, here.x @ turn, atol=1e-6)
+        assert np.allclose(np.exp(1j * (turned.heading - here.heading)), np.exp(1j * angle), atol=1e-7)  # type: ignore[operator]
+
+
+def test_a_lost_message_is_a_measurement_less() -> None:
+    fleet = convoy(4, 120)
+    errors = []
+    for loss in (0.0, 0.5, 0.95):
+        v2x = co.V2X(max_neighbours=3, radius=60.0, loss=loss)
+        seen = co.observe(fleet, WHITE, v2x, runs=10, frame="body")
+        track = co.PoseFilter("star")(seen, [1, 2])
+        errors.append(float(co.rt_le(track, fleet).mean()))
+        assert 2.0 < co.pose_nees(track, fleet).mean() < 4.5
+    assert errors == sorted(errors)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda r: co.PoseFilter("stars"), "unit"),
+        (lambda r: co.PoseFilter(fusion="naive"), "is for a fleet"),
+        (lambda r: co.PoseFilter(invariant=True), "solo vehicle"),
+        (lambda r: co.PoseFilter(gate=0.5), "gate"),
+        (lambda r: co.PoseFilter(spread=(1.0, 1.0, 1.0, 0.0)), "spread"),
+        (lambda r: co.PoseFilter("solo", begin=np.zeros((2, 4)))(r), "begin"),
+        (lambda r: co.PoseFilter()(r, ["m0"]), "is a landmark"),
+        (lambda r: co.PoseFilter()(co.observe(convoy(), WHITE)), "must be in body frames"),
+        (lambda r: co.PoseFilter()(observed(convoy(), replace(WHITE, compass=False))), "no heading of v0"),
+        (lambda r: co.heading_error(co.Kalman()(co.observe(convoy(), WHITE)), convoy()), "estimates none"),
+    ],
+)
+def test_mistakes_are_named(make: Any, words: str) -> None:
+    with pytest.raises(co.InputError, match=words):
+        make(observed(convoy(masts=1), runs=1))
+
+
+def test_neighbours_without_a_compass_are_named() -> None:
+    seen = observed(convoy(), replace(WHITE, compass=False), runs=1)
+    begin = np.zeros((5, 4))
+    with pytest.raises(co.InputError, match='unit="fleet"'):
+        co.PoseFilter(begin=begin)(seen)

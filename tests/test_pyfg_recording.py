@@ -1,0 +1,74 @@
+"""PyFG as a Recording in body frames: read against the file's lines, and range-only cooperation on a real log."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.data.pyfg_recording import graph_recording
+from coopoc.formats.pyfg import read_pyfg
+from coopoc.world.frames import body_motion
+
+
+@pytest.fixture(scope="module")
+def tiers(shared: Path) -> tuple[co.Recording, co.Fleet]:
+    return graph_recording(read_pyfg(shared / "pyfg" / "tiers.pyfg"))
+
+
+def test_odometry_and_ranges_are_those_of_the_file(tiers: tuple[co.Recording, co.Fleet]) -> None:
+    """Counts of the raw text, and the truth of its vertices: ranges err by their stated 0.04 m."""
+    seen, fleet = tiers
+    assert fleet.ids == ("A", "B", "C", "D", "L0")
+    assert seen.landmarks == (4,)
+    assert 0.9 * 7789 < len(seen.links) <= 7789  # several of a pair in a step are one
+    gap = fleet.position[seen.links.step, seen.links.neighbour] - fleet.position[seen.links.step, seen.links.observer]
+    error = seen.relative[0, :, 0] - np.linalg.norm(gap, axis=1)
+    assert np.median(np.abs(error)) < 0.04
+    assert seen.sensors.range_std == pytest.approx(0.04, abs=0.005)
+    motion, rate = body_motion(fleet)
+    assert seen.body is not None
+    for measured, true in (
+        (seen.velocity[0, 1:, :4, 0], motion[1:, :4, 0]),
+        (seen.body.yaw_rate[0, 1:, :4], rate[1:, :4]),
+    ):
+        assert np.corrcoef(measured.ravel(), true.ravel())[0, 1] > 0.8
+
+
+def test_ranges_alone_and_one_anchor_beat_dead_reckoning(tiers: tuple[co.Recording, co.Fleet]) -> None:
+    """The vertices' truth; only the first poses are taken from it. Ranges err alike for a while, so 0.3 m is assumed."""
+    seen, fleet = tiers
+    begin = np.full((5, 4), np.nan)
+    assert fleet.heading is not None
+    begin[:4] = np.column_stack([fleet.position[0, :4], fleet.heading[0, :4]])
+    noise, spread = replace(seen.sensors, range_std=0.3), (0.05, 0.05, 0.01, 0.05)
+    alone = replace(seen, relative=np.full(seen.relative.shape, np.nan))
+
+    def error(recording: co.Recording, **how: str) -> float:
+        method = co.PoseFilter(**how, gate=5.0, begin=begin, spread=spread, assumed=noise)  # type: ignore[arg-type]
+        return float(co.rt_le(method(recording, range(4)), fleet).mean())
+
+    together, dead = error(seen, unit="fleet"), error(alone, unit="solo")
+    assert together < 0.5 * dead
+    assert together < error(seen, unit="solo") < dead
+    assert together < error(seen, unit="fleet", fusion="intersection") < dead
+
+
+def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
+    lines = [f"VERTEX_SE2 {0.1 * k} A{k} {k} 0 0" for k in range(30)]
+    edges = [f"EDGE_SE2 {0.1 * k} A{k} A{k + 1} 1 0 0 0.01 0 0 0.01 0 0.01" for k in range(29)]
+    file = tmp_path / "one.pyfg"
+    file.write_text("\n".join(lines + edges) + "\n")
+    seen, fleet = graph_recording(read_pyfg(file))
+    assert np.allclose(seen.velocity[0, 1:, 0], [10.0, 0.0, 0.0])
+    assert len(seen.links) == 0
+    assert fleet.position[-1, 0, 0] == pytest.approx(29.0)
+    assert co.load_recording(file).ids == ("A",)
+    file.write_text("\n".join(lines + edges[:9] + edges[10:]) + "\n")
+    with pytest.raises(co.InputError, match="no odometry from A9 to A10"):
+        graph_recording(read_pyfg(file))
+    with pytest.raises(co.InputError, match="share two steps"):
+        graph_recording(read_pyfg(file), dt=5.0)
