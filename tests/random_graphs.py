@@ -96,9 +96,9 @@ def _paths(rng: np.random.Generator, d: int, robots: int, steps: int) -> tuple[n
         at, course, bend = rng.uniform(-10, 10, d) * np.r_[1, 1, np.full(d - 2, 0.2)], rng.uniform(-np.pi, np.pi), 0.0
         for _ in range(steps):
             home = np.arctan2(-at[1], -at[0]) - course
-            pull = 0.1 * np.sin(home) * max(0.0, np.hypot(at[0], at[1]) / 20.0 - 0.3)
+            homing = 0.1 * np.sin(home) * max(0.0, np.hypot(at[0], at[1]) / 20.0 - 0.3)
             bend = 0.8 * bend + 0.08 * rng.normal()
-            course += bend + pull
+            course += bend + homing
             tilt = [] if d == 2 else [0.1 * rng.normal(), 0.1 * rng.normal()]
             angles = [course, *tilt]
             found.append(at.copy())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -29,6 +30,7 @@ from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
 from coopoc.optimize.marginals import bayes_tree_marginals
+from coopoc.optimize.search import Search
 from coopoc.optimize.sparse import _made, sparse
 from coopoc.optimize.starts import chained
 
@@ -122,6 +124,18 @@ def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> N
     assert found.status is Status.SOLVED
     assert found.extras["start"] in ("odometry", "tree", "linear")
     assert found.cost <= solve(from_graph(graph, start="file")).cost * (1 + 1e-9)
+
+
+def test_the_search_for_a_start_is_counted() -> None:
+    """Iterations and seconds of a solution contain those of all starts that were tried."""
+    began = time.perf_counter()
+    problem = from_graph(random_graph(203, steps=150, turn_std=0.1, loops=80, seen=120))
+    took, found = time.perf_counter() - began, solve(problem)
+    alone = solve(problem.replace_unchecked(search=Search()))
+    assert found.iterations == alone.iterations + found.extras["start_iterations"]
+    assert found.extras["start_iterations"] >= 24  # two starts of twelve steps at least
+    assert 0.0 < found.extras["start_seconds"] <= min(took, found.solve_seconds)
+    assert found.extras["start"] == problem.search.start != ""
 
 
 def test_a_tree_goes_the_way_of_least_variance() -> None:

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from .backend import backends
 from .graphs import Objective, read_graph
 from .problem import Problem
+from .search import Search
 from .solution import Solution, Status
 from .solve import solve
 
@@ -44,7 +45,9 @@ def solve_file(
     if start == "relaxed":
         from .convex import staircase
 
+        began = time.perf_counter()
         problem = replace(problem, x0=staircase(problem, refine=False).x)
+        problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
     print(f"coopoc: {problem}", file=sys.stderr)
     solution = solve(problem, backend, throw=False)
     summary = described(solution)
@@ -65,6 +68,7 @@ def described(solution: Solution) -> dict[str, Any]:
         "backend": solution.backend,
         "cost": solution.cost,
         "gradient_norm": solution.gradient_norm,
+        "start": solution.extras.get("start"),
         "iterations": solution.iterations,
         "build_seconds": solution.build_seconds,
         "solve_seconds": solution.solve_seconds,

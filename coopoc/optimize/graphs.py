@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
@@ -15,7 +16,9 @@ from ..plugins import unknown
 from .factor import Factor
 from .problem import Problem
 from .race import race
+from .search import Search
 from .space import Space
+from .sparse import keep
 from .starts import STARTS, contenders
 
 Objective = Literal["chordal", "geodesic"]
@@ -62,21 +65,19 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         fixed = poses[:1]
     factors = _factors(graph, objective)
 
-    def problem(name: str) -> Problem:
-        x0 = x0_of(name)
-        return Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses, fixed=fixed, start=name)
-
     def x0_of(name: str) -> Floats:
         x0 = STARTS[name](graph)
         return x0 if poses else x0[:, : graph.dimension]
 
-    if start != "auto":
-        return problem(start)
-    names = contenders(graph)
-    first = problem(names[0])
-    assert first.x0 is not None
-    given = first.x0
-    return race(first, {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names})
+    began = time.perf_counter()
+    names = contenders(graph) if start == "auto" else (start,)
+    given = x0_of(names[0])
+    problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=fixed)
+    won = Search(names[0])
+    if start == "auto":
+        starts = {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names}
+        problem, won = race(problem, starts)
+    return keep(problem, problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began)))
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:

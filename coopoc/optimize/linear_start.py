@@ -14,8 +14,8 @@ from .space import Space, exp
 
 TIE = 1e-6
 """Weight of the start that is given beside the least weight of a measurement: it decides only what nothing measures."""
-PULL = 1e-4
-"""Weight of the last rotations beside that of a median relative rotation: it reaches a hundred poses along a chain."""
+PROXIMAL = 1e-4
+"""Weight of the last rotations beside that of a median relative rotation: it acts over a hundred poses of a chain."""
 SWEEPS = 10
 """Solves with the rotations of the one before; the matrix is factored once."""
 
@@ -34,7 +34,7 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     """(n, ambient): the least squares of relative poses, seen landmarks and priors over any matrices R_i, which
     are then projected to rotations; last over the positions with these rotations.
 
-    sum kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2 + tau |l_k - t_i - R_i z_ik|^2 + pull |R_i - P_i|_F^2,
+    sum kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2 + tau |l_k - t_i - R_i z_ik|^2 + mu |R_i - P_i|_F^2,
     P the rotations before: row a of all matrices and component a of all positions form one problem, and all d share one
     matrix. Without the last term matrices shrink towards zero along a chain, and what is left of them turns at random;
     with it each sweep is a step of a projected inverse power iteration, which lengthens them again. Ranges have no
@@ -52,7 +52,7 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     kappa = np.median(1.0 / _turn_variance(graph.relative_pose.covariance, d)) if len(graph.relative_pose) else 1.0
     turns = at[graph.is_pose][:, :d].ravel()
     whole = np.concatenate([np.swapaxes(rotation, 1, 2), position[:, None]], axis=1).reshape(n * (d + 1), d)
-    last = Rows(turns[:, None], np.ones((len(turns), 1)), None, np.full(len(turns), PULL * kappa))
+    last = Rows(turns[:, None], np.ones((len(turns), 1)), None, np.full(len(turns), PROXIMAL * kappa))
     solve = _least_squares([*rows, last], n * (d + 1))
     for _ in range(SWEEPS):
         found = solve(whole, whole[turns]).reshape(n, d + 1, d)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from .problem import Problem
+from .search import Search
 from .sparse import keep, sparse
 from .trust_region import Arrival, arrive
 
@@ -21,8 +22,8 @@ TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
 
 
-def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> Problem:
-    """The problem from the start that leads lowest; its x0 is where the steps from there have led.
+def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> tuple[Problem, Search]:
+    """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
     A start from which no step was refused and no promise failed by half ends the search: others are tried where the
     first had trouble, and all whose costs are near the least go on (ROUNDS). A problem that is not large takes the
@@ -32,13 +33,13 @@ def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> Proble
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
     """
-    system, tried = sparse(problem), {}
+    system, tried, taken = sparse(problem), {}, 0
     for name, start in starts.items():
         x = start()
         if system is None:
-            return problem.replace_unchecked(x0=frozen(x), start=name)
+            return problem.replace_unchecked(x0=frozen(x)), Search(name)
         end = arrive(system, x, STEPS, TOLERANCE)
-        tried[name] = system.cost(end.x), end.x
+        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         if smooth(end):
             break
     assert system is not None
@@ -48,11 +49,12 @@ def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> Proble
             break
         close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
         if len(close) > 1:
-            ends = {name: arrive(system, x, steps, TOLERANCE).x for name, x in close.items()}
-            tried = {name: (system.cost(x), x) for name, x in ends.items()}
+            ends = {name: arrive(system, x, steps, TOLERANCE) for name, x in close.items()}
+            tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
+            taken += sum(end.iterations for end in ends.values())
             least = min(cost for cost, _ in tried.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    return keep(system, problem.replace_unchecked(x0=frozen(x), start=name))
+    return keep(problem, problem.replace_unchecked(x0=frozen(x))), Search(name, taken)
 
 
 def smooth(end: Arrival) -> bool:

@@ -15,7 +15,7 @@ from .factor import Factor
 from .ldl import LDL
 from .problem import Problem
 from .space import Space
-from .tape import Model, kind_of, numbers_of, write
+from .tape import Model, NoTape, kind_of, numbers_of, write
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,8 +190,6 @@ class Sparse:
 def _goal(entries: Entries, nodes: Ints, written: Ints, dof: int) -> Any:
     """(outputs, M) where each output of a tape is added: the cost, the gradient, the Hessian, or, last, nowhere."""
     m, nowhere = entries.size, entries.size + 1 + len(entries.indices)
-    if len(written) <= 1:
-        return np.zeros((len(written), 1), dtype=np.int32)
     columns = [entries.number[node, k] for node in nodes.T for k in range(dof)]
     pairs = {(i, j): entries.pair(nodes[:, i], nodes[:, j]) for j in range(nodes.shape[1]) for i in range(j + 1)}
     goal = np.zeros((len(written), len(nodes)), dtype=np.int32)
@@ -220,9 +218,10 @@ def sparse(problem: Problem) -> Sparse | None:
     return _KEPT[problem]
 
 
-def keep(system: Sparse, problem: Problem) -> Problem:
-    """The problem, with the system of another that differs from it in x0 alone."""
-    _KEPT[problem] = system
+def keep(former: Problem, problem: Problem) -> Problem:
+    """The problem, with what is kept of a former one that differs from it in x0 and its search alone."""
+    if former in _KEPT:
+        _KEPT[problem] = _KEPT[former]
     return problem
 
 
@@ -230,7 +229,7 @@ def _made(problem: Problem) -> Sparse | None:
     try:
         for factor in problem.factors:
             write(kind_of(factor, problem.space), "newton")
-    except NotImplementedError:
+    except NoTape:
         return None
     return Sparse(
         problem.space, problem.factors, entries_of(problem), tuple(numbers_of(factor) for factor in problem.factors)
