@@ -87,15 +87,15 @@ def assess(problem: Problem, x: Floats) -> Assessment:
 
 def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
     """The assessment of a large problem by its own factors; None if it is singular. The cost is the formulas' own."""
-    entries, ldl = system.entries, system.ldl
+    entries, cholesky = system.entries, system.cholesky
     _, gradient, values = system.quadratic(x, "gauss-newton")
-    if not np.isfinite(values).all() or not ldl.factor(system.matrix(values)):
+    if not np.isfinite(values).all() or not cholesky.factor(system.matrix(values)):
         return None
-    dx = -ldl.solve(gradient)
+    dx = -cholesky.solve(gradient)
     row, column = np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :])
     free = (row >= 0) & (column >= 0)
     cov = np.zeros(row.shape)
-    cov[free] = ldl.inverse(row[free], column[free])
+    cov[free] = cholesky.inverse(row[free], column[free])
     moving = entries.number >= 0
     inflation = np.einsum("nii->ni", cov)[moving] * values[entries.diagonal]
     if not ((inflation > 0) & (inflation < INFLATION)).all():

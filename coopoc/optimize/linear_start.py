@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..formats.graph import Graph
-from .ldl import LDL
+from .cholesky import Cholesky
 from .space import Space, exp
 
 TIE = 1e-6
@@ -53,14 +53,14 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     turns = at[graph.is_pose][:, :d].ravel()
     whole = np.concatenate([np.swapaxes(rotation, 1, 2), position[:, None]], axis=1).reshape(n * (d + 1), d)
     last = Rows(turns[:, None], np.ones((len(turns), 1)), None, np.full(len(turns), PROXIMAL * kappa))
-    solve = _least_squares([*rows, last], n * (d + 1))
+    solve = _least_squares([*rows, last], n * (d + 1), d + 1)
     for _ in range(SWEEPS):
         found = solve(whole, whole[turns]).reshape(n, d + 1, d)
         rotation[graph.is_pose] = project(np.swapaxes(found[graph.is_pose, :d], 1, 2))
         found[:, :d] = np.swapaxes(rotation, 1, 2)
         whole = found.reshape(n * (d + 1), d)
     held = Rows(anchors[:, None], np.ones((len(anchors), 1)), None, np.full(len(anchors), np.inf))
-    steady = _least_squares([*_positions(graph, rotation), held], n)
+    steady = _least_squares([*_positions(graph, rotation), held], n, 1)
     return space.join(steady(position, position[anchors]), rotation)
 
 
@@ -142,9 +142,9 @@ def _fixes(graph: Graph, at: Ints) -> list[Rows]:
     ]
 
 
-def _least_squares(rows: list[Rows], count: int) -> Callable[[Floats, Floats], Floats]:
+def _least_squares(rows: list[Rows], count: int, width: int) -> Callable[[Floats, Floats], Floats]:
     """(start (count, d), goals of the rows that have none of their own) -> (count, d), by one factorisation;
-    what has no information stays at the start."""
+    what has no information stays at the start; `width` unknowns of a node follow one another."""
     from scipy.sparse import csc_matrix, csr_array, diags_array, triu
 
     finite = np.concatenate([part.weight[np.isfinite(part.weight)] for part in rows])
@@ -158,8 +158,8 @@ def _least_squares(rows: list[Rows], count: int) -> Callable[[Floats, Floats], F
         matrix = matrix + weighted[-1] @ G
     upper = csc_matrix(triu(matrix))
     upper.sort_indices()
-    ldl = LDL()
-    sound = ldl.factor(upper)
+    cholesky = Cholesky(np.arange(count) // width)
+    sound = cholesky.factor(upper)
 
     def solve(start: Floats, goal: Floats) -> Floats:
         if not sound:
@@ -167,7 +167,7 @@ def _least_squares(rows: list[Rows], count: int) -> Callable[[Floats, Floats], F
         right = tie * start
         for part, each in zip(rows, weighted, strict=True):
             right = right + each @ (goal if part.goal is None else part.goal)
-        return np.stack([ldl.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
+        return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
     return solve
 

@@ -11,8 +11,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ..arrays import Floats, Ints
+from .cholesky import Cholesky
 from .factor import Factor
-from .ldl import LDL
 from .problem import Problem
 from .space import Space
 from .tape import Model, NoTape, kind_of, numbers_of, write
@@ -135,11 +135,11 @@ class Sparse:
         return self.entries.size
 
     @property
-    def ldl(self) -> LDL:
+    def cholesky(self) -> Cholesky:
         """Factors of its Hessians, whose ordering is kept; each thread has its own."""
-        if not hasattr(self._local, "ldl"):
-            self._local.ldl = LDL()
-        return self._local.ldl  # type: ignore[no-any-return]
+        if not hasattr(self._local, "cholesky"):
+            self._local.cholesky = Cholesky(np.nonzero(self.entries.number >= 0)[0])
+        return self._local.cholesky  # type: ignore[no-any-return]
 
     @cached_property
     def _local(self) -> threading.local:

@@ -61,7 +61,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
     """
-    ldl, mu, doubt = system.ldl, 0.0, 0
+    cholesky, mu, doubt = system.cholesky, 0.0, 0
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
     newton, converged, last = 0, False, np.inf
@@ -69,7 +69,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     scale = _scale(system, values)
     while len(record) < max_iterations and not converged and mu < GIVE_UP:
         newton += model == "newton"
-        definite = ldl.factor(system.matrix(_damped(system, values, mu * scale)))
+        definite = cholesky.factor(system.matrix(_damped(system, values, mu * scale)))
         if not definite:
             record.append((cost, mu, np.nan))
             if model == "newton":
@@ -78,7 +78,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             else:
                 mu = _grown(mu)
             continue
-        dx = -ldl.solve(gradient)
+        dx = -cholesky.solve(gradient)
         promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
         there = system.retract(x, dx)
         after = system.cost(there)
