@@ -249,7 +249,8 @@ def hidden_frames(seed: int) -> Graph:
 def weights(seed: int) -> Graph:
     """Standard deviations between 0.001 and 1 of the same noise: weights six orders apart."""
     w = world(seed, 2, 2, 800)
-    edges = joined(w.relative(w.chain(), 0.02, 0.01), w.relative(w.near(300, 5.0), 0.02, 0.01))
+    loops = np.concatenate([w.near(300, 5.0), w.near(50, 8.0, others=True)])
+    edges = joined(w.relative(w.chain(), 0.02, 0.01), w.relative(loops, 0.02, 0.01))
     scale = 10.0 ** w.rng.uniform(-1.5, 1.5, len(edges))
     return w.graph(relative_pose=replace(edges, covariance=edges.covariance * (scale**2)[:, None, None]))
 
@@ -266,7 +267,7 @@ def zero_ranges(seed: int) -> Graph:
 
 
 def two_parts(seed: int) -> Graph:
-    """Two robots that never meet: the second is free to move as a whole."""
+    """Two robots that never meet."""
     w = world(seed, 2, 2, 500)
     return w.graph(relative_pose=joined(w.relative(w.chain(), 0.05, 0.02), w.relative(w.near(50, 5.0), 0.05, 0.02)))
 

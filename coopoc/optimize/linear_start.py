@@ -82,15 +82,19 @@ def project(matrix: Floats) -> Floats:
 
 def _anchors(graph: Graph) -> Ints:
     """One pose of each part of the graph that has no prior and that no linear measurement joins to another."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    n, pairs = len(graph.names), np.concatenate([graph.relative_pose.nodes, graph.relative_point.nodes])
-    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    part = connected_components(joined, directed=False)[1]
+    part = parts(len(graph.names), np.concatenate([graph.relative_pose.nodes, graph.relative_point.nodes]))
     held = part[np.concatenate([graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])]
     poses = np.flatnonzero(graph.is_pose & ~np.isin(part, held))
     return np.asarray(poses[np.unique(part[poses], return_index=True)[1]])
+
+
+def parts(n: int, pairs: Ints) -> Ints:
+    """(n,) number of the connected part that each node is in, by pairs (M, 2) that are joined."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(joined, directed=False)[1])
 
 
 def _rows(graph: Graph, at: Ints) -> list[Rows]:

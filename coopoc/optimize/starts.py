@@ -41,6 +41,18 @@ def file(graph: Graph) -> Floats:
     return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
 
 
+def separated(graph: Graph, x0: Floats) -> Floats:
+    """x0 with ends of a range that lie in one place moved apart by a share NUDGE of it, each another way: there a range
+    has no direction."""
+    position, (i, j) = x0[:, : graph.dimension], graph.ranges.nodes.T
+    distance = graph.ranges.distance
+    rows = np.flatnonzero(np.linalg.norm(position[j] - position[i], axis=1) < 1e-9 * distance)
+    way = 2.4 * np.arange(len(rows))
+    step = NUDGE * distance[rows, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
+    position[j[rows], :2] += step
+    return x0
+
+
 STARTS: dict[str, Callable[[Graph], Floats]] = {
     "odometry": chained,
     "apart": lambda graph: chained(graph, apart=True),
@@ -63,6 +75,8 @@ def contenders(graph: Graph) -> tuple[str, ...]:
     return ("odometry", "tree", "linear") if closed else ("odometry", "linear")
 
 
+NUDGE = 0.01
+"""Share of a range."""
 Roots = list[tuple[int, Floats, Floats]]
 """(pose, position, rotation) in the order in which the walk may start from them."""
 

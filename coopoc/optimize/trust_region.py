@@ -28,6 +28,8 @@ SLOW = 0.2
 """A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
+STILL = 12
+"""Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +66,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     cholesky, mu, doubt = system.cholesky, 0.0, 0
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
-    newton, converged, last = 0, False, np.inf
+    newton, converged, last, still = 0, False, np.inf, 0
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     scale = _scale(system, values)
     while len(record) < max_iterations and not converged and mu < GIVE_UP:
@@ -84,8 +86,9 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
         after = system.cost(there)
         hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
         share = 1.0 if hidden else (cost - after) / promised
+        still = still + 1 if hidden else 0
         record.append((cost, mu, share))
-        converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden)
+        converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden) or still > STILL
         if not share > 0.0:
             mu = _grown(mu)
             continue
