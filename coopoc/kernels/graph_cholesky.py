@@ -8,8 +8,8 @@ from ..arrays import Floats, Ints
 from .compile import compiled, inside
 from .graph_fronts import Fronts
 
-PANEL = 32
-"""Columns of a dense block that are eliminated at a time; the rest of it is updated by one product."""
+PANEL = 16
+"""Rows of a dense block that are eliminated at a time, and eight times as many before one product updates the rest."""
 WORTH = 8000
 """Multiplications from which a call of BLAS is faster than loops."""
 
@@ -112,23 +112,33 @@ def _wait(fronts: Fronts, d: int, k: int, begin: Ints, head: Ints, following: In
 def dense(block: Floats) -> bool:
     """L^T of the first c columns of a symmetric block (c, m) in its upper triangle, in place; False as above."""
     c, m = block.shape
-    for first in range(0, c, PANEL):
-        last = min(first + PANEL, c)
-        for k in range(first, last):
-            if not block[k, k] > 0.0:
-                return False
-            by = 1.0 / np.sqrt(block[k, k])
-            for i in range(k, m):
-                block[k, i] *= by
-            for j in range(k + 1, last):
-                by = block[k, j]
-                for i in range(j, m):
-                    block[j, i] -= by * block[k, i]
-        for left in range(last, c, 4 * PANEL):  # what lies below the diagonal is left out but for a corner of each
-            right = min(left + 4 * PANEL, c)
-            panel = np.ascontiguousarray(block[first:last, left:])
-            block[left:right, left:] -= np.dot(np.ascontiguousarray(panel[:, : right - left].T), panel)
+    for outer in range(0, c, 8 * PANEL):
+        end = min(outer + 8 * PANEL, c)
+        for first in range(outer, end, PANEL):
+            last = min(first + PANEL, end)
+            for k in range(first, last):
+                if not block[k, k] > 0.0:
+                    return False
+                by = 1.0 / np.sqrt(block[k, k])
+                for i in range(k, m):
+                    block[k, i] *= by
+                for j in range(k + 1, last):
+                    by = block[k, j]
+                    for i in range(j, m):
+                        block[j, i] -= by * block[k, i]
+            _downdate(block, (first, last), (last, end))
+        for left in range(end, c, 8 * PANEL):
+            _downdate(block, (outer, end), (left, min(left + 8 * PANEL, c)))
     return True
+
+
+@compiled
+def _downdate(block: Floats, done: tuple[int, int], rows: tuple[int, int]) -> None:
+    """Subtract from some rows the products of those that are done, from the column of the first on."""
+    if rows[0] < rows[1]:
+        panel = np.ascontiguousarray(block[done[0] : done[1], rows[0] :])
+        left = np.ascontiguousarray(panel[:, : rows[1] - rows[0]].T)
+        block[rows[0] : rows[1], rows[0] :] -= np.dot(left, panel)
 
 
 @compiled

@@ -6,8 +6,11 @@ import numpy as np
 
 from ..arrays import Floats
 from .compile import compiled
-from .graph_cholesky import PANEL, locate, shape
+from .graph_cholesky import locate, shape
 from .graph_fronts import Fronts
+
+PANEL = 32
+"""Rows that are inverted at a time."""
 
 
 @compiled

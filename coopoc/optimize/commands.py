@@ -25,7 +25,7 @@ def solve_file(
     /,
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
-    start: Literal["auto", "odometry", "tree", "linear", "apart", "file", "relaxed"] = "auto",
+    start: Literal["auto", "odometry", "tree", "linear", "incremental", "apart", "file", "relaxed"] = "auto",
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
     """Solve the factor graph of a PyFG or g2o file.
@@ -37,8 +37,8 @@ def solve_file(
         backend: coopoc check shows them.
         objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
         start: odometry chained from each robot's first vertex, a spanning tree over loops too, rotations relaxed
-            (linear), the lowest of these (auto), from a ring (apart), the file's vertices, or the rounded point of a
-            convex relaxation that needs no start.
+            (linear), growing along the odometry (incremental), the lowest of these (auto), from a ring (apart), the
+            file's vertices, or the rounded point of a convex relaxation that needs no start (relaxed).
         output: the solution as JSON; without it a summary goes to stdout.
     """
     problem = read_graph(file, objective, "apart" if start == "relaxed" else start)

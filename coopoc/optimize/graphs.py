@@ -9,11 +9,12 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, frozen
 from ..formats import load_graph
 from ..formats.graph import Graph
 from ..plugins import unknown
 from .factor import Factor
+from .incremental_start import incremental_start
 from .linear_start import parts
 from .problem import Problem
 from .race import race
@@ -23,7 +24,7 @@ from .sparse import keep
 from .starts import STARTS, contenders, separated
 
 Objective = Literal["chordal", "geodesic"]
-Start = Literal["odometry", "apart", "file", "tree", "linear", "auto"]
+Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
 
 
 def read_graph(path: str | Path, objective: Objective = "chordal", start: Start = "auto") -> Problem:
@@ -47,10 +48,10 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
             file; "apart" from a ring as wide as the mean range, all facing one way, as if nothing were known of how the
             robots stand to each other; "file" takes the vertices as they are; "tree" follows loop closures
-            and measurements between robots, too; "linear" relaxes rotations (`linear_start.py`); "auto"
-            tries several and keeps the one that leads lowest (`race.py`). Landmarks are put at
-            their priors, or where the first pose that measures them sees them, or by the ranges to them. The Solution
-            names the start in extras["start"].
+            and measurements between robots, too; "linear" relaxes rotations (`linear_start.py`); "incremental" solves
+            the first poses of all robots, then more with them (`incremental_start.py`); "auto" tries several and keeps
+            the one that leads lowest (`race.py`). Landmarks are put at their priors, or where the first pose that
+            measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
 
     >>> from coopoc.formats.edges import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
@@ -68,13 +69,16 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         return x0 if poses else x0[:, : graph.dimension]
 
     began = time.perf_counter()
-    names = contenders(graph) if start == "auto" else (start,)
+    names = contenders(graph) if start == "auto" else ("odometry" if start == "incremental" else start,)
     given = x0_of(names[0])
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_held(graph))
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names}
-        problem, won = race(problem, starts)
+        problem, won = race(problem, starts, partial(incremental_start, graph) if poses else None)
+    elif start == "incremental" and poses:
+        x0, steps = incremental_start(graph, problem)
+        problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     return keep(problem, problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began)))
 
 

@@ -208,10 +208,10 @@ LARGE = 60
 _KEPT: WeakKeyDictionary[Problem, Sparse | None] = WeakKeyDictionary()
 
 
-def sparse(problem: Problem) -> Sparse | None:
+def sparse(problem: Problem, least: int = LARGE) -> Sparse | None:
     """A large single problem ready to be evaluated, kept as long as the problem is; None if it is small, has a
-    separator or constraints, or a kind that no tape can hold."""
-    if problem.batch is not None or problem.separator or problem.constraints or len(problem.names) <= LARGE:
+    separator or constraints, or a kind that no tape can hold. Small are problems of up to `least` nodes."""
+    if problem.batch is not None or problem.separator or problem.constraints or len(problem.names) <= least:
         return None
     if problem not in _KEPT:
         _KEPT[problem] = _made(problem)
