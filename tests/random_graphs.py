@@ -51,7 +51,8 @@ def random_graph(
     other = np.argwhere(far[:count, :count] < 2 * REACH)
     other = other[(other[:, 0] // steps) < (other[:, 1] // steps)]
     to_mark = to_mark[rng.permutation(len(to_mark))]
-    enough = np.concatenate([to_mark[to_mark[:, 1] == mark][:5] for mark in range(count, count + landmarks)])
+    marks = range(count, count + landmarks)
+    enough = np.concatenate([to_mark[:0], *(to_mark[to_mark[:, 1] == mark][:5] for mark in marks)])
     ranged = np.concatenate([to_mark, other])
     ranged = np.concatenate([enough, ranged[rng.permutation(len(ranged))]])[: ranges or None]
     ranged = ranged[np.sort(np.unique(ranged, axis=0, return_index=True)[1])]
@@ -67,7 +68,7 @@ def random_graph(
     relative = relative @ _small(rng, d, len(pairs), turn_std)
     moved = local(pairs, step_std)
     distance = far[ranged[:, 0], ranged[:, 1]] + range_std * rng.normal(size=len(ranged))
-    marks = np.arange(count, count + landmarks)[:, None]
+    marked = np.arange(count, count + landmarks)[:, None]
     return Graph(
         d,
         names,
@@ -82,7 +83,7 @@ def random_graph(
         if len(ranged)
         else RangeEdges(),
         point_prior=PointEdges(
-            marks, world[count:] + 0.1 * rng.normal(size=(landmarks, d)), np.tile(0.01 * np.eye(d), (landmarks, 1, 1))
+            marked, world[count:] + 0.1 * rng.normal(size=(landmarks, d)), np.tile(0.01 * np.eye(d), (landmarks, 1, 1))
         )
         if priors
         else PointEdges(),
@@ -96,9 +97,9 @@ def _paths(rng: np.random.Generator, d: int, robots: int, steps: int) -> tuple[n
         at, course, bend = rng.uniform(-10, 10, d) * np.r_[1, 1, np.full(d - 2, 0.2)], rng.uniform(-np.pi, np.pi), 0.0
         for _ in range(steps):
             home = np.arctan2(-at[1], -at[0]) - course
-            pull = 0.1 * np.sin(home) * max(0.0, np.hypot(at[0], at[1]) / 20.0 - 0.3)
+            homing = 0.1 * np.sin(home) * max(0.0, np.hypot(at[0], at[1]) / 20.0 - 0.3)
             bend = 0.8 * bend + 0.08 * rng.normal()
-            course += bend + pull
+            course += bend + homing
             tilt = [] if d == 2 else [0.1 * rng.normal(), 0.1 * rng.normal()]
             angles = [course, *tilt]
             found.append(at.copy())

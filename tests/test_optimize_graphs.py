@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,7 +17,7 @@ from random_graphs import random_graph
 from scipy.optimize import least_squares
 
 from coopoc import InputError
-from coopoc.formats.edges import PointEdges, PoseEdges
+from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.arrowhead import structure
@@ -24,13 +25,16 @@ from coopoc.optimize.backends.gtsam_forms import forms
 from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, values, which_turn
 from coopoc.optimize.curvature import matrix, newton_decrease, true_blocks
 from coopoc.optimize.dual import Dual
+from coopoc.optimize.factor import Factor
 from coopoc.optimize.fuse import fused
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
 from coopoc.optimize.marginals import bayes_tree_marginals
+from coopoc.optimize.search import Search
 from coopoc.optimize.sparse import _made, sparse
 from coopoc.optimize.starts import chained
+from coopoc.optimize.trilateration import located
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
@@ -122,6 +126,18 @@ def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> N
     assert found.status is Status.SOLVED
     assert found.extras["start"] in ("odometry", "tree", "linear")
     assert found.cost <= solve(from_graph(graph, start="file")).cost * (1 + 1e-9)
+
+
+def test_the_search_for_a_start_is_counted() -> None:
+    """Iterations and seconds of a solution contain those of all starts that were tried."""
+    began = time.perf_counter()
+    problem = from_graph(random_graph(203, steps=150, turn_std=0.1, loops=80, seen=120))
+    took, found = time.perf_counter() - began, solve(problem)
+    alone = solve(problem.replace_unchecked(search=Search()))
+    assert found.iterations == alone.iterations + found.extras["start_iterations"]
+    assert found.extras["start_iterations"] > 12  # the steps of more than one start
+    assert 0.0 < found.extras["start_seconds"] <= min(took, found.solve_seconds)
+    assert found.extras["start"] == problem.search.start != ""
 
 
 def test_a_tree_goes_the_way_of_least_variance() -> None:
@@ -290,3 +306,75 @@ def test_threads_do_not_share_factors() -> None:
     with ThreadPoolExecutor(4) as pool:
         costs = {found.cost for found in pool.map(lambda _: solve(problem), range(8))}
     assert len(costs) == 1
+
+
+@pytest.mark.parametrize("seed", [208, 209])
+def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed: int) -> None:
+    """One robot, ranges to landmarks and odometry that ends far off: to the minimum that the truth leads to."""
+    graph = random_graph(seed, robots=1, steps=800, loops=0, seen=0, ranges=500, turn_std=0.03)
+    found = solve(from_graph(graph))
+    assert found.status is Status.SOLVED
+    best = solve(from_graph(graph, start="file")).cost
+    assert found.cost == pytest.approx(best, rel=1e-6)
+    grown = solve(from_graph(graph, start="incremental"))
+    assert grown.cost == pytest.approx(best, rel=1e-6)
+    assert solve(from_graph(graph, start="odometry"), throw=False).cost > 1.2 * best
+
+
+def test_a_point_is_located_as_scipy_finds_it() -> None:
+    """From many random guesses, in space and where all places lie in one plane."""
+    rng = np.random.default_rng(210)
+    for d, flat in ((2, 1.0), (3, 1.0), (3, 1e-3)):
+        places = rng.normal(0, 10, (8, d)) * np.r_[np.ones(d - 1), flat]
+        ranges = np.linalg.norm(places - rng.normal(0, 10, d), axis=1) + 0.1 * rng.normal(size=8)
+
+        def residual(at: np.ndarray, p: np.ndarray = places, r: np.ndarray = ranges) -> np.ndarray:
+            return np.linalg.norm(at - p, axis=1) - r
+
+        best = min(least_squares(residual, rng.normal(0, 10, d)).cost for _ in range(30))
+        assert 0.5 * np.square(residual(located(places, ranges))).sum() == pytest.approx(best, rel=1e-6)
+
+
+def test_ranges_of_zero_and_ends_in_one_place_are_taken() -> None:
+    """|v|^2 has a derivative at v = 0; a range whose ends coincide at the start has a direction after a nudge."""
+    graph = random_graph(211, robots=1, steps=70, landmarks=0, ranges=0, seen=0, loops=20)
+    a, b, c = 3, 40, 60
+    x0 = from_graph(graph, start="odometry").x0
+    x0 = np.array(x0)
+    ranges = RangeEdges([[a, b], [b, c]], [0.0, 2.0], [0.01, 0.01])
+    together = replace(graph, ranges=ranges, relative_pose=PoseEdges())
+    problem = from_graph(replace(graph, ranges=ranges))
+    gap = problem.space.position(problem.x0[b] - problem.x0[a])
+    assert problem.cost(problem.x0) == pytest.approx(
+        from_graph(replace(graph, ranges=replace(ranges, distance=[1e-9, 2.0]))).cost(problem.x0), rel=1e-6
+    )
+    assert np.linalg.norm(gap) > 0
+    start = from_graph(together, start="odometry").x0[:, :2]  # every pose without odometry is a root at the origin
+    assert np.linalg.norm(start[c] - start[b]) > 0
+
+
+def test_each_part_has_a_fixed_pose_unless_it_has_a_prior() -> None:
+    graph = replace(random_graph(212, robots=3, steps=40, landmarks=0, seen=0, loops=0), ranges=RangeEdges())
+    assert from_graph(graph).fixed == (0, 40, 80)
+    assert solve(from_graph(graph)).status is Status.SOLVED
+    prior = PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)])
+    assert from_graph(replace(graph, pose_prior=prior)).fixed == (0, 80)
+
+
+@pytest.mark.parametrize("weight", [1.0, 1e-4])
+def test_a_weak_measurement_is_no_free_node(weight: float) -> None:
+    """Two halves of a chain whose link has standard deviations 1 / weight as large: observed, however weakly; without
+    the link the second half is free."""
+    graph = random_graph(213, robots=1, steps=100, landmarks=0, ranges=0, seen=0, loops=0)
+    edges = graph.relative_pose
+    covariance = np.array(edges.covariance)
+    covariance[49] /= weight**2
+    found = solve(from_graph(replace(graph, relative_pose=replace(edges, covariance=covariance))))
+    assert found.status is Status.SOLVED
+    problem = from_graph(graph)
+    nodes = problem.factors[0].nodes
+    keep, factor = np.flatnonzero((nodes != [49, 50]).any(axis=1)), problem.factors[0]
+    cut = Factor(factor.kind, nodes[keep], factor.z[keep], std=factor.std[keep])
+    apart = solve(replace(problem, factors=(cut,)), throw=False)
+    assert apart.status is Status.RANK_DEFICIENT
+    assert set(apart.unobservable) == {f"A{k}" for k in range(50, 100)}

@@ -10,6 +10,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 import pytest
+from random_graphs import random_graph
 from scipy.io import mmread
 from scipy.optimize import least_squares
 
@@ -17,13 +18,16 @@ from coopoc import InputError
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Status, solve
 from coopoc.optimize.backends.cvxpy_ import prepare
+from coopoc.optimize.convex.certificate import certify
 from coopoc.optimize.convex.cones import semidefinite
 from coopoc.optimize.convex.manifold import minimise, tangent
+from coopoc.optimize.convex.newton import minimise_sparsely, tangent_basis
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers
 from coopoc.optimize.convex.quadratic import quadratic
 from coopoc.optimize.convex.relaxation import polished, shor
 from coopoc.optimize.convex.schur import Dense, Sparse
 from coopoc.optimize.convex.staircase import staircase
+from coopoc.optimize.graphs import from_graph
 
 PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
 UP = 0.6
@@ -340,3 +344,39 @@ def test_priors_and_fixes_in_the_worlds_frame_place_poses() -> None:
     assert free.solution.cost == pytest.approx(brute(strong, starts=8, spread=6.0), rel=1e-5)
     fixed = problem.add("position", [0, 2, 5], problem.x0[[0, 2, 5], :2], 0.5)
     assert solve(replace(fixed, x0=shor(fixed).x)).cost == pytest.approx(brute(fixed, starts=8, spread=6.0), rel=1e-5)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("seed", range(2))
+def test_newtons_steps_end_at_shors_bound(seed: int, d: int) -> None:
+    """Three columns to spare leave no local minima that are not the relaxation's own (Boumal et al., NeurIPS 2016)."""
+    for problem in (two_robots(seed, d=d, noise=3.0), two_robots(seed, d=d, fixed=True), swarm(seed, d=d, up=UP)):
+        form = quadratic(problem)
+        random = np.random.default_rng(seed).standard_normal((form.bound, form.columns + 3))
+        found = minimise_sparsely(form, Sparse(form), form.project(random))
+        assert found.converged
+        assert found.cost == pytest.approx(shor(problem, refine=False).lower_bound, rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_the_basis_spans_the_tangent_space(d: int) -> None:
+    """B is orthonormal, and B B^T is the projection that the constraints define, of blocks and of spheres."""
+    for problem in (two_robots(1, d=d), swarm(1, d=d, up=UP)):
+        form, rng = quadratic(problem), np.random.default_rng(1)
+        X, V = (rng.standard_normal((form.bound, form.columns + 2)) for _ in range(2))
+        X = form.project(X)
+        B = tangent_basis(form, X, form.bound)
+        assert (B.T @ B).toarray() == pytest.approx(np.eye(B.shape[1]), abs=1e-12)
+        assert (B @ (B.T @ V.ravel())).reshape(V.shape) == pytest.approx(tangent(form, X, V), abs=1e-12)
+
+
+def test_a_certificate_takes_the_time_it_is_given() -> None:
+    """Ranges alone correct a robot's odometry: multipliers prove little, some seconds a bound that none beats."""
+    graph = random_graph(214, robots=1, steps=300, loops=0, seen=0, ranges=150)
+    problem = from_graph(graph)
+    solution = solve(problem)
+    at_once, later = certify(problem, solution), certify(problem, solution, seconds=30.0)
+    assert at_once.lower_bound < 0.5 * solution.cost
+    assert 0.8 * solution.cost < later.lower_bound <= solution.cost * (1 + 1e-6)
+    with pytest.raises(InputError, match="positive"):
+        staircase(problem, seconds=0.0)

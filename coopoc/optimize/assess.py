@@ -21,6 +21,8 @@ from .sparse import Sparse, sparse
 
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
+CANCELLED = 1e-7
+"""Share of its terms that a row may keep along a direction that it does not see."""
 SMALL = 200
 """Nodes up to which a problem without a separator is assessed densely."""
 LARGE = 1000
@@ -56,8 +58,8 @@ class Assessment:
 
 def assess(problem: Problem, x: Floats) -> Assessment:
     """Assessment of a single problem at x (n, ambient)."""
-    if (system := sparse(problem)) is not None and (found := _as_graph(system, x)) is not None:
-        return found
+    if (system := sparse(problem)) is not None:
+        return _as_graph(problem, system, x)
     linear = problem.linearise(x[None])
     cost = float(linear.cost[0])
     gradient, unconstrained = (_as_matrix if is_small(problem) else _as_blocks)(problem, linear)
@@ -85,24 +87,31 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     return Assessment(cost, size, unknown, np.nan, unobservable, violation, violated, active)
 
 
-def _as_graph(system: Sparse, x: Floats) -> Assessment | None:
-    """The assessment of a large problem by its own factors; None if it is singular. The cost is the formulas' own."""
-    entries, ldl = system.entries, system.ldl
+def _as_graph(problem: Problem, system: Sparse, x: Floats) -> Assessment:
+    """The assessment of a large problem by its own factors. The cost is the formulas' own."""
+    entries, cholesky = system.entries, system.cholesky
     _, gradient, values = system.quadratic(x, "gauss-newton")
-    if not np.isfinite(values).all() or not ldl.factor(system.matrix(values)):
-        return None
-    dx = -ldl.solve(gradient)
+    cost, size = cost_of(system.space, system.factors, x[None])[0], float(np.linalg.norm(gradient))
+    unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
+    if not np.isfinite(values).all():
+        return Assessment(cost, size, unknown, np.nan)
+    if not cholesky.factor(system.matrix(values)):
+        return Assessment(
+            cost, size, unknown, np.nan, _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None)
+        )
+    dx = -cholesky.solve(gradient)
     row, column = np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :])
     free = (row >= 0) & (column >= 0)
     cov = np.zeros(row.shape)
-    cov[free] = ldl.inverse(row[free], column[free])
+    cov[free] = cholesky.inverse(row[free], column[free])
     moving = entries.number >= 0
     inflation = np.einsum("nii->ni", cov)[moving] * values[entries.diagonal]
-    if not ((inflation > 0) & (inflation < INFLATION)).all():
-        return None
     remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
-    size = float(np.linalg.norm(gradient))
-    return Assessment(cost_of(system.space, system.factors, x[None])[0], size, cov, remaining, promised=promised)
+    if not (inflation < INFLATION).all() and (
+        free_nodes := _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None)
+    ):
+        return Assessment(cost, size, unknown, np.nan, free_nodes)
+    return Assessment(cost, size, cov, remaining, promised=promised)
 
 
 Marginals: TypeAlias = Callable[[], tuple[Floats, Floats, bool]]
@@ -231,9 +240,24 @@ def _null_rows(J: Any) -> Floats:
         values = np.concatenate([values, np.zeros(len(rows) - len(values))])
         return np.asarray(rows[values <= 1e-5 * values.max(initial=1.0)])
     square = unit.T @ unit
-    factored = factorise(square + diags_array(np.full(len(length), 1e-10)), None)
+    factored = factorise(square + diags_array(np.full(len(length), 1e-12)), None)
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(3):
         ways = np.linalg.qr(factored.solve(ways))[0]
-    values, turn = np.linalg.eigh(ways.T @ (square @ ways))
-    return np.asarray((ways @ turn[:, values <= 1e-9]).T)
+    ways = ways @ np.linalg.eigh(ways.T @ (square @ ways))[1]
+    return np.asarray(ways[:, ~_seen(unit, ways)].T)
+
+
+def _seen(J: Any, ways: Floats) -> Bools:
+    """(K,) whether a row of J sees a direction (columns of `ways`), whatever its weight.
+
+    Along a direction that nothing measures the terms of every row cancel to rounding; where one is only weakly held,
+    some row keeps a share of its terms.
+    """
+    from scipy.sparse import diags_array
+
+    largest = abs(J).max(axis=1).toarray().ravel()
+    rows = diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J
+    left, terms = np.abs(rows @ ways), abs(rows) @ np.abs(ways)
+    matters = terms > 1e-3 * terms.max(axis=0)
+    return np.asarray((matters & (left > CANCELLED * terms)).any(axis=0))

@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from .backend import backends
 from .graphs import Objective, read_graph
 from .problem import Problem
+from .search import Search
 from .solution import Solution, Status
 from .solve import solve
 
@@ -24,7 +25,7 @@ def solve_file(
     /,
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
-    start: Literal["auto", "odometry", "tree", "linear", "apart", "file", "relaxed"] = "auto",
+    start: Literal["auto", "odometry", "tree", "linear", "incremental", "apart", "file", "relaxed"] = "auto",
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
     """Solve the factor graph of a PyFG or g2o file.
@@ -36,15 +37,17 @@ def solve_file(
         backend: coopoc check shows them.
         objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
         start: odometry chained from each robot's first vertex, a spanning tree over loops too, rotations relaxed
-            (linear), the lowest of these (auto), from a ring (apart), the file's vertices, or the rounded point of a
-            convex relaxation that needs no start.
+            (linear), growing along the odometry (incremental), the lowest of these (auto), from a ring (apart), the
+            file's vertices, or the rounded point of a convex relaxation that needs no start (relaxed).
         output: the solution as JSON; without it a summary goes to stdout.
     """
     problem = read_graph(file, objective, "apart" if start == "relaxed" else start)
     if start == "relaxed":
         from .convex import staircase
 
+        began = time.perf_counter()
         problem = replace(problem, x0=staircase(problem, refine=False).x)
+        problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
     print(f"coopoc: {problem}", file=sys.stderr)
     solution = solve(problem, backend, throw=False)
     summary = described(solution)
@@ -65,6 +68,7 @@ def described(solution: Solution) -> dict[str, Any]:
         "backend": solution.backend,
         "cost": solution.cost,
         "gradient_norm": solution.gradient_norm,
+        "start": solution.extras.get("start"),
         "iterations": solution.iterations,
         "build_seconds": solution.build_seconds,
         "solve_seconds": solution.solve_seconds,

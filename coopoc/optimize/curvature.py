@@ -66,12 +66,12 @@ def _by_tapes(system: Sparse, x: Floats) -> float | None:
     _, gradient, values = system.quadratic(x, "newton")
     if not np.isfinite(values).all():
         return None
-    if not system.ldl.factor(system.matrix(values)):
+    if not system.cholesky.factor(system.matrix(values)):
         own = system.entries.diagonal
         values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
-        if not system.ldl.factor(system.matrix(values)):
+        if not system.cholesky.factor(system.matrix(values)):
             return None
-    return float(0.5 * gradient @ system.ldl.solve(gradient))
+    return float(0.5 * gradient @ system.cholesky.solve(gradient))
 
 
 def _solved(scheme: Pattern, blocks: Floats, rhs: Floats) -> Floats | None:

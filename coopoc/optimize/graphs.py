@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, frozen
 from ..formats import load_graph
 from ..formats.graph import Graph
 from ..plugins import unknown
 from .factor import Factor
+from .incremental_start import incremental_start
+from .linear_start import parts
 from .problem import Problem
 from .race import race
+from .search import Search
 from .space import Space
-from .starts import STARTS, contenders
+from .sparse import keep
+from .starts import STARTS, contenders, separated
 
 Objective = Literal["chordal", "geodesic"]
-Start = Literal["odometry", "apart", "file", "tree", "linear", "auto"]
+Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
 
 
 def read_graph(path: str | Path, objective: Objective = "chordal", start: Start = "auto") -> Problem:
@@ -32,7 +37,7 @@ def read_graph(path: str | Path, objective: Objective = "chordal", start: Start 
 
 
 def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "auto") -> Problem:
-    """The problem of a graph, with the first pose fixed where the graph has neither priors nor fixed vertices.
+    """The problem of a graph; of each connected part without priors and fixed vertices the first pose is fixed.
 
     chordal: kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2, tau = d / trace(cov_t) and kappa = 1 / var_theta
     in the plane, 3 / (2 trace(cov_R)) in space, as SE-Sync (Rosen et al., IJRR 2019) and CORA (arXiv 2302.11614) have
@@ -43,10 +48,10 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
             file; "apart" from a ring as wide as the mean range, all facing one way, as if nothing were known of how the
             robots stand to each other; "file" takes the vertices as they are; "tree" follows loop closures
-            and measurements between robots, too; "linear" relaxes rotations (`linear_start.py`); "auto"
-            tries several and keeps the one that leads lowest (`race.py`). Landmarks are put at
-            their priors, or where the first pose that measures them sees them, or by the ranges to them. The Solution
-            names the start in extras["start"].
+            and measurements between robots, too; "linear" relaxes rotations (`linear_start.py`); "incremental" solves
+            the first poses of all robots, then more with them (`incremental_start.py`); "auto" tries several and keeps
+            the one that leads lowest (`race.py`). Landmarks are put at their priors, or where the first pose that
+            measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
 
     >>> from coopoc.formats.edges import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
@@ -57,26 +62,24 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         if value not in get_args(allowed):
             raise unknown(name, value, get_args(allowed))
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
-    fixed = tuple(graph.fixed.tolist())
-    if not fixed and not len(graph.pose_prior) and not len(graph.point_prior):
-        fixed = poses[:1]
     factors = _factors(graph, objective)
 
-    def problem(name: str) -> Problem:
-        x0 = x0_of(name)
-        return Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses, fixed=fixed, start=name)
-
     def x0_of(name: str) -> Floats:
-        x0 = STARTS[name](graph)
+        x0 = separated(graph, STARTS[name](graph))
         return x0 if poses else x0[:, : graph.dimension]
 
-    if start != "auto":
-        return problem(start)
-    names = contenders(graph)
-    first = problem(names[0])
-    assert first.x0 is not None
-    given = first.x0
-    return race(first, {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names})
+    began = time.perf_counter()
+    names = contenders(graph) if start == "auto" else ("odometry" if start == "incremental" else start,)
+    given = x0_of(names[0])
+    problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_held(graph))
+    won = Search(names[0])
+    if start == "auto":
+        starts = {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names}
+        problem, won = race(problem, starts, partial(incremental_start, graph) if poses else None)
+    elif start == "incremental" and poses:
+        x0, steps = incremental_start(graph, problem)
+        problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
+    return keep(problem, problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began)))
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
@@ -97,10 +100,26 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         else:
             std = np.sqrt(_mean_variance(points.covariance))[:, None].repeat(graph.dimension, axis=1)
             found.append(Factor(kind, points.nodes, points.position, std=std))
-    if len(graph.ranges):
-        edges_ = graph.ranges
-        found.append(Factor("range", edges_.nodes, edges_.distance[:, None], std=np.sqrt(edges_.variance)[:, None]))
+    ranges, std = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
+    apart = ranges.distance > 0
+    if apart.any():
+        found.append(Factor("range", ranges.nodes[apart], ranges.distance[apart, None], std=std[apart]))
+    if not apart.all():  # (|v| - 0)^2 = |v|^2, which has a derivative at v = 0, too
+        zero = np.zeros((int((~apart).sum()), graph.dimension))
+        found.append(Factor("displacement", ranges.nodes[~apart], zero, std=std[~apart] + zero))
     return tuple(found)
+
+
+def _held(graph: Graph) -> tuple[int, ...]:
+    """The fixed vertices, and the first pose of each part of the graph that has neither those nor priors."""
+    edges = (graph.relative_pose, graph.relative_point, graph.ranges)
+    part = parts(
+        len(graph.names), np.concatenate([each.nodes for each in edges if len(each)] or [np.empty((0, 2), int)])
+    )
+    held = [graph.fixed, *(each.nodes[:, 0] for each in (graph.pose_prior, graph.point_prior) if len(each))]
+    free = np.flatnonzero(graph.is_pose & ~np.isin(part, part[np.concatenate(held)]))
+    first = free[np.unique(part[free], return_index=True)[1]]
+    return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())
 
 
 def _mean_variance(covariance: Floats) -> Floats:

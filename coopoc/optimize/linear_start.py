@@ -9,13 +9,13 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..formats.graph import Graph
-from .ldl import LDL
+from .cholesky import Cholesky
 from .space import Space, exp
 
 TIE = 1e-6
 """Weight of the start that is given beside the least weight of a measurement: it decides only what nothing measures."""
-PULL = 1e-4
-"""Weight of the last rotations beside that of a median relative rotation: it reaches a hundred poses along a chain."""
+PROXIMAL = 1e-4
+"""Weight of the last rotations beside that of a median relative rotation: it acts over a hundred poses of a chain."""
 SWEEPS = 10
 """Solves with the rotations of the one before; the matrix is factored once."""
 
@@ -34,7 +34,7 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     """(n, ambient): the least squares of relative poses, seen landmarks and priors over any matrices R_i, which
     are then projected to rotations; last over the positions with these rotations.
 
-    sum kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2 + tau |l_k - t_i - R_i z_ik|^2 + pull |R_i - P_i|_F^2,
+    sum kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2 + tau |l_k - t_i - R_i z_ik|^2 + mu |R_i - P_i|_F^2,
     P the rotations before: row a of all matrices and component a of all positions form one problem, and all d share one
     matrix. Without the last term matrices shrink towards zero along a chain, and what is left of them turns at random;
     with it each sweep is a step of a projected inverse power iteration, which lengthens them again. Ranges have no
@@ -52,15 +52,15 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     kappa = np.median(1.0 / _turn_variance(graph.relative_pose.covariance, d)) if len(graph.relative_pose) else 1.0
     turns = at[graph.is_pose][:, :d].ravel()
     whole = np.concatenate([np.swapaxes(rotation, 1, 2), position[:, None]], axis=1).reshape(n * (d + 1), d)
-    last = Rows(turns[:, None], np.ones((len(turns), 1)), None, np.full(len(turns), PULL * kappa))
-    solve = _least_squares([*rows, last], n * (d + 1))
+    last = Rows(turns[:, None], np.ones((len(turns), 1)), None, np.full(len(turns), PROXIMAL * kappa))
+    solve = _least_squares([*rows, last], n * (d + 1), d + 1)
     for _ in range(SWEEPS):
         found = solve(whole, whole[turns]).reshape(n, d + 1, d)
         rotation[graph.is_pose] = project(np.swapaxes(found[graph.is_pose, :d], 1, 2))
         found[:, :d] = np.swapaxes(rotation, 1, 2)
         whole = found.reshape(n * (d + 1), d)
     held = Rows(anchors[:, None], np.ones((len(anchors), 1)), None, np.full(len(anchors), np.inf))
-    steady = _least_squares([*_positions(graph, rotation), held], n)
+    steady = _least_squares([*_positions(graph, rotation), held], n, 1)
     return space.join(steady(position, position[anchors]), rotation)
 
 
@@ -82,15 +82,19 @@ def project(matrix: Floats) -> Floats:
 
 def _anchors(graph: Graph) -> Ints:
     """One pose of each part of the graph that has no prior and that no linear measurement joins to another."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    n, pairs = len(graph.names), np.concatenate([graph.relative_pose.nodes, graph.relative_point.nodes])
-    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    part = connected_components(joined, directed=False)[1]
+    part = parts(len(graph.names), np.concatenate([graph.relative_pose.nodes, graph.relative_point.nodes]))
     held = part[np.concatenate([graph.pose_prior.nodes[:, 0], graph.point_prior.nodes[:, 0]])]
     poses = np.flatnonzero(graph.is_pose & ~np.isin(part, held))
     return np.asarray(poses[np.unique(part[poses], return_index=True)[1]])
+
+
+def parts(n: int, pairs: Ints) -> Ints:
+    """(n,) number of the connected part that each node is in, by pairs (M, 2) that are joined."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(joined, directed=False)[1])
 
 
 def _rows(graph: Graph, at: Ints) -> list[Rows]:
@@ -142,9 +146,9 @@ def _fixes(graph: Graph, at: Ints) -> list[Rows]:
     ]
 
 
-def _least_squares(rows: list[Rows], count: int) -> Callable[[Floats, Floats], Floats]:
+def _least_squares(rows: list[Rows], count: int, width: int) -> Callable[[Floats, Floats], Floats]:
     """(start (count, d), goals of the rows that have none of their own) -> (count, d), by one factorisation;
-    what has no information stays at the start."""
+    what has no information stays at the start; `width` unknowns of a node follow one another."""
     from scipy.sparse import csc_matrix, csr_array, diags_array, triu
 
     finite = np.concatenate([part.weight[np.isfinite(part.weight)] for part in rows])
@@ -158,8 +162,8 @@ def _least_squares(rows: list[Rows], count: int) -> Callable[[Floats, Floats], F
         matrix = matrix + weighted[-1] @ G
     upper = csc_matrix(triu(matrix))
     upper.sort_indices()
-    ldl = LDL()
-    sound = ldl.factor(upper)
+    cholesky = Cholesky(np.arange(count) // width)
+    sound = cholesky.factor(upper)
 
     def solve(start: Floats, goal: Floats) -> Floats:
         if not sound:
@@ -167,7 +171,7 @@ def _least_squares(rows: list[Rows], count: int) -> Callable[[Floats, Floats], F
         right = tie * start
         for part, each in zip(rows, weighted, strict=True):
             right = right + each @ (goal if part.goal is None else part.goal)
-        return np.stack([ldl.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
+        return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
     return solve
 

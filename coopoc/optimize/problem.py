@@ -18,6 +18,7 @@ from .inputs import numbers
 from .linear import Linear, linearise, sparse_jacobian
 from .measurements import lookup
 from .nodes import check_item, indices, no_such_node, points, rows
+from .search import Search
 from .space import Space
 from .window import Noise, WindowStep, recorded_steps, window_factors
 
@@ -47,7 +48,7 @@ class Problem:
         poses: the nodes that have a rotation.
         fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
         constraints: what must hold exactly.
-        start: what x0 is called in Solution.extras["start"], such as the start of a graph that won.
+        search: how x0 was found, such as the start of a graph that won; a Solution counts its work.
 
     Raises:
         InputError: repeated names, unknown nodes, kinds that need a pose, shapes that do not agree.
@@ -66,7 +67,7 @@ class Problem:
     poses: tuple[int, ...] = ()
     fixed: tuple[int, ...] = ()
     constraints: tuple[Constraint, ...] = ()
-    start: str = ""
+    search: Search = Search()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))

@@ -1,4 +1,4 @@
-"""The choice among starts: a few steps from each, cheapest first, and the lowest goes on."""
+"""The choice among starts: a few steps from each, cheapest first; the lowest goes on, or one that grows."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from .problem import Problem
+from .search import Search
 from .sparse import keep, sparse
 from .trust_region import Arrival, arrive
 
@@ -21,26 +22,37 @@ TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
 
 
-def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> Problem:
-    """The problem from the start that leads lowest; its x0 is where the steps from there have led.
+EXCESS = 1.5
+"""Cost over that of the measurements' own noise from which a minimum is not believed."""
+MORE = 50
+"""Steps before it is judged."""
+
+
+def race(
+    problem: Problem,
+    starts: Mapping[str, Callable[[], Floats]],
+    growing: Callable[[Problem], tuple[Floats, int]] | None = None,
+) -> tuple[Problem, Search]:
+    """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
     A start from which no step was refused and no promise failed by half ends the search: others are tried where the
-    first had trouble, and all whose costs are near the least go on (ROUNDS). A problem that is not large takes the
-    first.
+    first had trouble, and all whose costs are near the least go on (ROUNDS). Where the end is far above the noise of
+    the measurements, the growing start is tried, too. A problem that is not large takes the first.
 
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
+        growing: problem -> x0 and iterations of a start that is tried last, "incremental".
     """
-    system, tried = sparse(problem), {}
+    system, tried, taken = sparse(problem), {}, 0
     for name, start in starts.items():
         x = start()
         if system is None:
-            return problem.replace_unchecked(x0=frozen(x), start=name)
+            return problem.replace_unchecked(x0=frozen(x)), Search(name)
         end = arrive(system, x, STEPS, TOLERANCE)
-        tried[name] = system.cost(end.x), end.x
+        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         if smooth(end):
-            break
+            return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
     assert system is not None
     least = min(cost for cost, _ in tried.values())
     for within, steps in ROUNDS:
@@ -48,14 +60,36 @@ def race(problem: Problem, starts: Mapping[str, Callable[[], Floats]]) -> Proble
             break
         close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
         if len(close) > 1:
-            ends = {name: arrive(system, x, steps, TOLERANCE).x for name, x in close.items()}
-            tried = {name: (system.cost(x), x) for name, x in ends.items()}
+            ends = {name: arrive(system, x, steps, TOLERANCE) for name, x in close.items()}
+            tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
+            taken += sum(end.iterations for end in ends.values())
             least = min(cost for cost, _ in tried.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    return keep(system, problem.replace_unchecked(x0=frozen(x), start=name))
+    limit = EXCESS * expected(problem, system.size)
+    if growing is not None and system.cost(x) > limit:
+        end = arrive(system, x, MORE, TOLERANCE)
+        x, taken = end.x, taken + end.iterations
+        if system.cost(x) > limit:
+            grown, steps = growing(problem)
+            end = arrive(system, grown, MORE, TOLERANCE)
+            taken += steps + end.iterations
+            name, x = ("incremental", end.x) if system.cost(end.x) < system.cost(x) else (name, x)
+    return keep(problem, problem.replace_unchecked(x0=frozen(x))), Search(name, taken)
+
+
+def expected(problem: Problem, unknowns: int) -> float:
+    """Half the numbers measured beyond the unknowns: the mean of the cost at its minimum under the noise it assumes.
+
+    The entries of a rotation matrix that is measured count as the angles that they hold.
+    """
+    d, angles = problem.dimension, problem.space.angles
+    more = {"pose_chordal": d * d - angles, "relative_pose_chordal": d * d - angles}
+    spare = sum(len(f.nodes) * (f.size - more.get(f.kind, 0)) for f in problem.factors)
+    return 0.5 * max(spare - unknowns, 0)
 
 
 def smooth(end: Arrival) -> bool:
-    """Whether all promises came true by half and more."""
-    share = end.record[:, 2]
-    return bool(np.isfinite(share).all() and (np.abs(share - 1.0) < 0.5).all())
+    """Whether all promises came true by half and more, without damping; that an exact Hessian was not positive definite
+    is no trouble, since J^T J goes on."""
+    _, damping, share = end.record.T
+    return bool(not damping.any() and (np.abs(share[np.isfinite(share)] - 1.0) < 0.5).all())

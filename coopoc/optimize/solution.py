@@ -50,9 +50,9 @@ class Solution:
         cost: 1/2 sum of rho of the squared whitened residuals.
         gradient_norm: |J^T r| at x, with constraints that of the Lagrangian.
         status: how it ended.
-        iterations: of the backend.
+        iterations: of the backend, and of the search for a start: extras["start_iterations"] of them.
         build_seconds: to prepare the solver and the start.
-        solve_seconds: to run it.
+        solve_seconds: to run it, and of the search for a start: extras["start_seconds"] of them.
         backend: its name.
         names: of the nodes.
         shown: the node that `print` shows.

@@ -19,6 +19,7 @@ from .fuse import fused
 from .initial import initial_guess, somewhere
 from .lagrangian import is_constrained_minimum
 from .problem import Problem
+from .search import Search
 from .solution import Solution, SolveError, Status
 from .sparse import sparse
 
@@ -65,6 +66,8 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
     solution = _solved(problem, known, options)
     if solution.status is not Status.SOLVED and (other := known.fallback(problem, options)) is not None:
         solution = _after(solution, _solved(problem, known, other))
+    if problem.search.start:
+        solution = _with_search(solution, problem.search)
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
     return solution
@@ -99,7 +102,7 @@ def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
         unobservable=truth.unobservable,
         space=problem.space,
         violation=truth.violation,
-        extras=found.extras | violated | ({"start": problem.start} if problem.start else {}),
+        extras=found.extras | violated,
     )
 
 
@@ -110,6 +113,16 @@ def _after(first: Solution, second: Solution) -> Solution:
         build_seconds=first.build_seconds + second.build_seconds,
         solve_seconds=first.solve_seconds + second.solve_seconds,
         extras=second.extras | {"failed_first": f"{first.extras.get('method', first.backend)}: {first.status.name}"},
+    )
+
+
+def _with_search(solution: Solution, search: Search) -> Solution:
+    """The solution, with the iterations and the time of the search for its start."""
+    return replace(
+        solution,
+        iterations=solution.iterations + search.iterations,
+        solve_seconds=solution.solve_seconds + search.seconds,
+        extras=solution.extras | search.extras,
     )
 
 

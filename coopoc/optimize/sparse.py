@@ -11,11 +11,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ..arrays import Floats, Ints
+from .cholesky import Cholesky
 from .factor import Factor
-from .ldl import LDL
 from .problem import Problem
 from .space import Space
-from .tape import Model, kind_of, numbers_of, write
+from .tape import Model, NoTape, kind_of, numbers_of, write
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,11 +135,11 @@ class Sparse:
         return self.entries.size
 
     @property
-    def ldl(self) -> LDL:
+    def cholesky(self) -> Cholesky:
         """Factors of its Hessians, whose ordering is kept; each thread has its own."""
-        if not hasattr(self._local, "ldl"):
-            self._local.ldl = LDL()
-        return self._local.ldl  # type: ignore[no-any-return]
+        if not hasattr(self._local, "cholesky"):
+            self._local.cholesky = Cholesky(np.nonzero(self.entries.number >= 0)[0])
+        return self._local.cholesky  # type: ignore[no-any-return]
 
     @cached_property
     def _local(self) -> threading.local:
@@ -190,8 +190,6 @@ class Sparse:
 def _goal(entries: Entries, nodes: Ints, written: Ints, dof: int) -> Any:
     """(outputs, M) where each output of a tape is added: the cost, the gradient, the Hessian, or, last, nowhere."""
     m, nowhere = entries.size, entries.size + 1 + len(entries.indices)
-    if len(written) <= 1:
-        return np.zeros((len(written), 1), dtype=np.int32)
     columns = [entries.number[node, k] for node in nodes.T for k in range(dof)]
     pairs = {(i, j): entries.pair(nodes[:, i], nodes[:, j]) for j in range(nodes.shape[1]) for i in range(j + 1)}
     goal = np.zeros((len(written), len(nodes)), dtype=np.int32)
@@ -210,19 +208,20 @@ LARGE = 60
 _KEPT: WeakKeyDictionary[Problem, Sparse | None] = WeakKeyDictionary()
 
 
-def sparse(problem: Problem) -> Sparse | None:
+def sparse(problem: Problem, least: int = LARGE) -> Sparse | None:
     """A large single problem ready to be evaluated, kept as long as the problem is; None if it is small, has a
-    separator or constraints, or a kind that no tape can hold."""
-    if problem.batch is not None or problem.separator or problem.constraints or len(problem.names) <= LARGE:
+    separator or constraints, or a kind that no tape can hold. Small are problems of up to `least` nodes."""
+    if problem.batch is not None or problem.separator or problem.constraints or len(problem.names) <= least:
         return None
     if problem not in _KEPT:
         _KEPT[problem] = _made(problem)
     return _KEPT[problem]
 
 
-def keep(system: Sparse, problem: Problem) -> Problem:
-    """The problem, with the system of another that differs from it in x0 alone."""
-    _KEPT[problem] = system
+def keep(former: Problem, problem: Problem) -> Problem:
+    """The problem, with what is kept of a former one that differs from it in x0 and its search alone."""
+    if former in _KEPT:
+        _KEPT[problem] = _KEPT[former]
     return problem
 
 
@@ -230,7 +229,7 @@ def _made(problem: Problem) -> Sparse | None:
     try:
         for factor in problem.factors:
             write(kind_of(factor, problem.space), "newton")
-    except NotImplementedError:
+    except NoTape:
         return None
     return Sparse(
         problem.space, problem.factors, entries_of(problem), tuple(numbers_of(factor) for factor in problem.factors)

@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..formats.graph import Graph
 from .linear_start import linear_start
 from .space import Space
+from .trilateration import located
 
 
 def chained(graph: Graph, apart: bool = False) -> Floats:
@@ -41,6 +42,18 @@ def file(graph: Graph) -> Floats:
     return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
 
 
+def separated(graph: Graph, x0: Floats) -> Floats:
+    """x0 with ends of a range that lie in one place moved apart by a share NUDGE of it, each another way: there a range
+    has no direction."""
+    position, (i, j) = x0[:, : graph.dimension], graph.ranges.nodes.T
+    distance = graph.ranges.distance
+    rows = np.flatnonzero(np.linalg.norm(position[j] - position[i], axis=1) < 1e-9 * distance)
+    way = 2.4 * np.arange(len(rows))
+    step = NUDGE * distance[rows, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
+    position[j[rows], :2] += step
+    return x0
+
+
 STARTS: dict[str, Callable[[Graph], Floats]] = {
     "odometry": chained,
     "apart": lambda graph: chained(graph, apart=True),
@@ -63,6 +76,8 @@ def contenders(graph: Graph) -> tuple[str, ...]:
     return ("odometry", "tree", "linear") if closed else ("odometry", "linear")
 
 
+NUDGE = 0.01
+"""Share of a range."""
 Roots = list[tuple[int, Floats, Floats]]
 """(pose, position, rotation) in the order in which the walk may start from them."""
 
@@ -131,17 +146,12 @@ def _landmarks(graph: Graph, position: Floats, rotation: Floats, known: Bools) -
 
 
 def _by_ranges(graph: Graph, position: Floats, known: Bools) -> None:
-    """Points that are only ranged: linear least squares of r_k^2 - r_0^2, in place."""
+    """Points that are only ranged, in place."""
     nodes, r = graph.ranges.nodes, graph.ranges.distance
     for j in np.flatnonzero(~known & ~graph.is_pose).tolist():
         rows = np.flatnonzero((nodes == j).any(axis=1))
-        others: Ints = nodes[rows][nodes[rows] != j]
+        others: Ints = nodes[rows].sum(axis=1) - j
         seen = known[others]
-        p, d = position[others[seen]], r[rows[seen]]
-        if len(p) > graph.dimension:
-            matrix = np.concatenate([2.0 * p, np.ones((len(p), 1))], axis=1)
-            found = np.linalg.lstsq(matrix, np.square(p).sum(axis=1) - d * d, rcond=None)[0]
-            position[j] = found[: graph.dimension]
-        elif len(p):
-            position[j] = p[0] + d[0] * np.eye(graph.dimension)[0]
+        if seen.any():
+            position[j] = located(position[others[seen]], r[rows[seen]])
         known[j] = True

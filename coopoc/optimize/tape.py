@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 Model = Literal["cost", "gauss-newton", "newton"]
 
 
+class NoTape(Exception):
+    """A formula that CasADi cannot run, or one with an operation that no tape has."""
+
+
 class Kind(NamedTuple):
     """All that the tape of a factor depends on.
 
@@ -58,7 +62,7 @@ def kind_of(factor: Factor, space: Space) -> Kind:
 
 
 def numbers_of(factor: Factor) -> Floats:
-    """(P, M or 1) the tape's inputs that are no nodes: z, constants and weights of a single realisation."""
+    """(P, M) the tape's inputs that are no nodes: z, constants and weights of a single realisation."""
     weight = 1.0 / factor.std if factor.std is not None else factor.sqrt_information
     assert weight is not None
     assert factor.constants is not None
@@ -72,7 +76,7 @@ def write(kind: Kind, model: Model) -> Written:
     """The tape of a kind.
 
     Raises:
-        NotImplementedError: a formula that CasADi cannot run, or an operation that no tape has.
+        NoTape: the formula has none.
     """
     import casadi as ca
 
@@ -118,7 +122,7 @@ def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
         white = symbolic.white(known, space, nodes, steps, given, kind.full)
         rho = symbolic.robust(square, kind.loss)
     except Exception as problem:  # the formula is the user's: whatever it raises, the plain way takes it
-        raise NotImplementedError(f"{known.name} does not run on CasADi's numbers: {problem}") from problem
+        raise NoTape(f"{known.name} does not run on CasADi's numbers: {problem}") from problem
     cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
     return nodes, number, steps, (cost, white, square, rho)
 
@@ -127,23 +131,24 @@ def _tape(function: Any) -> Tape:
     """The operations of a CasADi function of one vector."""
     import casadi as ca
 
-    from ..kernels.graph_tape import OPERATIONS, Tape
+    from ..kernels.graph_tape import Tape
+    from ..kernels.operations import Operation
 
-    known = {getattr(ca, f"OP_{name}"): k for k, name in enumerate(OPERATIONS)}
+    known = {getattr(ca, f"OP_{operation.name}"): operation for operation in Operation}
+    known |= {ca.OP_SQ: Operation.MUL, ca.OP_TWICE: Operation.ADD}  # of one slot, which is read twice
     count = function.n_instructions()
     code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
     for k in range(count):
         found = function.instruction_id(k)
         if found not in known:
-            raise NotImplementedError(f"no tape has CasADi's operation {found}")
+            raise NoTape(f"no tape has CasADi's operation {found}")
         code[k] = known[found]
         read, written = function.instruction_input(k), function.instruction_output(k)
-        name = OPERATIONS[code[k]]
-        if name == "CONST":
+        if code[k] == Operation.CONST:
             place[k, 0], value[k] = written[0], function.instruction_constant(k)
-        elif name == "INPUT":
+        elif code[k] == Operation.INPUT:
             place[k, :2] = written[0], read[1]
-        elif name == "OUTPUT":
+        elif code[k] == Operation.OUTPUT:
             place[k, :2] = written[1], read[0]
         else:
             place[k] = written[0], read[0], read[-1]

@@ -28,6 +28,8 @@ SLOW = 0.2
 """A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
+STILL = 12
+"""Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +63,15 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
     """
-    ldl, mu, doubt = system.ldl, 0.0, 0
+    cholesky, mu, doubt = system.cholesky, 0.0, 0
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
-    newton, converged, last = 0, False, np.inf
+    newton, converged, last, still = 0, False, np.inf, 0
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     scale = _scale(system, values)
     while len(record) < max_iterations and not converged and mu < GIVE_UP:
         newton += model == "newton"
-        definite = ldl.factor(system.matrix(_damped(system, values, mu * scale)))
+        definite = cholesky.factor(system.matrix(_damped(system, values, mu * scale)))
         if not definite:
             record.append((cost, mu, np.nan))
             if model == "newton":
@@ -78,14 +80,15 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             else:
                 mu = _grown(mu)
             continue
-        dx = -ldl.solve(gradient)
+        dx = -cholesky.solve(gradient)
         promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
         there = system.retract(x, dx)
         after = system.cost(there)
         hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
         share = 1.0 if hidden else (cost - after) / promised
+        still = still + 1 if hidden else 0
         record.append((cost, mu, share))
-        converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden)
+        converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden) or still > STILL
         if not share > 0.0:
             mu = _grown(mu)
             continue

@@ -19,11 +19,10 @@ from ...arrays import Floats
 from ...errors import InputError
 from ...plugins import unknown
 from ..backend import Backend, Capabilities, Solver, SolverResult, looped
-from ..convex.certificate import lower_bound
 from ..convex.qcqp import Multipliers
 from ..convex.quadratic import TERMS, quadratic
 from ..convex.relaxation import first_vectors, polished, rounded, small
-from ..convex.schur import Dense
+from ..convex.schur import Dense, lower_bound
 from ..linear import entries
 from ..problem import Problem
 from . import gauss_newton

@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...arrays import Floats
 from ..problem import Problem
 from ..solution import Solution
-from .qcqp import Multipliers, multipliers
+from .qcqp import multipliers
 from .quadratic import quadratic
-from .schur import Reduced, reduce
+from .schur import lower_bound, reduce
 
 TOLERANCE = 1e-6
 """Largest gap of a certified solution, as a share of its cost (at least of 1, the cost of two residuals of one std)."""
@@ -46,8 +45,14 @@ class Certificate:
         return self.sentence
 
 
-def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, surrogate: bool = False) -> Certificate:
-    """Certificate of a solution, at the price of one eigenvalue: no relaxation is solved.
+def certify(
+    problem: Problem,
+    solution: Solution,
+    tolerance: float = TOLERANCE,
+    surrogate: bool = False,
+    seconds: float = 0.0,
+) -> Certificate:
+    """Certificate of a solution, at the price of one eigenvalue; a relaxation is solved only if there are `seconds`.
 
     With the multipliers L that belong to the solution's X in closed form, every point of the QCQP costs at least
 
@@ -63,6 +68,7 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
         tolerance: largest gap, as a share of max(cost, 1).
         surrogate: replace what is not quadratic (`surrogate`), solve that from the solution and certify its minimum;
             the sentence names the replaced factors and the distance of the two points.
+        seconds: for a better bound where the first proves nothing: that of `staircase` from the solution.
 
     Raises:
         InputError: as `quadratic`, or as `surrogate`.
@@ -74,12 +80,16 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
     certified global optimum of Problem(2 points; 2 position, 1 range)
     """
     if surrogate:
-        return _by_surrogate(problem, solution, tolerance)
+        return _by_surrogate(problem, solution, tolerance, seconds)
     form = quadratic(problem)
     x = solution.x
     X = form.lift(problem.space.position(x), problem.space.rotation(x))[: form.bound]
     reduced = reduce(form)
     bound, smallest, _ = lower_bound(reduced, multipliers(form, X, reduced.times(X)))
+    if seconds > 0 and solution.cost - bound > tolerance * max(solution.cost, 1.0):
+        from .staircase import staircase
+
+        bound = max(bound, staircase(replace(problem, x0=x), refine=False, seconds=seconds).lower_bound)
     certified = solution.cost - bound <= tolerance * max(solution.cost, 1.0)
     sentence = (
         f"certified global optimum of {problem!r}"
@@ -92,20 +102,14 @@ def certify(problem: Problem, solution: Solution, tolerance: float = TOLERANCE, 
     return Certificate(certified, sentence, solution.cost, max(bound, 0.0), smallest)
 
 
-def _by_surrogate(problem: Problem, solution: Solution, tolerance: float) -> Certificate:
+def _by_surrogate(problem: Problem, solution: Solution, tolerance: float, seconds: float) -> Certificate:
     from ..solve import solve
     from .surrogate import surrogate
 
     other = surrogate(problem)
     found = solve(replace(other.problem, x0=solution.x), throw=False)
-    verdict = certify(other.problem, found, tolerance)
+    verdict = certify(other.problem, found, tolerance, seconds=seconds)
     space = problem.space
     apart = np.linalg.norm(space.position(found.x) - space.position(solution.x), axis=1).max(initial=0.0)
     note = f"; surrogate: {'; '.join(other.replaced) or 'nothing replaced'}; at most {apart:.3g} m from the solution"
     return replace(verdict, sentence=verdict.sentence + note, surrogate=other.replaced)
-
-
-def lower_bound(reduced: Reduced, L: Multipliers) -> tuple[float, float, Floats]:
-    """A cost that no point beats, for any multipliers L; the smallest eigenvalue of C - L and its eigenvector."""
-    smallest, vector = reduced.smallest(L)
-    return 0.5 * (L.trace + L.problem.trace * min(smallest, 0.0)), smallest, vector

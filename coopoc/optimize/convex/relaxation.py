@@ -17,12 +17,11 @@ from ...errors import InputError
 from ..problem import Problem
 from ..solution import Solution
 from ..solve import solve
-from .certificate import lower_bound
 from .cones import semidefinite
 from .manifold import minimise
 from .qcqp import Multipliers, Quadratic
 from .quadratic import quadratic
-from .schur import Dense, Reduced
+from .schur import Dense, Reduced, lower_bound
 
 LARGEST = 60
 """Constrained rows up to which `shor` takes seconds at most; from some 30 rows on `staircase` is the faster one."""

@@ -109,20 +109,19 @@ class Sparse:
         return kept
 
     @cached_property
-    def _gram(self) -> Any:
+    def gram(self) -> Any:
         rows = self.problem.rows[:, self._kept]
         return (rows.T @ rows).tocsc()
 
     @cached_property
     def _inverse(self) -> Any:
-        bound = self.problem.bound
-        return factorise(self._gram[bound:, bound:])
+        return factorise(self.gram[self.problem.bound :, self.problem.bound :])
 
     @cached_property
     def _parts(self) -> tuple[Any, Any]:
         """Q_cc and Q_fc."""
         bound = self.problem.bound
-        return self._gram[:bound, :bound].tocsr(), self._gram[bound:, :bound].tocsr()
+        return self.gram[:bound, :bound].tocsr(), self.gram[bound:, :bound].tocsr()
 
     def _free(self, X: Floats) -> Floats:
         return np.asarray(-self._inverse.solve(self._parts[1] @ X))
@@ -140,28 +139,28 @@ class Sparse:
 
     @cached_property
     def _scale(self) -> float:
-        return float(self._gram.diagonal()[: self.problem.bound].mean())
+        return float(self.gram.diagonal()[: self.problem.bound].mean())
 
     @cached_property
     def _ridged(self) -> Any:
-        return factorise(self._shifted(None, -RIDGE * self._scale))
+        return factorise(self.shifted(None, -RIDGE * self._scale))
 
     def precondition(self, V: Floats) -> Floats:
         """(C + ridge)^-1 V."""
         return self._solve(self._ridged, V)
 
     def _solve(self, factored: Any, V: Floats) -> Floats:
-        full = np.zeros((self._gram.shape[0], *V.shape[1:]))
+        full = np.zeros((self.gram.shape[0], *V.shape[1:]))
         full[: len(V)] = V
         return np.asarray(factored.solve(full)[: len(V)])
 
-    def _shifted(self, less: Any, shift: float) -> Any:
+    def shifted(self, less: Any, shift: float) -> Any:
         """Q - diag(less + shift I, 0): its Schur complement is C - less - shift I."""
         from scipy.sparse import block_diag, csc_array, eye_array
 
-        bound, size = self.problem.bound, self._gram.shape[0]
+        bound, size = self.problem.bound, self.gram.shape[0]
         corner = shift * eye_array(bound) + (0 if less is None else less)
-        return csc_array(self._gram - block_diag([corner, csc_array((size - bound, size - bound))]))
+        return csc_array(self.gram - block_diag([corner, csc_array((size - bound, size - bound))]))
 
     def smallest(self, L: Multipliers) -> tuple[float, Floats]:
         """Of C - L: Lanczos on the inverse around a shift that a factorisation shows to be below the spectrum."""
@@ -170,13 +169,19 @@ class Sparse:
         less, shift, factored = L.sparse, -1e-7 * self._scale, None
         while factored is None:
             shift *= 10.0
-            factored = positive(self._shifted(less, shift))
+            factored = positive(self.shifted(less, shift))
         size = self.problem.bound
         whole = LinearOperator((size, size), matvec=lambda v: self.times(v.reshape(-1, 1))[:, 0] - less @ v.ravel())
         inverse = LinearOperator((size, size), matvec=lambda v: self._solve(factored, v.ravel()))
         start = np.random.default_rng(0).standard_normal(size)
         value, vector = eigsh(whole, k=1, sigma=shift, OPinv=inverse, v0=start, tol=1e-10)
         return float(value[0]), vector[:, 0]
+
+
+def lower_bound(reduced: Reduced, L: Multipliers) -> tuple[float, float, Floats]:
+    """A cost that no point beats, for any multipliers L; the smallest eigenvalue of C - L and its eigenvector."""
+    smallest, vector = reduced.smallest(L)
+    return 0.5 * (L.trace + L.problem.trace * min(smallest, 0.0)), smallest, vector
 
 
 def factorise(matrix: Any) -> Any:
@@ -192,5 +197,4 @@ def positive(matrix: Any) -> Any | None:
         factored = factorise(matrix)
     except RuntimeError:  # a pivot of exactly zero
         return None
-    sound = np.array_equal(factored.perm_r, factored.perm_c) and (factored.U.diagonal() > 0).all()
-    return factored if sound else None
+    return factored if np.array_equal(factored.perm_r, factored.perm_c) and (factored.U.diagonal() > 0).all() else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -11,12 +10,12 @@ from tqdm import tqdm
 from ...arrays import Floats
 from ...errors import InputError
 from ..problem import Problem
-from .certificate import lower_bound
 from .manifold import Stationary, minimise, retract
+from .newton import minimise_sparsely
 from .qcqp import Quadratic
 from .quadratic import quadratic
 from .relaxation import TIGHT, Relaxation, rounded
-from .schur import Reduced, reduce
+from .schur import Reduced, Sparse, lower_bound, reduce
 
 START = 2
 """Columns beyond d at a random start: with none to spare the first steps end in local minima."""
@@ -26,7 +25,9 @@ STALL = 1e-9
 """Share of the cost (at least of 1) that one more column must save to be followed by another."""
 
 
-def staircase(problem: Problem, refine: bool = True, seed: int = 0, height: int = HEIGHT) -> Relaxation:
+def staircase(
+    problem: Problem, refine: bool = True, seed: int = 0, height: int = HEIGHT, seconds: float = np.inf
+) -> Relaxation:
     """The semidefinite relaxation of `shor` with Z = Y Y^T, Y of a few columns, rounded and refined.
 
     minimise 1/2 <C, Y Y^T> over Y with p columns; if C - L has a negative eigenvalue there, its eigenvector in a new
@@ -39,9 +40,10 @@ def staircase(problem: Problem, refine: bool = True, seed: int = 0, height: int 
         refine: follow by `solve` from the rounded point.
         seed: of the random start.
         height: columns beyond d at which to give up.
+        seconds: after which to stop, with the best bound by then; for graphs, a small problem takes what it needs.
 
     Raises:
-        InputError: as `quadratic`; height below 1.
+        InputError: as `quadratic`; height below 1, seconds that are not positive.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> round(staircase(problem.add("range", ("a", "b"), 6.0, std=1.0)).lower_bound, 6)
@@ -49,11 +51,13 @@ def staircase(problem: Problem, refine: bool = True, seed: int = 0, height: int 
     """
     if not isinstance(height, int) or height < 1:
         raise InputError("height", height, "must be a whole number >= 1", f"Leave it out for {HEIGHT}.")
+    if not seconds > 0:
+        raise InputError("seconds", seconds, "must be positive", "Leave it out for as long as it takes.")
     began = time.perf_counter()
     form = quadratic(problem)
     reduced = reduce(form)
-    with tqdm(desc="staircase", unit=" steps", delay=2.0) as bar:
-        found, bound = _climb(form, reduced, _start(problem, form, seed), form.columns + height, bar)
+    start = _start(problem, form, seed)
+    found, bound = climb(form, reduced, start, form.columns + height, began + seconds)
     _, values, rows = np.linalg.svd(found.X, full_matrices=False)
     d = form.columns
     gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
@@ -68,17 +72,23 @@ def _start(problem: Problem, form: Quadratic, seed: int) -> Floats:
     return form.lift(where.position(problem.x0), where.rotation(problem.x0))[: form.bound]
 
 
-def _climb(form: Quadratic, reduced: Reduced, Y: Floats, most: int, bar: Any) -> tuple[Stationary, float]:
-    """A stationary point and the best bound on the way; the two agree, unless `most` columns or rounding stop it."""
+def climb(form: Quadratic, reduced: Reduced, Y: Floats, most: int, deadline: float) -> tuple[Stationary, float]:
+    """A stationary point and the best bound on the way; the two agree, unless `most` columns, rounding or the time
+    (time.perf_counter() of the `deadline`) stop it."""
     bound, before = -np.inf, np.inf
-    while True:
-        found = minimise(form, reduced, Y, tick=bar.update)
-        proved, smallest, vector = lower_bound(reduced, found.multipliers)
-        bound, size = max(bound, proved), max(found.cost, 1.0)
-        if found.cost - bound <= TIGHT * size or Y.shape[1] >= most or before - found.cost <= STALL * size:
-            return found, bound
-        bar.set_postfix(columns=Y.shape[1] + 1, cost=f"{found.cost:.6g}", bound=f"{max(bound, 0.0):.6g}")
-        Y, before = _escape(form, reduced, found, smallest, vector), found.cost
+    with tqdm(desc="staircase", unit=" steps", delay=2.0) as bar:
+        while True:
+            if isinstance(reduced, Sparse):
+                found = minimise_sparsely(form, reduced, Y, deadline=deadline, tick=bar.update)
+            else:
+                found = minimise(form, reduced, Y, tick=bar.update)
+            proved, smallest, vector = lower_bound(reduced, found.multipliers)
+            bound, size = max(bound, proved), max(found.cost, 1.0)
+            late = Y.shape[1] >= most or time.perf_counter() > deadline
+            if late or found.cost - bound <= TIGHT * size or before - found.cost <= STALL * size:
+                return found, bound
+            bar.set_postfix(columns=Y.shape[1] + 1, cost=f"{found.cost:.6g}", bound=f"{max(bound, 0.0):.6g}")
+            Y, before = _escape(form, reduced, found, smallest, vector), found.cost
 
 
 def _escape(form: Quadratic, reduced: Reduced, found: Stationary, smallest: float, v: Floats) -> Floats:

@@ -1,0 +1,63 @@
+"""The sparse Cholesky factor against NumPy's dense one: solves, definiteness, entries of the inverse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix, triu
+
+from coopoc.optimize.cholesky import Cholesky
+
+
+def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
+    """J^T J of a chain of nodes and of random pairs, each with a full block of rows; a prior on the first."""
+    rng = np.random.default_rng(seed)
+    k = np.arange(nodes - 1)
+    ends = np.concatenate([np.stack([k, k + 1], axis=1), rng.integers(0, nodes, (pairs, 2))])
+    J = np.zeros((len(ends) + 1, width, nodes, width))
+    J[np.arange(len(ends)), :, ends[:, 0]] = rng.normal(size=(len(ends), width, width))
+    J[np.arange(len(ends)), :, ends[:, 1]] += rng.normal(size=(len(ends), width, width))
+    J[-1, :, 0] = np.eye(width)
+    whole = J.reshape(-1, nodes * width)
+    return whole.T @ whole
+
+
+def upper(matrix: np.ndarray) -> csc_matrix:
+    found = csc_matrix(triu(csc_matrix(matrix)))
+    found.sort_indices()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("nodes", "pairs", "width"), [(1, 0, 3), (2, 0, 1), (40, 5, 3), (60, 30, 6), (90, 900, 2), (200, 600, 3)]
+)
+def test_it_solves_and_inverts_as_numpy_does(nodes: int, pairs: int, width: int) -> None:
+    """The last two fill in nearly everywhere, so that blocks of hundreds of columns take the way of BLAS."""
+    A = graph_matrix(nodes + pairs, nodes, pairs, width)
+    cholesky = Cholesky(np.repeat(np.arange(nodes), width))
+    for scale in (1.0, 3.0):  # the second factorisation uses the analysis of the first
+        assert cholesky.factor(upper(scale * A))
+        rhs = np.random.default_rng(1).normal(size=len(A))
+        assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(scale * A, rhs), rel=1e-6, abs=1e-8)
+        rows, columns = np.nonzero(A)
+        inverse = np.linalg.inv(scale * A)[rows, columns]
+        assert cholesky.inverse(rows, columns) == pytest.approx(inverse, rel=1e-6, abs=1e-8)
+
+
+@pytest.mark.parametrize("pairs", [3, 900])
+def test_a_matrix_that_curves_downwards_is_refused(pairs: int) -> None:
+    """The smallest eigenvalue is NumPy's; slightly above it the shifted matrix is indefinite, slightly below not."""
+    A = graph_matrix(pairs, 90, pairs, 2)
+    least = np.linalg.eigvalsh(A)[0]
+    cholesky = Cholesky()
+    for share, definite in ((0.99, True), (1.01, False), (0.5, True)):
+        assert cholesky.factor(upper(A - share * least * np.eye(len(A)))) is definite
+
+
+def test_parts_that_nothing_joins_are_factored_apart() -> None:
+    A = np.zeros((30, 30))
+    A[:12, :12], A[12:, 12:] = graph_matrix(7, 4, 2, 3), graph_matrix(8, 6, 1, 3)
+    order = np.random.default_rng(0).permutation(30)
+    cholesky, rhs = Cholesky(), np.arange(30.0)
+    assert cholesky.factor(upper(A[np.ix_(order, order)]))
+    assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(A[np.ix_(order, order)], rhs), rel=1e-8)
