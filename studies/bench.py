@@ -26,6 +26,8 @@ from coopoc.plugins import find, names
 
 from .bench_tasks import TASKS, VALIDATION, VERSION, Task, bound, recording
 
+COOPERATIVE = "cooperative"
+"""The shipped net whose method sends sums to its neighbours."""
 SMOOTHERS = frozenset({"batch-smoother"})
 """Methods that see the whole drive, for which a filtering bound is none."""
 
@@ -35,9 +37,10 @@ def method(name: str) -> Method:
     if in_file(name) or name in names("coopoc.methods"):
         made: Method = find("coopoc.methods", name)("nominal")
         return made
-    from coopoc.learned import load_method
+    from coopoc.learned import CooperativeGain, load_method
 
-    return load_method(name)
+    learned = load_method(name)
+    return CooperativeGain(learned.model, name=name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]
 
 
 def information(name: str, one: Method) -> str:
@@ -47,7 +50,7 @@ def information(name: str, one: Method) -> str:
     if not one.cooperative:
         return "solo"
     whole = name in WHOLE_FLEET or needs_whole_fleet(name)
-    return "fleet" if whole else "past" if name == "cooperative" else "star"
+    return "fleet" if whole else "past" if name == COOPERATIVE else "star"
 
 
 def tried(name: str, task: Task) -> dict[str, Any]:
