@@ -48,9 +48,9 @@ class Poses(NamedTuple):
 def new_poses(size: int) -> Poses:
     """Room for `size` numbers."""
     stride = (size + LANES - 1) // LANES * LANES
-    vector, cov = np.zeros(10 * stride), np.zeros((size + 2) * stride)
+    vector, cov = np.zeros(10 * stride + LANES), np.zeros((size + 2) * stride)  # three rows at a time reach beyond
     whole = cov.reshape((size + 2, stride))
-    return Poses(vector.reshape((10, stride)), whole, np.zeros((size + 2, stride)), vector, cov)
+    return Poses(vector[: 10 * stride].reshape((10, stride)), whole, np.zeros((size + 2, stride)), vector, cov)
 
 
 @part
