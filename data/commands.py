@@ -81,7 +81,7 @@ def check(
     Example: coopoc data check mylog --columns t=timestamp vehicle=car
 
     Args:
-        path: a file or a folder: tables, NMEA, a ROS bag, MR.CLAM; see docs/your_data.md.
+        path: a file or a folder: tables, NMEA, a ROS bag, PyFG, MR.CLAM; see docs/your_data.md.
         dt: s, steps of the recording.
         max_gap: s, longest gap of a vehicle's odometry that is bridged.
         columns: names in the files, where they differ from the standard ones.
@@ -105,6 +105,9 @@ def check(
     }
     log = load_log(path, **{name: value for name, value in given.items() if value not in (None, (), {})})
     print(log.summary)
+    if log.recording.body is not None:
+        print("in body frames: no innovations of position filters, and no picture; take co.PoseFilter")
+        return
     found = checked(log)
     for title, rows in (("Fixes", found.vehicles), ("Relative measurements", found.measurements)):
         if rows:

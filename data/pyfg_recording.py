@@ -25,8 +25,8 @@ FLAT = 0.01
 def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]:
     """Recording of the robots of a graph in the plane, in one run, and the truth that its vertices hold.
 
-    Odometry is chained and differenced over steps; a range belongs to the nearest step, to the robot that is named first.
-    Standard deviations are those of the file, brought to one step. Points are landmarks; all messages arrive at once.
+    Odometry is chained and differenced over steps; a range belongs to the nearest step, and to the robot that is named
+    first. Standard deviations are those of the file, for one step. Points are landmarks; messages arrive at once.
 
     Args:
         graph: of `read_pyfg`, with stamps.

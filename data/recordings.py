@@ -28,8 +28,8 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
-        name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of `save_recording`; options may stand
-            behind a question mark, as in "drive?dt=0.1".
+        name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of
+            `save_recording`; options may stand behind a question mark, as in "drive?dt=0.1".
         options: of the reader.
 
     Raises:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -235,3 +239,12 @@ def test_the_invariant_filter_is_that_of_the_group() -> None:
         back = np.linalg.inv(coordinates(state))
         assert np.allclose(track.x[0, t, 0, :2], state[:2], atol=1e-6)
         assert np.allclose(track.covariance[0, t, 0, :2, :2], (back @ cov @ back.T)[:2, :2], atol=1e-6)  # type: ignore[index]
+
+
+@pytest.mark.slow
+def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path: Path) -> None:
+    """numba's bounds checks, over members that come and go, in a process of its own."""
+    words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
+    env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(words, capture_output=True, text=True, env=env, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stdout[-2000:]

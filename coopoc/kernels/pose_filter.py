@@ -16,21 +16,8 @@ from .compile import compiled, inside
 from .pose_members import PoseSeen, arrange, place_at
 from .pose_motion import PoseNoise, velocity_variances
 from .pose_pairs import fuse_pairs
-from .pose_update import (
-    AT,
-    KEPT,
-    PENDING,
-    TOTAL,
-    Poses,
-    X,
-    new_poses,
-    retract,
-    settle,
-    update_fix,
-    update_heading,
-    update_relative,
-    wrapped,
-)
+from .pose_rows import retract, update_fix, update_heading, update_relative, wrapped
+from .pose_update import AT, KEPT, PENDING, TOTAL, Poses, X, new_poses, settle
 
 UNPLACED = 7
 """Bits of all components: nothing is known of the place of one of the two."""

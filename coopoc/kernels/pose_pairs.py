@@ -7,7 +7,8 @@ from typing import Any
 
 from .compile import part
 from .pose_motion import PoseNoise
-from .pose_update import AT, KEPT, Poses, X, settle, update_relative
+from .pose_rows import update_relative
+from .pose_update import AT, KEPT, Poses, X, settle
 
 TRIED = 10
 """Weights that covariance intersection tries."""

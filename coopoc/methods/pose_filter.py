@@ -26,11 +26,6 @@ from .track import Track
 
 Unit = Literal["solo", "star", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
-ODOMETRY = Message("fix, compass, velocity and yaw rate", 10)
-"""Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2)."""
-POSE = Message("pose and covariance", 16, cumulative=True)
-"""Position and heading (4), covariance (10), id and time (2)."""
-UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_neighbour=4)
 SPREAD = (1.0, 1.0, 1.0, 0.2)
 """m and rad, standard deviations of poses at the first step that are given."""
 
@@ -121,8 +116,8 @@ class PoseFilter:
     def message(self) -> Message:
         """What each vehicle sends."""
         if self.unit == "fleet":
-            return UPLOAD if self.fusion == "joint" else POSE
-        return ODOMETRY if self.cooperative else NO_MESSAGE
+            return pose_unit.UPLOAD if self.fusion == "joint" else pose_unit.POSE
+        return pose_unit.ODOMETRY if self.cooperative else NO_MESSAGE
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos.

@@ -10,12 +10,18 @@ from ..arrays import AnyArray, Bools, Ints
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.sensors import Sensors
+from ..world.v2x import Message
 from .star import ACCELERATION_STD, FORGOTTEN
 
 if TYPE_CHECKING:
     from ..kernels.pose_members import PoseSeen
     from ..kernels.pose_motion import PoseNoise
 
+ODOMETRY = Message("fix, compass, velocity and yaw rate", 10)
+"""Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2)."""
+POSE = Message("pose and covariance", 16, cumulative=True)
+"""Position and heading (4), covariance (10), id and time (2)."""
+UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_neighbour=4)
 LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
 

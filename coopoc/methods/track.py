@@ -72,6 +72,8 @@ class Track:
             if name not in optional or getattr(self, name) is not None:
                 object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
         object.__setattr__(self, "notes", texts("notes", self.notes))
+        if not isinstance(self.extras, Mapping):
+            raise InputError("extras", repr(self.extras)[:60], "must be name -> (R, T, E)", "Give {} for none.")
         extras = {name: checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3]) for name, v in self.extras.items()}
         object.__setattr__(self, "extras", extras)
         if not np.isfinite(self.x).all():

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..errors import InputError
 from .recording import Recording
 from .spherical import vector_cov
 
@@ -68,6 +69,9 @@ class MostInformative:
     @classmethod
     def at_first(cls, recording: Recording, ego: int, link: Ints, cumulative: bool) -> MostInformative:
         """Before any measurement or message; a vehicle without a message may stand."""
+        if recording.body is not None:
+            hint = "Take nearest or round robin."
+            raise InputError("schedule", "most informative", "is for recordings in the world frame", hint)
         runs, vehicles = recording.runs, len(recording.ids)
         own, vector = (np.broadcast_to(UNKNOWN * np.eye(3), (*n, 3, 3)).copy() for n in ((runs,), (runs, vehicles)))
         speed = recording.sensors.velocity_floor**2 * np.ones((runs, vehicles, 3))
