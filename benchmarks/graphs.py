@@ -3,6 +3,7 @@
 Run:  python benchmarks/graphs.py                            (every PyFG file in ../shared/data/pyfg, if it is there)
       python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
       python benchmarks/graphs.py folder --hard              (any folder of PyFG and g2o files, with hard variants)
+      python benchmarks/graphs.py --unseen                   (kinds of graphs that no file holds, three seeds each)
 
 GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
 as it comes, from chained odometry. It has no factor for a landmark's position in a pose's frame with our weights, so
@@ -25,6 +26,7 @@ import gtsam
 import numpy as np
 from hard_graphs import VARIANTS
 from tabulate import tabulate
+from unseen_graphs import FAMILIES
 
 from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import load_graph
@@ -105,6 +107,14 @@ def row(name: str, graph: Graph) -> list[object]:
     return [*cells, problem.cost(x), iterations, time.process_time() - began, error(graph, x[:, : graph.dimension])]
 
 
+def unseen() -> Iterator[list[object]]:
+    """A row per family and seed."""
+    row("warm", FAMILIES["marine"](0))
+    for name, make in FAMILIES.items():
+        for seed in range(3):
+            yield row(f"{name}, seed {seed}", make(seed))
+
+
 HEADER = (
     "graph nodes start auto cost iterations seconds ATE odometry cost iterations seconds GTSAM iterations seconds ATE"
 )
@@ -123,12 +133,12 @@ def main(*arguments: str) -> None:
     """Print the table, and the totals."""
     given = [a for a in arguments if not a.startswith("--")]
     folder = Path(given[0]) if given else FOLDER
-    if not folder.is_dir():
+    if "--unseen" not in arguments and not folder.is_dir():
         print(f"no folder {folder}", file=sys.stderr)
         return
     files = sorted(f for f in folder.rglob("*") if f.suffix in (".pyfg", ".g2o"))
     files = [f for f in files if not given[1:] or f.stem in given[1:]]
-    found = list(rows(files, "--hard" in arguments))
+    found = list(unseen() if "--unseen" in arguments else rows(files, "--hard" in arguments))
     total: list[object] = [
         "total",
         "",

@@ -26,7 +26,9 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
     False
     """
     given = np.asarray(values)
-    array = np.require(given, dtype, ["C", "A"])
+    array = np.array(given, dtype, order="C", copy=None)
+    if not array.flags.aligned:
+        array = array.copy()
     if array.flags.writeable:
         if array is given and not isinstance(values, list | tuple):
             array = array.copy()  # the caller may go on writing to its own

@@ -26,7 +26,7 @@ from coopoc.optimize.convex.qcqp import Quadratic, multipliers
 from coopoc.optimize.convex.quadratic import quadratic
 from coopoc.optimize.convex.relaxation import polished, shor
 from coopoc.optimize.convex.schur import Dense, Sparse
-from coopoc.optimize.convex.staircase import staircase
+from coopoc.optimize.convex.staircase import scaled_bound, staircase
 from coopoc.optimize.graphs import from_graph
 
 PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
@@ -368,6 +368,22 @@ def test_the_basis_spans_the_tangent_space(d: int) -> None:
         B = tangent_basis(form, X, form.bound)
         assert (B.T @ B).toarray() == pytest.approx(np.eye(B.shape[1]), abs=1e-12)
         assert (B @ (B.T @ V.ravel())).reshape(V.shape) == pytest.approx(tangent(form, X, V), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_share_of_any_multipliers_bounds_every_cost(seed: int) -> None:
+    """Of those at random points, which are far from feasible: at most the bound that CVXPY's solver finds."""
+    problem = two_robots(seed, noise=3.0)
+    form = quadratic(problem)
+    reduced, best = Sparse(form), shor(problem, refine=False).lower_bound
+    found = minimise_sparsely(
+        form, reduced, form.lift(problem.space.position(problem.x0), problem.space.rotation(problem.x0))[: form.bound]
+    )
+    rng = np.random.default_rng(seed)
+    for noise in (0.0, 0.1):
+        X = form.project(found.X + noise * rng.standard_normal(found.X.shape))
+        bound = scaled_bound(reduced, multipliers(form, X, reduced.times(X)))
+        assert -1e-6 <= bound <= best * (1 + 1e-6) + 1e-6
 
 
 def test_a_certificate_takes_the_time_it_is_given() -> None:

@@ -71,7 +71,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     began = time.perf_counter()
     names = contenders(graph) if start == "auto" else ("odometry" if start == "incremental" else start,)
     given = x0_of(names[0])
-    problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_held(graph))
+    problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names}
@@ -110,7 +110,7 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
     return tuple(found)
 
 
-def _held(graph: Graph) -> tuple[int, ...]:
+def _fixed(graph: Graph) -> tuple[int, ...]:
     """The fixed vertices, and the first pose of each part of the graph that has neither those nor priors."""
     edges = (graph.relative_pose, graph.relative_point, graph.ranges)
     part = parts(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..arrays import Bools, Floats, Ints, frozen
 from ..errors import InputError
 from .constraint import Constraint
 from .factor import Factor
+from .growing import Growing
 from .inputs import numbers
 from .linear import Linear, linearise, sparse_jacobian
 from .measurements import lookup
@@ -60,7 +62,7 @@ class Problem:
     """
 
     names: tuple[str, ...]
-    factors: tuple[Factor, ...] = ()
+    factors: Sequence[Factor] = ()
     x0: Floats | None = None
     separator: tuple[int, ...] = ()
     dimension: int = 3
@@ -184,7 +186,8 @@ class Problem:
         if len(sizes) > 1:
             hint = "Use the same number of realisations throughout."
             raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
-        grown = self.replace_unchecked(factors=(*self.factors, factor))
+        before = self.factors if isinstance(self.factors, Growing) else Growing(self.factors)
+        grown = self.replace_unchecked(factors=before.plus(factor))
         kept: dict[str, Any] = {
             name: self.__dict__[name] for name in ("_place", "_turning", "space", "movable") if name in self.__dict__
         }
@@ -222,8 +225,8 @@ class Problem:
     def replace_unchecked(self, **changes: Any) -> Problem:
         """The problem with changes that come from checked parts and need not be checked again."""
         changed = object.__new__(Problem)
-        for field in fields(Problem):
-            object.__setattr__(changed, field.name, changes.get(field.name, getattr(self, field.name)))
+        kept = self.__dict__
+        changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
         return changed
 
     def linearise(self, x: Floats) -> Linear:
@@ -305,9 +308,17 @@ class Problem:
         return cls(tuple(names or map(str, range(count))), factors, separator=ego)
 
     def __repr__(self) -> str:
-        kinds = ", ".join(f"{len(f.nodes)} {f.kind}" for f in self.factors)
+        count: Counter[str] = Counter()
+        for factor in self.factors:
+            count[factor.kind] += len(factor.nodes)
+        kinds = ", ".join(f"{number} {kind}" for kind, number in count.items())
         runs = "" if self.batch is None else f", {self.batch} realisations"
         what = "points" if not self.poses else "poses" if len(self.poses) == len(self.names) else "nodes"
         plane = " in the plane" if self.dimension == 2 else ""
         bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
         return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
+
+
+@cache
+def _fields() -> tuple[str, ...]:
+    return tuple(field.name for field in fields(Problem))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -125,7 +126,7 @@ class Sparse:
     """
 
     space: Space
-    factors: tuple[Factor, ...]
+    factors: Sequence[Factor]
     entries: Entries
     numbers: tuple[Floats, ...]
 

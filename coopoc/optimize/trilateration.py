@@ -28,7 +28,7 @@ def located(places: Floats, ranges: Floats) -> Floats:
         return np.asarray(places[0] + ranges[0] * np.eye(d)[0])
     matrix = np.concatenate([2.0 * p, np.ones((len(p), 1))], axis=1)
     guess = np.linalg.lstsq(matrix, np.square(p).sum(axis=1) - ranges**2, rcond=None)[0][:d]
-    normal = np.linalg.svd(p, full_matrices=True)[2][-1]
+    normal = np.linalg.eigh(p.T @ p)[1][:, 0]
     flat = guess - normal * (guess @ normal)
     height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
 

@@ -138,20 +138,20 @@ class Sparse:
         return out
 
     @cached_property
-    def _scale(self) -> float:
+    def scale(self) -> float:
+        """Mean diagonal of the constrained rows."""
         return float(self.gram.diagonal()[: self.problem.bound].mean())
 
     @cached_property
     def _ridged(self) -> Any:
-        return factorise(self.shifted(None, -RIDGE * self._scale))
+        return factorise(self.shifted(None, -RIDGE * self.scale))
 
     def precondition(self, V: Floats) -> Floats:
         """(C + ridge)^-1 V."""
         return self._solve(self._ridged, V)
 
     def _solve(self, factored: Any, V: Floats) -> Floats:
-        full = np.zeros((self.gram.shape[0], *V.shape[1:]))
-        full[: len(V)] = V
+        full = np.concatenate([V, np.zeros((self.gram.shape[0] - len(V), *V.shape[1:]))])
         return np.asarray(factored.solve(full)[: len(V)])
 
     def shifted(self, less: Any, shift: float) -> Any:
@@ -166,7 +166,7 @@ class Sparse:
         """Of C - L: Lanczos on the inverse around a shift that a factorisation shows to be below the spectrum."""
         from scipy.sparse.linalg import LinearOperator, eigsh
 
-        less, shift, factored = L.sparse, -1e-7 * self._scale, None
+        less, shift, factored = L.sparse, -1e-7 * self.scale, None
         while factored is None:
             shift *= 10.0
             factored = positive(self.shifted(less, shift))

@@ -12,15 +12,21 @@ from ...errors import InputError
 from ..problem import Problem
 from .manifold import Stationary, minimise, retract
 from .newton import minimise_sparsely
-from .qcqp import Quadratic
+from .qcqp import Multipliers, Quadratic
 from .quadratic import quadratic
 from .relaxation import TIGHT, Relaxation, rounded
-from .schur import Reduced, Sparse, lower_bound, reduce
+from .schur import Reduced, Sparse, lower_bound, positive, reduce
 
 START = 2
 """Columns beyond d at a random start: with none to spare the first steps end in local minima."""
 HEIGHT = 12
 """Columns beyond d after which the staircase gives up; the bound then is what it has proved by that time."""
+FAR = 1e-2
+"""Gap, as a share of the cost (at least of 1), from which a share of the multipliers may prove more than all."""
+BISECTIONS = 10
+"""Of that share."""
+ROUNDING = 1e-12
+"""Of the mean diagonal, by which a factorisation may be off."""
 STALL = 1e-9
 """Share of the cost (at least of 1) that one more column must save to be followed by another."""
 
@@ -84,11 +90,30 @@ def climb(form: Quadratic, reduced: Reduced, Y: Floats, most: int, deadline: flo
                 found = minimise(form, reduced, Y, tick=bar.update)
             proved, smallest, vector = lower_bound(reduced, found.multipliers)
             bound, size = max(bound, proved), max(found.cost, 1.0)
+            if isinstance(reduced, Sparse) and found.cost - proved > FAR * size:
+                bound = max(bound, scaled_bound(reduced, found.multipliers))
             late = Y.shape[1] >= most or time.perf_counter() > deadline
             if late or found.cost - bound <= TIGHT * size or before - found.cost <= STALL * size:
                 return found, bound
             bar.set_postfix(columns=Y.shape[1] + 1, cost=f"{found.cost:.6g}", bound=f"{max(bound, 0.0):.6g}")
             Y, before = _escape(form, reduced, found, smallest, vector), found.cost
+
+
+def scaled_bound(reduced: Sparse, L: Multipliers) -> float:
+    """1/2 a tr L with the largest share a in [0, 1) of the multipliers for which C - a L is positive semidefinite.
+
+    Such multipliers are feasible, whatever L. Where C - L is indefinite in a few directions they prove more than a
+    shift of all rows by the smallest eigenvalue.
+    """
+    share, fails, less = 0.0, 1.0, L.sparse
+    shift = ROUNDING * reduced.scale
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (share + fails)
+        if positive(reduced.shifted(middle * less, -shift)) is None:
+            fails = middle
+        else:
+            share = middle
+    return 0.5 * (share * L.trace - shift * L.problem.trace)
 
 
 def _escape(form: Quadratic, reduced: Reduced, found: Stationary, smallest: float, v: Floats) -> Floats:
