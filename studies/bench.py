@@ -32,15 +32,20 @@ SMOOTHERS = frozenset({"batch-smoother"})
 """Methods that see the whole drive, for which a filtering bound is none."""
 
 
-def method(name: str) -> Method:
-    """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME"."""
+def method(name: str, late: bool = False) -> Method:
+    """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME".
+
+    Args:
+        name: of the method.
+        late: whether messages are: then the cooperative gain sends its newest fix, for sums must come in time.
+    """
     if in_file(name) or name in names("coopoc.methods"):
         made: Method = find("coopoc.methods", name)("nominal")
         return made
     from coopoc.learned import CooperativeGain, load_method
 
     learned = load_method(name)
-    return CooperativeGain(learned.model, name=name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]
+    return CooperativeGain(learned.model, not late, name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]
 
 
 def information(name: str, one: Method) -> str:
@@ -57,7 +62,7 @@ def tried(name: str, task: Task) -> dict[str, Any]:
     """A method's row for one task: error with its interval, bound, consistency, bytes and time; or why it failed."""
     row: dict[str, Any] = {"task": task.name}
     try:
-        one = method(name)
+        one = method(name, task.v2x.latency > 0)
         held = information(name, one)
         seen, fleet = recording(task, held in ("", "fleet"))
         one(seen.between(0, 3), [task.columns[0]])  # compiles
