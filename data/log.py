@@ -20,7 +20,7 @@ from .bag import is_bag, read_bag
 from .geodetic import to_enu
 from .kinds import KINDS
 from .log_links import linked
-from .log_rows import Rows, check_arrivals, read_rows, stacked
+from .log_rows import LONG, Rows, check_arrivals, read_rows, stacked
 from .log_summary import Summary, Tally
 from .log_vehicle import Vehicle, samples, vehicle
 from .motion import Signal
@@ -211,7 +211,7 @@ def log_files(path: Path, columns: Mapping[str, str] | None = None) -> bool:
         return True
     if path.suffix.lower() not in TABLES:
         return False
-    return bool(set(columns or ()) - OF_FLEETS) or bool(OF_LOGS & set(_header(path)))
+    return bool(set(columns or ()) & ({*LONG, *KINDS} - OF_FLEETS)) or bool(OF_LOGS & set(_header(path)))
 
 
 def _header(path: Path) -> list[str]:

@@ -6,14 +6,12 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path as File
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from coopoc.errors import InputError
-from coopoc.evaluate.relative_error import Unit
-from coopoc.evaluate.score import Aligned, Path, Score, scores
 from coopoc.formats.kitti import read_kitti
 from coopoc.formats.lines import read_words
 from coopoc.formats.rotations import to_rotation
@@ -21,6 +19,11 @@ from coopoc.formats.tum import read_tum
 
 from .cells import numeric, read_frame, seconds, words
 from .source import split
+
+if TYPE_CHECKING:
+    from coopoc.evaluate.score import Path, Score
+
+Aligned, Unit = Literal["none", "each", "team"], Literal["steps", "m"]
 
 COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 QUATERNION = ("qx", "qy", "qz", "qw")
@@ -35,6 +38,8 @@ def read_paths(name: str) -> dict[str, Path]:
     Raises:
         InputError: a file with a fault, named with its line or row.
     """
+    from coopoc.evaluate.score import Path
+
     word, options = split(name)
     file = File(word)
     if not file.is_file():
@@ -51,6 +56,8 @@ def read_paths(name: str) -> dict[str, Path]:
 
 
 def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
+    from coopoc.evaluate.score import Path
+
     frame = read_frame(file, columns.get("id", "id")).rename(columns={header: key for key, header in columns.items()})
     for column in ("t", "x", "y"):
         if column not in frame.columns:
@@ -105,6 +112,8 @@ def score(
         unit: of delta, steps or m.
         output: the scores as JSON.
     """
+    from coopoc.evaluate.score import scores
+
     if not truth:
         raise InputError("truth", "()", "must name a file", "Add --truth FILE.")
     made: list[dict[str, Path]] = [{}, {}]

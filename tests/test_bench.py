@@ -11,7 +11,7 @@ import pytest
 
 import coopoc as co
 from coopoc.errors import InputError
-from coopoc.studies import bench, bench_tasks
+from coopoc.studies import bench, bench_cards, bench_tasks
 from coopoc.studies.bench_tasks import TASKS, VALIDATION, VERSION
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,7 +40,7 @@ class Own:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tasks with two runs and two egos."""
     few = tuple(replace(task, runs=2, egos=2) for task in TASKS if task.name in ("alone", "paper", "spoofed"))
-    monkeypatch.setattr(bench, "TASKS", few)
+    monkeypatch.setattr(bench_tasks, "TASKS", few)
 
 
 def test_parameters_are_chosen_on_other_drives_and_draws() -> None:
@@ -81,7 +81,7 @@ def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None,
     rows = {row["task"]: row for row in card["tasks"]}
     assert rows["alone"]["failed"] == "ValueError: neighbours are missing"
     assert rows["paper"]["rt_le_m"][0] == pytest.approx(6.06, abs=0.1)
-    assert "failed" in bench.page([card])
+    assert "failed" in bench_cards.page([card])
 
 
 def test_wrong_words_are_named(tmp_path: Path) -> None:
@@ -100,15 +100,22 @@ def test_no_committed_card_lies_below_its_bound() -> None:
         card = json.loads(file.read_text())
         assert card["benchmark"] == VERSION
         for row in card["tasks"]:
-            if "bound_m" in row:  # within its interval
-                assert row["rt_le_m"][2] > row["bound_m"], (card["method"], row)
+            if (
+                "bound_m" in row
+            ):  # ten draws of errors that last a minute and are common hold some twenty independent ones
+                share = 0.8 if row["task"] == "lasting" else 0.97
+                assert row["over_bound"] > share, (card["method"], row)
 
 
 def test_the_page_shows_the_committed_cards() -> None:
     """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
-    assert bench.page([json.loads(file.read_text()) for file in CARDS]) in (ROOT / "docs" / "benchmark.md").read_text()
+    assert (
+        bench_cards.page([json.loads(file.read_text()) for file in CARDS])
+        in (ROOT / "docs" / "benchmark.md").read_text()
+    )
 
 
 def test_the_bound_with_the_past_is_least() -> None:
-    levels = [bench_tasks.bound(PAPER, each) for each in ("solo", "star", "past")]
+    task = replace(PAPER, egos=1)
+    levels = [bench_tasks.bound(task, each) for each in ("solo", "star", "past")]
     assert levels == sorted(levels, reverse=True)

@@ -75,7 +75,7 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
 def test_channels_keep_their_order(results: Results) -> None:
     error = {name: numbers.mean(results, at(channel=name)) for name in CHANNELS}
     assert error["ideal"] == min(error.values())  # type: ignore[type-var]
-    assert numbers.mean(results, at(method="bound", noise_model="bound", channel="ideal")) is not None
+    assert numbers.mean(results, at(method="bound", noise_model="with its past", channel="ideal")) is not None
 
 
 def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None:

@@ -27,7 +27,7 @@ def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: 
     said = survey.answers(found)
     alone, together, bound = (
         numbers.rms(found["budget"], {"method": method, "noise_model": known, "max_neighbours": k, "rate_hz": 0.0})
-        for method, known, k in (("kalman", "nominal", 0), ("joint", "nominal", 4), ("bound", "bound", 4))
+        for method, known, k in (("kalman", "nominal", 0), ("joint", "nominal", 4), ("bound", "with its past", 4))
     )
     assert alone is not None
     assert together is not None
