@@ -151,6 +151,7 @@ def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     assert "cells failed: 1, try them again with --retry-failed" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_failed_cell_is_repeated_when_asked(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("raise")
     words = ["run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}"]
@@ -178,6 +179,7 @@ def test_shards_are_merged_and_two_runs_compared(tmp_path: Path) -> None:
     assert "\n1,KF,finished,not computed\n" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> None:
     words = ["run", "small", "--jobs", jobs, "--set", "runs=2", "pause=0.4"]

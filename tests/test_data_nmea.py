@@ -115,6 +115,7 @@ def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d(shared: Path) -> None:
     np.testing.assert_allclose(log.recording.gnss[0, :100, 0], wanted, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_gap_of_the_third_cats_car_is_one(shared: Path) -> None:
     """Stated for this set: one gap of 221.5 s in car 3."""
     pytest.importorskip("pynmeagps")

@@ -174,6 +174,7 @@ def test_a_channel_and_a_metric_keep_their_promise(tmp_path: Path, crossing: Fle
     assert measure("nees", Kalman()(observe(crossing, Sensors())), crossing).shape == (1, 1)
 
 
+@pytest.mark.slow
 def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_path: Path) -> None:
     """In `federate`, in the study of rules, in `coopoc train`; an unknown rule is named with the nearest one."""
     (block,) = [text for text in blocks("python") if "own_rules.py:ClippedMean" in text]
@@ -189,6 +190,7 @@ def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_
     assert "Did you mean own_rules.py:best_half?" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:
     ran, report = commands("rates")[:2]
     assert "| Every" in shell(ran, folder)
@@ -205,6 +207,7 @@ def test_a_notebook_gets_a_frame_and_a_table(folder: Path) -> None:
     subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, check=True)
 
 
+@pytest.mark.slow
 def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
     (toml,) = blocks("toml")
     info = tmp_path / "my_coopoc-1.0.dist-info"

@@ -64,6 +64,7 @@ def rolled(step: Step, net: GainNet, gnss: Floats, velocity: Floats, dt: float) 
     return np.stack(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["file", "script"])
 def test_a_whole_drive_has_the_error_of_the_net(
     kind: str, shipped: checkpoint.Checkpoint, request: pytest.FixtureRequest

@@ -39,6 +39,7 @@ def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder: Path) -> No
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder: Path) -> None:
     trained, ran = (line for line in commands("constant_gain.py"))
     assert "constant_gain.RECIPE-gnss-axis-0.safetensors  3 parameters" in shell(trained, folder)

@@ -501,6 +501,7 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
     assert losses[0] < losses[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aggregate", ["mean", "multi_krum"])
 def test_a_net_is_federated_the_same_way(aggregate: str) -> None:
     """GainNet with all options at once moves, stays finite and repeats to the last bit."""

@@ -198,6 +198,7 @@ def test_a_restarted_server_continues_to_the_same_weights(rule_: str, tmp_path: 
         read(path, job)
 
 
+@pytest.mark.slow
 @flower
 def test_a_failed_run_raises_and_leaves_its_last_round(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """All nodes vanish after round 1: the ServerApp ends with an error, its checkpoint and progress are on disk, and

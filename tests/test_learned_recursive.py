@@ -68,6 +68,7 @@ def test_untrained_net_is_filterpys_filter() -> None:
         np.testing.assert_allclose(track.covariance[0, t, 0], theirs.P, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-10), (torch.float32, 2e-4)])
 def test_compiled_rollout_and_gradient_are_those_of_plain_torch(dtype: torch.dtype, close: float) -> None:
     """Of `RecursiveGain.step`, and of torch's autograd through it."""

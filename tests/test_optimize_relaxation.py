@@ -246,6 +246,7 @@ def test_the_staircase_climbs_to_shors_bound_from_anywhere(seed: int) -> None:
             assert staircase(nowhere, refine=False, seed=start).lower_bound == pytest.approx(goal, rel=1e-5, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_robots_that_do_not_know_where_the_others_are() -> None:
     """mrclam5a, every robot starting at the origin: better than the local minimum at 78.2 in the data's README."""
     from coopoc.optimize.graphs import read_graph

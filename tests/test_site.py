@@ -20,7 +20,11 @@ def test_every_page_has_a_place() -> None:
     assert placed - pages == {"gallery.md"}
 
 
-@pytest.mark.parametrize("tutorial", TUTORIALS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "tutorial",
+    [pytest.param(path, marks=pytest.mark.slow) if path.stem == "learned" else path for path in TUTORIALS],
+    ids=lambda path: path.stem,
+)
 def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-W", "error", tutorial], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

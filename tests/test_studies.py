@@ -77,6 +77,7 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     assert "budget" not in captions
 
 
+@pytest.mark.slow
 def test_neighbours_of_solo_filters_alone_ends_well(tmp_path: Path) -> None:
     coopoc = str(Path(sys.executable).with_name("coopoc"))
     command = [coopoc, "run", "neighbours", "--set", "method=gnss,kalman", "runs=2", "egos=1"]
@@ -212,6 +213,7 @@ def test_weights_of_another_training_are_refused(tmp_path: Path) -> None:
             use({**p, "clients": "town04"})
 
 
+@pytest.mark.slow
 def test_only_what_the_cells_name_is_trained(tmp_path: Path) -> None:
     p = study("error_cdf", weights=str(tmp_path), train_seeds=1).settings
     weights.prepare([{**p, "method": name} for name in ("gnss", "okf")])
@@ -310,6 +312,7 @@ def test_mistakes_end_with_a_sentence_and_status_2(arguments: list[str], words: 
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_train_command_makes_a_checkpoint_that_loads(tmp_path: Path) -> None:
     coopoc = str(Path(sys.executable).with_name("coopoc"))
     command = [coopoc, "train", "okf", "--seed", "3", "--out", str(tmp_path)]

@@ -88,6 +88,7 @@ def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(s
     assert views(tmp_path / "small") == whole
 
 
+@pytest.mark.slow
 def test_two_runners_that_start_together(study: Study, tmp_path: Path) -> None:
     words = [*COMMAND, "--out", str(tmp_path)]
     both = [subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in "ab"]

@@ -74,6 +74,7 @@ def wait_for(folder: Path, count: int) -> None:
     raise AssertionError("no cell was finished in 100 s")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_killed_run_resumes_to_the_last_digit(study: Study, tmp_path: Path, jobs: int) -> None:
     whole = run_study(study, tmp_path / "whole", settings={"pause": 0.12}, progress=False)
@@ -259,6 +260,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert path.read_text() == "old"
 
 
+@pytest.mark.slow
 def test_two_runs_do_not_share_a_folder(study: Study, tmp_path: Path) -> None:
     """The second would swap the manifest, and the first would publish the second's cells as its own."""
     first = start(tmp_path, 1)
@@ -309,6 +311,7 @@ def test_results_of_a_folder_that_holds_none(tmp_path: Path) -> None:
         Results.load(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_worker_may_hold_a_large_recording(study: Study) -> None:
     """loky would end a worker that has grown by 300 MB, and what it holds for the next cell would be made again."""
     grow = importlib.import_module("small_study").grow
