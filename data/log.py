@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,24 +17,14 @@ from coopoc.world.v2x import V2X
 
 from . import log_sensors
 from .bag import is_bag, read_bag
-from .geodetic import to_enu
-from .kinds import KINDS
+from .log_files import files_of, rows_of_file
+from .log_frame import local, on_one_clock, origin_of
 from .log_links import linked
-from .log_rows import LONG, Rows, check_arrivals, read_rows, stacked
+from .log_rows import Rows, check_arrivals, stacked
 from .log_summary import Summary, Tally
+from .log_truth import truth_of
 from .log_vehicle import Vehicle, samples, vehicle
-from .motion import Signal
-from .nmea import read_nmea
-from .rows import backward_difference, interpolate
 from .scale import check_scale, check_size, check_time
-
-TABLES, NMEA = (".csv", ".parquet", ".xlsx"), (".nmea", ".nme")
-OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
-"""Columns of a table of drives."""
-OF_LOGS = {"kind", "partner", "arrival", *KINDS} - OF_FLEETS - {"speed", "heading", "height"}
-"""Columns that no table of drives has."""
-TRUTH = "truth"
-"""Stem of the file of a folder that holds the truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +97,15 @@ def read_log(
         rows, actual = read_bag(path, tally)
         true = None if truth is None else Path(truth)
     else:
-        files, true = _files(path, None if truth is None else Path(truth))
-        rows, actual = stacked([_rows_of_file(file, tally, columns, kinds, ignore) for file in files]), None
+        files, true = files_of(path, None if truth is None else Path(truth))
+        rows, actual = stacked([rows_of_file(file, tally, columns, kinds, ignore) for file in files]), None
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
-    rows = _on_one_clock(rows, clock or {}, path.name)
+    rows = on_one_clock(rows, clock or {}, path.name)
     check_time(rows.t, path.name)
     check_arrivals(rows)
-    actual = _rows_of_file(true, Tally(), columns, kinds, ()) if true else actual
-    origin = _origin(rows, origin)
+    actual = rows_of_file(true, Tally(), columns, kinds, ()) if true else actual
+    origin = origin_of(rows, origin)
     rows, given = local(rows, origin), log_sensors.stds(rows)
     planar = not (rows.kind == "z").any()
     _check_scale(rows, path.name, any_scale)
@@ -141,139 +131,8 @@ def read_log(
         observers=tuple(range(len(ids))),
         notes=(f"measurements of {path.name}, nothing is simulated", *tally.sentences),
     )
-    fleet = None if actual is None else _truth(local(actual, origin), recording, max_gap, path.stem, true)
+    fleet = None if actual is None else truth_of(local(actual, origin), recording, max_gap, path.stem, true)
     return Log(recording, fleet, _summary(path, recording, vehicles, tally), "messages" in tally.read, origin)
-
-
-def local(rows: Rows, origin: tuple[float, float, float] | None) -> Rows:
-    """Rows in SI units, with x, y, z in place of latitude, longitude, height (0 where there is none in the log)."""
-    value, kind, std = rows.value.copy(), rows.kind.copy(), rows.std.copy()
-    for name in dict.fromkeys(kind.tolist()):
-        one, here = KINDS[name], rows.kind == name
-        value[here] = one.turn * one.scale * value[here] + one.offset
-        if one.name in ("heading", "azimuth", "bearing"):
-            value[here] = np.arctan2(np.sin(value[here]), np.cos(value[here]))
-        std[here] *= one.scale
-        kind[here] = one.name
-    rows = replace(rows, value=value, kind=kind, std=std)
-    geodetic = np.isin(kind, ["latitude", "longitude", "height"])
-    if not geodetic.any() or origin is None:
-        return rows
-    parts, heights = [rows.take(~geodetic)], bool((kind == "height").any())
-    for name in dict.fromkeys(rows.vehicle[geodetic].tolist()):
-        mine = rows.take(geodetic & (rows.vehicle == name))
-        fixes, first = samples(mine, ("latitude", "longitude", "height"), Tally(), 3 if heights else 2)
-        at = fixes.value if heights else np.column_stack([fixes.value[:, :2], np.full(len(fixes.t), origin[2])])
-        enu, base = to_enu(at, origin), mine.take(first)
-        deviation = _std_of_sample(mine, fixes)
-        for axis, kind_ in enumerate("xyz" if heights else "xy"):
-            parts.append(
-                replace(base, value=enu[:, axis], kind=np.full(len(first), kind_, dtype=object), std=deviation[:, axis])
-            )
-    return stacked(parts)
-
-
-def _std_of_sample(rows: Rows, fixes: Signal) -> Floats:
-    """(M, 3) m along east, north and up, of fixes in degrees, whose standard deviations are metres."""
-    out = np.full((len(fixes.t), 3), np.nan)
-    for axis, kind in enumerate(("longitude", "latitude", "height")):
-        own = rows.take((rows.kind == kind) & np.isfinite(rows.std))
-        if len(own):
-            order = np.argsort(own.t, kind="stable")
-            place = np.clip(np.searchsorted(own.t[order], fixes.t - 1e-9), 0, len(own) - 1)
-            out[:, axis] = own.std[order][place]
-    return out
-
-
-def _rows_of_file(
-    file: Path, tally: Tally, columns: Mapping[str, str] | None, kinds: Mapping[str, str] | None, ignore: Sequence[str]
-) -> Rows:
-    if file.suffix.lower() in NMEA:
-        return read_nmea(file, tally)
-    return read_rows(file, tally, columns, kinds, ignore)
-
-
-def log_files(path: Path, columns: Mapping[str, str] | None = None) -> bool:
-    """Whether a path is a log: a bag, NMEA, a folder with such files or tables, or a table with a column of a log.
-
-    Args:
-        path: of a file or folder.
-        columns: names in the file, as `read_log` takes them; a key that only a log has makes it one.
-
-    >>> log_files(Path("drive.nmea")), log_files(Path("drive.parquet"), {"latitude": "lat"})
-    (True, True)
-    """
-    if is_bag(path):
-        return True
-    if path.is_dir():
-        return any(file.suffix.lower() in (*TABLES, *NMEA) for file in path.iterdir())
-    if path.suffix.lower() in NMEA:
-        return True
-    if path.suffix.lower() not in TABLES:
-        return False
-    return bool(set(columns or ()) & ({*LONG, *KINDS} - OF_FLEETS)) or bool(OF_LOGS & set(_header(path)))
-
-
-def _header(path: Path) -> list[str]:
-    """Column names of a table, none where the file cannot be read (its reader will name the fault)."""
-    if path.suffix.lower() == ".parquet":
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_schema
-
-        try:
-            return [str(name).lower() for name in read_schema(path).names]
-        except (OSError, ArrowException):
-            return []
-    if path.suffix.lower() != ".csv" or not path.is_file():
-        return []
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        return [word.strip().strip('"').lower() for word in file.readline(10_000).split(",")]
-
-
-def _files(path: Path, truth: Path | None) -> tuple[list[Path], Path | None]:
-    if not path.exists():
-        raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
-    if truth is not None and not truth.is_file():
-        raise InputError("truth", str(truth), "must be a file", "Check the path.")
-    if path.is_file():
-        return [path], truth
-    found = sorted(file for file in path.iterdir() if file.suffix.lower() in (*TABLES, *NMEA))
-    own = [file for file in found if file.stem.lower() == TRUTH]
-    files = [file for file in found if file not in own and file != truth]
-    if not files:
-        endings = ", ".join((*TABLES, *NMEA))
-        raise InputError("path", str(path), f"must hold files in {endings}", "Point at the folder of the log.")
-    return files, truth or (own[0] if own else None)
-
-
-def _on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
-    known = sorted(set(rows.vehicle.tolist()))
-    for one in clock:
-        if one not in known:
-            allowed = f"must be a vehicle of {name}, which has {', '.join(known)}"
-            raise InputError("clock", repr(one), allowed, "Name the vehicle as in the log.")
-    ahead = np.array([clock.get(one, 0.0) for one in rows.vehicle.tolist()])
-    partner = np.array([clock.get(one, 0.0) for one in rows.partner.tolist()])
-    return replace(rows, t=rows.t - ahead, arrival=rows.arrival - partner)
-
-
-def _origin(rows: Rows, given: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-    """The origin that is given, or the first fix in degrees."""
-    degrees = rows.take(np.isin(rows.kind, ["latitude", "longitude", "height"]))
-    if given is not None or not len(degrees):
-        return given
-    flat = np.flatnonzero(np.isin(rows.kind, ["x", "y"]))
-    if len(flat):
-        hint = "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two."
-        raise InputError(f"{rows.place(int(flat[0]))}, x", "metres", "stand beside fixes in degrees", hint)
-    heights = bool((degrees.kind == "height").any())
-    order = np.argsort(degrees.t, kind="stable")
-    for k in order.tolist():
-        here = degrees.take((degrees.t == degrees.t[k]) & (degrees.vehicle == degrees.vehicle[k]))
-        found = dict(zip(here.kind.tolist(), here.value.tolist(), strict=True))
-        if {"latitude", "longitude", *(["height"] if heights else [])} <= set(found):
-            return found["latitude"], found["longitude"], found.get("height", 0.0)
-    raise InputError("latitude, longitude", "never together", "must be given at one time", "Check the columns.")
 
 
 def _check_scale(rows: Rows, name: str, any_scale: bool) -> None:
@@ -325,33 +184,6 @@ def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
         )
     grid: Floats = t.min() + step * np.arange(int(count))
     return grid
-
-
-def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str, file: Path | None) -> Fleet:
-    """Truth of the members that have one, on the steps of the recording."""
-    position = np.full((len(recording.t), len(recording.ids), 3), np.nan)
-    known = set(rows.vehicle.tolist())
-    if not known & set(recording.ids):
-        where = f"{file.name if file else 'truth'}: column vehicle"
-        allowed = f"must name vehicles of the log: {', '.join(recording.ids)}"
-        raise InputError(where, ", ".join(sorted(known)), allowed, "Rename them, or leave the truth out.")
-    planar = not (rows.kind == "z").any()
-    for column, one in enumerate(recording.ids):
-        true, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Tally(), 2 if planar else 3)
-        if len(true.t) > 1:
-            value = np.nan_to_num(true.value)
-            gap = max_gap or max(5 * recording.dt, 0.5, 1.5 * true.interval)
-            start = recording.t[0]
-            position[:, column] = interpolate(true.t - start, value, recording.t - start, gap)
-        elif len(true.t) == 1:
-            position[:, column] = np.nan_to_num(true.value[0])
-    there = np.isfinite(position[..., 0])
-    alone = there.copy()
-    alone[1:] &= ~there[:-1]
-    alone[:-1] &= ~there[1:]
-    position[alone] = np.nan
-    velocity = backward_difference(recording.t, position, recording.ids)
-    return Fleet(recording.ids, recording.t, position, velocity, name=name, source=f"truth of {name}")
 
 
 def _check_options(dt: float | None, max_gap: float | None, clock: Mapping[str, float] | None) -> None:

@@ -15,7 +15,8 @@ from coopoc.world.recording import Recording
 from coopoc.world.storage import is_recording, read_recording
 from coopoc.world.v2x import V2X
 
-from .log import Log, log_files, read_log
+from .log import Log, read_log
+from .log_files import log_files
 from .log_links import under
 from .log_summary import Summary
 from .mrclam import read_mrclam

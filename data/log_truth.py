@@ -1,0 +1,43 @@
+"""The truth of a log, on the steps of its recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
+
+from .log_rows import Rows
+from .log_summary import Tally
+from .log_vehicle import samples
+from .rows import backward_difference, interpolate
+
+
+def truth_of(rows: Rows, recording: Recording, max_gap: float | None, name: str, file: Path | None) -> Fleet:
+    """Truth of the members that have one, on the steps of the recording."""
+    position = np.full((len(recording.t), len(recording.ids), 3), np.nan)
+    known = set(rows.vehicle.tolist())
+    if not known & set(recording.ids):
+        where = f"{file.name if file else 'truth'}: column vehicle"
+        allowed = f"must name vehicles of the log: {', '.join(recording.ids)}"
+        raise InputError(where, ", ".join(sorted(known)), allowed, "Rename them, or leave the truth out.")
+    planar = not (rows.kind == "z").any()
+    for column, one in enumerate(recording.ids):
+        true, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Tally(), 2 if planar else 3)
+        if len(true.t) > 1:
+            value = np.nan_to_num(true.value)
+            gap = max_gap or max(5 * recording.dt, 0.5, 1.5 * true.interval)
+            start = recording.t[0]
+            position[:, column] = interpolate(true.t - start, value, recording.t - start, gap)
+        elif len(true.t) == 1:
+            position[:, column] = np.nan_to_num(true.value[0])
+    there = np.isfinite(position[..., 0])
+    alone = there.copy()
+    alone[1:] &= ~there[:-1]
+    alone[:-1] &= ~there[1:]
+    position[alone] = np.nan
+    velocity = backward_difference(recording.t, position, recording.ids)
+    return Fleet(recording.ids, recording.t, position, velocity, name=name, source=f"truth of {name}")
