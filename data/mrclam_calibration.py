@@ -129,7 +129,8 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     if known.sum() < FEWEST:
         allowed = f"must be {FEWEST} or more"
         raise InputError("calibrate_s", f"{known.sum()} measurements in {until:g} s", allowed, "Take longer.")
-    return tuple(_grouped(error[known], observer[known], t[known]) for error in (reach, angle))
+    ranges, bearings = (_grouped(error[known], observer[known], t[known]) for error in (reach, angle))
+    return ranges, bearings
 
 
 def _grouped(error: Floats, observer: Ints, t: Floats) -> float:

@@ -112,4 +112,4 @@ def _landmarks(log: MrclamLog, first: int) -> Floats:
     order = np.lexsort((late, mark, observer, step))
     order = order[((step >= 0) & (step < len(log.fleet.t)) & (mark >= 0))[order]]
     order = order[changes(step[order], observer[order], mark[order])]
-    return np.column_stack([step, observer, first + mark, reach, bearing])[order]
+    return np.asarray(np.column_stack([step, observer, first + mark, reach, bearing])[order])

@@ -126,7 +126,7 @@ def _ranges(graph: Graph, who: tuple[Ints, int], begin: float, t: Floats) -> Flo
     order = order[fits[order]]
     order = order[changes(step[order], ends[order, 0], ends[order, 1])]
     table = np.column_stack([step, ends, graph.ranges.distance])[order]
-    return table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
+    return np.asarray(table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))])
 
 
 def _sensors(graph: Graph, dt: float) -> Sensors:

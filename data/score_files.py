@@ -23,7 +23,8 @@ from .source import split
 if TYPE_CHECKING:
     from coopoc.evaluate.score import Path, Score
 
-Aligned, Unit = Literal["none", "each", "team"], Literal["steps", "m"]
+Aligned = Literal["none", "each", "team"]
+Unit = Literal["steps", "m"]
 
 COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 QUATERNION = ("qx", "qy", "qz", "qw")

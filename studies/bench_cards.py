@@ -63,8 +63,8 @@ def tried(name: str, task: Task) -> dict[str, Any]:
         found = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
     except Exception as error:  # a failure is a row
         return row | {"failed": f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"}
-    error = mean_interval(found["rt_le_m"].T)
-    row |= {"rt_le_m": [round(value, 4) for value in (error.mean, error.low, error.high)]}
+    level = mean_interval(found["rt_le_m"].T)
+    row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
     if held:
         least = bound(task, held)
         rms = float(np.sqrt(np.mean(found["rt_le_m"] ** 2)))
