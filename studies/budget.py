@@ -65,11 +65,14 @@ def _pareto(results: Results) -> Plot | None:
             else:
                 level = [Line(of(*pair), error, {"alpha": 0.75})]
                 drawn += draw(left, level) and draw(right, level)
-        for pair in (*SHARED, PAST):
+        for pair in SHARED:
             found = sorted((one.size, one.error) for one in ran if _pair(one) == pair and one.size)
             if found:
                 right.plot(*zip(*found, strict=True), **{**strokes(of(*pair), thin=True), "linestyle": "none"})
                 drawn += draw(right, [Line(of(*pair), dict(front(found)), {"marker": ""})])
+        least = min((one.error for one in ran if _pair(one) == PAST), default=None)
+        if least is not None:
+            drawn += draw(right, [Line(of(*PAST), least)])
         if not drawn:
             return None
         for panel in (left, right):
@@ -81,8 +84,8 @@ def _pareto(results: Results) -> Plot | None:
     text = (
         "RT-LE against bytes. Left: what each vehicle sends and receives in training, spread over 1, 10 and 100 hours "
         "of driving (right to left). Right: payload that an ego receives over a channel that loses nothing, at each K, "
-        "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound counts "
-        "what newcomers did before, which estimates and sums carry."
+        "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound is that of "
+        "most neighbours at every step, with what newcomers did before: no message brings more, whatever its bytes."
     )
     return Plot(figure, scene.caption(results, text))
 
