@@ -61,6 +61,7 @@ def _header(path: Path) -> list[str]:
 
 
 def files_of(path: Path, truth: Path | None) -> tuple[list[Path], Path | None]:
+    """The files of a log that hold measurements, and the one of the truth: named, or `truth.*` of the folder."""
     if not path.exists():
         raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
     if truth is not None and not truth.is_file():
@@ -79,6 +80,7 @@ def files_of(path: Path, truth: Path | None) -> tuple[list[Path], Path | None]:
 def rows_of_file(
     file: Path, tally: Tally, columns: Mapping[str, str] | None, kinds: Mapping[str, str] | None, ignore: Sequence[str]
 ) -> Rows:
+    """The rows of one file, NMEA or a table, in the order of the file; what is refused is counted in the tally."""
     if file.suffix.lower() in NMEA:
         return read_nmea(file, tally)
     return read_rows(file, tally, columns, kinds, ignore)

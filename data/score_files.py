@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict
+from math import isnan
 from pathlib import Path as File
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -81,7 +82,7 @@ def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
         rows = rows[np.argsort(t[rows], kind="stable")]
         twice = np.flatnonzero(np.diff(t[rows]) == 0)
         if len(twice):
-            where, stamp = f"{file.name}: row {rows[twice[0] + 1] + 1}", f"{t[rows[twice[0]]]:.17g} s"
+            where, stamp = f"{file.name}: row {rows[twice[0] + 1] + 1}", f"{t[rows[twice[0]]].item()!r} s"
             raise InputError(where, stamp, f"is there twice for {name}", "Leave one of them out.")
         parts = (None if part is None else part[rows] for part in (turned, covariance))
         found[name] = Path(t[rows], at[rows], *parts)
@@ -94,6 +95,7 @@ def score(
     truth: Annotated[tuple[str, ...], arg(metavar="FILE")] = (),
     align: Aligned = "none",
     max_diff: float = 0.01,
+    offset: float = 0.0,
     delta: float = 1.0,
     unit: Unit = "steps",
     output: Annotated[File | None, arg(metavar="FILE")] = None,
@@ -109,7 +111,8 @@ def score(
         truth: the same kinds of files; vehicles are matched by file name or id.
         align: none compares in the frame given, each aligns every vehicle, team moves all by one motion.
         max_diff: s, how far stamps that belong together may be apart.
-        delta: between the poses of the relative error.
+        offset: s, added to the estimates' stamps.
+        delta: between the poses of the relative error; a whole number of steps, or a length.
         unit: of delta, steps or m.
         output: the scores as JSON.
     """
@@ -124,12 +127,23 @@ def score(
                 if vehicle in paths:
                     raise InputError("vehicle", repr(vehicle), "is in two files", "Name the files, or ids, apart.")
                 paths[vehicle] = path
-    rows = scores(*made, aligned=align, max_diff=max_diff, delta=delta, unit=unit)
+    rows = scores(*made, aligned=align, max_diff=max_diff, offset=offset, delta=delta, unit=unit)
     print(table(rows, delta, unit))
+    for row in rows:
+        for remark in row.remarks:
+            print(f"coopoc: {row.vehicle}: {remark}", file=sys.stderr)
     if output is not None:
-        output.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+        output.write_text(json.dumps([_plain(asdict(row)) for row in rows], indent=1, allow_nan=False) + "\n")
         print(f"coopoc: scores are in {output}", file=sys.stderr)
     return 0
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """JSON knows no NaN: null stands for an interval that one block does not give."""
+    return {
+        key: _plain(value) if isinstance(value, dict) else None if isinstance(value, float) and isnan(value) else value
+        for key, value in values.items()
+    }
 
 
 def table(rows: list[Score], delta: float, unit: Unit) -> str:

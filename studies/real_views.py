@@ -90,6 +90,8 @@ def figure(results: Results) -> Plot | None:
 
 
 def findings(results: Results) -> dict[str, str]:
+    """Key and sentence of what the cells show; a finding whose cells are missing is left out."""
+
     def of(k: int, n: int, value: str = "rt_le_m") -> float | None:
         return mean(results, {**FLEET, "max_neighbours": k, "landmarks": n}, value)
 

@@ -135,7 +135,7 @@ def test_tables_hold_vehicles_and_covariances(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("t,x\n0,1\n", r"a\.csv: column y = missing: must be there; the file has t, x"),
-        ("t,x,y\n0,1,2\n0,3,4\n", r"a\.csv: row 2 = 0 s: is there twice for a"),
+        ("t,x,y\n0,1,2\n0,3,4\n", r"a\.csv: row 2 = 0.0 s: is there twice for a"),
         ("t,x,y\n0,1,two\n", r"row 1, column y"),
     ],
 )
@@ -157,3 +157,55 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
         )
     with pytest.raises(InputError, match="must name a file"):
         score(("a.tum",))
+
+
+def wandering(count: int = 200) -> Track:
+    t = np.arange(count) / 10
+    return Track(t, np.column_stack([3 * t, 5 * np.sin(t / 3), np.cos(t)]), np.tile(np.eye(3), (count, 1, 1)))
+
+
+def test_signs_of_another_unit_or_clock_are_said() -> None:
+    """Stamps in ms, stamps 3 ms apart at 10 Hz, centimetres, feet, a monocular scale; and nothing where all is well."""
+    truth = wandering()
+    noise = np.random.default_rng(3).normal(0, 0.1, (200, 3))
+    good = Track(truth.t, truth.position + noise, truth.rotation)
+    (row,) = scores({"a": good}, {"a": truth})
+    assert row.remarks == ()
+    (row,) = scores({"a": Track(truth.t * 1000, good.position, good.rotation)}, {"a": truth})
+    assert row.poses == 1
+    assert row.rpe_m is None
+    assert "1 of 200 stamps meet" in row.remarks[0]
+    assert row.remarks[0].endswith("the estimate looks like ms.")
+    assert row.remarks[1] == "no relative error: the drive is shorter than 1 steps."
+    for factor, word in ((100, "in cm"), (1 / 0.3048, "in feet"), (0.5, "divided by 0.5")):
+        (row,) = scores({"a": Track(truth.t, factor * good.position, good.rotation)}, {"a": truth}, aligned="each")
+        assert word in row.remarks[0]
+    dense = Track(np.arange(0, 20, 0.001), np.repeat(truth.position, 100, axis=0))
+    (row,) = scores({"a": dense}, {"a": truth})
+    assert row.missed == 19800
+    assert row.remarks == ()
+
+
+def test_a_clock_of_its_own_is_mended_by_an_offset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = wandering()
+    late = Track(truth.t + 1000.5, truth.position + np.array([0.3, 0.4, 0.0]))
+    with pytest.raises(InputError, match=r"0\.0\.\.19\.9 s.*offset"):
+        scores({"a": late}, {"a": truth})
+    (row,) = scores({"a": late}, {"a": truth}, offset=-1000.5)
+    assert row.poses == 200
+    assert row.rt_le_m.mean == pytest.approx(0.5)
+    for name, path in (("late", late), ("truth", truth)):
+        pd.DataFrame(path.position, columns=["x", "y", "z"]).assign(t=path.t).to_csv(tmp_path / f"{name}.csv")
+    files = (str(tmp_path / "late.csv"),), (str(tmp_path / "truth.csv"),)
+    assert score(*files, max_diff=0.04, offset=-1020.4, output=tmp_path / "one.json") == 0
+    shown = capsys.readouterr()
+    assert "1 of 200 stamps meet" in shown.err
+    assert "nan" not in shown.out
+    (kept,) = json.loads((tmp_path / "one.json").read_text(), parse_constant=pytest.fail)
+    assert kept["ape_m"]["low"] is None
+
+
+def test_a_part_of_a_step_is_refused() -> None:
+    for delta in (0.5, 1.5, float("nan")):
+        with pytest.raises(InputError, match="delta"):
+            scores({"a": wandering()}, {"a": wandering()}, delta=delta)

@@ -138,5 +138,5 @@ def _determined(size: Floats) -> None:
             "estimate, truth",
             f"singular values {size[open_][0].tolist()} m^2",
             f"at least {size.shape[-1] - 1} must differ from zero, or the rotation is open",
-            "Align x and y only ([..., :2]) for a straight drive, or pass aligned=False.",
+            "A straight drive has no frame of its own: compare it in the frame given, or align x and y alone.",
         )

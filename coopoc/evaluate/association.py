@@ -38,13 +38,17 @@ def associated(estimate: Floats, truth: Floats, max_diff: float = 0.01, offset: 
     )
     kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff) if len(long) else np.zeros(0, int)
     if not len(kept):
-        span = f"{_span(x)} and {_span(y)}"
-        raise InputError(
-            "stamps", span, f"must agree within {max_diff:g} s somewhere", "Check the clocks: offset=, max_diff=."
-        )
+        spans = f"{span(x)} and {span(y)}"
+        hint = "Check the unit of the stamps, the clocks (offset) and the rates (max_diff)."
+        raise InputError("stamps", spans, f"must agree within {max_diff:g} s somewhere", hint)
     pair = (kept.astype(np.int64), nearest[kept].astype(np.int64))
     return (pair[1], pair[0]) if swap else pair
 
 
-def _span(t: Floats) -> str:
-    return f"{t[0]:.17g}..{t[-1]:.17g} s" if len(t) else "no stamps"
+def span(t: Floats) -> str:
+    """First and last stamp with all their digits.
+
+    >>> span(np.array([0.1, 1311868230.5]))
+    '0.1..1311868230.5 s'
+    """
+    return f"{t[0].item()!r}..{t[-1].item()!r} s" if len(t) else "no stamps"

@@ -21,11 +21,11 @@ def relative_error(
     Args:
         estimate: positions (T, 3) m and rotations (T, 3, 3), body to frame.
         truth: the same at the same instants.
-        delta: from i to j, and from there to the next.
+        delta: from i to j, and from there to the next; a whole number of steps.
         unit: "steps", or "m" along the estimated path.
 
     Raises:
-        InputError: other shapes, or a drive shorter than `delta`.
+        InputError: other shapes, a part of a step, or a drive shorter than `delta`.
 
     Source: Sturm et al., IROS 2012, equation 2; evo's "RPE, translation part" is the same number.
 
@@ -41,7 +41,7 @@ def relative_error(
     if not (x.shape == y.shape == (len(x), 3) and r.shape == q.shape == (len(x), 3, 3)):
         given = f"shapes {x.shape}, {r.shape}, {y.shape}, {q.shape}"
         raise InputError("estimate, truth", given, "must be (T, 3) and (T, 3, 3)", "Take both at the same instants.")
-    at = _ends(x, number("delta", delta, 1e-12, allowed="> 0"), unit)
+    at = ends(x, delta, unit)
     i, j = at[:-1], at[1:]
     if not len(i):
         raise InputError("delta", f"{delta:g} {unit}", "must fit into the drive once", "Take a smaller one.")
@@ -50,14 +50,25 @@ def relative_error(
     return np.asarray(np.linalg.norm(moved - wanted, axis=1))
 
 
-def _ends(x: Floats, delta: float, unit: Unit) -> Ints:
-    """Steps between which motions are compared."""
+def ends(x: Floats, delta: float, unit: Unit) -> Ints:
+    """(n + 1,) steps between which the motions of a path x (T, 3) are compared.
+
+    Raises:
+        InputError: `delta` is not positive, or a part of a step.
+
+    >>> ends(np.zeros((7, 3)), 3, "steps")
+    array([0, 3, 6])
+    """
     if unit == "steps":
-        return np.arange(0, len(x), max(round(delta), 1))
-    ends, gone = [0], 0.0
+        steps = number("delta", delta, 1, allowed="a whole number of steps, >= 1")
+        if steps % 1:
+            raise InputError("delta", delta, "must be a whole number of steps", 'For a length, set unit to "m".')
+        return np.arange(0, len(x), int(steps))
+    delta = number("delta", delta, 1e-12, allowed="> 0")
+    found, gone = [0], 0.0
     for k, step in enumerate(np.linalg.norm(np.diff(x, axis=0), axis=1).tolist(), 1):
         gone += step
         if gone >= delta:
-            ends.append(k)
+            found.append(k)
             gone = 0.0
-    return np.array(ends, dtype=np.int64)
+    return np.array(found, dtype=np.int64)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -13,7 +13,8 @@ from ..errors import InputError
 from ..plugins import suggestion, unknown
 from .alignment import Alignment, align
 from .association import associated
-from .relative_error import Unit, relative_error
+from .relative_error import Unit, ends, relative_error
+from .score_remarks import remarks
 from .statistics import Interval, mean_interval
 
 Aligned = Literal["none", "each", "team"]
@@ -47,8 +48,9 @@ class Score:
         rt_le_m: root of the mean squared error as it stands, with its interval over blocks of time.
         ape_m: the same after the alignment.
         ape_max_m: largest error after the alignment.
-        rpe_m: root of the mean squared relative error, None without rotations.
+        rpe_m: root of the mean squared relative error, None without rotations or in a drive shorter than its delta.
         nees: mean of e^T P^-1 e, 3 if consistent (2 where heights claim no variance), None without covariances.
+        remarks: signs of another unit, clock or scale, a sentence each.
     """
 
     vehicle: str
@@ -59,6 +61,7 @@ class Score:
     ape_max_m: float
     rpe_m: float | None
     nees: float | None
+    remarks: tuple[str, ...] = field(default=())
 
 
 def scores(
@@ -67,6 +70,7 @@ def scores(
     *,
     aligned: Aligned = "none",
     max_diff: float = 0.01,
+    offset: float = 0.0,
     delta: float = 1.0,
     unit: Unit = "steps",
     blocks: int = 20,
@@ -79,6 +83,7 @@ def scores(
         aligned: "none" compares in the frame given; "each" aligns every vehicle by itself (evo's `-a`); "team" moves
             all by one motion, which keeps where they are to each other.
         max_diff: s, how far stamps that belong together may be apart.
+        offset: s, added to the estimates' stamps.
         delta: of the relative error.
         unit: of `delta`.
         blocks: of time, over which intervals are drawn: errors of one drive are correlated, its blocks hardly.
@@ -97,7 +102,12 @@ def scores(
     if aligned not in ("none", "each", "team"):
         raise unknown("aligned", aligned, ("none", "each", "team"))
     blocks = number("blocks", blocks, 2, kind=int, allowed=">= 2")
-    pairs = {name: _pair(name, path, truths, len(estimates), max_diff) for name, path in estimates.items()}
+    alone = len(estimates) == len(truths) == 1
+    named = {name: _truth(name, truths, alone) for name in estimates}
+    pairs = {}
+    for name, path in estimates.items():
+        i, j = associated(path.t, named[name].t, max_diff, offset)
+        pairs[name] = _at(path, i), _at(named[name], j)
     team = None
     if aligned == "team":
         team = align(*(np.concatenate([pair[k].position for pair in pairs.values()]) for k in (0, 1)))
@@ -108,12 +118,16 @@ def scores(
         raw = np.linalg.norm(estimate.position - truth.position, axis=1)
         error = np.linalg.norm(moved.position - truth.position, axis=1)
         relative = None
-        if estimate.rotation is not None and truth.rotation is not None:
+        stamps = estimates[name].t + offset, named[name].t
+        said = remarks(stamps, (estimate.position, truth.position), max_diff)
+        if len(ends(estimate.position, delta, unit)) < 2:
+            said = (*said, f"no relative error: the drive is shorter than {delta:g} {unit}.")
+        elif estimate.rotation is not None and truth.rotation is not None:
             both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
             relative = float(np.sqrt(np.square(relative_error(*both, delta, unit)).mean()))
         missed = len(estimates[name].t) - len(raw)
         spread = (rms_interval(raw, blocks), rms_interval(error, blocks), float(error.max()))
-        rows.append(Score(name, len(raw), missed, *spread, relative, _nees(moved, truth)))
+        rows.append(Score(name, len(raw), missed, *spread, relative, _nees(moved, truth), said))
     return rows
 
 
@@ -132,14 +146,12 @@ def rms_interval(error: Floats, blocks: int = 20) -> Interval:
     return Interval(rms, float(np.sqrt(max(found.low, 0.0))), float(np.sqrt(found.high)), count)
 
 
-def _pair(name: str, path: Path, truths: Mapping[str, Path], count: int, max_diff: float) -> tuple[Path, Path]:
-    """Estimate and truth at the instants that they share."""
-    if name not in truths and not (count == len(truths) == 1):
+def _truth(name: str, truths: Mapping[str, Path], alone: bool) -> Path:
+    """The truth of that name, or the only one."""
+    if name not in truths and not alone:
         hint = suggestion(name, truths, "Name the files, or the ids in them, alike.")
         raise InputError("vehicle", repr(name), f"has no truth among {', '.join(truths)}", hint)
-    truth = truths.get(name) or next(iter(truths.values()))
-    i, j = associated(path.t, truth.t, max_diff)
-    return _at(path, i), _at(truth, j)
+    return truths.get(name) or next(iter(truths.values()))
 
 
 def _at(path: Path, k: Ints) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -21,6 +22,8 @@ class Interval:
 
     >>> print(Interval(1.423, 1.391, 1.46, 100))
     1.42 [1.39, 1.46]
+    >>> print(Interval(1.423, math.nan, math.nan, 1))
+    1.42
     """
 
     mean: float
@@ -29,7 +32,7 @@ class Interval:
     n: int
 
     def __str__(self) -> str:
-        return f"{self.mean:.3g} [{self.low:.3g}, {self.high:.3g}]"
+        return f"{self.mean:.3g}" + (f" [{self.low:.3g}, {self.high:.3g}]" if math.isfinite(self.low) else "")
 
 
 def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
