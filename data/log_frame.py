@@ -78,7 +78,7 @@ def origin_of(rows: Rows, given: tuple[float, float, float] | None) -> tuple[flo
 
 
 def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
-    """Rows with the s that each vehicle's clock is ahead taken off its stamps; an InputError for a vehicle not there."""
+    """Rows with stamps less the s that each vehicle's clock is ahead; an InputError for a vehicle not there."""
     known = sorted(set(rows.vehicle.tolist()))
     for one in clock:
         if one not in known:

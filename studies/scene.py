@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
 
 Start = Literal["gnss", "true"]
-CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "optimize", "evaluate", "learned", "data", "studies"))
-"""The packages whose code makes the numbers of a cell."""
+CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "kernels", "optimize", "evaluate", "learned", "data"))
+"""The packages whose code makes the numbers of a cell, beside the cell's own."""
 DRAWN: Mapping[str, Any] = {"data": "town10", "egos": "auto", "seed": 0}
 WEIGHTS: Mapping[str, Any] = {"clients": "town10-clients", "weights": "runs/weights"}
 SOLO: Mapping[str, Any] = {"velocity_reading": "axis", "start": "gnss"}

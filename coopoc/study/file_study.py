@@ -1,4 +1,4 @@
-"""A study in a file of one's own: the file's contents name its cells, and workers load it by its path."""
+"""A study in a file of one's own: the code of its cell names the cells, and workers load the file by its path."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 from ..errors import InputError
 from ..one_file import file_digest, from_file
 from .cell import Params, Row
+from .reached import code_of
 from .study import Study
 
 
@@ -38,9 +39,10 @@ def file_study(name: str) -> Study:
         hint = "Give STUDY = coopoc.Study(...) in the file."
         raise InputError("study", repr(name), f"is a {type(study).__name__}, no Study", hint)
     path, _, attribute = name.rpartition(":")
-    contents, own = file_digest(name, "study"), study.key
+    code, own = code_of(study.cell), study.key
 
     def key(params: Params) -> Mapping[str, Any]:
-        return {**own(params), "study file": contents}
+        return {**own(params), "cell": code}
 
-    return replace(study, cell=_FileCell(f"{Path(path).resolve()}:{attribute}", contents), key=key)
+    cell = _FileCell(f"{Path(path).resolve()}:{attribute}", file_digest(name, "study"))
+    return replace(study, cell=cell, key=key)

@@ -25,6 +25,7 @@ from .manifest import Manifest, environments
 from .publish import publish
 from .results import Results
 from .shard import Shard
+from .specification import check_views
 from .study import Study
 
 
@@ -181,6 +182,7 @@ def _keep(folder: Path, outcome: Outcome) -> bool:
 
 def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:
     found = find_study(study) if isinstance(study, str) else study
+    check_views(found)
     found = found.override({name: data_path(name, value, out) for name, value in (settings or {}).items()})
     return found, found.cells(), Path(out) / found.name
 

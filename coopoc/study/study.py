@@ -16,6 +16,7 @@ from ..one_file import file_digest, in_file
 from ..plugins import unknown
 from .cell import Cell, Params, Row, Scalar, digest
 from .parse import parse
+from .reached import code_of
 
 if TYPE_CHECKING:
     from .plot import Plot
@@ -47,7 +48,8 @@ class Study:
         grid: axis -> values (their product), or a list of parameter mappings. Values are scalars.
         settings: defaults that all cells share (runs, seed, data, egos ...), overridden by --set key=value.
         key: parameters -> anything else that changes the numbers (fleet digest, hash of weights, revision of the
-            methods). Evaluated for every cell before any work, so an InputError raised here is reported at once.
+            methods; the code of the cell counts anyway, see `code_of`). Evaluated for every cell before any work, so
+            an InputError raised here is reported at once.
         prepare: called once with the parameters of the cells that are not finished and the number of processes,
             before they are computed, in the process that started the run: trains or downloads what several cells
             share. It must resume by itself.
@@ -105,7 +107,8 @@ class Study:
 
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
-        found = [_named(self, params) for params in _expand(self)]
+        code = code_of(self.cell)
+        found = [_named(self, params, code) for params in _expand(self)]
         if not found:
             raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
         count = Counter(cell.name for cell in found)
@@ -138,12 +141,13 @@ class Study:
         return replace(self, settings=settings, grid=grid)
 
 
-def _named(study: Study, params: Mapping[str, Scalar]) -> Cell:
+def _named(study: Study, params: Mapping[str, Scalar], code: str) -> Cell:
     for name, value in params.items():
         if not isinstance(value, Scalar):
             raise InputError(name, repr(value), "must be a number, a word, a bool or None", "Pass a name instead.")
     given = {**study.settings, **params}
     content = {"study": study.name, "given": given, "axes": sorted(params), "key": study.key(given)}
+    content["code"] = code
     content["files"] = {name: file_digest(v, name) for name, v in given.items() if isinstance(v, str) and in_file(v)}
     return Cell(params, given, digest({**content, "coopoc": metadata.version("coopoc")}))
 
