@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from importlib import metadata
 from typing import Any
 
+from .entry_names import names_in
 from .errors import InputError
 from .one_file import from_file, in_file
 
@@ -42,12 +43,17 @@ def points(group: str) -> Mapping[str, metadata.EntryPoint]:
 
 
 def names(group: str) -> tuple[str, ...]:
-    """All names in a group. An entry point that holds a mapping stands for the names in it.
+    """All names in a group. An entry point that holds a mapping stands for the names in it. Where these stand in the
+    source nothing is imported.
 
     >>> isinstance(names("coopoc.methods"), tuple)
     True
     """
-    return tuple(sorted(n for name, point in points(group).items() for n in _members(point) or [name]))
+    found: list[str] = []
+    for name, point in points(group).items():
+        written = names_in(point.value)
+        found += (_members(point) if written is None else written) or [name]
+    return tuple(sorted(found))
 
 
 def find(group: str, name: str) -> Any:
@@ -77,7 +83,7 @@ def find(group: str, name: str) -> Any:
     loaded = registered[name].load() if name in registered else None
     if loaded is not None and not isinstance(loaded, Mapping):
         return loaded
-    for point in registered.values():
+    for point in sorted(registered.values(), key=lambda point: name not in (names_in(point.value) or ())):
         members = _members(point)
         if name in members:
             return members[name]
