@@ -56,7 +56,7 @@ $(READY): pyproject.toml constraints.txt
 		{ rm -rf $(VENV); echo "No venv module: apt-get install python3-venv, then repeat."; exit 1; }
 	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
 	$(PIP) setuptools wheel torch
-	$(PIP) --no-build-isolation --editable .
+	$(PIP) --no-build-isolation --editable '.[learned]'
 	@touch $(READY)
 
 $(VENV)/.ready-dev: $(READY)

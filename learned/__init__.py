@@ -1,5 +1,6 @@
 """Learned gains: nets that filter, their federated, centralised and individual training, and their shipped weights."""
 
+from . import torch_installed as torch_installed
 from .checkpoint import Checkpoint, load, save
 from .federation.federated import federate
 from .federation.history import Federation, ledger

@@ -151,7 +151,7 @@ class Job:
 
 def sensors(setting: Setting) -> Sensors:
     """The paper's training noise in the setting's reading."""
-    return replace(Sensors.paper_training(), velocity_reading=setting.reading)
+    return Sensors.paper_training(setting.reading)
 
 
 def recipe_of(name: str) -> Recipe:

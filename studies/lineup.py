@@ -30,9 +30,9 @@ from .presence import complete, scored_where_present
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 BOUND = ("bound", "bound")
+"""The bound as (method, noise model)."""
 PAST = ("bound", "with its past")
 """The bound of a star whose newcomers bring what they did before, as messages with estimates or sums do."""
-"""The bound as (method, noise model)."""
 
 
 def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = True, **options: Any) -> Study:

@@ -16,6 +16,7 @@ from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.track import Method
 from coopoc.study.study import Params, Row, Study
+from coopoc.world.sensors import Sensors
 
 from . import lineup, scene, weights
 from .privacy_views import FIGURES, TABLES, findings
@@ -116,13 +117,12 @@ def trained(p: Params) -> Trained:
     from coopoc.learned.nets.gain_net import GainNet
     from coopoc.learned.nets.okf import NoiseParameters
     from coopoc.learned.privacy.differential import Privacy, auc_bound, epsilon, noise_for
-    from coopoc.learned.recipes import Setting, sensors
     from coopoc.learned.training.clients import clients
     from coopoc.learned.training.schedule import Schedule
 
     net = GainNet if p["method"] == "fedkalmannet" else NoiseParameters
     plan, drives, delta = PLANS[p["method"]], scene.fleet(p["clients"]), float(p["delta"])
-    acting, seeds = sensors(Setting(reading=p["velocity_reading"])), weights.seeds(p)
+    acting, seeds = Sensors.paper_training(p["velocity_reading"]), weights.seeds(p)
     groups = [clients(drives, acting, seed=seed, start=scene.start(p)) for seed in seeds]
     z = noise_for(float(p["epsilon"]), plan.rounds, 1.0, delta)
     count = len(drives.ids)

@@ -14,7 +14,7 @@ from coopoc.one_file import file_digest, from_file, in_file
 from coopoc.plugins import unknown
 from coopoc.study.study import Params
 from coopoc.world.sensing import observe
-from coopoc.world.sensors import VelocityReading
+from coopoc.world.sensors import Sensors, VelocityReading
 from coopoc.world.v2x import V2X
 
 from .scene import Start, fleet, start
@@ -131,10 +131,8 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 
 @lru_cache
 def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
-    from coopoc.learned.recipes import Setting, sensors
-
     drives = fleet(clients)
-    acting = sensors(Setting(reading=reading))
+    acting = Sensors.paper_training(reading)
     return NoiseModel.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
 
 

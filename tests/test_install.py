@@ -54,3 +54,50 @@ print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in
 def test_installed_package_is_strictly_typed(site: Path, tmp_path: Path) -> None:
     config = str(ROOT / "pyproject.toml")
     outside(site, tmp_path, sys.executable, "-m", "mypy", "--strict", "--config-file", config, "-p", "coopoc")
+
+
+WITHOUT_TORCH = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("torch", "safetensors"):
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Absent())
+"""
+"""Not installed: `torch` and its extra are left out of the core."""
+
+
+def test_without_torch_all_but_learned_gains_works(tmp_path: Path) -> None:
+    code = f"""{WITHOUT_TORCH}
+import coopoc as co
+from coopoc.cli import main
+fleet = co.load_fleet("town10")
+v2x = co.V2X(max_neighbours=2)
+seen = co.observe(fleet.between(0, 30), co.Sensors.paper_scenario2(), v2x, runs=1, seed=0, observers=[24])
+print(co.JointFilter("nominal")(seen, egos=[24]).x.shape)
+print(co.solve(co.Problem.from_snapshot(seen, step=9, ego=24)).status.name)
+for words in (["list"], ["run", "consistency", "--set", "method=kalman,joint", "runs=1", "max_neighbours=6"]):
+    try:
+        main(words)
+    except SystemExit as end:
+        assert not end.code, (words, end.code)
+assert "torch" not in sys.modules
+for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "runs=1"]):
+    try:
+        main(words)
+    except SystemExit as end:
+        assert end.code == 2, (words, end.code)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert "SOLVED" in done.stdout
+    assert "fedkalmannet" in done.stdout
+    assert done.stderr.count("pip install 'coopoc[learned]'") == 2

@@ -153,9 +153,9 @@ class Sensors:
         return self
 
     @classmethod
-    def paper_training(cls) -> Sensors:
+    def paper_training(cls, velocity_reading: VelocityReading = "axis") -> Sensors:
         """Noise of the paper's training set: 1.5 m per axis, 10 % of the velocity (section IV.A)."""
-        return cls()
+        return cls(velocity_reading=velocity_reading)
 
     @classmethod
     def paper_scenario1(cls) -> Sensors:
