@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc.study.marks import series
 from coopoc.study.numbers import Number, interval, mean, present, sentence
 from coopoc.study.pivot import crossed, pivot
 from coopoc.study.style import look
@@ -75,12 +76,15 @@ def figure(results: Results) -> Plot | None:
         others = [(look(name).label, {"method": name, **most}, look(name).color) for name in METHODS]
         for axis, shown in ((left, lines), (right, others)):
             for label, where, color in shown:
+                gid = series(label)
                 each = {n: interval(results, {**where, "landmarks": n}) for n in LANDMARKS}
                 ran = {at[n]: value for n, value in each.items() if value is not None}
                 if ran:
-                    axis.plot(list(ran), [one.mean for one in ran.values()], color=color, label=label, marker="o")
+                    axis.plot(
+                        list(ran), [one.mean for one in ran.values()], color=color, label=label, marker="o", gid=gid
+                    )
                     ends = [one.low for one in ran.values()], [one.high for one in ran.values()]
-                    axis.fill_between(list(ran), *ends, alpha=0.12, color=color, linewidth=0)
+                    axis.fill_between(list(ran), *ends, alpha=0.12, color=color, linewidth=0, gid=gid)
             axis.set(xticks=list(at.values()), xticklabels=list(at), xlabel="Landmarks", yscale="log")
             plain_log(axis.yaxis)
             axis.legend()

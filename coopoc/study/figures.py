@@ -49,7 +49,8 @@ def sweep(
             group = group.sort_values(x)
             options = strokes(names)
             axes.plot(group[x], group["mean"], **options)
-            axes.fill_between(group[x], group["low"], group["high"], color=options["color"], alpha=0.15, linewidth=0)
+            band = {"color": options["color"], "gid": options["gid"], "linewidth": 0}
+            axes.fill_between(group[x], group["low"], group["high"], alpha=0.15, **band)
             drawn.append(names)
         ticks = sorted(summary[x].unique())
         if len(ticks) <= 12:
@@ -131,7 +132,13 @@ def convergence(
             options = strokes(names)
             axes.plot(table.index, table.mean(axis=1), **options, markevery=max(1, len(table) // 10))
             axes.fill_between(
-                table.index, table.min(axis=1), table.max(axis=1), color=options["color"], alpha=0.18, linewidth=0
+                table.index,
+                table.min(axis=1),
+                table.max(axis=1),
+                color=options["color"],
+                gid=options["gid"],
+                alpha=0.18,
+                linewidth=0,
             )
             drawn.append(names)
         axes.set(xlabel=words(x), ylabel=words(y))

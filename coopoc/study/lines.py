@@ -88,7 +88,8 @@ def draw(axis: Axes, lines: Sequence[Line]) -> list[Mapping[str, Any]]:
             axis.plot(list(points), [one.mean if x in bands else one for x, one in points.items()], **style)
             if bands:
                 ends = [one.low for one in bands.values()], [one.high for one in bands.values()]
-                axis.fill_between(list(bands), *ends, alpha=0.12, color=style["color"], linewidth=0)
+                band = {"color": style["color"], "gid": style["gid"], "linewidth": 0}
+                axis.fill_between(list(bands), *ends, alpha=0.12, **band)
         elif line.points is None:
             continue
         else:

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.ticker import FixedLocator, NullFormatter, StrMethodFormatter
 
 from ..errors import InputError
+from .marks import series
 from .plot import Plot, canvas
 from .style import NEUTRAL, look
 
@@ -41,7 +42,7 @@ def multiples(
         for panel, case in zip(axes[0], cases, strict=True):
             panel.axvspan(1.0, (target or {}).get(case, 1.0), color=NEUTRAL, alpha=0.35, linewidth=0)
             panel.axvline(1.0, color="black", linewidth=0.9)
-            for row, ((method, _), each) in enumerate(found.items()):
+            for row, ((method, noise_model), each) in enumerate(found.items()):
                 values = np.array(each.get(case, ()), dtype=float)
                 shown = look(method)
                 panel.plot(
@@ -53,6 +54,7 @@ def multiples(
                     markersize=4,
                     alpha=0.8,
                     markeredgewidth=0.6,
+                    gid=series(method, noise_model),
                 )
             panel.set(title=case, xscale="log", xlabel="× reference")
             panel.xaxis.set_major_locator(FixedLocator(NEAR if panel.get_xlim()[1] < 2.1 else FAR))

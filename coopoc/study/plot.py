@@ -19,6 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from . import store
+from .marks import marks, series
 from .results import Results
 from .style import RC, line, look
 
@@ -46,6 +47,12 @@ class Plot:
                 self.figure.savefig(buffer, format=suffix, metadata=dict(metadata))
                 store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
         return self.caption
+
+    def marks(self) -> list[dict[str, Any]]:
+        """Where its lines stand and what they say, see `coopoc.study.marks`."""
+        with mpl.rc_context(RC):
+            _settle(self.figure)
+            return marks(self.figure)
 
     def _repr_png_(self) -> bytes:
         """Image for a notebook."""
@@ -99,11 +106,14 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
 
 
 def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
-    """Line options of a method (colour, marker) and of a noise model (line style); the bound is dashed."""
+    """Line options of a method (colour, marker) and of a noise model (line style), and the line's name; the bound is
+    dashed."""
     shown = look(_line(names))
     dashes = "--" if _line(names) == "bound" else line(names.get("noise_model"))
     width = {"linewidth": 0.8} if thin else {}
-    return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8, **width}
+    name = series(_line(names), str(names.get("noise_model", "")))
+    drawn = {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
+    return {**drawn, **width, "gid": name}
 
 
 def legend(

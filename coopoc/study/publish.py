@@ -79,6 +79,8 @@ def views(folder: str | Path) -> Mapping[str, Any]:
     for view in (*found["tables"], *found["figures"]):
         if not isinstance(view, dict) or not isinstance(view.get("caption"), str):
             raise store.damaged(path, "a view without a caption")
+        if not all(map(_is_mark, view.get("marks", ()))):
+            raise store.damaged(path, "a mark without its series, place or text")
         file_name("view", view.get("name"), f"Run the study again: {path} was not written by coopoc run.")
     return found
 
@@ -140,7 +142,14 @@ def _save_table(table: Table, path: Path) -> dict[str, Any]:
 
 
 def _save_figure(plot: Any, path: Path) -> dict[str, Any]:
-    return {"caption": str(plot.save(path))}
+    return {"caption": str(plot.save(path)), "marks": plot.marks() if hasattr(plot, "marks") else []}
+
+
+def _is_mark(mark: Any) -> bool:
+    if not isinstance(mark, dict) or not all(isinstance(mark.get(key), str) for key in ("series", "text")):
+        return False
+    at = mark.get("at")
+    return isinstance(at, list) and len(at) == 2 and all(isinstance(share, int | float) for share in at)
 
 
 def _data(value: Any) -> Any:

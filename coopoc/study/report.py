@@ -13,11 +13,14 @@ import markupsafe
 from ..errors import InputError
 from ..file_names import inside
 from . import store
+from .inline_svg import inline
+from .marks import described
 from .pdf import printed
 from .publish import views
 from .results import Results
 from .style import look, title, words
 from .tables import FORMATS, Table
+from .terms import explained
 
 _MIME = {
     "csv": "text/csv",
@@ -48,7 +51,7 @@ def report(
         out: the file; a name in .pdf is printed by Chromium.
         title: of the page.
         lead: sentences under the title, before the first study.
-        answers: question -> answer, shown after the lead.
+        answers: question -> answer, shown after the lead; default each study's question with its first finding.
         cards: name of a data set -> field -> value.
 
     Raises:
@@ -61,10 +64,12 @@ def report(
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
+    first = next(({**s["figures"][0][0], "section": s["name"]} for s in sections if s["figures"]), None)
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
-        answers=answers or {},
+        answers=answers or {s["question"]: next(iter(s["findings"].values())) for s in sections if s["findings"]},
+        first=first if len(sections) > 1 else None,
         sections=sections,
         cards=cards or {},
         environment=_environment(sections),
@@ -113,7 +118,11 @@ def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]
     content = {form: _bytes(folder, f"figures/{view['name']}.{form}") for form in ("pdf", "png", "svg")}
     name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= _LARGEST_SVG else "png"
     files = [_file(name, form, content[form]) for form in ("pdf", "png")]
-    return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
+    found = {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files, "svg": None, "marks": []}
+    if drawn == "svg" and view.get("marks"):  # a figure without lines of methods has nothing to choose
+        svg = inline(content["svg"], name)
+        found |= {"svg": svg, "marks": [{**mark, "name": described(mark["series"])} for mark in view["marks"]]}
+    return found
 
 
 def _bytes(folder: Path, name: str) -> bytes:
@@ -155,6 +164,7 @@ def _template() -> jinja2.Template:
     )
     jinja.filters["named"] = _named
     jinja.filters["shown"] = _shown
+    jinja.filters["explained"] = explained
     return jinja.get_template("report.html.j2")
 
 
