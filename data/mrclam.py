@@ -12,6 +12,7 @@ from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
 from . import mrclam_files as files
+from .nearest import steps_of
 from .rows import backward_difference, interpolate
 from .scale import check_size
 
@@ -147,7 +148,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     odometry = np.stack([_step_means(a[:, 0] - start, a[:, 1:], t) for a in wheels], axis=1)
     found = files.measurements(folder, numbers)
     seen = found.rows - [start, 0, 0, 0, 0]
-    step = np.rint(seen[:, 0] / dt).astype(np.int64)
+    step, _ = steps_of(seen[:, 0], dt, len(t))
     marks, sightings = files.landmarks(folder), found.landmarks - [start, 0, 0, 0, 0]
     row = {subject: k for k, subject in enumerate(marks[:, 0].tolist())}
     sightings[:, 2] = [row.get(subject, -1) for subject in sightings[:, 2].tolist()]
@@ -158,7 +159,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         speed=odometry[..., 0],
         turn_rate=odometry[..., 1],
         time=seen[:, 0],
-        step=np.where((step >= 0) & (step < len(t)), step, -1),
+        step=step,
         observer=seen[:, 1].astype(np.int64),
         subject=seen[:, 2].astype(np.int64),
         range=seen[:, 3],

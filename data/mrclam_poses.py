@@ -17,7 +17,8 @@ from coopoc.world.v2x import V2X
 
 from .mrclam import MrclamLog
 from .mrclam_calibration import Calibration, delayed
-from .mrclam_recording import changes, kept
+from .mrclam_recording import kept
+from .nearest import nearest, steps_of
 
 
 def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
@@ -107,9 +108,6 @@ def _robots(log: MrclamLog, v2x: V2X) -> Floats:
 def _landmarks(log: MrclamLog, first: int) -> Floats:
     """(L, 5) step, observer, column of the landmark, range m, bearing rad."""
     t, observer, mark, reach, bearing = log.sightings.T
-    step = np.rint(t / log.fleet.dt)
-    late = np.abs(t - log.fleet.dt * step)
-    order = np.lexsort((late, mark, observer, step))
-    order = order[((step >= 0) & (step < len(log.fleet.t)) & (mark >= 0))[order]]
-    order = order[changes(step[order], observer[order], mark[order])]
+    step, late = steps_of(t, log.fleet.dt, len(log.fleet.t))
+    order = nearest(late, step, observer, mark)
     return np.asarray(np.column_stack([step, observer, first + mark, reach, bearing])[order])

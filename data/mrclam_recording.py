@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats, Ints
+from coopoc.arrays import Floats, Ints
 from coopoc.world.links import Links
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe, schedule
@@ -12,6 +12,7 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from .mrclam import MrclamLog, innovations
+from .nearest import changes, nearest
 
 HEIGHT_STD = 0.01
 """m, how well z = 0 is known: the robots drive on one floor."""
@@ -107,18 +108,9 @@ def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> tuple[Ints, int, int]:
     visible = present[log.step, log.observer] & present[log.step, log.subject] & np.isfinite(log.observer_heading)
     index = known[visible[known] | gaps]
     late = np.abs(log.time - log.fleet.t[log.step])[index]
-    index = index[np.lexsort((late, log.subject[index], log.observer[index], log.step[index]))]
-    first = changes(log.step[index], log.observer[index], log.subject[index])
-    unique = index[first]
+    unique = index[nearest(late, log.step[index], log.observer[index], log.subject[index])]
     near = unique[log.range[unique] <= v2x.radius]
     near = near[np.lexsort((log.range[near], log.observer[near], log.step[near]))]
     groups = changes(log.step[near], log.observer[near])
     rank = np.arange(len(near)) - np.maximum.accumulate(np.where(groups, np.arange(len(near)), 0))
-    return near[rank < v2x.max_neighbours], int((~visible[known]).sum()), int((~first).sum())
-
-
-def changes(*keys: Ints) -> Bools:
-    """True at the first of each run of equal rows."""
-    rows = np.column_stack(keys)
-    first: Bools = np.append(True, (np.diff(rows, axis=0) != 0).any(axis=1))[: len(rows)]
-    return first
+    return near[rank < v2x.max_neighbours], int((~visible[known]).sum()), len(index) - len(unique)

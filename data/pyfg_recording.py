@@ -15,7 +15,7 @@ from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
-from .mrclam_recording import changes
+from .nearest import nearest, steps_of
 from .rows import backward_difference
 
 FLAT = 0.01
@@ -118,13 +118,8 @@ def _ranges(graph: Graph, who: tuple[Ints, int], begin: float, t: Floats) -> Flo
     column[marks] = robots + np.arange(len(marks))
     ends = column[graph.ranges.nodes]
     ends = np.where((ends[:, :1] >= robots) & (ends[:, :1] > ends[:, 1:]), ends[:, ::-1], ends)  # a robot observes
-    dt = t[1] - t[0]
-    step = np.rint((graph.ranges.stamps - begin) / dt)
-    late = np.abs(graph.ranges.stamps - begin - dt * step)
-    order = np.lexsort((late, ends[:, 1], ends[:, 0], step))
-    fits = (step >= 0) & (step < len(t)) & (ends >= 0).all(axis=1) & (ends[:, 0] < robots)
-    order = order[fits[order]]
-    order = order[changes(step[order], ends[order, 0], ends[order, 1])]
+    step, late = steps_of(graph.ranges.stamps - begin, t[1] - t[0], len(t))
+    order = nearest(late, step, np.where(ends[:, 0] < robots, ends[:, 0], -1), ends[:, 1])
     table = np.column_stack([step, ends, graph.ranges.distance])[order]
     return np.asarray(table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))])
 
