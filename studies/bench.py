@@ -18,6 +18,7 @@ def benchmark(
     methods: Annotated[Positional[tuple[str, ...]], arg(metavar="METHOD")] = (),
     /,
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/benchmark"),
+    data: Annotated[Path | None, arg(metavar="FOLDER")] = None,
     validation: bool = False,
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK")] = (),
     table: bool = False,
@@ -26,16 +27,20 @@ def benchmark(
 
     Example: coopoc benchmark joint lkf-sa mine.py:Own
 
+    Example: coopoc benchmark pose-fleet gauss-newton --data ~/measured
+
     Example: coopoc benchmark --table --out benchmarks/cards
 
     Args:
-        methods: names of `coopoc list`, shipped learned gains, or mine.py:NAME.
+        methods: names of `coopoc list`, shipped learned gains, or mine.py:NAME; with --data also pose-solo, pose-fleet,
+            pose-intersection, pose-naive, and backends.
         out: folder of the cards.
+        data: with MR.CLAM's set 6 and PyFG files somewhere below it, for the tasks of real measurements.
         validation: the tasks on which parameters may be chosen, whose cards are no submission.
         tasks: some of the tasks; all without it.
         table: print the table of the folder's cards, worst last.
     """
-    from .bench_cards import card, page
+    from .bench_cards import card, page, simulated
     from .bench_tasks import TASKS, VALIDATION
 
     known = {task.name: task for task in (VALIDATION if validation else TASKS)}
@@ -47,7 +52,9 @@ def benchmark(
     failed = 0
     for name in methods:
         began = time.perf_counter()
-        made = card(name, [known[task] for task in tasks or known])
+        if data is None and not simulated(name):
+            raise InputError("data", None, f"must name the folder of measurements for {name}", "Add --data FOLDER.")
+        made = card(name, [known[task] for task in tasks or known] if simulated(name) else [], data)
         failed += sum("failed" in row for row in made["tasks"])
         folder = out / "validation" if validation else out
         folder.mkdir(parents=True, exist_ok=True)

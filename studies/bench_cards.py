@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
-from importlib.metadata import version
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names
+from coopoc.study.environment import environment
 
 from .bench_tasks import VERSION, Task, bound, recording
 
@@ -54,15 +55,16 @@ def information(name: str, one: Method) -> str:
 
 def tried(name: str, task: Task) -> dict[str, Any]:
     """A method's row for one task: error with its interval, bound, consistency, bytes and time; or why it failed."""
+    return _row(task.name, partial(_tried, name, task))
+
+
+def _tried(name: str, task: Task) -> dict[str, Any]:
     row: dict[str, Any] = {"task": task.name}
-    try:
-        one = method(name, task.v2x.latency > 0)
-        held = information(name, one)
-        seen, fleet = recording(task, held in ("", "fleet"))
-        one(seen.between(0, 3), [task.columns[0]])  # compiles
-        found = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
-    except Exception as error:  # a failure is a row
-        return row | {"failed": f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"}
+    one = method(name, task.v2x.latency > 0)
+    held = information(name, one)
+    seen, fleet = recording(task, held in ("", "fleet"))
+    one(seen.between(0, 3), [task.columns[0]])  # compiles
+    found = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
     level = mean_interval(found["rt_le_m"].T)
     row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
     if held:
@@ -76,22 +78,103 @@ def tried(name: str, task: Task) -> dict[str, Any]:
     return row
 
 
-def card(name: str, tasks: Iterable[Task]) -> dict[str, Any]:
-    """The card of a method: what it is, with which versions, and a row for each task."""
+def measured(name: str, data: Path) -> list[dict[str, Any]]:
+    """Rows of the tasks of real measurements: graphs of a backend, logs of a pose filter or of "mine.py:NAME"."""
+    from . import bench_real
+
+    rows: list[dict[str, Any]] = []
+    if name in names("coopoc.backends"):
+        for file in tqdm(bench_real.BEST, desc=name, unit="graph", delay=2.0):
+            rows.append(_row(file, partial(bench_real.graph_row, data, file, name)))
+    elif name in bench_real.POSES or in_file(name):
+        for task in bench_real.LOGGED:
+            made: Any = find("coopoc.methods", name)("nominal") if in_file(name) else name
+            rows.append(_row(task.name, partial(bench_real.pose_row, task, data, made)))
+    return rows
+
+
+def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return made()
+    except Exception as error:  # a failure is a row
+        return {"task": task, "failed": f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"}
+
+
+def simulated(name: str) -> bool:
+    """Whether the simulated tasks are for a name: those of backends and of pose filters are real ones."""
+    from .bench_real import POSES
+
+    return name not in POSES and name not in names("coopoc.backends")
+
+
+def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str, Any]:
+    """The card of a method: what it is, with which versions, and a row for each task.
+
+    Args:
+        name: of a method, a pose filter or a backend, or "mine.py:NAME".
+        tasks: simulated ones.
+        data: folder of the real measurements; None leaves these tasks out.
+    """
     digest = hashlib.sha256(Path(name.rpartition(":")[0]).read_bytes()).hexdigest() if in_file(name) else ""
     with tqdm(list(tasks), desc=name, unit="task", delay=2.0) as bar:
         rows = [tried(name, task) for task in bar]
-    versions = {package: version(package) for package in ("coopoc", "numpy", "numba", "torch")}
+    rows += [] if data is None else measured(name, data)
+    known = environment()
+    versions = {one: known[one] for one in ("coopoc", "numpy", "numba", "torch") if one in known}
     return {"benchmark": VERSION, "method": name, "source": digest, "versions": versions, "tasks": rows}
 
 
 def page(cards: Iterable[Mapping[str, Any]]) -> str:
-    """Markdown table of cards: RT-LE in m and, in parentheses, over its bound; the least geometric mean first."""
+    """Markdown tables of cards, of simulated tasks and of logs and graphs where there are any.
+
+    Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean first.
+    """
+    given = list(cards)
+    return "\n\n".join(part for part in (_simulated(given), _logs(given), _graphs(given)) if part)
+
+
+def _logs(cards: Sequence[Mapping[str, Any]]) -> str:
+    """RT-LE, heading error and NEES of pose filters, a row per task and method."""
+    rows = []
+    for one, row in _rows(cards, ("robots", "uwb")):
+        if "failed" in row:
+            rows.append((row["task"], np.inf, {"task": row["task"], "method": one, "RT-LE [m]": "failed"}))
+            continue
+        mean, low, high = row["rt_le_m"]
+        shown = {"task": row["task"], "method": one, "RT-LE [m]": f"{mean:.3g} [{low:.3g}, {high:.3g}]"}
+        shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
+        shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
+        rows.append((row["task"], mean, shown))
+    return _table([shown for *_, shown in sorted(rows, key=lambda row: row[:2])])
+
+
+def _graphs(cards: Sequence[Mapping[str, Any]]) -> str:
+    """Cost over the least known, status and time of backends, a row per backend."""
+    shown: dict[str, dict[str, Any]] = {}
+    for one, row in _rows(cards, tuple(row["task"] for card in cards for row in card["tasks"] if "over_best" in row)):
+        cell = "failed" if "failed" in row else f"{row['over_best']:.4g} {row['status']}, {row['seconds']:.2g} s"
+        shown.setdefault(one, {"backend": one})[row["task"]] = cell
+    return _table(list(shown.values()))
+
+
+def _rows(cards: Sequence[Mapping[str, Any]], tasks: Sequence[str]) -> list[tuple[str, Mapping[str, Any]]]:
+    return [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] in tasks]
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> str:
     from tabulate import tabulate
 
-    rows = []
+    return str(tabulate(rows, headers="keys", tablefmt="github", disable_numparse=True)) if rows else ""
+
+
+def _simulated(cards: Sequence[Mapping[str, Any]]) -> str:
+    from .bench_tasks import TASKS
+
+    rows, known = [], {task.name for task in TASKS}
     for one in cards:
-        cells = {row["task"]: row for row in one["tasks"]}
+        cells = {row["task"]: row for row in one["tasks"] if row["task"] in known}
+        if not cells:
+            continue
         shown = {name: _cell(row) for name, row in cells.items()}
         errors = [row["rt_le_m"][0] for row in cells.values() if "rt_le_m" in row]
         mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(cells) else np.inf
@@ -105,7 +188,7 @@ def page(cards: Iterable[Mapping[str, Any]]) -> str:
             (mean, {"method": one["method"], "mean": f"{mean:.3g}" if np.isfinite(mean) else "-", **shown, **extra})
         )
     rows.sort(key=lambda row: row[0])
-    return str(tabulate([row for _, row in rows], headers="keys", tablefmt="github", disable_numparse=True))
+    return _table([row for _, row in rows])
 
 
 def _cell(row: Mapping[str, Any]) -> str:

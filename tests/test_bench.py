@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import coopoc as co
+from coopoc.data.recordings import load_log
 from coopoc.errors import InputError
-from coopoc.studies import bench, bench_cards, bench_tasks
+from coopoc.studies import bench, bench_cards, bench_real, bench_tasks
 from coopoc.studies.bench_tasks import TASKS, VALIDATION, VERSION
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -119,3 +120,63 @@ def test_the_bound_with_the_past_is_least() -> None:
     task = replace(PAPER, egos=1)
     levels = [bench_tasks.bound(task, each) for each in ("solo", "star", "past")]
     assert levels == sorted(levels, reverse=True)
+
+
+OWN_POSES = """
+from dataclasses import dataclass
+import coopoc as co
+
+@dataclass(frozen=True)
+class Own:
+    noise_model: object = "nominal"
+    begin: object = None
+    assumed: object = None
+    name: str = "own"
+    cooperative: bool = True
+    message: co.Message = co.PoseFilter().message
+
+    def __call__(self, recording, egos=(0,)):
+        return co.PoseFilter("solo", begin=self.begin, assumed=self.assumed)(recording, egos)
+"""
+
+
+def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Path) -> None:
+    """The row's RT-LE is that of a PoseFilter by hand; a method of one's own gets the first poses and the noise."""
+    (tmp_path / "mine.py").write_text(OWN_POSES)
+    rows = {}
+    for name in ("pose-solo", "pose-fleet", f"{tmp_path / 'mine.py'}:Own"):
+        made = bench_cards.card(name, [], shared / "pyfg") if "fleet" in name else None
+        rows[name] = {row["task"]: row for row in (made or bench_cards.card(name, [], shared))["tasks"]}
+    assert "must hold MRCLAM_Dataset6" in rows["pose-fleet"]["robots"]["failed"]
+    solo, whole = rows["pose-solo"]["uwb"], rows["pose-fleet"]["uwb"]
+    assert whole["rt_le_m"][2] < solo["rt_le_m"][0]
+    log = load_log(shared / "pyfg" / "tiers.pyfg")
+    assert log.truth is not None
+    assert log.truth.heading is not None
+    begin = np.column_stack([log.truth.position[0], log.truth.heading[0]])
+    begin[4] = np.nan
+    noise = replace(log.recording.sensors, range_std=bench_real.RANGE_STD)
+    size = int(10 / log.truth.dt)
+
+    def by_hand(made: co.PoseFilter) -> float:
+        error = np.linalg.norm(made(log.recording, range(4)).x[0] - log.truth.position[:, :4], axis=2)  # type: ignore[union-attr]
+        first = range(0, len(error) - size + 1, size)
+        return float(np.mean([np.sqrt(np.mean(error[k : k + size] ** 2, axis=0)) for k in first]))
+
+    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=bench_real.SPREAD, assumed=noise)
+    assert whole["rt_le_m"][0] == pytest.approx(by_hand(fleet), abs=2e-4)
+    own = rows[f"{tmp_path / 'mine.py'}:Own"]
+    mine = co.PoseFilter("solo", begin=begin, assumed=noise)
+    assert own["uwb"]["rt_le_m"][0] == pytest.approx(by_hand(mine), abs=2e-4)
+    assert own["robots"]["rt_le_m"][0] > rows["pose-solo"]["robots"]["rt_le_m"][0] / 2
+    assert own["robots"]["data"] == rows["pose-solo"]["robots"]["data"]
+
+
+def test_graphs_are_tasks_for_backends(shared: Path) -> None:
+    row = bench_real.graph_row(shared, "mrclam5a.pyfg", "gauss-newton")
+    assert row["status"] == "SOLVED"
+    assert row["over_best"] == pytest.approx(1.0, abs=1e-4)
+    shown = bench_cards.page([{"method": "gauss-newton", "tasks": [row]}])
+    assert "1 SOLVED" in shown
+    with pytest.raises(InputError, match="must name the folder of measurements for gauss-newton"):
+        bench.benchmark(("gauss-newton",))

@@ -16,6 +16,7 @@ from ..errors import InputError
 _LIBRARIES = (
     "numpy",
     "scipy",
+    "numba",
     "torch",
     "gtsam",
     "casadi",

@@ -1,0 +1,165 @@
+"""CL-Bench's tasks of real measurements: robots among landmarks, UWB ranges for pose filters, graphs for backends."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coopoc.arrays import Floats
+from coopoc.data.recordings import load_log
+from coopoc.errors import InputError
+from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.metrics import errors
+from coopoc.evaluate.pose_metrics import heading_error, pose_nees
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.methods.pose_filter import PoseFilter
+from coopoc.optimize.graphs import read_graph
+from coopoc.optimize.solve import solve
+from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
+from coopoc.world.v2x import V2X
+
+from . import real
+
+POSES: Mapping[str, Mapping[str, Any]] = {
+    "pose-solo": {"unit": "solo"},
+    "pose-fleet": {"unit": "fleet"},
+    "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
+    "pose-naive": {"unit": "fleet", "fusion": "naive"},
+}
+"""Pose filters by name: their options."""
+GATE = 5.0
+RANGE_STD = 0.3
+"""m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
+SPREAD = (0.05, 0.05, 0.01, 0.05)
+"""m, m, m and rad of the first poses where they are the file's truth."""
+BEST: Mapping[str, float] = {
+    "mrclam5a.pyfg": 69.10353,
+    "mrclam6.pyfg": 3144.2650,
+    "plaza1.pyfg": 1332.7850,
+    "tiers.pyfg": 2050.1000,
+}
+"""Graph -> least cost that is known of its chordal objective."""
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What pose filters are tried on.
+
+    Args:
+        name: of the task.
+        question: that it asks.
+        file: file or folder below the folder of data.
+        block_s: s of a block of time, over which errors are averaged.
+    """
+
+    name: str
+    question: str
+    file: str
+    block_s: float
+
+
+LOGGED = (
+    Logged("robots", "MR.CLAM 6: odometry, two landmarks, four neighbours, nothing else.", "MRCLAM_Dataset6", 30.0),
+    Logged("uwb", "Four robots that range one another and one anchor.", "tiers.pyfg", 10.0),
+)
+
+
+def located(folder: Path, name: str) -> Path:
+    """The file or folder of that name anywhere below a folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = sorted(folder.rglob(name)) if folder.is_dir() else []
+    if not found:
+        hint = "docs/benchmark.md names the sources."
+        raise InputError("data", str(folder), f"must hold {name}, however deep", hint)
+    return found[0]
+
+
+@lru_cache(maxsize=2)
+def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
+    """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
+    if task.name == "robots":
+        until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
+        whole, begin = real.seen(str(path), until, v2x, GATE)
+        fleet = real.log(str(path), until)[0].fleet
+        start = int(until / fleet.dt)
+        return real.thinned(whole, 2, start), fleet, start, {"begin": begin}
+    log = load_log(path)
+    if log.truth is None or log.truth.heading is None:
+        raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
+    begin = np.column_stack([log.truth.position[0], log.truth.heading[0]])
+    begin[list(log.recording.landmarks)] = np.nan
+    noise = replace(log.recording.sensors, range_std=RANGE_STD)
+    return log.recording, log.truth, 0, {"begin": begin, "spread": SPREAD, "assumed": noise}
+
+
+def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
+    """RT-LE with its interval over robots and blocks of time, heading error, NEES, bytes and time.
+
+    Args:
+        task: that is run.
+        folder: of the data.
+        made: name in POSES, or a method of one's own; fields `begin`, `spread`, `assumed` are set if it has them.
+    """
+    path = located(folder, task.file)
+    recording, fleet, start, known = seen(task, path)
+    if isinstance(made, str):
+        made = PoseFilter(**POSES[made], lasting=task.name == "robots", gate=GATE, **known)
+    elif is_dataclass(made):
+        own = {field.name for field in fields(made)}
+        made = replace(made, **{name: value for name, value in known.items() if name in own})  # type: ignore[type-var]
+    who = [k for k in range(len(recording.ids)) if k not in recording.landmarks]
+    ids = [recording.ids[k] for k in who]
+    made(recording.between(0, 3), ids)  # compiles
+    began = time.perf_counter()
+    track = made(recording, ids)
+    seconds = time.perf_counter() - began
+    account = of_track(track, recording, made.message)
+    squares = np.square(_blocks(errors(track, fleet)[0], start, task.block_s / fleet.dt))
+    level = mean_interval(np.sqrt(squares))
+    row = {"task": task.name, "data": hashed(path)}
+    row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    if track.heading is not None:
+        turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
+        row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
+        row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
+    received = account.of("online", "on air", "per receiver") / account.seconds
+    row["received_bytes_per_second"] = round(float(received.mean()))
+    row["microseconds_per_step"] = round(1e6 * seconds / len(recording.t) / len(who), 2)
+    return row
+
+
+def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
+    """Cost over the least that is known, status and s of a solve, its search for a start included."""
+    path = located(folder, file)
+    problem = read_graph(path)
+    solution = solve(problem, backend, throw=False)
+    seconds = solution.build_seconds + solution.solve_seconds
+    row = {"task": path.name, "data": hashed(path), "status": solution.status.name, "cost": round(solution.cost, 4)}
+    return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
+
+
+def _blocks(error: Floats, start: int, length: float) -> Floats:
+    """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
+    size = max(int(length), 1)
+    parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
+    found = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
+    return np.asarray(found.T)
+
+
+def hashed(path: Path) -> str:
+    """First 12 hex digits of the SHA-256 of a file, or of the measurements of a folder."""
+    sha = hashlib.sha256()
+    for file in sorted(path.glob("*.dat")) if path.is_dir() else [path]:
+        sha.update(file.read_bytes())
+    return sha.hexdigest()[:12]
