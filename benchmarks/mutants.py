@@ -13,13 +13,16 @@ import argparse
 import ast
 import copy
 import csv
+import os
 import random
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 from tqdm import tqdm
 
@@ -85,13 +88,16 @@ def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 
 def mutants(file: Path) -> Iterator[Mutant]:
     """All mutants of a file, whose annotations and docstrings stay."""
-    text = file.read_text()
-    tree = ast.parse(text)
-    for node in list(_inside_functions(tree)):
+    text = file.read_bytes()
+    starts = [0, *(found.end() for found in re.finditer(rb"\n", text))]
+    for node in _inside_functions(ast.parse(text)):
+        first = starts[node.lineno - 1] + node.col_offset
+        last = starts[cast(int, node.end_lineno) - 1] + cast(int, node.end_col_offset)
         for change, other in changes(node):
-            changed = _Replaced(node.lineno, node.col_offset, type(node), other).visit(ast.parse(text))
-            words = ast.unparse(ast.fix_missing_locations(changed))
-            yield Mutant(str(file.relative_to(ROOT)), node.lineno, change, words)
+            words = ast.unparse(ast.fix_missing_locations(other))
+            within = f"({words})" if isinstance(other, ast.expr) else words
+            whole = text[:first] + within.encode() + text[last:]
+            yield Mutant(str(file.relative_to(ROOT)), node.lineno, change, whole.decode())
 
 
 def _inside_functions(tree: ast.Module) -> Iterator[ast.expr | ast.stmt]:
@@ -99,7 +105,7 @@ def _inside_functions(tree: ast.Module) -> Iterator[ast.expr | ast.stmt]:
     waiting: list[ast.AST] = [node for outer in tree.body for node in _bodies(outer)]
     while waiting:
         node = waiting.pop(0)
-        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.arguments):
+        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.arguments | ast.JoinedStr):
             continue
         if isinstance(node, ast.expr | ast.stmt):
             yield node
@@ -110,16 +116,6 @@ def _bodies(outer: ast.AST) -> list[ast.stmt]:
     if isinstance(outer, ast.FunctionDef):
         return outer.body
     return [part for inner in outer.body for part in _bodies(inner)] if isinstance(outer, ast.ClassDef) else []
-
-
-class _Replaced(ast.NodeTransformer):
-    def __init__(self, line: int, column: int, kind: type[ast.AST], other: ast.AST) -> None:
-        self.key, self.other = (line, column, kind), other
-
-    def visit(self, node: ast.AST) -> ast.AST:
-        if (getattr(node, "lineno", None), getattr(node, "col_offset", None), type(node)) == self.key:
-            return self.other
-        return self.generic_visit(node)
 
 
 def tests_of(file: str) -> list[str]:
@@ -134,25 +130,34 @@ def tests_of(file: str) -> list[str]:
     return [*found[:MOST_TESTS], file]
 
 
-def survives(mutant: Mutant, limit: float, more: list[str]) -> bool:
-    """Whether all tests of the file, and `more`, pass with the mutant in its place; one that runs too long is found."""
+def found_by(mutant: Mutant, limit: float, more: list[str]) -> str:
+    """The test that fails with the mutant in its place, "" if all of the file's tests and `more` pass.
+
+    The machine code of the unchanged file stays: a changed kernel compiles into a cache of its own.
+    """
     file = ROOT / mutant.file
-    original = file.read_text()
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider"]
-    try:
-        file.write_text(mutant.text)
-        done = subprocess.run(
-            [*command, *dict.fromkeys([*tests_of(mutant.file), *more])],
-            cwd=ROOT,
-            capture_output=True,
-            timeout=limit,
-            check=False,
-        )
-        return done.returncode == 0
-    except subprocess.TimeoutExpired:
-        return False
-    finally:
-        file.write_text(original)
+    original, times = file.read_bytes(), file.stat()
+    names = dict.fromkeys([*tests_of(mutant.file), *more])
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *names]
+    with tempfile.TemporaryDirectory() as cache:
+        own = {"NUMBA_CACHE_DIR": cache} if _is_compiled(file.parent) else {}
+        try:
+            file.write_text(mutant.text)
+            done = subprocess.run(
+                command, cwd=ROOT, env=os.environ | own, capture_output=True, text=True, timeout=limit, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return f"more than {limit:.0f} s"
+        finally:
+            file.write_bytes(original)
+            os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    return "" if done.returncode == 0 else failed[1] if failed else f"exit {done.returncode}"
+
+
+def _is_compiled(folder: Path) -> bool:
+    """Whether a folder holds kernels, which compile anew after a change of any file beside them."""
+    return any(re.search(r"import .*\b(compiled|as_written)\b", file.read_text()) for file in folder.glob("*.py"))
 
 
 def main() -> None:
@@ -175,15 +180,15 @@ def main() -> None:
     found = 0
     with given.out.open("w", newline="") as out:
         table = csv.writer(out)
-        table.writerow(["file", "line", "change", "found"])
+        table.writerow(["file", "line", "change", "found by"])
         for k in (bar := tqdm(range(given.count), unit="mutant")):
             mutant = _drawn(files, drawn)
-            alive = survives(mutant, given.limit, given.tests)
-            found += not alive
+            by = found_by(mutant, given.limit, given.tests)
+            found += bool(by)
             bar.set_postfix(found=f"{found}/{k + 1}")
-            table.writerow([mutant.file, mutant.line, mutant.change, not alive])
+            table.writerow([mutant.file, mutant.line, mutant.change, by])
             out.flush()
-            if alive:
+            if not by:
                 tqdm.write(f"survives: {mutant.file}:{mutant.line}: {mutant.change}", file=sys.stdout)
     print(f"{found} of {given.count} mutants were found.")
 
