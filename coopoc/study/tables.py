@@ -79,7 +79,7 @@ class Table:
                 raise ValueError(wrong)
             shown: dict[str, Any] = {name: given[name] for name in allowed}
             return cls(rows=rows, caption=str(given["caption"]), intervals=bool(given["intervals"]), **texts, **shown)
-        except (TypeError, KeyError, ValueError) as error:
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise InputError("table", type(given).__name__, f"is damaged ({error})", "Repeat coopoc run.") from None
 
     def render(self, form: str) -> str:
