@@ -20,8 +20,10 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import cast
 
@@ -120,15 +122,36 @@ def _bodies(outer: ast.AST) -> list[ast.stmt]:
 
 
 def tests_of(file: str) -> list[str]:
-    """Files of tests that mention the names which a file defines, most mentions first."""
-    tree = ast.parse((ROOT / file).read_text())
-    defined = [
-        n.name for n in tree.body if isinstance(n, ast.FunctionDef | ast.ClassDef) and not n.name.startswith("_")
-    ]
-    words = re.compile("|".join(rf"\b{re.escape(word)}\b" for word in [*defined, Path(file).stem]))
-    counts = {str(t.relative_to(ROOT)): len(words.findall(t.read_text())) for t in (ROOT / "tests").glob("test_*.py")}
-    found = sorted((t for t in counts if counts[t]), key=lambda t: -counts[t])
-    return [*found[:MOST_TESTS], file]
+    """Files of tests that mention most what a file defines, what files define that import it, and those that import
+    these, each less than the one before; a shared word in the names of the files counts as ten mentions."""
+    weights, level, scores = {ROOT / file: 9}, {ROOT / file}, Counter[str]()
+    for weight in (3, 1):
+        level = {user for used in level for user in _importers(used)} - weights.keys()
+        weights |= dict.fromkeys(level, weight)
+    texts = {str(test.relative_to(ROOT)): test.read_text() for test in (ROOT / "tests").glob("test_*.py")}
+    for used, weight in weights.items():
+        words = re.compile("|".join(rf"\b{re.escape(word)}\b" for word in _defined(used)))
+        for test, text in texts.items():
+            shared = set(used.stem.split("_")) & set(Path(test).stem.split("_")[1:])
+            scores[test] += weight * (len(words.findall(text)) + 10 * len(shared))
+    return [*(test for test, score in scores.most_common(MOST_TESTS) if score), file]
+
+
+@cache
+def _defined(file: Path) -> tuple[str, ...]:
+    """Public names of a file that are more than a common word, and its own."""
+    kinds = ast.FunctionDef | ast.ClassDef
+    names = [node.name for node in ast.parse(file.read_text()).body if isinstance(node, kinds)]
+    return (file.stem, *(name for name in names if name[0] != "_" and (name != name.lower() or "_" in name)))
+
+
+@cache
+def _importers(file: Path) -> tuple[Path, ...]:
+    """Files that import from a file."""
+    line = re.compile(rf"^\s*from \S*\b{file.stem} import|^\s*from \.+\S* import .*\b{file.stem}\b", re.MULTILINE)
+    folders = (ROOT / "coopoc", ROOT / "learned")
+    every = [other for folder in folders for other in folder.rglob("*.py") if other.name != "__init__.py"]
+    return tuple(other for other in every if other != file and line.search(other.read_text()))
 
 
 def found_by(mutant: Mutant, limit: int, more: list[str]) -> str:
