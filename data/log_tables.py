@@ -63,6 +63,9 @@ def read_rows(
             hint = suggestion(header, headers, "Name a column of the file.")
             raise InputError(f"{file}: columns[{key!r}]", repr(header), allowed, hint)
     frame = frame.rename(columns={header: key for key, header in names.items()})
+    if twice := next((key for key in names if (frame.columns == key).sum() > 1), None):
+        allowed = f"is not the only column {twice} then: the file has one of that name"
+        raise InputError(f"{file}: columns[{twice!r}]", repr(names[twice]), allowed, "Rename or remove one of the two.")
     if "t" not in frame.columns:
         raise _no_column(file, "t", frame)
     read = _long if {"kind", "value"} <= set(frame.columns) or "kind" in frame.columns else _wide
