@@ -11,13 +11,16 @@ import pytest
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.optimize import Problem, solve
 
 NOISE = co.Sensors(
     gnss_std=(1.5, 1.5, 2.5), velocity_reading="speed", azimuth_std=0.05, inclination_std=0.05, yaw_rate_std=0.02
 )
 CHANNEL = co.V2X(max_neighbours=4, radius=60.0, loss=0.2, latency=0.1)
-NEAR = {"mds": 1e-5, "admm": 1e-5, "qcqp-relaxation": 2e-4}
-"""m, where an iteration or a cone solver stops at its own tolerance; 1e-6 elsewhere."""
+NEAR = {"qcqp-relaxation": 2e-4, "cooperative-map-5": 2e-4, "cooperative-map-gnc": 2e-4, "mhe": 2e-4}
+"""m, where an iteration or a cone solver stops at its own tolerance, of 0.1 mm and less; 1e-6 elsewhere."""
+AXIS = ("kalman-adaptive", "kalman-variational")
+"""Methods that estimate a variance for each axis, and so know directions."""
 
 
 class Change(NamedTuple):
@@ -88,6 +91,8 @@ def assert_equivariant(
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fleet) -> None:
     """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
+    if name in AXIS and change == "rotation":
+        pytest.skip("estimates a variance for each axis of the world")
     observers = None if name in WHOLE_FLEET else ["c0", "c3"]
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, observers=observers)
     assert_equivariant(METHODS[name]("nominal"), rec, CHANGES[change], NEAR.get(name, 1e-6), ("c0", "c3"))
@@ -110,3 +115,17 @@ def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fle
 def test_every_pose_filter_follows_the_world(method: co.PoseFilter, change: str, crossing: co.Fleet) -> None:
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, frame="body")
     assert_equivariant(method, rec, CHANGES[change], 1e-6, ("c0", "c3"))
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi", "osqp"])
+def test_every_solver_follows_the_world(backend: str, change: str, crossing: co.Fleet) -> None:
+    """A star and a window of it; marginals turn with the world."""
+    rec, world = co.observe(crossing.between(0, 8), NOISE, CHANNEL, seed=5, observers=["c0"]), CHANGES[change]
+    for window in (1, 5):
+        here, there = (solve(Problem.from_window(seen, 7, "c0", window), backend) for seen in (rec, world.of(rec)))
+        column = [there.names.index(name) for name in here.names]
+        np.testing.assert_allclose(there.position[column], here.position @ world.matrix.T + world.shift, atol=1e-6)
+        turned = world.matrix @ here.covariance @ world.matrix.T
+        np.testing.assert_allclose(there.covariance[column], turned, rtol=1e-6, atol=1e-7)
+        assert there.cost == pytest.approx(here.cost, rel=1e-7)
