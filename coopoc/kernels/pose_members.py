@@ -102,7 +102,7 @@ def goes_on(seen: PoseSeen, run: int, before: int, member: int) -> bool:
     """Whether a member is one of the last step. One without a message so far begins with the first: its place was
     arbitrary, and its variance is finite."""
     known = seen.newest[run, before] >= 0 or seen.newest[run, member] < 0
-    return seen.member[before] == seen.member[member] and known
+    return bool(known and seen.member[before] == seen.member[member])
 
 
 @inside
