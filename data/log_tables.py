@@ -150,10 +150,11 @@ def _checked(rows: Rows) -> Rows:
             hint = f"Is it in another unit? Other kinds: {', '.join(n for n in KINDS if KINDS[n].name == k.name)}."
             allowed = f"must be within +-{k.limit:.4g}"
             raise InputError(f"{rows.place(far[0])}, {kind}", f"{rows.value[far[0]]:.10g}", allowed, hint)
-        low = here[value < 0] if kind in ("range", "inclination") else here[:0]
+        bound = {"range": "> 0", "inclination": ">= 0"}.get(kind)
+        low = here[(value < 0) | ((value == 0) & (bound == "> 0"))] if bound else here[:0]
         if len(low):
             raise InputError(
-                f"{rows.place(low[0])}, {kind}", f"{rows.value[low[0]]:.10g}", "must be >= 0", "Remove the row."
+                f"{rows.place(low[0])}, {kind}", f"{rows.value[low[0]]:.10g}", f"must be {bound}", "Remove the row."
             )
         bad = here[~(np.isnan(rows.std[here]) | (rows.std[here] > 0))]
         if len(bad):
