@@ -3,6 +3,7 @@
 # make test-quick   a part of the tests, in a minute once the kernels are compiled
 # make test-slow   the tests that make test leaves out: strict types, deployments over TLS, clusters, kills, trainings
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
+# make fuzz    every text reader under coverage-guided fuzzing, MINUTES each (default 10); finds go to build/fuzz
 # make docs    the site in build/site, tutorials executed; a warning is an error
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
 # make clean   forget the environment (results in runs/ stay)
@@ -12,6 +13,7 @@
 PYTHON ?= python3
 TORCH_INDEX ?=
 JOBS ?= 2
+MINUTES ?= 10
 VENV := .venv
 READY := $(VENV)/.ready
 PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt \
@@ -21,7 +23,7 @@ PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadf
 QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_small formats formats_errors data_readers data_log \
 	optimize_problem optimize_agreement statistics study_tables study_grid layering)
 
-.PHONY: paper test test-quick test-slow test-bounds docs benchmark help clean
+.PHONY: paper test test-quick test-slow test-bounds fuzz docs benchmark help clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -40,6 +42,9 @@ test-slow: $(VENV)/.ready-dev
 test-bounds: $(VENV)/.ready-dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \
 		-n $(JOBS) --dist loadfile tests/test_memory_safety.py $(wildcard tests/test_kernels_s*.py)
+
+fuzz: $(VENV)/.ready-fuzz
+	OMP_NUM_THREADS=1 PYTHONPATH=tests $(VENV)/bin/python -m fuzz.every --minutes $(MINUTES)
 
 docs: $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
@@ -62,6 +67,10 @@ $(READY): pyproject.toml constraints.txt
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
 	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,nmea,ros,flower,privacy,export,cluster]'
+	@touch $@
+
+$(VENV)/.ready-fuzz: $(VENV)/.ready-dev
+	$(PIP) --no-build-isolation --editable '.[fuzz]'
 	@touch $@
 
 $(VENV)/.ready-docs: $(READY)

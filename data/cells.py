@@ -154,8 +154,7 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
     if kind == "m":
         return np.asarray(given.dt.total_seconds(), dtype=float)
     utc = pd.to_datetime(given, utc=True)
-    nanoseconds = utc.astype("datetime64[ns, UTC]").astype("int64").to_numpy()
-    return np.asarray(nanoseconds // 1000 / 1e6, dtype=float)
+    return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, dtype=float)  # in ns years end at 2262
 
 
 def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:

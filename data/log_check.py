@@ -22,11 +22,14 @@ WIDE, NARROW = 2.0, 0.4
 FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ENOUGH = 20
+COARSE = 0.5
+"""rad: no sensor's angles scatter as much about positions that are better known."""
 MISTAKEN = (
     (0.0, 3e-3, "Is t in ms, or finer? Divide it: stamps are in s."),
     (5e-3, 2e-2, "Is speed in cm/s? Speeds are in m/s."),
-    (0.2, 0.4, "Is speed in km/h? Name it speed_kmh."),
+    (0.2, 0.4, "Is speed in km/h? Name it speed_kmh. Or in feet a second? Speeds are in m/s."),
     (0.42, 0.55, "Is speed in miles an hour, or in knots? Speeds are in m/s."),
+    (3.0, 3.6, "Are positions in feet, or ranges? They are in m."),
 )
 """Ratios of the distance of fixes to that of odometry (least, largest), and the unit that explains them."""
 
@@ -190,6 +193,20 @@ def _measurements(rec: Recording, residual: Floats, expected: Floats) -> tuple[l
         )
         if len(r) < ENOUGH:
             continue
+        place = float(np.sqrt(max(should**2 - stated**2, 0.0)))
+        far = rec.relative[0, seen, 0] - residual[seen, 0] > FAR * place
+        if k == 0 and far.sum() >= ENOUGH:
+            ratio = float(np.median(rec.relative[0, seen, 0][far] / (rec.relative[0, seen, 0] - r)[far]))
+            if not 0.8 <= ratio <= 1.25:
+                hint = next(
+                    (hint for low, high, hint in MISTAKEN[4:] if low < ratio < high), "Check the units of both."
+                )
+                doubts.append(f"ranges are {ratio:.2f} times the distances of the positions. {hint}")
+        if k == 1 and std > COARSE > 3 * place:
+            doubts.append(
+                f"azimuths scatter by {np.degrees(std):.0f} deg about the positions: check their sense (anticlockwise) "
+                "and whose heading they count from, and that no axis is mirrored."
+            )
         if (k == 1 and abs(np.exp(1j * r).mean()) < 0.5) or (abs(median) > max(0.35, 3 * should) and k == 1):
             doubts.append(
                 f"azimuths miss the positions by {np.degrees(median):.0f} deg in the median: check their zero "

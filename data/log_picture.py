@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc.escapes import picture
 from coopoc.evaluate.innovations import dimensions
 from coopoc.pictures import COLORS, INK
 from coopoc.world.recording import Recording
@@ -85,10 +86,10 @@ def _map(axes: Axes, log: Log, found: Check) -> None:
     for column, name in enumerate(rec.ids):
         z, color = rec.gnss[0, :, column], _color(column)
         if _stands(rec, column):
-            axes.plot(*z[0, :2], "^", color=color, ms=9, mec="white", label=name)
+            axes.plot(*z[0, :2], "^", color=color, ms=9, mec="white", label=picture(name))
             continue
         axes.plot(z[:, 0], z[:, 1], ".", color=color, ms=3.2, alpha=0.4, mew=0, rasterized=True)
-        axes.plot(found.x[:, column, 0], found.x[:, column, 1], color=color, lw=1.6, label=name)
+        axes.plot(found.x[:, column, 0], found.x[:, column, 1], color=color, lw=1.6, label=picture(name))
         if log.truth is not None:
             true = log.truth.position[:, column]
             axes.plot(true[:, 0], true[:, 1], color=INK, lw=0.7, ls=(0, (4, 2)))
@@ -118,7 +119,7 @@ def _time(axes: Axes, rec: Recording) -> None:
         )
         for times, offset, color in rows:
             axes.vlines(times, column + offset - 0.09, column + offset + 0.09, color=color, lw=0.6, rasterized=True)
-    axes.set_yticks(range(len(rec.ids)), rec.ids)
+    axes.set_yticks(range(len(rec.ids)), [picture(name) for name in rec.ids])
     axes.set_ylim(len(rec.ids) - 0.4, -0.6)
     axes.grid(axis="y", visible=False)
     axes.set_xlabel("time [s]")
@@ -134,7 +135,7 @@ def _fixes(axes: Axes, rec: Recording, found: Check) -> None:
         each = size * found.normalised[np.isfinite(found.normalised[:, column]), column]
         if len(each) > 1 and not _stands(rec, column):
             heights, _ = np.histogram(np.minimum(each, top - 1e-9), bins, density=True)
-            label = f"{name}: mean {each.mean():.3g}"
+            label = f"{picture(name)}: mean {each.mean():.3g}"
             axes.stairs(heights, bins, color=_color(column), lw=1.4, label=label)
     line = np.linspace(0, top, 200)
     axes.plot(line, chi2(size).pdf(line), color=INK, lw=1.8, ls=(0, (4, 2)), label=f"$\\chi^2_{size}$: mean {size}")

@@ -63,6 +63,9 @@ def read_rows(
             hint = suggestion(header, headers, "Name a column of the file.")
             raise InputError(f"{file}: columns[{key!r}]", repr(header), allowed, hint)
     frame = frame.rename(columns={header: key for key, header in names.items()})
+    if twice := next((key for key in names if (frame.columns == key).sum() > 1), None):
+        allowed = f"is not the only column {twice} then: the file has one of that name"
+        raise InputError(f"{file}: columns[{twice!r}]", repr(names[twice]), allowed, "Rename or remove one of the two.")
     if "t" not in frame.columns:
         raise _no_column(file, "t", frame)
     read = _long if {"kind", "value"} <= set(frame.columns) or "kind" in frame.columns else _wide
@@ -147,10 +150,11 @@ def _checked(rows: Rows) -> Rows:
             hint = f"Is it in another unit? Other kinds: {', '.join(n for n in KINDS if KINDS[n].name == k.name)}."
             allowed = f"must be within +-{k.limit:.4g}"
             raise InputError(f"{rows.place(far[0])}, {kind}", f"{rows.value[far[0]]:.10g}", allowed, hint)
-        low = here[value < 0] if kind in ("range", "inclination") else here[:0]
+        bound = {"range": "> 0", "inclination": ">= 0"}.get(kind)
+        low = here[(value < 0) | ((value == 0) & (bound == "> 0"))] if bound else here[:0]
         if len(low):
             raise InputError(
-                f"{rows.place(low[0])}, {kind}", f"{rows.value[low[0]]:.10g}", "must be >= 0", "Remove the row."
+                f"{rows.place(low[0])}, {kind}", f"{rows.value[low[0]]:.10g}", f"must be {bound}", "Remove the row."
             )
         bad = here[~(np.isnan(rows.std[here]) | (rows.std[here] > 0))]
         if len(bad):

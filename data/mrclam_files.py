@@ -14,8 +14,11 @@ from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats.lines import LARGEST
 
+from .scale import check_time
+
 SUBJECTS = 5
 """Subjects 1 to 5 are robots, those beyond are landmarks."""
+DEGREES = "Convert degrees to radians."
 TURN = 2 * np.pi + 1e-6
 
 
@@ -54,6 +57,8 @@ def truth(folder: Path, robot: int) -> Floats:
     """(L, 4) unix time s, x m, y m, heading rad (unwrapped) of a robot by Vicon; times increase."""
     table = _read(folder / f"Robot{robot}_Groundtruth.dat", 4)
     _in_order(folder / f"Robot{robot}_Groundtruth.dat", table[:, 0], strictly=True)
+    turn = "must have a heading within a turn, in rad"
+    _refuse(folder / f"Robot{robot}_Groundtruth.dat", table, np.abs(table[:, 3]) > TURN, turn, DEGREES)
     table[:, 3] = np.unwrap(table[:, 3])
     return table
 
@@ -62,6 +67,8 @@ def odometry(folder: Path, robot: int) -> Floats:
     """(L, 3) unix time s, speed m/s, turn rate rad/s of a robot's wheels; times do not decrease."""
     table = _read(folder / f"Robot{robot}_Odometry.dat", 3)
     _in_order(folder / f"Robot{robot}_Odometry.dat", table[:, 0])
+    slow = "must turn by less than a turn a second, in rad/s"
+    _refuse(folder / f"Robot{robot}_Odometry.dat", table, np.abs(table[:, 2]) > TURN, slow, DEGREES)
     return table
 
 
@@ -89,7 +96,7 @@ def measurements(folder: Path, numbers: tuple[int, ...]) -> Seen:
         _refuse(file, table, subject == robot, whose, "Check Barcodes.dat, or remove the line.")
         _refuse(file, table, table[:, 2] <= 0, "must have a range > 0 m", "Remove the line.")
         turn = "must have a bearing within a turn, in rad"
-        _refuse(file, table, np.abs(table[:, 3]) > TURN, turn, "Convert degrees to radians.")
+        _refuse(file, table, np.abs(table[:, 3]) > TURN, turn, DEGREES)
         here = np.isin(subject, numbers)
         of_mark = subject > SUBJECTS
         observer = np.full(len(subject), column)
@@ -132,7 +139,8 @@ def _read(file: Path, columns: int) -> Floats:
 
 
 def _in_order(file: Path, t: Floats, strictly: bool = False) -> None:
-    """InputError at the first time that comes before the one above it, or with it; a late one is named itself."""
+    """InputError at a time that is in no seconds, and at the first that comes before the one above it, or with it."""
+    check_time(t, file.name)
     gap = np.diff(t)
     bad = np.flatnonzero(gap <= 0 if strictly else gap < 0)
     if len(bad):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from .log_summary import Tally
 
 KNOT = 1852 / 3600
 DAY = 86400.0
+LATITUDE, LONGITUDE = re.compile(r"\d\d[0-5]\d(\.\d*)?"), re.compile(r"\d{3}[0-5]\d(\.\d*)?")
+"""Degrees and minutes: the parser takes the last digits before the point for minutes, however many there are."""
 SLOW = 0.5
 """m/s, below which a course over ground is noise."""
 
@@ -104,6 +107,8 @@ class _Found:
 
     def gga(self, s: Any, clock: _Clock, row: int, file: str, tally: Tally) -> None:
         t = clock.at(s.time)
+        if (s.lat or s.lon) and not (LATITUDE.fullmatch(s.payload[1]) and LONGITUDE.fullmatch(s.payload[3])):
+            raise ValueError("latitude and longitude must be ddmm.mmm and dddmm.mmm")
         if not s.quality or s.lat == "" or s.lon == "":
             tally.refuse("fixes of quality 0", 1, f"{file}: line {row}")
             return

@@ -15,7 +15,7 @@ LATEST = 1e11
 """s since 1970, the year 5138."""
 LONGEST_ID = 200
 """Characters."""
-CELLS, PER_ROW = 2_000_000, 200
+CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
 import json
 import math
@@ -162,6 +163,51 @@ def test_malformed_answers_are_rejected_with_a_reason_and_training_goes_on() -> 
         assert row.number == 0 or set(row.rejected) == {f"node {node}" for node in nodes}
     assert rows[1].rejected["node 10"] == "malformed answer: a name that is not 1 to 200 printable characters"
     assert rows[1].rejected["node 33"] == "malformed answer: a validation-loss of 1e+308 m^2, must be in [0, 1e+12]"
+
+
+@flower
+def test_a_client_of_another_version_is_rejected_with_both_versions() -> None:
+    """Its answers may mean something else; the others' weights are those of `federate` without it."""
+    job, fleet = job_of(TINY | {"rounds": 2}), drives(3)
+    expected = in_process(job, fleet)
+    theta = expected.history[0].weights
+    versions = {7: "99.1.0", 8: "", 9: 3, 10: "9" * 4000}
+    others = {node: sends(f"other{node}", theta, change=put("client", "version", v)) for node, v in versions.items()}
+    others[11] = sends("other11", theta, change=lambda content: content["client"].__delitem__("version"))
+    rows, _ = deployed(job, {i: honest(job, fleet, i) for i in range(3)} | others)
+    for row, other in zip(rows, expected.history, strict=True):
+        assert torch.equal(row.weights, other.weights)
+    mine = importlib.metadata.version("coopoc")
+    wanted = f"malformed answer: made by coopoc {{}}, the server has {mine}: install the same"
+    assert rows[1].rejected == {
+        f"node {node}": wanted.format("99.1.0" if node == 7 else "an unknown version") for node in others
+    }
+
+
+@flower
+def test_replayed_answers_change_nothing() -> None:
+    """A node on the way delivers each answer twice and those of the rounds before again, before the new ones."""
+    job, fleet = job_of(TINY), drives(3)
+    expected, grid, kept = in_process(job, fleet), room({i: honest(job, fleet, i) for i in range(3)}), list[Any]()
+    pushed = grid.push_messages
+
+    def replaying(messages: Any) -> Any:
+        asked = list(messages)
+        names = pushed(asked)
+        for message, reply in zip(asked, grid.replies, strict=True):  # every question and answer has a name of its own
+            name = f"{message.metadata.group_id}-{message.metadata.dst_node_id}-{message.metadata.message_type}"
+            message.metadata.__dict__["_message_id"] = name
+            reply.metadata.__dict__["_reply_to_message_id"] = name
+        kept.extend(grid.replies)
+        grid.replies = [*grid.replies, *grid.replies, *kept]  # the last is delivered first
+        return names
+
+    grid.push_messages = replaying
+    rows = list(rounds(grid, job, 3, Wait(60.0, 10.0, lambda _: None)))
+    assert len(kept) > 9
+    for row, other in zip(rows, expected.history, strict=True):
+        assert torch.equal(row.weights, other.weights)
+        assert not row.rejected
 
 
 @flower

@@ -105,7 +105,7 @@ def test_break_even_of_the_papers_training() -> None:
         break_even(once, once)
 
 
-def test_cards_tell_what_their_trainings_moved() -> None:
+def test_the_card_of_a_training_names_the_bytes_it_moved() -> None:
     """By hand: 20 rounds of 12 numbers down, 12 and a loss up; drives of six numbers a step, and weights back once."""
     drives = load_fleet("town10-clients")
     fed, pooled = (load_weights(WEIGHTS / f"{name}.safetensors").card for name in ("fedkalmannet", "okf"))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopoc.optimize import Loss, Problem, pose, solve
+from coopoc.optimize import Loss, Problem, pose, solve, solve_batch
 from coopoc.optimize.assess import assess
 from coopoc.optimize.dense import NUMBERS, damped_step, diagonal_blocks, is_small, normal_matrix
 from coopoc.optimize.descend import _damping
@@ -87,3 +87,15 @@ def test_damping_follows_the_share_of_the_promise_that_came_true() -> None:
     share = np.array([0.9, 0.5, 0.1, 0.1, -1.0, -1.0])
     better = np.array([True, True, True, True, False, False])
     assert _damping(mu, better, share) == pytest.approx([2e-3, 1e-2, 4e-2, 1e-2, 1e-1, 1e-3])
+
+
+def test_damping_grows_until_a_step_helps_however_much_that_takes() -> None:
+    """A range that is too short, seen nearly along the height that is known: J^T J has a 4,000th of the curvature
+    across it, so that no step helps below that damping. Closed form: straight above, and the range's share of the
+    height is its information's."""
+    z = np.array([9.0, 9.5])
+    problem = Problem("av", dimension=2, x0=[[0, 0], [0.05, 10]], fixed=(0,))
+    problem = problem.add("position", ["v"], np.full((2, 1, 2), [0.0, 10.0]), std=[1e3, 1e-3])
+    problem = problem.add("range", [("a", "v")], z[:, None, None], std=1.0)
+    found = solve_batch(problem, backend="gauss-newton").x[:, 1]
+    assert found == pytest.approx(np.column_stack([0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)]), abs=1e-6)

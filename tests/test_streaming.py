@@ -395,3 +395,20 @@ def test_documented_code_runs() -> None:
         found: dict[str, Any] = {}
         exec(block, found)
         assert np.isfinite(found["x"]).all()
+
+
+def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
+    """No direction is seen in one place: a filter of a star gave NaN from there on."""
+    stream = JointFilter(FITTED).start()
+    stream.step([0, 0, 0], [1, 0, 0], 0.1)
+    with pytest.raises(InputError, match="the range first and > 0"):
+        stream.step([0, 0, 0], [1, 0, 0], 0.1, [RelativeMeasurement("b", [0.0, 0.1, 1.5], [1, 0, 0], [1, 0, 0])])
+    near = RelativeMeasurement("b", [1e-6, 0.1, 1.5], [1, 0, 0], [1, 0, 0])
+    x, cov = stream.step([0, 0, 0], [1, 0, 0], 0.1, neighbours=[near])
+    assert np.isfinite(x).all()
+    assert (np.linalg.eigvalsh(cov) > 0).all()
+    recording = observe(crossing, Sensors(), V2X(max_neighbours=2))
+    relative = recording.relative.copy()
+    relative[0, 3, 0] = 0.0
+    with pytest.raises(InputError, match="must be a range > 0 m"):
+        replace(recording, relative=relative)

@@ -10,6 +10,8 @@ from ..arrays import Floats
 from ..errors import InputError
 
 Place = Callable[[int], str]
+LEAST = 1e-100
+"""Least entry of a diagonal, and one over the largest: products of what is beyond them leave the range of numbers."""
 
 
 def symmetric(upper: Floats, size: int) -> Floats:
@@ -48,11 +50,11 @@ def inverse(matrices: Floats, place: Place, what: str) -> Floats:
     [[[0.25, 0.0], [0.0, 1e-08]]]
     """
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
-    positive = (diagonal > 0).all(axis=-1)
-    scale = np.exp2(np.rint(-0.5 * np.log2(np.where(diagonal > 0, diagonal, 1))))
+    positive = (diagonal > LEAST) & (diagonal < 1 / LEAST)
+    scale = np.exp2(np.rint(-0.5 * np.log2(np.where(positive, diagonal, 1))))
     both = scale[:, :, None] * scale[:, None, :]
     scaled = matrices * both
-    bad = np.flatnonzero(~positive | (np.linalg.eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1))
+    bad = np.flatnonzero(~positive.all(axis=-1) | (np.linalg.eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1))
     if len(bad):
         row = int(bad[0])
         raise InputError(

@@ -59,7 +59,7 @@ def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int],
     old = first - before
     same = old == count
     for k in range(min(old, count)):
-        same = same and seen.member[first + k] == seen.member[before + k]
+        same = same and goes_on(seen, run, before + k, first + k)
     if not same:
         for i in range(old * d):
             poses.vector[KEPT, i] = poses.vector[X, i]
@@ -68,10 +68,10 @@ def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int],
     for k in range(old):
         uses[len(uses) // 2 + k] = uses[k]
     for k in range(count):
-        came = k if same else previous(seen, before, old, first + k)
+        came = k if same else previous(seen, run, before, old, first + k)
         if not same:
             for m in range(count):
-                other = previous(seen, before, old, first + m)
+                other = previous(seen, run, before, old, first + m)
                 for i in range(d):
                     for j in range(d):
                         both = came >= 0 and other >= 0
@@ -84,17 +84,25 @@ def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int],
         if came < 0:
             join(poses, seen, noise, (run, t, k), d)
     for k in range(count):
-        if same or previous(seen, before, old, first + k) >= 0:
+        if same or previous(seen, run, before, old, first + k) >= 0:
             advance(poses, seen, noise, (run, t, k), (d, count * d), uses[k])
 
 
 @part
-def previous(seen: PoseSeen, before: int, old: int, member: int) -> int:
-    """Place of a member in the last step, -1 if it was not there."""
+def previous(seen: PoseSeen, run: int, before: int, old: int, member: int) -> int:
+    """Place of a member in the last step, -1 if it begins now."""
     for k in range(old):
-        if seen.member[before + k] == seen.member[member]:
+        if goes_on(seen, run, before + k, member):
             return k
     return -1
+
+
+@part
+def goes_on(seen: PoseSeen, run: int, before: int, member: int) -> bool:
+    """Whether a member is one of the last step. One without a message so far begins with the first: its place was
+    arbitrary, and its variance is finite."""
+    known = seen.newest[run, before] >= 0 or seen.newest[run, member] < 0
+    return bool(known and seen.member[before] == seen.member[member])
 
 
 @inside

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 
 OWN = "ADMM exchanges positions only: its covariance is that of each vehicle's own filter, without the neighbours' gain"
 
+PENALTY = 6.75
+"""Of a fix's information on its best axis. With more, vehicles stay near their own beliefs; with less, the first rounds
+weigh them too little."""
+
 
 @dataclass(frozen=True, eq=False)
 class ConsensusADMM:
@@ -45,7 +49,8 @@ class ConsensusADMM:
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         rounds: iterations a step.
-        rho: 1/m^2, the penalty; any positive one converges.
+        rho: 1/m^2, the penalty; any positive one converges. None: PENALTY times the information of a fix, so that few
+            rounds suffice however certain fixes are.
 
     References:
         Boyd et al., "Distributed Optimization and Statistical Learning via the ADMM", Foundations and Trends in Machine
@@ -54,7 +59,7 @@ class ConsensusADMM:
 
     noise_model: NoiseModel | str = "nominal"
     rounds: int = 3
-    rho: float = 3.0
+    rho: float | None = None
     name: str = "admm"
     cooperative: bool = True
 
@@ -62,8 +67,10 @@ class ConsensusADMM:
         check_options(self)
         if self.rounds < 1:
             raise InputError("rounds", self.rounds, "must be a whole number >= 1", "Use 1 for one exchange a step.")
-        if not (np.isfinite(self.rho) and self.rho > 0):
-            raise InputError("rho", self.rho, "must be positive and finite", "About the information of a fix, 1/m^2.")
+        if self.rho is not None and not (np.isfinite(self.rho) and self.rho > 0):
+            raise InputError(
+                "rho", self.rho, "must be positive and finite", "Leave it out for one that fits the fixes."
+            )
 
     @property
     def message(self) -> Message:
@@ -76,7 +83,8 @@ class ConsensusADMM:
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
             from ..kernels.consensus import follow
 
-            found = follow(measured, pairs, assumed, int(self.rounds), float(self.rho))
+            rho = PENALTY / np.median(assumed.fix.min(axis=-1)) if self.rho is None else self.rho
+            found = follow(measured, pairs, assumed, int(self.rounds), float(rho))
             return Answer(*found, self.message.rounds, (OWN,))
 
         return fleet_track(self, self.noise_model, recording, egos, lambda: exchange(recording, self.message), solve)

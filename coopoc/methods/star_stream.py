@@ -45,8 +45,8 @@ class RelativeMeasurement:
     def __post_init__(self) -> None:
         row = np.full(11, np.nan)
         relative, named = numbers(self.relative), isinstance(self.id, str) and self.id
-        if relative.shape != (3,) or not named or not (0.0 <= relative[0] < math.inf or math.isnan(relative[0])):
-            text = "must have a name and three numbers, the range first and >= 0"
+        if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
+            text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
         row[RELATIVE], row[MESSAGE] = relative, float(self.velocity is not None)
         row[FIX], row[MESSAGE_AGE] = fix_or_none(self.gnss, "neighbour's gnss"), seconds("age", self.age)

@@ -104,6 +104,7 @@ class Track:
         >>> len(co.Kalman()(co.observe(fleet, co.Sensors())).plot(fleet=fleet).lines)
         2
         """
+        from ..escapes import picture
         from ..pictures import COLORS, PALE, axes, ellipses, finish
 
         run = number("run", run, 0, len(self.x) - 1, kind=int, allowed=f"in 0..{len(self.x) - 1}")
@@ -120,7 +121,7 @@ class Track:
                 label = "truth" if k == 0 else None
                 ax.plot(*fleet.position[:, ego, :2].T, color=PALE, lw=4, zorder=1, label=label)
             name = f"vehicle {ego}" if fleet is None else fleet.ids[ego]
-            ax.plot(*self.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=name)
+            ax.plot(*self.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=picture(name))
             if self.covariance is not None:
                 ellipses(ax, self.x[run, ::every, k, :2], self.covariance[run, ::every, k, :2, :2], color)
         return finish(ax)

@@ -19,6 +19,12 @@ from .search import Search
 from .solution import Solution, Status
 from .solve import solve
 
+UNLIKELY = 30.0
+"""Factor by which residuals may differ from what is stated; on real graphs they are 0.2 to 1 times as large."""
+MISTAKEN = (
+    "Are its matrices covariances where the format has information, or the reverse, its angles in rad, lengths in m?"
+)
+
 
 def solve_file(
     file: Annotated[Positional[Path], arg(metavar="FILE")],
@@ -50,14 +56,28 @@ def solve_file(
         problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
     print(f"coopoc: {problem}", file=sys.stderr)
     solution = solve(problem, backend, throw=False)
-    summary = described(solution)
+    summary = described(solution) | {"misfit": (size := misfit(problem, solution))}
     if output is not None:
         output.write_text(json.dumps(summary | nodes(solution)) + "\n")
         print(f"coopoc: the solution is in {output}", file=sys.stderr)
     print(json.dumps(summary, indent=1))
     if solution.status is not Status.SOLVED:
         print(f"coopoc: {solution.status.value}", file=sys.stderr)
+    if size is not None and not 1 / UNLIKELY < size < UNLIKELY:
+        print(f"coopoc: residuals are {size:.2g} times what the file states. {MISTAKEN}", file=sys.stderr)
     return int(solution.status is not Status.SOLVED)
+
+
+def misfit(problem: Problem, solution: Solution) -> float | None:
+    """Size of the residuals over their standard deviations, sqrt(2 cost / redundancy); 1 is as stated, None where the
+    measurements only just suffice.
+
+    >>> misfit(tiny(), solve(tiny())) < 2
+    True
+    """
+    residual, jacobian = problem.whiten(solution.x)
+    redundant = residual.size - len(np.unique(jacobian.nonzero()[1]))
+    return float(np.sqrt(2.0 * solution.cost / redundant)) if redundant > 0 and np.isfinite(solution.cost) else None
 
 
 def described(solution: Solution) -> dict[str, Any]:

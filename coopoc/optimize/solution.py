@@ -109,6 +109,7 @@ class Solution:
         >>> solve(problem).plot(problem=problem).get_ylabel()
         'North [m]'
         """
+        from ..escapes import picture
         from ..pictures import COLORS, INK, axes, ellipses, finish, pairs
 
         ax, at, few = axes(ax), self.position[:, :2], len(self.names) <= NAMED
@@ -126,7 +127,7 @@ class Solution:
         if few:
             ellipses(ax, at, self.covariance[:, :2, :2], COLORS[0], "95 %")
             for name, place in zip(self.names, at.tolist(), strict=True):
-                ax.annotate(name, place, xytext=(5, 5), textcoords="offset points", fontsize=8, color=INK)
+                ax.annotate(picture(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8, color=INK)
         ax.plot(*at.T, "o", ms=4 if few else 1.5, color=COLORS[0], zorder=3)
         return finish(ax)
 

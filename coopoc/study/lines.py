@@ -8,6 +8,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
+from ..escapes import picture
 from ..evaluate.statistics import Interval
 from .numbers import ran
 from .plot import Plot, canvas, legend, plain_log, strokes
@@ -64,7 +65,7 @@ def panels(
     with canvas(1, len(shown), width=width, height=height, sharey=True, squeeze=False) as (figure, (axes,)):
         for axis, panel in zip(axes, shown, strict=True):
             drawn += draw(axis, panel.lines)
-            axis.set(title=panel.title, xlabel=panel.xlabel)
+            axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if panel.xticks:
                 texts = list(panel.xticks.values()) if isinstance(panel.xticks, Mapping) else None
                 axis.set_xticks(list(panel.xticks), texts)

@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator
 
+from ..escapes import picture
 from . import store
 from .marks import marks, series
 from .results import Results
@@ -131,7 +132,7 @@ def legend(
     for method, names in {_line(names): names for names in lines}.items():
         options = strokes({"method": method} if "method" in names else names)
         text = look(method).label + (words or {}).get(method, "")
-        handles.append(Line2D([], [], **options, label=text))
+        handles.append(Line2D([], [], **options, label=picture(text)))
     styles: dict[Any, list[str]] = {}
     modelled = [n for n in lines if "noise_model" in n and "method" in n and n["method"] != "bound"]
     for known in dict.fromkeys(str(n["noise_model"]) for n in modelled):
@@ -139,7 +140,9 @@ def legend(
             continue
         styles.setdefault(line(known), []).append(known)
     if len(styles) > 1:
-        handles += [Line2D([], [], color="#555555", linestyle=k, label=" / ".join(v)) for k, v in styles.items()]
+        handles += [
+            Line2D([], [], color="#555555", linestyle=k, label=picture(" / ".join(v))) for k, v in styles.items()
+        ]
     if not any(lines):
         return
     place: dict[str, Any] = {} if inside else {"bbox_to_anchor": (1.02, 1.0), "borderaxespad": 0}

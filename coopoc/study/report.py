@@ -11,6 +11,7 @@ import jinja2
 import markupsafe
 
 from ..errors import InputError
+from ..escapes import uncontrolled
 from ..file_names import inside
 from . import store
 from .inline_svg import inline
@@ -160,7 +161,12 @@ def _environment(sections: Sequence[Mapping[str, Any]]) -> dict[str, str]:
 def _template() -> jinja2.Template:
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     jinja = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=loader,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=lambda value: uncontrolled(value) if type(value) is str else value,
     )
     jinja.filters["named"] = _named
     jinja.filters["shown"] = _shown

@@ -13,10 +13,10 @@ import pyarrow as pa
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..escapes import spreadsheet
 from ..evaluate.statistics import Interval, mean_interval
 from ..plugins import unknown
 from . import store
-from .escapes import spreadsheet
 from .manifest import read
 from .parse import assignments, parse
 

@@ -12,6 +12,7 @@ from scipy import stats
 
 from ..arrays import AnyArray, Floats
 from ..errors import InputError
+from ..escapes import picture
 from ..world.fleet import Fleet
 from .plot import Plot, canvas
 from .style import NEUTRAL
@@ -37,7 +38,7 @@ def paths(fleet: Fleet, caption: str = "") -> Plot:
     ) as (figure, axes):
         for n, name in enumerate(fleet.ids):
             shade = _path(axes[0, n], fleet.position[:, n, :2], speed[:, n], top)
-            axes[0, n].set(title=name, xlabel="East [m]")
+            axes[0, n].set(title=picture(name), xlabel="East [m]")
             axes[1, n].plot(fleet.t - fleet.t[0], speed[:, n], color="#333333", linewidth=1.0)
             axes[1, n].set(xlabel="Time [s]", ylim=(0, 1.05 * top))
         axes[0, 0].set_ylabel("North [m]")
@@ -56,7 +57,7 @@ def innovations(samples: Mapping[str, tuple[AnyArray, float, str]], caption: str
     with canvas(1, len(samples), width=3.3 * len(samples), height=2.9, squeeze=False) as (figure, axes):
         for panel, (name, (values, sigma, unit)) in zip(axes[0], samples.items(), strict=True):
             _histogram(panel, np.asarray(values, dtype=float).ravel(), sigma, unit)
-            panel.set(title=name, xlabel=f"Innovation [{unit}]")
+            panel.set(title=picture(name), xlabel=f"Innovation [{unit}]")
         axes[0, 0].set_ylabel("Density")
     return Plot(figure, caption or "Innovations (bars) against the Gaussian that is assumed (line).")
 

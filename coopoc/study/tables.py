@@ -12,9 +12,9 @@ from typing import Any, Literal, TypeAlias
 from tabulate import tabulate
 
 from ..errors import InputError
+from ..escapes import markdown, spreadsheet, tex, visible
 from ..evaluate.statistics import Interval
 from ..plugins import unknown
-from .escapes import markdown, spreadsheet, tex
 from .style import METHODS
 
 Entry: TypeAlias = Interval | float | int | str | None
@@ -79,7 +79,7 @@ class Table:
                 raise ValueError(wrong)
             shown: dict[str, Any] = {name: given[name] for name in allowed}
             return cls(rows=rows, caption=str(given["caption"]), intervals=bool(given["intervals"]), **texts, **shown)
-        except (TypeError, KeyError, ValueError) as error:
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise InputError("table", type(given).__name__, f"is damaged ({error})", "Repeat coopoc run.") from None
 
     def render(self, form: str) -> str:
@@ -134,13 +134,15 @@ class Table:
     def to_html(self) -> str:
         """A <table> without styling of its own."""
         bold = self._bold()
-        titles = [escape(title).replace(" = ", "&nbsp;=&nbsp;") for title in self.header]  # K = 4 stays in one line
+        titles = [
+            escape(visible(title)).replace(" = ", "&nbsp;=&nbsp;") for title in self.header
+        ]  # K = 4 stays in one line
         head = "".join(f"<th scope=col>{title}</th>" for title in titles)
         body = []
         for i, row in enumerate(self.rows):
             cells = [self._html(e, (i, j) in bold) for j, e in enumerate(row)]
             body.append("<tr>" + "".join(cells) + "</tr>")
-        caption = f"<caption>{escape(' '.join(self.below))}</caption>"
+        caption = f"<caption>{escape(visible(' '.join(self.below)))}</caption>"
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
     def _repr_html_(self) -> str:
@@ -168,7 +170,7 @@ class Table:
 
     def _html(self, entry: Entry, bold: bool) -> str:
         if isinstance(entry, str):
-            return f"<td>{escape(entry)}</td>"
+            return f"<td>{escape(visible(entry))}</td>"
         mean, _, ends = self.text(entry).partition(" ")
         small = f" <span class=interval>{escape(ends)}</span>" if ends else ""
         return f"<td class=number>{_mark(escape(mean), bold, '<strong>{}</strong>')}{small}</td>"

@@ -29,7 +29,13 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
             refuse(name, values, partly, "must be NaN on all axes or on none", "Set all three to NaN.")
         if name == "velocity":
             refuse(name, values, missing != missing[:1], "must be NaN in all runs or in none", "Absence is no noise.")
-    refuse("relative", relative[..., 0], relative[..., 0] < 0, "must be a range >= 0 m", "Reflect or drop it.")
+    refuse(
+        "relative",
+        relative[..., 0],
+        relative[..., 0] <= 0,
+        "must be a range > 0 m",
+        "Make it NaN: no direction is seen in one place.",
+    )
 
 
 def check_landmarks(landmarks: tuple[int, ...], gnss: Floats, velocity: Floats) -> None:

@@ -235,6 +235,7 @@ class Recording:
         >>> observe(fleet, Sensors()).plot(step=1).get_xlabel()
         'East [m]'
         """
+        from ..escapes import picture
         from ..pictures import COLORS, INK, axes, finish, pairs
 
         run, last = number("run", run, 0, self.runs - 1, kind=int, allowed=f"in 0..{self.runs - 1}"), len(self.t) - 1
@@ -242,7 +243,7 @@ class Recording:
         ax, fixes, few = axes(ax), self.gnss[run, :, :, :2], len(self.ids) <= len(COLORS)
         for k, name in enumerate(self.ids):
             color = COLORS[k % len(COLORS)]
-            ax.plot(*fixes[:, k].T, ".", ms=1.6, color=color, alpha=0.6, label=name if few else None, zorder=2)
+            ax.plot(*fixes[:, k].T, ".", ms=1.6, color=color, alpha=0.6, label=picture(name) if few else None, zorder=2)
         here = self.links.step == step
         observer, neighbour = self.links.observer[here], self.links.neighbour[here]
         pairs(ax, fixes[step, observer], fixes[step, neighbour], INK)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -22,7 +24,7 @@ LARGEST_LOSS = 1e12
 
 
 class MalformedAnswerError(ValueError):
-    """An answer of a client that cannot be used; the text does not quote the answer beyond a number."""
+    """An answer of a client that cannot be used; the text quotes no more of it than a number or a version."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +79,8 @@ def answer(report: Report) -> RecordDict:
     """Content of the answering message, under the names that Flower's own strategies read."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, MetricRecord, RecordDict
 
-    metrics, client = MetricRecord({"num-examples": report.pieces}), ConfigRecord({"name": report.name})
+    metrics = MetricRecord({"num-examples": report.pieces})
+    client = ConfigRecord({"name": report.name, "version": version("coopoc")})
     metrics["validation-loss"] = report.validation_loss
     content = RecordDict({"metrics": metrics, "client": client})
     if report.failure:
@@ -92,7 +95,7 @@ def reported(content: RecordDict) -> Report:
     """The report in an answer, validated; other contents are ignored.
 
     Raises:
-        MalformedAnswerError: a name, a number or weights outside their range.
+        MalformedAnswerError: a name, a number or weights outside their range, or a client of another version.
         Exception: of any kind, if something is missing or of another type, as clients may send anything.
     """
     metrics: Any = content["metrics"]
@@ -102,6 +105,9 @@ def reported(content: RecordDict) -> Report:
         raise MalformedAnswerError(f"a name that is not 1 to {LONGEST} printable characters")
     if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
         raise MalformedAnswerError("a number of pieces that is not in 1..2^31 - 1")
+    if (theirs := client.get("version")) != version("coopoc"):
+        given = theirs if isinstance(theirs, str) and re.fullmatch(r"[\w.+!-]{1,40}", theirs) else "an unknown version"
+        raise MalformedAnswerError(f"made by coopoc {given}, the server has {version('coopoc')}: install the same")
     weights = _theta(content) if "arrays" in content and not failure else None
     training = math.nan if weights is None else _loss(metrics, "training-loss")
     return Report(name, pieces, _loss(metrics, "validation-loss"), training, weights, failure)

@@ -22,7 +22,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, number
 from coopoc.methods.track import Method
 
 from ..method import LearnedGain
@@ -144,6 +144,21 @@ class Recurrent(Gain):
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
         return LearnedGain(self, name, x0)
+
+
+def size(field: str, value: object) -> int:
+    """Number of units of a net; the card of a checkpoint may hold anything.
+
+    >>> size("hidden", 8)
+    8
+    """
+    return int(number(field, value, 1, 1024, kind=int, allowed="in 1..1024", hint="The shipped nets have 5 to 40."))
+
+
+def seed_of(value: object) -> int:
+    """Seed of initial weights."""
+    hint = "Any whole number from 0 on will do."
+    return int(number("seed", value, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint))
 
 
 @cache

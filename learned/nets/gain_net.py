@@ -13,7 +13,7 @@ from ..engine import rollout as engine
 from ..engine.places import CELLS, LOG_FLOOR, SHORTEST, SIZE
 from ..training.clients import Batch
 from ..training.schedule import Moving, Schedule
-from .gain import Recurrent
+from .gain import Recurrent, seed_of, size
 
 
 class Memory(NamedTuple):
@@ -65,10 +65,10 @@ class GainNet(Recurrent):
         magnitudes: bool = False,
     ) -> None:
         super().__init__()
-        self.in_mult, self.out_mult, self.magnitudes = in_mult, out_mult, magnitudes
+        self.in_mult, self.out_mult, self.magnitudes = size("in_mult", in_mult), size("out_mult", out_mult), magnitudes
         wide, both, seen = SIZE * in_mult, 2 * CELLS, SIZE + magnitudes
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.manual_seed(seed_of(seed))
             self.update = nn.Linear(seen, wide)
             self.evolution = nn.Linear(seen, wide)
             self.observation = nn.Linear(2 * seen, 2 * wide)

@@ -22,7 +22,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain, over_time
+from .gain import Gain, over_time, seed_of, size
 from .stack import flatten, layers, named
 
 MEMORY = 100.0
@@ -128,9 +128,9 @@ class NoiseNet(Gain):
 
     def __init__(self, hidden: int = 8, seed: int = 0) -> None:
         super().__init__()
-        self.hidden = hidden
+        self.hidden = size("hidden", hidden)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.manual_seed(seed_of(seed))
             self.fix_hidden, self.fix = nn.Linear(2, hidden), nn.Linear(hidden, 1)
             self.motion_hidden, self.motion = nn.Linear(5, hidden), nn.Linear(hidden, 2)
         for last in (self.fix, self.motion):

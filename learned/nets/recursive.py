@@ -21,7 +21,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 from ..method import divergence
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain, over_time
+from .gain import Gain, over_time, seed_of, size
 from .levels import FEATURES, GNSS_STD, STILL, Levels, after, first, noise
 from .recursive_kernel import HEADS, LIMIT, rollout
 
@@ -62,9 +62,9 @@ class RecursiveGain(Gain):
 
     def __init__(self, hidden: int = 16, seed: int = 0) -> None:
         super().__init__()
-        self.hidden = hidden
+        self.hidden = size("hidden", hidden)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.manual_seed(seed_of(seed))
             self.cell = nn.GRUCell(FEATURES + 3, hidden)
             self.heads = nn.Linear(hidden, HEADS)
         nn.init.zeros_(self.heads.weight)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .gain import Recurrent
+from .gain import Recurrent, seed_of, size
 from .stack import Layer, layers
 
 SIZE = 3
@@ -50,9 +50,9 @@ class SplitGain(Recurrent):
 
     def __init__(self, hidden: int = 24, seed: int = 0) -> None:
         super().__init__()
-        self.hidden = hidden
+        self.hidden = size("hidden", hidden)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
+            torch.manual_seed(seed_of(seed))
             self.see = nn.ModuleList(nn.Linear(2 * SIZE, hidden) for _ in range(2))
             self.cell = nn.ModuleList(nn.GRUCell(hidden, hidden) for _ in range(2))
             last = [nn.Linear(hidden, SIZE * SIZE) for _ in range(2)]

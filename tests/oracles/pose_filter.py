@@ -50,7 +50,9 @@ def pose_filter(seen, noise, begin, spread, options, run):  # type: ignore[no-un
     for t in range(len(seen.start) - 1):
         now, prior, blocks, P_old, old = list(range(seen.start[t], seen.start[t + 1])), [], [], None, {}
         if past:
-            P_old, old = past["P"], past["at"]
+            newest = {seen.member[i]: seen.newest[run, i] for i in now}
+            old = {n: at for n, at in past["at"].items() if past["sent"][n] >= 0 or newest.get(n, -1) < 0}
+            P_old = past["P"]
         for i in now:
             n, sent = seen.member[i], seen.newest[run, i]
             u = np.append(seen.velocity[run, sent, n], seen.yaw_rate[run, sent, n])

@@ -1,8 +1,9 @@
-"""Text from data in Markdown, LaTeX and CSV, where it must not act as markup, a command or a formula."""
+"""Text from data in tables, pages and pictures, where it must not act as markup, a command, a formula or a control."""
 
 from __future__ import annotations
 
 import re
+import unicodedata
 
 _LATEX = {
     "\\": r"\textbackslash{}",
@@ -29,13 +30,43 @@ _LATEX = {
 }
 
 
+def uncontrolled(text: str) -> str:
+    """Text without control characters and marks of direction, which would reorder what stands beside it.
+
+    >>> uncontrolled("a\\u202eb\\x1b[2J")
+    'a b [2J'
+    """
+    return "".join(
+        " " if letter not in "\n\t" and unicodedata.category(letter)[0] == "C" else letter for letter in text
+    )
+
+
+def visible(text: str) -> str:
+    """The same on one line.
+
+    >>> visible("a\\n b")
+    'a b'
+    """
+    return " ".join(uncontrolled(text).split())
+
+
+def picture(text: str) -> str:
+    """Text that matplotlib shows as it is: without mathematics, and in the legend even behind an underscore.
+
+    >>> picture("_a$b$")
+    ' _a\\\\$b\\\\$'
+    """
+    shown = visible(text).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
+
+
 def spreadsheet(text: str) -> str:
     """Text that a spreadsheet takes for text: behind an apostrophe if it would be a formula and is no number.
 
     >>> spreadsheet("=1+1"), spreadsheet("-0.5"), spreadsheet("KF")
     ("'=1+1", '-0.5', 'KF')
     """
-    if not text.startswith(("=", "+", "-", "@", "\t", "\r", "\n")):
+    if not visible(text).startswith(("=", "+", "-", "@")):
         return text
     try:
         float(text)
@@ -50,7 +81,7 @@ def markdown(text: str) -> str:
     >>> markdown("a|<b>")
     'a\\\\|\\\\<b>'
     """
-    return re.sub(r"<(?=[A-Za-z/!?])", r"\\<", " ".join(text.splitlines())).replace("|", "\\|")
+    return re.sub(r"<(?=[A-Za-z/!?])", r"\\<", visible(text)).replace("|", "\\|")
 
 
 def tex(text: str) -> str:
@@ -59,4 +90,4 @@ def tex(text: str) -> str:
     >>> tex(r"\input{x}")
     '\\textbackslash{}input\\{x\\}'
     """
-    return "".join(_LATEX.get(letter, letter) for letter in " ".join(text.splitlines()))
+    return "".join(_LATEX.get(letter, letter) for letter in visible(text))

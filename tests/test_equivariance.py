@@ -1,0 +1,131 @@
+"""Equivariance: a recording that is moved, turned about z, mirrored in y or renumbered gives the track that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.optimize import Problem, solve
+
+NOISE = co.Sensors(
+    gnss_std=(1.5, 1.5, 2.5), velocity_reading="speed", azimuth_std=0.05, inclination_std=0.05, yaw_rate_std=0.02
+)
+CHANNEL = co.V2X(max_neighbours=4, radius=60.0, loss=0.2, latency=0.1)
+NEAR = {"qcqp-relaxation": 2e-4, "cooperative-map-5": 2e-4, "cooperative-map-gnc": 2e-4, "mhe": 2e-4}
+"""m, where an iteration or a cone solver stops at its own tolerance, of 0.1 mm and less; 1e-6 elsewhere."""
+AXIS = ("kalman-adaptive", "kalman-variational")
+"""Methods that estimate a variance for each axis, and so know directions."""
+
+
+class Change(NamedTuple):
+    """y -> -y if `mirrored`, turned about z by `angle` (rad), then moved by `shift` (m); vehicles in `order`."""
+
+    angle: float = 0.0
+    mirrored: bool = False
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    order: tuple[int, ...] = tuple(range(8))
+
+    @property
+    def matrix(self) -> np.ndarray:  # type: ignore[type-arg]
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ np.diag([1, -1 if self.mirrored else 1, 1])
+
+    def azimuth(self, angle: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        turned = (-angle if self.mirrored else angle) + self.angle
+        return np.arctan2(np.sin(turned), np.cos(turned))
+
+    def of(self, rec: co.Recording) -> co.Recording:
+        """The recording that the same drive would have given in the changed world."""
+        order = np.array(self.order)
+        column = np.argsort(order)
+        step, observer, neighbour = rec.links.step, column[rec.links.observer], column[rec.links.neighbour]
+        rows = np.lexsort((neighbour, observer, step))
+        links = co.Links(step[rows], observer[rows], neighbour[rows])
+        world, relative = rec.body is None, rec.relative[:, rows].copy()
+        side = -1.0 if self.mirrored else 1.0
+        relative[..., 1] = self.azimuth(relative[..., 1]) if world else side * relative[..., 1]
+        velocity = rec.velocity @ self.matrix.T if world else rec.velocity * [1, side, 1]
+        body = rec.body and co.Body(side * rec.body.yaw_rate[:, :, order], self.azimuth(rec.body.heading[:, :, order]))
+        return replace(
+            rec,
+            ids=tuple(rec.ids[k] for k in order),
+            gnss=(rec.gnss @ self.matrix.T + self.shift)[:, :, order],
+            velocity=velocity[:, :, order],
+            links=links,
+            relative=relative,
+            broadcasts=rec.broadcasts[:, order],
+            arrival=rec.arrival[:, rows],
+            observers=tuple(int(column[k]) for k in rec.observers),
+            body=body,
+        )
+
+
+CHANGES = {
+    "translation": Change(shift=(400.0, -250.0, 30.0)),
+    "rotation": Change(angle=2.2),
+    "permutation": Change(order=(3, 6, 0, 5, 1, 7, 2, 4)),
+    "mirrored y": Change(mirrored=True),
+}
+
+
+def assert_equivariant(
+    method: Callable[..., co.Track], rec: co.Recording, change: Change, near: float, egos: tuple[str, ...]
+) -> None:
+    here, there = method(rec, egos), method(change.of(rec), egos)
+    np.testing.assert_allclose(there.x, here.x @ change.matrix.T + change.shift, rtol=0, atol=near)
+    if here.covariance is not None:
+        turned = change.matrix @ here.covariance @ change.matrix.T
+        np.testing.assert_allclose(there.covariance, turned, rtol=0, atol=10 * near * np.abs(turned).max())
+    if here.heading is not None:
+        apart = there.heading - change.azimuth(here.heading)
+        np.testing.assert_allclose(np.sin(apart / 2), 0, atol=near)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fleet) -> None:
+    """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
+    if name in AXIS and change == "rotation":
+        pytest.skip("estimates a variance for each axis of the world")
+    observers = None if name in WHOLE_FLEET else ["c0", "c3"]
+    rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, observers=observers)
+    assert_equivariant(METHODS[name]("nominal"), rec, CHANGES[change], NEAR.get(name, 1e-6), ("c0", "c3"))
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize(
+    "method",
+    [
+        co.PoseFilter("solo"),
+        co.PoseFilter("solo", exact=False, invariant=True),
+        co.PoseFilter("star"),
+        co.PoseFilter("star", lasting=True),
+        co.PoseFilter("fleet"),
+        co.PoseFilter("fleet", fusion="naive"),
+        co.PoseFilter("fleet", fusion="intersection"),
+    ],
+    ids=lambda m: f"{m.unit}-{m.fusion}" + "-invariant" * m.invariant + "-lasting" * m.lasting,
+)
+def test_every_pose_filter_follows_the_world(method: co.PoseFilter, change: str, crossing: co.Fleet) -> None:
+    rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, frame="body")
+    assert_equivariant(method, rec, CHANGES[change], 1e-6, ("c0", "c3"))
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi", "osqp"])
+def test_every_solver_follows_the_world(backend: str, change: str, crossing: co.Fleet) -> None:
+    """A star and a window of it; marginals turn with the world."""
+    rec, world = co.observe(crossing.between(0, 8), NOISE, CHANNEL, seed=5, observers=["c0"]), CHANGES[change]
+    for window in (1, 5):
+        here, there = (solve(Problem.from_window(seen, 7, "c0", window), backend) for seen in (rec, world.of(rec)))
+        column = [there.names.index(name) for name in here.names]
+        np.testing.assert_allclose(there.position[column], here.position @ world.matrix.T + world.shift, atol=1e-6)
+        turned = world.matrix @ here.covariance @ world.matrix.T
+        np.testing.assert_allclose(there.covariance[column], turned, rtol=1e-6, atol=1e-7)
+        assert there.cost == pytest.approx(here.cost, rel=1e-7)
