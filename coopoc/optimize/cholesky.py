@@ -38,7 +38,7 @@ class Cholesky:
             column = np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
             self._place = places(self._fronts, self._rank[upper.indices], self._rank[column])
             self._factor = np.empty(int(self._fronts.start[-1]))
-        return bool(factorise(self._fronts, self._place, upper.data, self._factor))
+        return not len(upper.data) or bool(factorise(self._fronts, self._place, upper.data, self._factor))
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
