@@ -30,7 +30,7 @@ Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "a
 
 
 def read_graph(path: str | Path, objective: Objective = "chordal", start: Start = "auto") -> Problem:
-    """The problem of a PyFG or g2o file; see `from_graph`.
+    """The problem of a PyFG, g2o or JRL file; see `from_graph`.
 
     Raises:
         InputError: a line that is wrong, with file and number; an unknown suffix, objective or start.
