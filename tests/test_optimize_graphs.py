@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from random_graphs import random_graph
 from scipy.optimize import least_squares
+from scipy.sparse import csc_array
 
 from coopoc import InputError
 from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
@@ -32,7 +33,7 @@ from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
 from coopoc.optimize.marginals import bayes_tree_marginals
 from coopoc.optimize.search import Search
-from coopoc.optimize.sparse import _made, sparse
+from coopoc.optimize.sparse import Sparse, _made, sparse
 from coopoc.optimize.starts import chained
 from coopoc.optimize.trilateration import located
 
@@ -171,8 +172,13 @@ def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> Non
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
-def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str | None) -> None:
-    """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences."""
+@pytest.mark.parametrize("most", [0, 1000], ids=["kernel", "casadi"])
+def test_tapes_are_the_formulas(
+    dimension: int, objective: Objective, loss: str | None, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences, run by the
+    kernel of large problems and by CasADi, which runs small ones."""
+    monkeypatch.setattr("coopoc.optimize.layout.DENSE", most)
     graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
     problem = from_graph(graph, objective, start="file")
     rho = None if loss is None else Loss(loss, 2.0)
@@ -188,12 +194,18 @@ def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str 
     assert system.cost(x) == pytest.approx(cost, rel=1e-12)
     assert gradient == pytest.approx(J.T @ r, abs=1e-9 * np.abs(J.T @ r).max())
     dense = (J.T @ J).toarray()
-    assert system.matrix(values).toarray() == pytest.approx(np.triu(dense), abs=1e-9 * np.abs(dense).max())
+    assert upper(system, values) == pytest.approx(np.triu(dense), abs=1e-9 * np.abs(dense).max())
     values = system.quadratic(x, "newton")[2]
     if loss != "truncated":  # its differences jump at the kink
         scheme = structure(problem)[0]
         exact = matrix(scheme, true_blocks(problem, problem.linearise(x[None]))).toarray()[np.ix_(movable, movable)]
-        assert system.matrix(values).toarray() == pytest.approx(np.triu(exact), abs=3e-6 * np.abs(exact).max())
+        assert upper(system, values) == pytest.approx(np.triu(exact), abs=3e-6 * np.abs(exact).max())
+
+
+def upper(system: Sparse, values: np.ndarray) -> np.ndarray:
+    """The upper triangle of a Hessian."""
+    entries, size = system.entries, system.size
+    return csc_array((values, entries.indices, entries.indptr), shape=(size, size)).toarray()
 
 
 def test_a_formula_that_casadi_cannot_run_takes_the_plain_way() -> None:
@@ -395,7 +407,7 @@ def test_gtsams_elimination_takes_over_where_its_optimizer_does_not_arrive() -> 
     graph = replace(random_graph(216, robots=1, steps=40, landmarks=0, seen=0, loops=12), ranges=RangeEdges())
     edges, scale = graph.relative_pose, np.array([1e6, 1e6, 1.0])
     small = replace(edges, position=1e6 * edges.position, covariance=edges.covariance * scale[:, None] * scale)
-    problem = from_graph(replace(graph, position=1e6 * graph.position, relative_pose=small), "geodesic")
+    problem = from_graph(replace(graph, position=1e6 * graph.position, relative_pose=small), "geodesic", "odometry")
     found = solve(problem, "gtsam")
     assert found.extras["failed_first"] == "lm: MAX_ITERATIONS"
     assert found.cost == pytest.approx(solve(from_graph(graph, "geodesic")).cost, rel=1e-9)
