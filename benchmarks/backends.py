@@ -18,6 +18,7 @@ import numpy as np
 from backends_casadi import PLAIN, casadi_exact
 from backends_convex import cvxpy_linear, osqp_linear
 from backends_gtsam import fixed_lag, gtsam_exact, gtsam_linear
+from backends_single import one_by_one
 from backends_star import Job, star
 from tabulate import tabulate
 from timing import timed
@@ -38,6 +39,8 @@ def jobs(runs: int = RUNS, steps: int = STEPS) -> list[Job]:
         *(casadi_exact(exact, method) for method in PLAIN),
         osqp_linear(linear),
         cvxpy_linear(linear),
+        one_by_one(linear, "converted"),
+        one_by_one(exact, "exact"),
     ]
 
 

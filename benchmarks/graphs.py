@@ -2,7 +2,7 @@
 
 Run:  python benchmarks/graphs.py                            (every PyFG file in ../shared/data/pyfg, if it is there)
       python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
-      python benchmarks/graphs.py folder --hard              (any folder of PyFG and g2o files, with hard variants)
+      python benchmarks/graphs.py folder --hard              (any folder of PyFG, g2o and JRL files, with hard variants)
       python benchmarks/graphs.py --unseen                   (kinds of graphs that no file holds, three seeds each)
 
 GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
@@ -29,7 +29,7 @@ from tabulate import tabulate
 from unseen_graphs import FAMILIES
 
 from coopoc.evaluate.alignment import absolute_error
-from coopoc.formats import load_graph
+from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.backends.gtsam_forms import pose_of
@@ -136,7 +136,7 @@ def main(*arguments: str) -> None:
     if "--unseen" not in arguments and not folder.is_dir():
         print(f"no folder {folder}", file=sys.stderr)
         return
-    files = sorted(f for f in folder.rglob("*") if f.suffix in (".pyfg", ".g2o"))
+    files = sorted(f for f in folder.rglob("*") if f.suffix in GRAPHS)
     files = [f for f in files if not given[1:] or f.stem in given[1:]]
     found = list(unseen() if "--unseen" in arguments else rows(files, "--hard" in arguments))
     total: list[object] = [

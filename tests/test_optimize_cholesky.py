@@ -34,9 +34,10 @@ def upper(matrix: np.ndarray) -> csc_matrix:
 def test_it_solves_and_inverts_as_numpy_does(nodes: int, pairs: int, width: int) -> None:
     """The last two fill in nearly everywhere, so that blocks of hundreds of columns take the way of BLAS."""
     A = graph_matrix(nodes + pairs, nodes, pairs, width)
-    cholesky = Cholesky(np.repeat(np.arange(nodes), width))
+    pattern = upper(A)
+    cholesky = Cholesky(pattern.indptr, pattern.indices, np.repeat(np.arange(nodes), width))
     for scale in (1.0, 3.0):  # the second factorisation uses the analysis of the first
-        assert cholesky.factor(upper(scale * A))
+        assert cholesky.factor(upper(scale * A).data)
         rhs = np.random.default_rng(1).normal(size=len(A))
         assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(scale * A, rhs), rel=1e-6, abs=1e-8)
         rows, columns = np.nonzero(A)
@@ -49,15 +50,16 @@ def test_a_matrix_that_curves_downwards_is_refused(pairs: int) -> None:
     """The smallest eigenvalue is NumPy's; slightly above it the shifted matrix is indefinite, slightly below not."""
     A = graph_matrix(pairs, 90, pairs, 2)
     least = np.linalg.eigvalsh(A)[0]
-    cholesky = Cholesky()
+    cholesky = Cholesky(upper(A).indptr, upper(A).indices)
     for share, definite in ((0.99, True), (1.01, False), (0.5, True)):
-        assert cholesky.factor(upper(A - share * least * np.eye(len(A)))) is definite
+        assert cholesky.factor(upper(A - share * least * np.eye(len(A))).data) is definite
 
 
 def test_parts_that_nothing_joins_are_factored_apart() -> None:
     A = np.zeros((30, 30))
     A[:12, :12], A[12:, 12:] = graph_matrix(7, 4, 2, 3), graph_matrix(8, 6, 1, 3)
     order = np.random.default_rng(0).permutation(30)
-    cholesky, rhs = Cholesky(), np.arange(30.0)
-    assert cholesky.factor(upper(A[np.ix_(order, order)]))
+    pattern, rhs = upper(A[np.ix_(order, order)]), np.arange(30.0)
+    cholesky = Cholesky(pattern.indptr, pattern.indices)
+    assert cholesky.factor(pattern.data)
     assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(A[np.ix_(order, order)], rhs), rel=1e-8)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from random_graphs import random_graph
 from scipy.optimize import least_squares
+from scipy.sparse import csc_array
 
 from coopoc import InputError
 from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
@@ -32,7 +33,7 @@ from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
 from coopoc.optimize.marginals import bayes_tree_marginals
 from coopoc.optimize.search import Search
-from coopoc.optimize.sparse import _made, sparse
+from coopoc.optimize.sparse import Sparse, _made, sparse
 from coopoc.optimize.starts import chained
 from coopoc.optimize.trilateration import located
 
@@ -171,8 +172,13 @@ def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> Non
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
-def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str | None) -> None:
-    """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences."""
+@pytest.mark.parametrize("most", [0, 1000], ids=["kernel", "casadi"])
+def test_tapes_are_the_formulas(
+    dimension: int, objective: Objective, loss: str | None, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences, run by the
+    kernel of large problems and by CasADi, which runs small ones."""
+    monkeypatch.setattr("coopoc.optimize.layout.DENSE", most)
     graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
     problem = from_graph(graph, objective, start="file")
     rho = None if loss is None else Loss(loss, 2.0)
@@ -188,12 +194,18 @@ def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str 
     assert system.cost(x) == pytest.approx(cost, rel=1e-12)
     assert gradient == pytest.approx(J.T @ r, abs=1e-9 * np.abs(J.T @ r).max())
     dense = (J.T @ J).toarray()
-    assert system.matrix(values).toarray() == pytest.approx(np.triu(dense), abs=1e-9 * np.abs(dense).max())
+    assert upper(system, values) == pytest.approx(np.triu(dense), abs=1e-9 * np.abs(dense).max())
     values = system.quadratic(x, "newton")[2]
     if loss != "truncated":  # its differences jump at the kink
         scheme = structure(problem)[0]
         exact = matrix(scheme, true_blocks(problem, problem.linearise(x[None]))).toarray()[np.ix_(movable, movable)]
-        assert system.matrix(values).toarray() == pytest.approx(np.triu(exact), abs=3e-6 * np.abs(exact).max())
+        assert upper(system, values) == pytest.approx(np.triu(exact), abs=3e-6 * np.abs(exact).max())
+
+
+def upper(system: Sparse, values: np.ndarray) -> np.ndarray:
+    """The upper triangle of a Hessian."""
+    entries, size = system.entries, system.size
+    return csc_array((values, entries.indices, entries.indptr), shape=(size, size)).toarray()
 
 
 def test_a_formula_that_casadi_cannot_run_takes_the_plain_way() -> None:
@@ -359,6 +371,58 @@ def test_each_part_has_a_fixed_pose_unless_it_has_a_prior() -> None:
     assert solve(from_graph(graph)).status is Status.SOLVED
     prior = PoseEdges([[45]], [[7.0, 8.0]], [[0.5]], [0.01 * np.eye(3)])
     assert from_graph(replace(graph, pose_prior=prior)).fixed == (0, 80)
+
+
+@pytest.mark.parametrize("lone", [5, 21, 70])
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
+def test_a_pose_without_measurements_changes_nothing(lone: int, backend: str) -> None:
+    """It is a part of its own, whose first pose is fixed; as one matrix, by blocks and sparse. Referee: the same graph
+    without it, by GTSAM's elimination."""
+    graph = random_graph(214, robots=1, steps=lone, landmarks=0, ranges=0, seen=0, loops=3)
+    more = replace(
+        graph,
+        names=(*graph.names, "B0"),
+        is_pose=np.append(graph.is_pose, True),
+        position=np.vstack([graph.position, [9.0, 9.0]]),
+        orientation=np.vstack([graph.orientation, [0.5]]),
+        stamps=np.append(graph.stamps, 0.0),
+    )
+    found, expected = solve(from_graph(more), backend), solve(from_graph(graph), "gtsam", optimizer="elimination")
+    np.testing.assert_allclose(found.x[:-1], expected.x, atol=1e-6)
+    np.testing.assert_allclose(found.covariance[:-1], expected.covariance, rtol=1e-5, atol=1e-9)
+    assert not found.covariance[-1].any()
+
+
+@pytest.mark.parametrize("start", ["auto", "incremental", "linear"])
+def test_a_graph_whose_poses_are_all_fixed_is_solved_where_it_is(start: str) -> None:
+    graph = random_graph(215, robots=1, steps=80, landmarks=0, ranges=0, seen=0, loops=3)
+    problem = from_graph(replace(graph, fixed=np.arange(80)), start=start)
+    found = solve(problem)
+    assert (found.status, found.cost) == (Status.SOLVED, pytest.approx(problem.cost(problem.x0)))
+
+
+def test_gtsams_elimination_takes_over_where_its_optimizer_does_not_arrive() -> None:
+    """Lengths in micrometres: GTSAM's Levenberg-Marquardt ends above the minimum, which does not depend on the unit.
+    Referee: the same graph in metres."""
+    graph = replace(random_graph(216, robots=1, steps=40, landmarks=0, seen=0, loops=12), ranges=RangeEdges())
+    edges, scale = graph.relative_pose, np.array([1e6, 1e6, 1.0])
+    small = replace(edges, position=1e6 * edges.position, covariance=edges.covariance * scale[:, None] * scale)
+    problem = from_graph(replace(graph, position=1e6 * graph.position, relative_pose=small), "geodesic", "odometry")
+    found = solve(problem, "gtsam")
+    assert found.extras["failed_first"] == "lm: MAX_ITERATIONS"
+    assert found.cost == pytest.approx(solve(from_graph(graph, "geodesic")).cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("objective", ["chordal", "geodesic"])
+def test_a_measurement_without_variance_is_named(objective: Objective) -> None:
+    graph = random_graph(217, robots=1, steps=20, landmarks=1, ranges=4, seen=0, loops=0)
+    covariance, variance = np.array(graph.relative_pose.covariance), np.array(graph.ranges.variance)
+    covariance[7, 2] = covariance[7, :, 2] = 0.0
+    with pytest.raises(InputError, match="relative_pose A7 A8 = least variance 0: must be > 0"):
+        from_graph(replace(graph, relative_pose=replace(graph.relative_pose, covariance=covariance)), objective)
+    variance[2] = 0.0
+    with pytest.raises(InputError, match=r"ranges \w+ \w+ = least variance 0"):
+        from_graph(replace(graph, ranges=replace(graph.ranges, variance=variance)), objective)
 
 
 @pytest.mark.parametrize("weight", [1.0, 1e-4])

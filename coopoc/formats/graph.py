@@ -79,21 +79,22 @@ class Graph(Vertices):
         return {one: np.flatnonzero(self.is_pose & (letter == one)) for one in first}
 
     def stamped(self, stamps: npt.ArrayLike) -> Graph:
-        """The same graph with other stamps, for every edge that of its first pose; NaN takes them away.
+        """The same graph with other stamps, an edge that of its first pose, else point; NaN takes them away.
 
         Args:
-            stamps: a number or (n,), s; those of points are not kept.
+            stamps: a number or (n,), s; points do not keep them.
 
         >>> graph = Graph(2, ("A0", "A1"), [True, True], np.zeros((2, 2)), np.zeros((2, 1)))
         >>> graph.stamped([0, 0.1]).stamps
         array([0. , 0.1])
         """
-        own = np.where(self.is_pose, np.broadcast_to(np.asarray(stamps, dtype=float), len(self.names)), np.nan)
+        every = np.broadcast_to(np.asarray(stamps, dtype=float), len(self.names))
+        own = np.where(self.is_pose, every, np.nan)
         edges = {}
         for field in ENDS:
             edge = getattr(self, field)
-            given = own[edge.nodes]
-            edges[field] = replace(edge, stamps=np.where(np.isnan(given[:, 0]), given[:, -1], given[:, 0]))
+            first = np.where(self.is_pose[edge.nodes[:, 0]], edge.nodes[:, 0], edge.nodes[:, -1])
+            edges[field] = replace(edge, stamps=every[first])
         return replace(self, stamps=own, **edges)
 
     def __repr__(self) -> str:

@@ -5,8 +5,10 @@ from . import kinds as _kinds  # noqa: F401  (registers the kinds that we know)
 from .backend import Backend, Capabilities, SolverResult, backends
 from .batch import Batch, solve_batch
 from .constraint import Constraint
+from .distributed import Distributed, solve_distributed
 from .factor import Factor
 from .gnc import GNCBatch, solve_gnc, solve_gnc_batch
+from .joint import joint_covariance
 from .local_problem import LocalProblem
 from .losses import Loss
 from .measurements import MEASUREMENTS, Measurement, measurement
@@ -21,6 +23,7 @@ __all__ = [
     "Batch",
     "Capabilities",
     "Constraint",
+    "Distributed",
     "Factor",
     "GNCBatch",
     "LocalProblem",
@@ -33,10 +36,12 @@ __all__ = [
     "Space",
     "Status",
     "backends",
+    "joint_covariance",
     "measurement",
     "pose",
     "solve",
     "solve_batch",
+    "solve_distributed",
     "solve_gnc",
     "solve_gnc_batch",
 ]

@@ -13,7 +13,7 @@ from ..arrays import Bools, Floats
 from .active import Active, active_at
 from .arrowhead import marginals, structure
 from .dense import diagonal_blocks, is_small, normal_matrix
-from .linear import Linear, cost_of
+from .linear import Linear
 from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
 from .problem import Problem
@@ -88,24 +88,22 @@ def assess(problem: Problem, x: Floats) -> Assessment:
 
 
 def _as_graph(problem: Problem, system: Sparse, x: Floats) -> Assessment:
-    """The assessment of a large problem by its own factors. The cost is the formulas' own."""
-    entries, cholesky = system.entries, system.cholesky
-    _, gradient, values = system.quadratic(x, "gauss-newton")
-    cost, size = cost_of(system.space, system.factors, x[None])[0], float(np.linalg.norm(gradient))
+    """The assessment of a problem by tapes and its own factors."""
+    cholesky = system.cholesky
+    cost, gradient, values = system.quadratic(x, "gauss-newton")
+    size = float(np.linalg.norm(gradient))
     unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
     if not np.isfinite(values).all():
         return Assessment(cost, size, unknown, np.nan)
-    if not cholesky.factor(system.matrix(values)):
+    if not cholesky.factor(values):
         return Assessment(
             cost, size, unknown, np.nan, _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None)
         )
     dx = -cholesky.solve(gradient)
-    row, column = np.broadcast_arrays(entries.number[:, :, None], entries.number[:, None, :])
-    free = (row >= 0) & (column >= 0)
-    cov = np.zeros(row.shape)
-    cov[free] = cholesky.inverse(row[free], column[free])
-    moving = entries.number >= 0
-    inflation = np.einsum("nii->ni", cov)[moving] * values[entries.diagonal]
+    free, rows, columns = system.entries.own
+    cov = np.zeros(free.shape)
+    cov[free] = cholesky.inverse(rows, columns)
+    inflation = np.einsum("nii->ni", cov)[system.entries.number >= 0] * values[system.entries.diagonal]
     remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
     if not (inflation < INFLATION).all() and (
         free_nodes := _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None)

@@ -15,30 +15,31 @@ class Cholesky:
     `factor` before all else; what is asked is of the matrix that was factored last.
 
     Args:
+        indptr: (u + 1,) of the upper triangle, CSC with sorted rows and no diagonal left out.
+        indices: of its rows.
         group: (u,) ascending, the node of each unknown; the last of a node has the neighbours of all. None: each is
             alone.
 
-    >>> from scipy.sparse import csc_matrix
-    >>> cholesky = Cholesky()
-    >>> cholesky.factor(csc_matrix(np.triu([[2.0, 1.0], [1.0, 2.0]]))), cholesky.solve(np.array([3.0, 3.0])).round(6)
+    >>> cholesky = Cholesky(np.array([0, 1, 3]), np.array([0, 0, 1]))
+    >>> cholesky.factor(np.array([2.0, 1.0, 2.0])), cholesky.solve(np.array([3.0, 3.0])).round(6)
     (True, array([1., 1.]))
     """
 
-    def __init__(self, group: Ints | None = None) -> None:
-        self._group = group
-        self._fronts: Any = None
+    def __init__(self, indptr: Ints, indices: Ints, group: Ints | None = None) -> None:
+        from ..kernels.graph_cholesky import places
 
-    def factor(self, upper: Any) -> bool:
-        """Factor an upper triangle (CSC, sorted rows, no diagonal left out); whether it is positive definite."""
-        from ..kernels.graph_cholesky import factorise, places
+        size = len(indptr) - 1
+        self._fronts = analysed(indptr, indices, np.arange(size) if group is None else group)
+        self._rank = np.argsort(self._fronts.order)
+        column = np.repeat(np.arange(size), np.diff(indptr))
+        self._place = places(self._fronts, self._rank[indices], self._rank[column])
+        self._factor = np.empty(int(self._fronts.start[-1]))
 
-        if self._fronts is None:
-            self._fronts = analysed(upper, np.arange(upper.shape[0]) if self._group is None else self._group)
-            self._rank = np.argsort(self._fronts.order)
-            column = np.repeat(np.arange(upper.shape[0]), np.diff(upper.indptr))
-            self._place = places(self._fronts, self._rank[upper.indices], self._rank[column])
-            self._factor = np.empty(int(self._fronts.start[-1]))
-        return bool(factorise(self._fronts, self._place, upper.data, self._factor))
+    def factor(self, values: Floats) -> bool:
+        """Factor an upper triangle's values; whether it is positive definite."""
+        from ..kernels.graph_cholesky import factorise
+
+        return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
@@ -58,7 +59,7 @@ class Cholesky:
         return found[places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
-def analysed(upper: Any, group: Ints) -> Any:
+def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     """Fronts of a pattern, its groups of unknowns in the order of approximate minimum degree.
 
     References:
@@ -71,14 +72,14 @@ def analysed(upper: Any, group: Ints) -> Any:
     name, begin, width = np.unique(group, return_index=True, return_counts=True)
     n, last = len(name), begin + width - 1
     which = np.repeat(np.arange(n), width)
-    length = np.diff(upper.indptr)[last]
+    length = np.diff(indptr)[last]
     column = np.repeat(np.arange(n), length)
-    row = which[upper.indices[_runs(upper.indptr[last], length)]]
+    row = which[indices[_runs(indptr[last], length)]]
     both = np.concatenate([row, column]), np.concatenate([column, row])
     pattern = coo_array((np.ones(2 * len(row)), both), shape=(n, n)).tocsr()
-    indptr, indices = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
-    order, parent = elimination_tree(indptr, indices, minimum_degree(indptr, indices))
-    at, below = structures(indptr, indices, order, parent)
+    both_ways = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
+    order, parent = elimination_tree(*both_ways, minimum_degree(*both_ways))
+    at, below = structures(*both_ways, order, parent)
     head = supernodes(parent, at, below, width[order], np.array(RELAXED))
     first = np.concatenate([[0], np.cumsum(width[order])])
     top = head[1:] - 1

@@ -34,12 +34,12 @@ def solve_file(
     start: Literal["auto", "odometry", "tree", "linear", "incremental", "apart", "file", "relaxed"] = "auto",
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
-    """Solve the factor graph of a PyFG or g2o file.
+    """Solve the factor graph of a PyFG, g2o or JRL file.
 
     Example: coopoc solve drive.pyfg --backend gtsam --output solution.json
 
     Args:
-        file: .pyfg or .g2o.
+        file: .pyfg, .g2o or .jrl.
         backend: coopoc check shows them.
         objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
         start: odometry chained from each robot's first vertex, a spanning tree over loops too, rotations relaxed

@@ -66,10 +66,10 @@ def _by_tapes(system: Sparse, x: Floats) -> float | None:
     _, gradient, values = system.quadratic(x, "newton")
     if not np.isfinite(values).all():
         return None
-    if not system.cholesky.factor(system.matrix(values)):
+    if not system.cholesky.factor(values):
         own = system.entries.diagonal
         values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
-        if not system.cholesky.factor(system.matrix(values)):
+        if not system.cholesky.factor(values):
             return None
     return float(0.5 * gradient @ system.cholesky.solve(gradient))
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ..arrays import Floats, frozen
+from ..errors import InputError
 from ..formats import load_graph
+from ..formats.edges import ENDS
 from ..formats.graph import Graph
 from ..plugins import unknown
 from .factor import Factor
@@ -28,7 +30,7 @@ Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "a
 
 
 def read_graph(path: str | Path, objective: Objective = "chordal", start: Start = "auto") -> Problem:
-    """The problem of a PyFG or g2o file; see `from_graph`.
+    """The problem of a PyFG, g2o or JRL file; see `from_graph`.
 
     Raises:
         InputError: a line that is wrong, with file and number; an unknown suffix, objective or start.
@@ -53,6 +55,9 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
             the one that leads lowest (`race.py`). Landmarks are put at their priors, or where the first pose that
             measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
 
+    Raises:
+        InputError: an unknown objective or start, a measurement without variance, by its vertices.
+
     >>> from coopoc.formats.edges import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
     >>> from_graph(Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges))
@@ -62,6 +67,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         if value not in get_args(allowed):
             raise unknown(name, value, get_args(allowed))
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
+    _refuse_exact(graph, objective)
     factors = _factors(graph, objective)
 
     def x0_of(name: str) -> Floats:
@@ -80,6 +86,24 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     return keep(problem, problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began)))
+
+
+def _refuse_exact(graph: Graph, objective: Objective) -> None:
+    """InputError for the first measurement without variance; a chordal objective sees means of variances alone."""
+    for kind in ENDS:
+        edges: Any = getattr(graph, kind)
+        if kind == "ranges":
+            least = edges.variance
+        elif objective == "geodesic":
+            least = np.linalg.eigvalsh(edges.covariance).min(axis=1, initial=np.inf)
+        else:
+            d, own = graph.dimension, np.einsum("mii->mi", edges.covariance)
+            least = np.minimum(own[:, :d].mean(axis=1), own[:, d:].mean(axis=1) if own.shape[1] > d else np.inf)
+        exact = np.flatnonzero(~(least > 0))
+        if len(exact):
+            ends = " ".join(graph.names[k] for k in edges.nodes[exact[0]])
+            hint = "Give it a variance, or fix its vertices where they are known exactly."
+            raise InputError(f"{kind} {ends}", f"least variance {least[exact[0]]:g}", "must be > 0", hint)
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Bools, Floats, Ints
 from ..formats.graph import Graph
-from .factor import unchecked
+from .part import restricted
 from .problem import Problem
 from .sparse import sparse
 from .trilateration import located
@@ -96,22 +96,3 @@ def _joining(graph: Graph, x: Floats, used: Bools, d: int) -> Bools:
             x[point, :d] = located(x[other[seen], :d], graph.ranges.distance[rows[seen]])
             joins[point] = True
     return joins
-
-
-def restricted(problem: Problem, used: Bools, x: Floats) -> Problem:
-    """The problem of some nodes (n,) and of the measurements that lie among them, from x (n, ambient)."""
-    number = np.cumsum(used) - 1
-    factors = []
-    for factor in problem.factors:
-        rows = np.flatnonzero(used[factor.nodes].all(axis=1))
-        if len(rows):
-            parts = {
-                name: array[rows] if len(array := getattr(factor, name)) == len(factor.nodes) else array
-                for name in ("z", "std", "sqrt_information", "constants")
-                if getattr(factor, name) is not None
-            }
-            factors.append(unchecked(factor, nodes=number[factor.nodes[rows]], **parts))
-    poses, fixed = (tuple(number[[k for k in which if used[k]]].tolist()) for which in (problem.poses, problem.fixed))
-    names = tuple(name for name, keep in zip(problem.names, used.tolist(), strict=True) if keep)
-    changes = {"names": names, "factors": tuple(factors), "x0": frozen(x[used]), "poses": poses, "fixed": fixed}
-    return problem.replace_unchecked(**changes)

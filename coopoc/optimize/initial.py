@@ -6,10 +6,10 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..world.spherical import to_vector
 from .dense import damped_step
 from .factor import Factor, unchecked
 from .problem import Problem
+from .sparse import sparse
 
 LEAST_RANGE = 1.0
 """m; a noisy range near zero would make the converted angles seem exact."""
@@ -42,7 +42,12 @@ def initial_guess(problem: Problem) -> Floats:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
     linear = converted(problem)
     x: Floats = np.zeros((batch, len(problem.names), problem.dimension))
-    if linear.factors:
+    if linear.factors and (system := sparse(linear)) is not None:
+        _, gradient, values = system.quadratic(x[0], "gauss-newton")
+        values[system.entries.diagonal] += RIDGE
+        system.cholesky.factor(values)
+        x = system.retract(x[0], -system.cholesky.solve(gradient))[None]
+    elif linear.factors:
         x = damped_step(linear, linear.linearise(x), np.full_like(x, RIDGE))
     return _apart(problem, linear, x)
 
@@ -86,16 +91,18 @@ def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:
 
 
 def _vector(factor: Factor) -> Factor:
-    d, az = factor.z[..., 0], factor.z[..., 1]
-    d, sa, ca = np.maximum(d, LEAST_RANGE), np.sin(az), np.cos(az)
+    d, az = np.maximum(factor.z[..., 0], LEAST_RANGE), factor.z[..., 1]
+    sa, ca = np.sin(az), np.cos(az)
+    inverse = np.zeros((*d.shape, factor.size, factor.size))
     if factor.size == 2:
-        rows = [[ca, sa], [-sa / d, ca / d]]
-        z = np.stack([d * ca, d * sa], axis=-1)
+        inverse[..., 0, 0], inverse[..., 0, 1] = ca, sa
+        inverse[..., 1, 0], inverse[..., 1, 1] = -sa / d, ca / d
     else:
         si, ci = np.sin(factor.z[..., 2]), np.cos(factor.z[..., 2])
-        sine = np.where(si < 0, -1.0, 1.0) * np.maximum(np.abs(si), LEAST_SINE)
-        zero = np.zeros_like(d)
-        rows = [[si * ca, si * sa, ci], [-sa / (d * sine), ca / (d * sine), zero], [ci * ca / d, ci * sa / d, -si / d]]
-        z = to_vector(factor.z)
-    inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    return Factor("displacement", factor.nodes, z, sqrt_information=factor.root @ inverse)
+        across = d * np.where(si < 0, -1.0, 1.0) * np.maximum(np.abs(si), LEAST_SINE)
+        inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 0, 2] = si * ca, si * sa, ci
+        inverse[..., 1, 0], inverse[..., 1, 1] = -sa / across, ca / across
+        inverse[..., 2, 0], inverse[..., 2, 1], inverse[..., 2, 2] = ci * ca / d, ci * sa / d, -si / d
+    z, nothing = factor.z[..., :1] * inverse[..., 0, :], np.empty((len(factor.nodes), 0))
+    root = factor.whiten_jacobian(inverse)
+    return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)

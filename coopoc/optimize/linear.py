@@ -68,18 +68,6 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
     return Linear(x, tuple(residuals), tuple(jacobians), cost, many)
 
 
-def cost_of(space: Space, factors: Sequence[Factor], x: Floats) -> Floats:
-    """(B,) 1/2 sum of rho at x (B, n, ambient), without derivatives."""
-    total = np.zeros(len(x))
-    for factor in factors:
-        assert factor.constants is not None
-        seen = local(space, factor.measurement, x, factor.nodes)
-        gap = factor.measurement.difference(*seen, factor.z, factor.constants)
-        square = np.square(factor.whiten(gap)).sum(axis=-1)
-        total += 0.5 * (square if factor.loss is None else factor.loss.cost(square)).sum(axis=-1)
-    return total
-
-
 def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
     known = factor.measurement
     assert factor.constants is not None

@@ -162,8 +162,8 @@ def _least_squares(rows: list[Rows], count: int, width: int) -> Callable[[Floats
         matrix = matrix + weighted[-1] @ G
     upper = csc_matrix(triu(matrix))
     upper.sort_indices()
-    cholesky = Cholesky(np.arange(count) // width)
-    sound = cholesky.factor(upper)
+    cholesky = Cholesky(upper.indptr, upper.indices, np.arange(count) // width)
+    sound = cholesky.factor(upper.data)
 
     def solve(start: Floats, goal: Floats) -> Floats:
         if not sound:

@@ -24,6 +24,7 @@ class Pattern:
         rows: products of each block, one block after the other.
         starts: as `rows`.
         negated: (P,) blocks between nodes that only subtract.
+        empty: own blocks of fixed nodes without measurements.
         minus: rows that subtract in blocks that also add.
         gradient_rows: the same for the gradient, by node.
         gradient_signs: as `gradient_rows`.
@@ -38,6 +39,7 @@ class Pattern:
     rows: Ints
     starts: Ints
     negated: Bools
+    empty: Ints
     minus: Ints
     gradient_rows: Ints
     gradient_signs: Floats
@@ -73,6 +75,12 @@ def pattern(n: int, factors: Sequence[tuple[Ints, bool]], still: Bools | None = 
             end_signs.append(np.full(count, -1.0 if k and opposite else 1.0))
         top += count * (3 if apart else 1)
         gradient_top += count * (2 if apart else 1)
+    lone = np.empty(0, np.int64)
+    if still is not None:
+        lone = np.setdiff1d(np.flatnonzero(still.all(axis=1)), np.concatenate(ends))
+        keys.append(lone * (n + 1))
+        rows.append(np.zeros_like(lone))
+        signs.append(np.ones(len(lone)))
     key, end = np.concatenate(keys), np.concatenate(ends)
     order, gradient_order = np.argsort(key, kind="stable"), np.argsort(end, kind="stable")
     blocks, starts = np.unique(key[order], return_index=True)
@@ -86,6 +94,7 @@ def pattern(n: int, factors: Sequence[tuple[Ints, bool]], still: Bools | None = 
         np.concatenate(rows)[order],
         starts,
         negated,
+        np.searchsorted(blocks, lone * (n + 1)),
         np.flatnonzero(mixed),
         np.concatenate(end_rows)[gradient_order],
         np.concatenate(end_signs)[gradient_order][:, None],
@@ -164,6 +173,7 @@ def assemble(scheme: Pattern, parts: Sequence[Floats]) -> Floats:
         gathered[:, scheme.minus] *= -1.0
     blocks: Floats = np.add.reduceat(gathered, scheme.starts, axis=1).reshape(len(every), -1, dof, dof)
     blocks[:, scheme.negated] *= -1.0
+    blocks[:, scheme.empty] = 0.0
     return _stilled(scheme, blocks)
 
 

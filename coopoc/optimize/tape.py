@@ -50,10 +50,12 @@ class Written(NamedTuple):
     Attributes:
         tape: for the kernel.
         entries: (outputs, 2); the cost has -1 twice.
+        function: the same as CasADi's Function of (inputs,) -> (outputs,).
     """
 
     tape: Tape
     entries: Ints
+    function: Any
 
 
 def kind_of(factor: Factor, space: Space) -> Kind:
@@ -66,9 +68,10 @@ def numbers_of(factor: Factor) -> Floats:
     weight = 1.0 / factor.std if factor.std is not None else factor.sqrt_information
     assert weight is not None
     assert factor.constants is not None
-    parts = [factor.z.T, factor.constants.T, weight.reshape(len(weight), -1).T]
-    count = len(factor.nodes)
-    return np.concatenate([np.broadcast_to(part, (len(part), count)) for part in parts])
+    first, second = factor.z.shape[1], factor.z.shape[1] + factor.constants.shape[1]
+    out = np.empty((second + weight[0].size, len(factor.nodes)))
+    out[:first], out[first:second], out[second:] = factor.z.T, factor.constants.T, weight.reshape(len(weight), -1).T
+    return out
 
 
 @lru_cache(maxsize=256)
@@ -102,7 +105,7 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.cse(here)
     kept = [k for k in range(here.size1()) if not here[k].is_zero()]
     function = ca.Function("tape", [ca.vertcat(nodes, number)], [ca.vertcat(*(ca.densify(here[k]) for k in kept))])
-    return Written(_tape(function), np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
+    return Written(_tape(function), np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
 
 
 def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:

@@ -1,4 +1,4 @@
-"""The outer loop of a large problem: J^T J where its model is good, the exact Hessian where it misleads."""
+"""The outer loop of a single problem: J^T J where its model is good, the exact Hessian where it misleads."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ GROWTH, DECAY = 10.0, 5.0
 middle where a step overshoots."""
 FIRST = 1e-4
 """Damping once some is needed."""
-FLAT = 1e-14
-"""Share of the cost whose promise ends the loop: some 1e-6 standard deviations to go, before the step that is taken."""
+FLAT = 1e-18
+"""Share of the cost whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 SLOW = 0.2
@@ -71,7 +71,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     scale = _scale(system, values)
     while len(record) < max_iterations and not converged and mu < GIVE_UP:
         newton += model == "newton"
-        definite = cholesky.factor(system.matrix(_damped(system, values, mu * scale)))
+        definite = cholesky.factor(_damped(system, values, mu * scale))
         if not definite:
             record.append((cost, mu, np.nan))
             if model == "newton":
@@ -83,7 +83,8 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
         dx = -cholesky.solve(gradient)
         promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
         there = system.retract(x, dx)
-        after = system.cost(there)
+        trial, used = system.quadratic(there, model), model
+        after = trial[0]
         hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
         share = 1.0 if hidden else (cost - after) / promised
         still = still + 1 if hidden else 0
@@ -100,7 +101,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             model = "newton" if doubt >= DOUBT else model
         last = promised
         if not converged:
-            cost, gradient, values = system.quadratic(x, model)
+            cost, gradient, values = trial if model == used else system.quadratic(x, model)
             scale = _scale(system, values) if model == "gauss-newton" else scale
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 

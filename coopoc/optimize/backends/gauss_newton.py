@@ -10,8 +10,8 @@ from ...arrays import Floats
 from ..assess import factorise
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..curvature import newton_step
-from ..dense import damped_step, is_small
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend, one_step
+from ..dense import damped_step
+from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
 from ..linear import Linear
 from ..problem import Problem
 from ..sparse import Sparse, sparse
@@ -35,10 +35,8 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     step = linear_step(structure)
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        if problem.linear and is_small(problem) and max_iterations:
-            return one_step(problem, step, x)
         if max_iterations and (system := sparse(problem)) is not None:
-            return _graph(system, x, max_iterations, tolerance)
+            return _by_tapes(system, x, 1 if problem.linear else max_iterations, tolerance)
         patience = max_iterations if problem.batch is not None else min(max_iterations, PATIENCE)
         end = descend(problem, step, x, patience, tolerance)
         if end.converged.all() or patience == max_iterations:
@@ -50,8 +48,8 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     return solver
 
 
-def _graph(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
-    """The result of a large problem from x (1, n, ambient)."""
+def _by_tapes(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
+    """The result of a single problem from x (1, n, ambient)."""
     end = arrive(system, x[0], max_iterations, tolerance)
     extras = {"newton_steps": end.newton_steps, "record": end.record}
     return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)

@@ -16,7 +16,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...plugins import unknown
-from ..backend import Backend, Capabilities, Solver, SolverResult, looped
+from ..backend import Backend, Capabilities, Options, Solver, SolverResult, looped
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..linear import Linear
 from ..problem import Problem
@@ -64,6 +64,13 @@ def prepare(
 
         return solver
     return looped(lambda problem, x: _optimised(problem, x, max_iterations, tolerance, optimizer))
+
+
+def fallback(problem: Problem, options: Options) -> Options | None:
+    """Our loop with GTSAM's elimination, where GTSAM's own Levenberg-Marquardt did not arrive."""
+    if options.get("optimizer", "auto") != "auto" or not _own(problem):
+        return None
+    return {**options, "optimizer": "elimination"}
 
 
 def _own(problem: Problem) -> bool:
@@ -190,4 +197,5 @@ BACKEND = Backend(
     "GTSAM's own factors and Levenberg-Marquardt where it has them all, else its elimination; GNC (optimizer=)",
     "gtsam",
     Capabilities(batched=True),
+    fallback,
 )

@@ -92,7 +92,8 @@ class _System:
         k, q = (form.stiefel.shape[1], form.sphere.shape[1]) if form.bound else (0, 0)
         dof = k * p - k * (k + 1) // 2, q * p - 1
         count = len(form.stiefel), len(form.sphere), size - form.bound
-        self.cholesky = Cholesky(np.repeat(np.arange(sum(count)), np.repeat([*dof, p], count)))
+        group = np.repeat(np.arange(sum(count)), np.repeat([*dof, p], count))
+        self.cholesky = Cholesky(self._pattern.indptr, self._pattern.indices, group)
         self._keys = _keys(self._pattern)
 
     def factor(self, hessian: Any, damping: Floats) -> bool:
@@ -102,9 +103,7 @@ class _System:
         values, upper = np.zeros(len(self._keys)), csc_matrix(triu(hessian))
         values[np.searchsorted(self._keys, _keys(upper))] = upper.data
         values[self._pattern.indptr[1:] - 1] += damping
-        return self.cholesky.factor(
-            csc_matrix((values, self._pattern.indices, self._pattern.indptr), self._pattern.shape)
-        )
+        return self.cholesky.factor(values)
 
 
 def _keys(matrix: Any) -> Ints:

@@ -1,0 +1,80 @@
+"""Joint covariances against NumPy's inverse and GTSAM's joint marginals."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from random_graphs import random_graph
+
+from coopoc import InputError
+from coopoc.optimize import MEASUREMENTS, Problem, measurement, solve
+from coopoc.optimize.backends.gtsam_forms import forms
+from coopoc.optimize.backends.gtsam_native import native_graph, values, which_turn
+from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.joint import joint_covariance
+
+
+@pytest.mark.parametrize("steps", [10, 60])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_joint_covariance_is_a_part_of_the_inverse(dimension: int, steps: int) -> None:
+    """Few nodes by a dense factor, many by a sparse one; a fixed node has none."""
+    problem = from_graph(random_graph(1, dimension, steps=steps))
+    found, dof = solve(problem), problem.space.dof
+    J = problem.whiten(found.x)[1].toarray()
+    free = np.flatnonzero(problem.movable.ravel())
+    inverse = np.zeros((J.shape[1], J.shape[1]))
+    inverse[np.ix_(free, free)] = np.linalg.inv(J[:, free].T @ J[:, free])
+    nodes = ["A0", "A5", "B3", "L1", "A5"]
+    joint = joint_covariance(problem, found, nodes)
+    blocks = inverse.reshape(len(problem.names), dof, len(problem.names), dof).swapaxes(1, 2)
+    places = [problem.index(node) for node in nodes]
+    assert joint == pytest.approx(blocks[np.ix_(places, places)], rel=1e-6, abs=1e-12)
+    assert not joint[0].any()
+    assert joint[1, 1] == pytest.approx(found.covariance[places[1]], rel=1e-6)
+
+
+def ring(kind: str = "range") -> Problem:
+    """Points with fixes and distances around a ring, and a window's separator."""
+    rng, names = np.random.default_rng(2), [f"p{k}" for k in range(30)]
+    at = np.stack([20 * np.cos(np.arange(30) / 5), 20 * np.sin(np.arange(30) / 5)], axis=1)
+    problem = Problem(names, x0=at, dimension=2, separator=(0,)).add("position", names, at, std=2.0)
+    pairs = [(0, k) for k in range(1, 30)]
+    apart = np.linalg.norm(at[1:] - at[0], axis=1) + 0.1 * rng.normal(size=29)
+    return problem.add(kind, pairs, apart, std=0.1)
+
+
+def test_joint_marginals_are_gtsams() -> None:
+    problem = ring()
+    found = solve(problem)
+    graph = native_graph(problem, forms(problem)).graph
+    tree = gtsam.Marginals(graph, values(problem.space, which_turn(problem), found.x, range(30)))
+    whole = tree.jointMarginalCovariance(keys := [0, 7, 21])
+    joint = joint_covariance(problem, found, keys)
+    for i, a in enumerate(keys):
+        for j, b in enumerate(keys):
+            assert joint[i, j] == pytest.approx(whole.at(a, b), rel=1e-6, abs=1e-12)
+
+
+def test_a_kind_without_a_tape_has_joint_covariances() -> None:
+    @measurement("distance_by_numpy_of_test", arity=2, components=("distance",), plane=(0,))
+    def formula(x: object, y: object, z: object, m: object = np) -> tuple[object]:
+        return (m.sqrt(x * x + y * y) if type(x).__module__ != "casadi.casadi" else 1 / 0,)
+
+    try:
+        problem, plain = ring("distance_by_numpy_of_test"), ring()
+        joint, expected = (joint_covariance(p, solve(p), [0, 7]) for p in (problem, plain))
+        assert joint == pytest.approx(expected, rel=1e-6)
+    finally:
+        del MEASUREMENTS["distance_by_numpy_of_test"]
+
+
+def test_what_has_no_covariance_is_refused() -> None:
+    problem = Problem("ab").add("displacement", ("a", "b"), [1, 0, 0], std=1.0)
+    with pytest.raises(InputError, match="must hold all nodes"):
+        joint_covariance(problem, solve(problem, throw=False), "ab")
+    fixed = problem.add("position", "a", [0, 0, 0], std=1.0)
+    with pytest.raises(InputError, match="constraints"):
+        joint_covariance(fixed.constrain("position", "a", lower=0.0), solve(fixed), "ab")
+    with pytest.raises(InputError, match="'c'"):
+        joint_covariance(fixed, solve(fixed), "ac")
