@@ -10,6 +10,8 @@ from .evaluate.ledger import break_even as break_even
 from .evaluate.metrics import max_error as max_error
 from .evaluate.metrics import nees as nees
 from .evaluate.metrics import rt_le as rt_le
+from .evaluate.pose_bounds import fleet_pose_bound as fleet_pose_bound
+from .evaluate.pose_bounds import pose_bound as pose_bound
 from .evaluate.pose_metrics import heading_error as heading_error
 from .evaluate.pose_metrics import pose_nees as pose_nees
 from .evaluate.statistics import paired_difference as paired_difference
