@@ -79,7 +79,7 @@ def seen(noise: Sensors, v2x: V2X, speed: float, seconds: float, runs: int, seed
 
 
 def cell(p: Params) -> list[Row]:
-    """Rms errors of all vehicles over the last part of the drive: a row per run; of the bound one row."""
+    """Rms errors of all vehicles at the end of the drive: a row per run; of the bound one row."""
     fleet, noise, v2x = convoy(float(p["speed"]), float(p["after_s"])), sensors(p), channel(p)
     last = slice(-round(float(p["score_s"]) / DT), None)
     if p["method"] == "bound":
@@ -155,7 +155,7 @@ STUDY = Study(
     "What does a heading cost that is measured with an error, or only estimated, and when does a fleet find its own?",
     cell,
     _grid(),
-    settings={"runs": 20, "seed": 0, "radius_m": 60.0, "gnss_std_m": 1.5, "yaw_rate_std": 0.01, "score_s": 0.5},
+    settings={"runs": 20, "seed": 0, "radius_m": 60.0, "gnss_std_m": 1.5, "yaw_rate_std": 0.01, "score_s": 0.1},
     key=key,
     shares=("compass", "max_neighbours", "speed", "after_s"),
     tables={
@@ -169,7 +169,7 @@ STUDY = Study(
     limitations=(
         "One convoy: the geometry decides how much a bearing tells.",
         "One state needs a centre; the bound is that of all measurements of all vehicles.",
-        "First headings without a compass are sought over the time that is scored, so that nothing of it is new.",
+        "Of a drive its last instant is scored: first headings without a compass are sought in all of it.",
     ),
     reference=reference("heading_error"),
     minutes=5,

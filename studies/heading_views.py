@@ -99,7 +99,7 @@ def figure(results: Results) -> Plot | None:
                     label = f"{speed:g} m/s" if style == "-" else None
                     marker = "o" if style == "-" else ""
                     axis.plot(list(ran), list(ran.values()), style, color=color, marker=marker, label=label)
-            axis.set(xscale="log", yscale="log", ylim=(0.5, 150), title=f"No compass, K = {k}", xlabel="Time [s]")
+            axis.set(xscale="log", yscale="log", ylim=(0.15, 200), title=f"No compass, K = {k}", xlabel="Time [s]")
             axis.set_xticks(list(AFTER), [f"{x:g}" for x in AFTER])
             axis.minorticks_off()
             plain_log(axis.yaxis)
@@ -110,12 +110,12 @@ def figure(results: Results) -> Plot | None:
             for method, known in LINES:
                 points = {x: rms(results, at(method, known, k, word)) for x, word in places.items()}
                 names = {"method": at(method, known, k, NONE)["method"], "noise_model": known}
-                style = {"linestyle": ":" if method == "bound" else "--" if known == FIRST else "-"}
-                drawn += draw(cost, [Line(names, points, style)])
+                drawn += draw(cost, [Line(names, points)])
         cost.set_xticks(list(places), [TITLES[word].replace("no compass", "none") for word in places.values()])
-        cost.set(ylabel="RT-LE [m]", xlabel="Compass", title="K = 0 (above) and 10", ylim=(0, None))
+        cost.set(ylabel="RT-LE [m]", xlabel="Compass", title="K = 0 (above) and 10", yscale="log")
+        plain_log(cost.yaxis)
         legend(cost, drawn)
-    text = "Dotted: the bound. Dashed: only the first heading of the compass is taken."
+    text = "Dotted on the left: the bound."
     return Plot(figure, _note(results, text))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -21,8 +21,12 @@ from . import pose_unit
 from .central_filter import CENTRE, centre
 from .options import check_options
 from .pose_begin import check_compass, first_poses, pose_egos
+from .pose_stream import PoseStream
 from .pose_unit import Members
 from .track import Track
+
+if TYPE_CHECKING:
+    from ..kernels.pose_filter import PoseOptions
 
 Unit = Literal["solo", "star", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
@@ -153,6 +157,34 @@ class PoseFilter:
             extras,
         )
 
+    def start(self, dt: float, begin: Floats | None = None, *, max_age: float = 1.0) -> PoseStream:
+        """This filter for a vehicle alone or a star that is fed as it drives, one `step` of dt s after the other.
+
+        Args:
+            dt: s.
+            begin: (4,) m and rad, pose at the first step; None: its fix and compass.
+            max_age: s, older messages are not used.
+
+        Raises:
+            InputError: a filter of a fleet, or one without `assumed`.
+
+        >>> from coopoc import OwnMeasurement, Sensors
+        >>> stream = PoseFilter("solo", assumed=Sensors(heading_std=0.1)).start(dt=0.1)
+        >>> stream.step(OwnMeasurement([9.0, 0, 0], 0.0, gnss=[1.0, 2.0, 0.0], heading=0.5)).x.round(3).tolist()
+        [1.0, 2.0, 0.0, 0.5]
+        """
+        if self.unit == "fleet":
+            raise InputError("unit", self.unit, "has no stream", 'Take "solo" or "star".')
+        if self.assumed is None:
+            raise InputError("assumed", None, "is needed: a stream has no recording", "Give assumed=Sensors(...).")
+        dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
+        noise = pose_unit.pose_noise(self.assumed.check_assumed(), dt, self.gate)
+        given = np.full(4, np.nan) if begin is None else np.asarray(begin, dtype=float)
+        if given.shape != (4,):
+            raise InputError("begin", begin, "must be (x, y, z, heading)", "Give NaN for what is not known.")
+        first = given, np.array(self.spread, dtype=float)
+        return PoseStream(self.unit == "star", noise, self.options(), first, dt, max_age)
+
     def _each(self, recording: Recording, columns: Sequence[int], begin: Floats) -> Iterator[_Found]:
         """Egos one after the other."""
         links = recording.links
@@ -198,10 +230,17 @@ class PoseFilter:
         self, recording: Recording, members: Members, links: Ints, begin: Floats, kept: Bools | None = None
     ) -> tuple[Floats, Floats, Floats]:
         """States, covariances, and cost and number of measurements of a unit, as of `kernels.pose_filter`."""
-        from ..kernels.pose_filter import PoseOptions, follow
+        from ..kernels.pose_filter import follow, follow_apart
 
         noise = pose_unit.pose_noise(self.assumed or recording.sensors, recording.dt, self.gate)
+        measured, options = pose_unit.seen(recording, members, links, kept), self.options()
+        memory = pose_unit.memory(int(np.diff(members.start).max()), options.d)
+        run = follow if self.fusion == "joint" else follow_apart
+        return run(measured, noise, begin, np.array(self.spread, dtype=float), options, memory)
+
+    def options(self) -> PoseOptions:
+        """As the kernel takes them."""
+        from ..kernels.pose_filter import PoseOptions
+
         fusion = get_args(Fusion).index(self.fusion)
-        options = PoseOptions(6 if self.lasting else 4, 1 + self.exact, self.invariant, fusion)
-        measured = pose_unit.seen(recording, members, links, kept)
-        return follow(measured, noise, begin, np.array(self.spread, dtype=float), options)
+        return PoseOptions(6 if self.lasting else 4, 1 + self.exact, self.invariant, fusion, 0)
