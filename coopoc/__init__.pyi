@@ -10,6 +10,8 @@ from .evaluate.ledger import break_even as break_even
 from .evaluate.metrics import max_error as max_error
 from .evaluate.metrics import nees as nees
 from .evaluate.metrics import rt_le as rt_le
+from .evaluate.pose_bounds import fleet_pose_bound as fleet_pose_bound
+from .evaluate.pose_bounds import pose_bound as pose_bound
 from .evaluate.pose_metrics import heading_error as heading_error
 from .evaluate.pose_metrics import pose_nees as pose_nees
 from .evaluate.statistics import paired_difference as paired_difference
@@ -34,6 +36,8 @@ from .methods.moving_horizon import MovingHorizon as MovingHorizon
 from .methods.msmv import MSMV as MSMV
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.pose_filter import PoseFilter as PoseFilter
+from .methods.pose_measurement import BodyMeasurement as BodyMeasurement
+from .methods.pose_measurement import OwnMeasurement as OwnMeasurement
 from .methods.pose_start import pose_start as pose_start
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
@@ -54,6 +58,7 @@ from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body import Body as Body
+from .world.cam_recording import cam_received as cam_received
 from .world.channel_load import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.frames import in_world as in_world

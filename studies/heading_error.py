@@ -1,128 +1,177 @@
-"""Cost of a wrong heading, which turns a bearing on board into an azimuth of the world."""
+"""What a heading costs: known, from a compass that errs, or estimated from odometry, bearings and fixes alone."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from functools import lru_cache, partial
+from typing import Any
 
-from coopoc.study.numbers import mean, present, sentence
-from coopoc.study.pivot import across, crossed
-from coopoc.study.style import look
+import numpy as np
 
-from . import lineup, scene
-from .lineup import BOUND, of
+from coopoc.arrays import Floats
+from coopoc.errors import InputError
+from coopoc.evaluate.metrics import errors
+from coopoc.evaluate.pose_bounds import fleet_pose_bound
+from coopoc.evaluate.pose_metrics import heading_error, pose_nees
+from coopoc.methods.joint_filter import JointFilter
+from coopoc.methods.pose_filter import PoseFilter
+from coopoc.methods.pose_start import pose_start
+from coopoc.methods.track import Track
+from coopoc.study.environment import revision
+from coopoc.study.study import Params, Row, Study
+from coopoc.world.fleet import Fleet
+from coopoc.world.frames import in_world, turned
+from coopoc.world.recording import Recording
+from coopoc.world.sensing import observe
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
 
-if TYPE_CHECKING:
-    from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
-    from coopoc.study.tables import Table
+from . import heading_views as views
+from .heading_views import ALWAYS, FIRST, NONE
+from .lineup import reference
+from .scene import CODE
 
-DEGREES = (0.0, 1.0, 2.0, 4.0, 8.0)
-KINDS = {"heading_std_deg": "noise, new at every step", "heading_bias_deg": "bias, one per vehicle and run"}
-EXACT = "heading taken as exact"
-LINES = (("joint", "nominal"), ("joint", EXACT), ("lkf-sa", "nominal"), ("lkf-sa", EXACT), ("split-ci", "nominal"))
-NEIGHBOURS = (2, 10)
-NO_ERROR = dict.fromkeys(KINDS, 0.0)
-NOTE = (
-    "An observer's heading error turns all that it sees alike. Nominal filters know its size and take it as noise "
-    "of each azimuth; the others take the heading as exact."
-)
+VEHICLES, WIDTH, AHEAD, BEND, COURSE, DT = 11, 4.0, 10.0, 25.0, 2.0, 0.1
+"""Of the convoy: vehicles, m between its two lanes and from row to row, m of a bend, rad of its road, s of a step."""
+WHITE, EXACT = np.deg2rad(1.0), np.deg2rad(0.01)
+"""rad, white noise of a compass beside its bias, and all the error of one that is exact."""
+
+
+def convoy(speed: float, seconds: float) -> Fleet:
+    """Vehicles in two lanes that wind along at a speed m/s, each heading along its way, also if it stands."""
+    t = np.arange(round(seconds / DT) + 1) * DT
+    row, lane = np.divmod(np.arange(VEHICLES), 2)
+    way = speed * t[:, None] + AHEAD * row
+    heading = COURSE + 0.5 * np.sin(way / BEND)
+    middle = np.concatenate([heading[:1], (heading[1:] + heading[:-1]) / 2])
+    velocity = speed * np.stack([np.cos(middle), np.sin(middle), 0 * middle], axis=2)
+    start = turned(np.stack([AHEAD * row, WIDTH * lane, 0.0 * row], axis=1), np.asarray(COURSE))
+    steps = np.concatenate([np.zeros((1, VEHICLES, 3)), DT * velocity[1:]])
+    position = start + np.cumsum(steps, axis=0)
+    return Fleet(tuple(f"v{k}" for k in range(VEHICLES)), t, position, velocity, name="convoy", heading=heading)
+
+
+def sensors(p: Params) -> Sensors:
+    """The paper's noise with the compass of the cell: a bias of its degrees for each vehicle and run, and 1 degree."""
+    fix, word = float(p["gnss_std_m"]), str(p["compass"])
+    noise = replace(Sensors.paper_training(), gnss_std=(fix, fix, fix), yaw_rate_std=float(p["yaw_rate_std"]))
+    if word == NONE:
+        return replace(noise, compass=False)
+    if word == "exact":
+        return replace(noise, heading_std=EXACT)
+    return replace(noise, heading_std=WHITE, heading_bias_std=np.deg2rad(float(word)))
+
+
+def channel(p: Params) -> V2X:
+    """The K nearest of the convoy."""
+    return V2X(max_neighbours=int(p["max_neighbours"]), radius=float(p["radius_m"]))
+
+
+@lru_cache(maxsize=1)
+def seen(noise: Sensors, v2x: V2X, speed: float, seconds: float, runs: int, seed: int) -> tuple[Recording, Floats]:
+    """What all measure, and first headings where there is no compass; first positions are the first fixes."""
+    recording = observe(convoy(speed, seconds), noise, v2x, runs=runs, seed=seed, frame="body")
+    begin = np.full((runs, VEHICLES, 4), np.nan)
+    if not noise.compass:
+        begin[..., 3] = pose_start(recording, seconds=seconds)[..., 3]
+    return recording, begin
+
+
+def cell(p: Params) -> list[Row]:
+    """Rms errors of all vehicles at the end of the drive: a row per run; of the bound one row."""
+    fleet, noise, v2x = convoy(float(p["speed"]), float(p["after_s"])), sensors(p), channel(p)
+    last = slice(-round(float(p["score_s"]) / DT), None)
+    if p["method"] == "bound":
+        cov = fleet_pose_bound(fleet, noise, v2x)[last]
+        square = np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)
+        return [{"run": 0, "ego": "all", "rt_le_m": _root(square), "heading_deg": np.rad2deg(_root(cov[..., 3, 3]))}]
+    runs = int(p["runs"])
+    recording, begin = seen(noise, v2x, float(p["speed"]), float(p["after_s"]), runs, int(p["seed"]))
+    track = tracked(p, recording, begin)
+    position, rows = errors(track, fleet)[:, last], []
+    for run in range(runs):
+        row: Row = {"run": run, "ego": "all", "rt_le_m": _root(position[run] ** 2)}
+        if track.heading is not None:
+            row["heading_deg"] = np.rad2deg(_root(heading_error(track, fleet)[run, last] ** 2))
+            row["nees"] = float(pose_nees(track, fleet)[run, last].mean())
+        rows.append(row)
+    return rows
+
+
+def tracked(p: Params, recording: Recording, begin: Floats) -> Track:
+    """The track of all vehicles by the cell's method."""
+    everyone = range(VEHICLES)
+    if p["method"] == "joint":
+        return JointFilter()(in_world(recording), everyone)
+    if p["noise_model"] == FIRST:
+        assert recording.body is not None
+        heading = recording.body.heading.copy()
+        heading[:, 1:] = np.nan
+        recording = replace(recording, body=replace(recording.body, heading=heading))
+    unit: Any = "fleet" if p["method"] == "pose-fleet" else "solo"
+    spread = (*recording.sensors.fix_std, 0.15)
+    return PoseFilter(unit, begin=begin, spread=spread)(recording, everyone)
+
+
+def _root(squares: Floats) -> float:
+    return float(np.sqrt(np.mean(squares)))
+
+
+def key(p: Params) -> Mapping[str, str]:
+    """Digest of the code.
+
+    Raises:
+        InputError: parameters of which no cell can be made.
+    """
+    sensors(p), channel(p)
+    if not DT <= float(p["score_s"]) <= min(views.AFTER):
+        raise InputError("score_s", p["score_s"], f"must be {DT:g}..{min(views.AFTER):g} s", "0.5 is the default.")
+    return {"code": revision(*CODE)}
 
 
 def _grid() -> list[dict[str, Any]]:
-    """One kind of error at a time; the solo filter and the bound, which the heading does not change, once."""
-    cases = [NO_ERROR, *({**NO_ERROR, kind: size} for kind in KINDS for size in DEGREES[1:])]
-    return [
-        of("kalman", "nominal", **NO_ERROR, max_neighbours=0),
-        *(
-            of(*line, **case, max_neighbours=k)
-            for case in cases
-            for k in NEIGHBOURS
-            for line in LINES
-            if case != NO_ERROR or line[1] != EXACT
-        ),
-        *(of(*BOUND, **NO_ERROR, max_neighbours=k) for k in NEIGHBOURS),
+    """All compasses at one speed after a long drive; without a compass all speeds after all times."""
+    compass = {"speed": views.SPEED, "after_s": max(views.AFTER)}
+    cases = [{**compass, "compass": word} for word in views.COMPASSES]
+    cases += [
+        {"speed": speed, "after_s": after, "compass": NONE}
+        for speed in views.SPEEDS
+        for after in views.AFTER
+        if (speed, after) != tuple(compass.values())
     ]
+    rows = []
+    for case in cases:
+        for k in views.NEIGHBOURS:
+            pose, errs = "pose-fleet" if k else "pose-solo", case["compass"] not in (NONE, "exact")
+            lines = [(pose, ALWAYS), *([(pose, FIRST)] if errs else []), ("bound", "bound")]
+            lines += [("joint", ALWAYS)] if case["compass"] != NONE else []
+            rows += [{**case, "max_neighbours": k, "method": m, "noise_model": known} for m, known in lines]
+    return rows
 
 
-def at(kind: str, size: float, method: str, known: str, k: int) -> dict[str, Any]:
-    """A selection; without an error all noise models are one."""
-    return of(method, known if size else "nominal", **{**NO_ERROR, kind: size}, max_neighbours=k)
-
-
-def _table(results: Results, value: str, text: str, decimals: int) -> Table | None:
-    def number(results: Results, where: Mapping[str, Any]) -> float | None:
-        return mean(results, at(**where), value)
-
-    rows = [
-        ((words, k, look(method).label, known), {"kind": kind, "k": k, "method": method, "known": known})
-        for kind, words in KINDS.items()
-        for k in NEIGHBOURS
-        for method, known in LINES
-    ]
-    columns = across(number, {f"{size:g}°": {"size": size} for size in DEGREES})
-    head = ("Heading error", "K", "Method", "Noise model")
-    return crossed(results, head, rows, columns, scene.caption(results, text, NOTE), decimals=decimals)
-
-
-def _figure(results: Results) -> Plot | None:
-    """RT-LE against the size of the error, a panel per kind and K."""
-    from coopoc.study.lines import Line, Panel, panels
-
-    shown = []
-    for kind, words in KINDS.items():
-        for k in NEIGHBOURS:
-            if present(results, {"max_neighbours": k}):
-                lines = [
-                    Line(of(*line), {size: mean(results, at(kind, size, *line, k)) for size in DEGREES})
-                    for line in LINES
-                ]
-                for pair, level in ((("kalman", "nominal"), 0), (BOUND, k)):
-                    lines.append(Line(of(*pair), mean(results, of(*pair, max_neighbours=level))))
-                shown.append(Panel(lines, f"{words.partition(',')[0]}, K = {k}", "Heading error [°]", DEGREES))
-    text = "RT-LE against the heading's error; horizontal: the solo filter, and the bound for an exact heading."
-    return panels(shown, scene.caption(results, text, NOTE), 1.4 + 1.75 * len(shown))
-
-
-FINDING = (
-    "4° of {words}, K = {k}: the joint filter goes from {none:.2f} m to {ignored:.2f} m if it takes the heading as "
-    "exact, {known:.2f} m if the error is modelled; alone {alone:.2f} m."
-)
-
-
-def _findings(results: Results) -> dict[str, str]:
-    return {
-        f"{kind}, K = {k}": sentence(
-            FINDING,
-            words=words.partition(",")[0],
-            k=k,
-            none=mean(results, at(kind, 0.0, "joint", "nominal", k)),
-            ignored=mean(results, at(kind, 4.0, "joint", EXACT, k)),
-            known=mean(results, at(kind, 4.0, "joint", "nominal", k)),
-            alone=mean(results, {"method": "kalman", "max_neighbours": 0}),
-        )
-        for kind, words in KINDS.items()
-        for k in NEIGHBOURS
-    }
-
-
-STUDY = lineup.study(
+STUDY = Study(
     "heading_error",
-    "How wrong may the heading be before relative measurements that depend on it do more harm than good?",
-    grid=_grid(),
-    settings={**scene.TOWN, "runs": 30, "train_seeds": 0},
-    shares=(*KINDS, "max_neighbours"),
+    "What does a heading cost that is measured with an error, or only estimated, and when does a fleet find its own?",
+    cell,
+    _grid(),
+    settings={"runs": 20, "seed": 0, "radius_m": 60.0, "gnss_std_m": 1.5, "yaw_rate_std": 0.01, "score_s": 0.1},
+    key=key,
+    shares=("compass", "max_neighbours", "speed", "after_s"),
     tables={
-        "rt_le": partial(_table, value="rt_le_m", text="RT-LE [m].", decimals=3),
-        "nees": partial(_table, value="nees", text="NEES (3 is consistent).", decimals=1),
+        "compass": partial(views.compasses, value="rt_le_m", text="RT-LE [m]", decimals=2),
+        "compass_heading": partial(views.compasses, value="heading_deg", text="Heading error [°]", decimals=2),
+        "nees": partial(views.compasses, value="nees", text="NEES of a pose (3 is consistent)", decimals=1),
+        "found": views.found,
     },
-    figures={"rt_le": _figure},
-    findings=_findings,
+    figures={"heading": views.figure},
+    findings=views.findings,
     limitations=(
-        "The bound is for an exact heading: with an unknown one it is higher.",
-        "Heading and velocity err apart: a real odometer turns its velocity by the same wrong heading.",
+        "One convoy: the geometry decides how much a bearing tells.",
+        "One state needs a centre; the bound is that of all measurements of all vehicles.",
+        "Of a drive its last instant is scored: first headings without a compass are sought in all of it.",
     ),
+    reference=reference("heading_error"),
     minutes=5,
-    metrics={"rt_le_m": "lower", "nees": 3.0},
+    metrics={"rt_le_m": "lower", "heading_deg": "lower", "nees": 3.0},
 )

@@ -18,19 +18,23 @@ from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors
 from coopoc.evaluate.pose_metrics import heading_error, pose_nees
+from coopoc.learned.pose_noise import PoseTask, fit_pose_noise
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.study.environment import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.recording import Recording
+from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from . import real_views as views
 from .scene import CODE
 
 METHODS: Mapping[str, Mapping[str, Any]] = dict(
-    zip(views.METHODS, ({}, {"fusion": "intersection"}, {"fusion": "naive"}), strict=True)
+    zip((*views.METHODS, views.LEARNED), ({}, {"fusion": "intersection"}, {"fusion": "naive"}, {}), strict=True)
 )
+TRAINING, SETTLED = (1, 4, 15), 30.0
+"""Landmarks of the drives that noise is learned on, and s until they are thinned there."""
 
 
 @lru_cache(maxsize=2)
@@ -45,6 +49,21 @@ def seen(data: str, until: float, v2x: V2X, gate: float) -> tuple[Recording, Flo
     """All that the robots measured, and their first poses."""
     recording = pose_recording(log(data, until)[0], v2x, log(data, until)[1])
     return recording, pose_start(recording, gate=gate)
+
+
+@lru_cache(maxsize=1)
+def learned(data: str, until: float, gate: float) -> Sensors:
+    """Noise learned on the part that calibrates, alone and together, with few landmarks and with all."""
+    found, known = log(data, until)
+    steps, settled, tasks = int(until / found.fleet.dt), int(SETTLED / found.fleet.dt), []
+    for k in (0, max(views.NEIGHBOURS)):
+        whole, begin = seen(data, until, V2X(max_neighbours=k, radius=float("inf")), gate)
+        unit: Any = "fleet" if k else "solo"
+        method = PoseFilter(unit, lasting=True, gate=gate, begin=begin)
+        for landmarks in TRAINING:
+            part = thinned(whole, landmarks, settled).between(0, steps)
+            tasks.append(PoseTask(part, found.fleet.between(0, steps), found.fleet.ids, method, settled))
+    return fit_pose_noise(tasks, known.sensors)
 
 
 def channel(p: Params) -> V2X:
@@ -76,7 +95,8 @@ def cell(p: Params) -> list[Row]:
     start, block = int(until / fleet.dt), max(int(float(p["block_s"]) / fleet.dt), 1)
     unit: Any = "fleet" if p["max_neighbours"] else "solo"
     how = METHODS[p["method"]] if p["max_neighbours"] else {}
-    method = PoseFilter(unit, **how, lasting=True, gate=gate, begin=begin)
+    assumed = learned(data, until, gate) if p["method"] == views.LEARNED else None
+    method = PoseFilter(unit, **how, lasting=True, gate=gate, begin=begin, assumed=assumed)
     recording = thinned(whole, int(p["landmarks"]), start)
     track = method(recording, fleet.ids)
     account = of_track(track, recording, method.message)
@@ -104,7 +124,8 @@ def _grid() -> list[dict[str, Any]]:
         for method in METHODS
         for k in views.NEIGHBOURS
         for n in views.LANDMARKS
-        if k or method == "pose-fleet"
+        if (k or method in ("pose-fleet", views.LEARNED))
+        and (method != views.LEARNED or k in (0, max(views.NEIGHBOURS)))
     ]
     return [{"method": method, "max_neighbours": k, "landmarks": n} for method, k, n in cases]
 
@@ -122,6 +143,7 @@ STUDY = Study(
         "heading": partial(views.table, value="heading_deg", text="Rms of the heading error [°].", decimals=1),
         "nees": partial(views.table, value="nees", text="NEES of a pose (3 is consistent).", decimals=1),
         "bytes": views.bytes,
+        "learned": views.learned,
         "fusion": partial(views.fusions, value="rt_le_m", text="RT-LE [m] of the ways of fusion, K = 4.", decimals=3),
         "fusion_nees": partial(views.fusions, value="nees", text="NEES, K = 4.", best=None, decimals=1),
     },

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc.evaluate.statistics import Interval
 from coopoc.study.marks import series
-from coopoc.study.numbers import Number, interval, mean, present, sentence
+from coopoc.study.numbers import Number, difference, interval, mean, present, sentence
 from coopoc.study.pivot import crossed, pivot
 from coopoc.study.style import look
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from coopoc.study.tables import Table
 
 METHODS = ("pose-fleet", "pose-intersection", "pose-naive")
+LEARNED = "pose-learned"
+"""One state with the noise that is learned on the first part."""
 LANDMARKS, NEIGHBOURS = (0, 1, 2, 4, 15), (0, 1, 2, 3, 4)
 FLEET = {"method": "pose-fleet"}
 NOTE = (
@@ -44,6 +48,29 @@ def fusions(results: Results, value: str, text: str, **options: Any) -> Table | 
     if present(results, where, value) is None:
         return None
     return pivot(results, "method", "landmarks", value, where, _caption(results, text), **options)
+
+
+def learned(results: Results) -> Table | None:
+    """RT-LE with the calibrated and the learned noise, their paired difference, and both NEES."""
+
+    def other(number: Any) -> Number:
+        return lambda results, where: number(results, {**where, "method": LEARNED})
+
+    def gap(results: Results, where: Mapping[str, Any]) -> Interval | None:
+        return difference(results, {**where, "method": LEARNED}, where)
+
+    columns: list[tuple[str, Number]] = [
+        ("Calibrated", mean),
+        ("Learned", other(mean)),
+        ("Difference", gap),
+        ("NEES", partial(mean, value="nees")),
+        ("NEES, learned", other(partial(mean, value="nees"))),
+    ]
+    if present(results, {"method": LEARNED}) is None:
+        return None
+    rows = [((k, n), {**FLEET, "max_neighbours": k, "landmarks": n}) for k in (0, max(NEIGHBOURS)) for n in LANDMARKS]
+    text = "RT-LE [m] with noise calibrated by its sums, and learned by the log score of the poses, on the same part."
+    return crossed(results, ("K", "Landmarks"), rows, columns, _caption(results, text), best=None, decimals=3)
 
 
 def bytes(results: Results) -> Table | None:

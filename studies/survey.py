@@ -77,7 +77,7 @@ LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
 QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "correlated_gnss": ("If GNSS errors are time-correlated?", ("own", "common")),
     "latency_loss": ("If messages are late or lost?", ("late", "lost one by one")),
-    "heading_error": ("If the heading is wrong?", ("heading_bias_deg, K = 2", "heading_bias_deg, K = 10")),
+    "heading_error": ("If the heading is not known?", ("cost, K = 2", "found, K = 2")),
     "robustness": ("If neighbours are spoofed?", ("K = 4", "K = 10")),
     "consistency": ("Which methods are consistent?", ("credible",)),
 }

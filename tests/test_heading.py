@@ -10,7 +10,7 @@ import pytest
 
 from coopoc import V2X, Fleet, Sensors, observe, run_study
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.studies import heading_error as study
+from coopoc.studies import heading_views as study
 from coopoc.study import numbers
 from coopoc.world.spherical import wrap
 
@@ -41,24 +41,18 @@ def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
     assert NoiseModel.nominal(Sensors()).sensors == Sensors()
 
 
-def test_the_study_shows_what_ignoring_it_costs(tmp_path: Path, short_town: str) -> None:
-    wanted = {
-        "data": short_town,
-        "runs": 3,
-        "egos": "2",
-        "heading_std_deg": "0.0,8.0",
-        "heading_bias_deg": "0.0,8.0",
-        "max_neighbours": "0,10",
-        "method": "kalman,joint,bound",
-    }
+def test_the_study_shows_what_a_heading_costs(tmp_path: Path) -> None:
+    wanted = {"runs": 4, "speed": "0.0,10.0", "after_s": "3.0,30.0", "max_neighbours": "0,2", "compass": "exact,3,none"}
     results = run_study("heading_error", tmp_path, settings=wanted, progress=False)
-    for kind in study.KINDS:
-        none, modelled, ignored = (
-            numbers.mean(results, study.at(kind, size, "joint", known, 10), "nees")
-            for size, known in ((0.0, "nominal"), (8.0, "nominal"), (8.0, study.EXACT))
-        )
-        assert none is not None
-        assert modelled is not None
-        assert ignored is not None
-        assert none < modelled < ignored
-    assert "Joint filter" in (tmp_path / "heading_error" / "tables" / "rt_le.md").read_text()
+    pose, first, joint, bound = study.LINES
+    exact, estimated, noise, once, turned = (
+        numbers.mean(results, study.at(*line, 2, compass)) or np.nan
+        for line, compass in ((pose, "exact"), (pose, "none"), (pose, "3"), (first, "3"), (joint, "3"))
+    )
+    assert exact < estimated < noise < turned
+    assert once < noise
+    for k, line, least, most in ((0, pose, 60.0, 180.0), (2, pose, 0.3, 4.0), (2, bound, 0.3, 4.0)):
+        still = numbers.rms(results, study.at(*line, k, "none", 0.0, 3.0), "heading_deg")
+        assert still is not None
+        assert least < still < most
+    assert "Position filter" in (tmp_path / "heading_error" / "tables" / "compass.md").read_text()

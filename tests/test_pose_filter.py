@@ -78,8 +78,8 @@ def test_the_kernel_is_the_dense_oracle(rough: co.Recording, kind: str, d: int, 
     seen, noise = pose_unit.seen(rough, members, links), pose_unit.pose_noise(NOISE, rough.dt, np.inf)
     begin, spread = np.full((2, 10, 4), np.nan), np.array([1.0, 1.0, 1.0, 0.1])
     begin[:, 0] = [*rough.gnss[0, 0, 0], 0.3]
-    options = PoseOptions(d, passes, False, 0)
-    x, cov, _ = follow(seen, noise, begin, spread, options)
+    options, memory = PoseOptions(d, passes, False, 0, 0), pose_unit.memory(int(np.diff(members.start).max()), d)
+    x, cov, _ = follow(seen, noise, begin, spread, options, memory)
     for run in range(2):
         wanted, covariance = oracle.pose_filter(seen, noise, begin, spread, options, run)
         scale = np.sqrt(np.einsum("...ii->...i", covariance)) + 1e-3

@@ -21,7 +21,7 @@ def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: 
         "train_seeds": 1,
     }
     found = survey.stages(("budget",), tmp_path, 1, {**few, "channel": "ideal"})
-    two = {**few, "method": "kalman,joint,bound", "max_neighbours": "0,2"}
+    two = {"runs": 1, "max_neighbours": "2", "after_s": "3,30", "speed": "0,1,10"}
     found |= survey.stages(("heading_error",), tmp_path, 1, two)
     assert "stage 1 of 2: heading_error" in capsys.readouterr().err
     said = survey.answers(found)
@@ -33,13 +33,13 @@ def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: 
     assert together is not None
     assert bound is not None
     limits = [f"Which method with {words}?" for words in survey.LIMITS.values()]
-    assert list(said) == [*limits, "If the heading is wrong?"]
+    assert list(said) == [*limits, "If the heading is not known?"]
     rich, poor, none, heading = said.values()
     assert rich.startswith("With the noise known, Joint filter with K = 4 and ")
     assert f"{together / bound:.2f} times the bound" in rich
     assert none.startswith("With the noise known, KF: ")
     assert "with the noise fitted elsewhere, KF" in none
     assert poor != rich  # 4 neighbours at 10 Hz take more than 300 B/s
-    assert heading.startswith("4° of bias")
+    assert heading.startswith("K = 2, 10 m/s: ")
     page = report([tmp_path / "budget"], tmp_path / "report.html", answers=said).read_text()
     assert f"<dt>Which method with no V2X?</dt><dd>{none}</dd>" in page

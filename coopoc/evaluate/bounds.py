@@ -53,7 +53,7 @@ def posterior_bound(
     >>> float(posterior_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0)[1, 0, 0])  # standing still: 4 / 2
     2.0
     """
-    v2x = _checked(fleet, sensors, v2x)
+    v2x = checked_noise(fleet, sensors, v2x)
     if not isinstance(information, str) or information not in ("star", "fleet"):
         raise unknown("information", information, ("star", "fleet"), "For solo give K = 0.")
     instance("smoothing", smoothing, bool)
@@ -106,7 +106,7 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
     >>> float(fleet_bound(fleet, rigid, V2X())[0, 1, 0, 0].round(3))  # two fixes for one body: 4 / 2
     2.0
     """
-    v2x = _checked(fleet, sensors, v2x)
+    v2x = checked_noise(fleet, sensors, v2x)
     everyone = range(len(fleet.ids))
     links = find_links(fleet, everyone, v2x.max_neighbours, v2x.radius, sensors.min_range)
     members = [np.flatnonzero(row) for row in fleet.present]
@@ -132,12 +132,13 @@ def bound_rt_le(cov: Floats) -> float:
     return float(np.sqrt(np.trace(checked("cov", cov, "(T, 3, 3)", (-1, 3, 3)), axis1=-2, axis2=-1).mean()))
 
 
-def _checked(fleet: Fleet, sensors: Sensors, v2x: V2X | None) -> V2X:
+def checked_noise(fleet: Fleet, sensors: Sensors, v2x: V2X | None, landmarks: bool = False) -> V2X:
+    """The channel, None being none; InputError for an acting std of zero."""
     instance("fleet", fleet, Fleet)
     instance("sensors", sensors, Sensors)
     v2x = V2X(max_neighbours=0) if v2x is None else instance("v2x", v2x, V2X)
     if min(sensors.gnss_std) <= 0:
         raise InputError("gnss_std", sensors.gnss_std, "must be > 0", "With exact fixes the bound is zero.")
-    if v2x.max_neighbours and min(sensors.relative_std) <= 0:
+    if (v2x.max_neighbours or landmarks) and min(sensors.relative_std) <= 0:
         raise InputError("relative_std", sensors.relative_std, "must be > 0", "An exact one merges two vehicles.")
     return v2x

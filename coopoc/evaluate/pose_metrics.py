@@ -44,11 +44,21 @@ def pose_nees(track: Track, fleet: Fleet) -> Floats:
     (5, 2, 1)
     """
     turn = heading_error(track, fleet)
+    error = np.concatenate([(track.x - fleet.position[:, list(track.egos)])[..., :2], turn[..., None]], axis=-1)
+    solved = np.linalg.solve(pose_covariance(track), error[..., None])[..., 0]
+    return np.asarray((error * solved).sum(axis=-1))
+
+
+def pose_covariance(track: Track) -> Floats:
+    """Covariance (R, T, E, 3, 3) of (x, y, heading), m and rad.
+
+    Raises:
+        InputError: a track without covariances.
+    """
     if track.covariance is None or track.heading_covariance is None:
         raise InputError("covariance", None, "this method claims none", "NEES needs one.")
-    error = np.concatenate([(track.x - fleet.position[:, list(track.egos)])[..., :2], turn[..., None]], axis=-1)
-    cov = np.empty((*error.shape, 3))
+    cov = np.empty((*track.x.shape, 3))
     cov[..., :2, :2] = track.covariance[..., :2, :2]
     cov[..., 2, :2] = cov[..., :2, 2] = track.heading_covariance[..., :2]
     cov[..., 2, 2] = track.heading_covariance[..., 3]
-    return np.asarray((error * np.linalg.solve(cov, error[..., None])[..., 0]).sum(axis=-1))
+    return cov

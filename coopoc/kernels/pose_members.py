@@ -6,10 +6,12 @@ import math
 from typing import NamedTuple
 
 from ..arrays import Bools, Floats, Ints
-from .compile import inside, part
+from .compile import part, storage
 from .pose_motion import PoseNoise, predict
 from .pose_update import HEADING, KEPT, Poses, X
 
+COMPASS, VELOCITY, RATE = 3, 4, 7
+"""Places in `PoseSeen.own`, behind the fix."""
 UNKNOWN_HEADING = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
 
@@ -18,94 +20,89 @@ class PoseSeen(NamedTuple):
     """What a unit has measured and received in R runs of T steps of N vehicles, in body frames.
 
     Attributes:
-        gnss: (R, T, N, 3) m, NaN for a missing fix.
-        velocity: (R, T, N, 3) m/s, forward, left and up.
-        yaw_rate: (R, T, N) rad/s.
-        heading: (R, T, N) rad, NaN for a missing compass.
+        own: (R, T, N, 8) fix m, compass rad, NaN where missing, velocity m/s forward, left and up, yaw rate rad/s.
         member: (M,) columns of the members of all steps.
         start: (T+1,) first member of each step.
         newest: (R, M) step of the newest message of each member, -1 for none.
         fresh: (R, M) whether it is new.
-        observer: (L,) place of the observer among the members of the step.
-        other: (L,) place of the other, -1 for a landmark.
+        ends: (L, 2) places of observer and other among the members of the step, -1 for a landmark.
         first: (T+1,) first relative measurement of each step.
         place: (L, 3) m, of the landmark.
         relative: (R, L, 3) m, rad from the observer's heading, rad; NaN where missing.
         dt: s.
     """
 
-    gnss: Floats
-    velocity: Floats
-    yaw_rate: Floats
-    heading: Floats
+    own: Floats
     member: Ints
     start: Ints
     newest: Ints
     fresh: Bools
-    observer: Ints
-    other: Ints
+    ends: Ints
     first: Ints
     place: Floats
     relative: Floats
     dt: float
 
 
-@inside
+@storage
 def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int], d: int, uses: Floats) -> None:
     """Take the members of this step in their order from those of the last one, and move them; others join."""
+    vector, cov, kept = poses.vector, poses.cov, poses.kept
+    start, member, newest = seen.start, seen.member, seen.newest
     run, t = at
-    first, count = seen.start[t], seen.start[t + 1] - seen.start[t]
-    before = seen.start[t - 1] if t > 0 else first
+    first, count = start[t], start[t + 1] - start[t]
+    before = start[t - 1] if t > 0 else first
     old = first - before
     same = old == count
     for k in range(min(old, count)):
-        same = same and goes_on(seen, run, before + k, first + k)
+        same = same and goes_on(member, newest, run, before + k, first + k)
     if not same:
         for i in range(old * d):
-            poses.vector[KEPT, i] = poses.vector[X, i]
+            vector[KEPT, i] = vector[X, i]
             for j in range(old * d):
-                poses.kept[i, j] = poses.cov[i, j]
+                kept[i, j] = cov[i, j]
     for k in range(old):
         uses[len(uses) // 2 + k] = uses[k]
     for k in range(count):
-        came = k if same else previous(seen, run, before, old, first + k)
+        came = k if same else previous(member, newest, (run, before, old), first + k)
         if not same:
             for m in range(count):
-                other = previous(seen, run, before, old, first + m)
+                other = previous(member, newest, (run, before, old), first + m)
                 for i in range(d):
                     for j in range(d):
                         both = came >= 0 and other >= 0
-                        value = poses.kept[came * d + i, other * d + j] if both else 0.0
-                        poses.cov[k * d + i, m * d + j] = value
+                        value = kept[came * d + i, other * d + j] if both else 0.0
+                        cov[k * d + i, m * d + j] = value
             for i in range(d):
-                poses.vector[X, k * d + i] = poses.vector[KEPT, came * d + i] if came >= 0 else 0.0
-        again = came >= 0 and seen.newest[run, before + came] == seen.newest[run, first + k]
+                vector[X, k * d + i] = vector[KEPT, came * d + i] if came >= 0 else 0.0
+        again = came >= 0 and newest[run, before + came] == newest[run, first + k]
         uses[k] = uses[len(uses) // 2 + came] + 1.0 if again else 1.0
         if came < 0:
             join(poses, seen, noise, (run, t, k), d)
     for k in range(count):
-        if same or previous(seen, run, before, old, first + k) >= 0:
+        if same or previous(member, newest, (run, before, old), first + k) >= 0:
             advance(poses, seen, noise, (run, t, k), (d, count * d), uses[k])
 
 
 @part
-def previous(seen: PoseSeen, run: int, before: int, old: int, member: int) -> int:
+def previous(member: Ints, newest: Ints, last: tuple[int, int, int], one: int) -> int:
     """Place of a member in the last step, -1 if it begins now."""
+    run, before, old = last
     for k in range(old):
-        if goes_on(seen, run, before + k, member):
+        if goes_on(member, newest, run, before + k, one):
             return k
     return -1
 
 
 @part
-def goes_on(seen: PoseSeen, run: int, before: int, member: int) -> bool:
+def goes_on(member: Ints, newest: Ints, run: int, before: int, one: int) -> bool:
     """Whether a member is one of the last step. One without a message so far begins with the first: its place was
     arbitrary, and its variance is finite."""
-    known = seen.newest[run, before] >= 0 or seen.newest[run, member] < 0
-    return bool(known and seen.member[before] == seen.member[member])
+    known = newest[run, before] >= 0 or newest[run, one] < 0
+    return bool(known and member[before] == member[one])
 
 
-@inside
+@storage
 def advance(
     poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, int], sizes: tuple[int, int], uses: float
 ) -> None:
@@ -118,35 +115,37 @@ def advance(
             poses.cov[k * d + axis, k * d + axis] += noise.flat
         poses.cov[k * d + HEADING, k * d + HEADING] += UNKNOWN_HEADING
         return
-    u, age = seen.velocity[run, sent, column], seen.dt * (t - sent)
-    odometry = (u[0], u[1], u[2], seen.yaw_rate[run, sent, column])
+    own, age = seen.own[run, sent, column], seen.dt * (t - sent)
+    odometry = (own[VELOCITY], own[VELOCITY + 1], own[VELOCITY + 2], own[RATE])
     more = (2.0 * uses - 1.0, (age * noise.acceleration) ** 2)
     predict(poses, (k * d, d, size), odometry, seen.dt, noise, more)
 
 
-@inside
+@storage
 def join(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, int], d: int) -> None:
     """Begin a member where its message places it, and know nothing of it yet."""
+    vector, cov = poses.vector, poses.cov
     run, t, k = at
     i = seen.start[t] + k
     sent, column, block = seen.newest[run, i], seen.member[i], k * d
-    heading = seen.heading[run, sent, column] if sent >= 0 else math.nan
-    poses.vector[X, block + HEADING] = 0.0 if math.isnan(heading) else heading
+    heading = seen.own[run, sent, column, COMPASS] if sent >= 0 else math.nan
+    vector[X, block + HEADING] = 0.0 if math.isnan(heading) else heading
     for axis in range(3):
-        fix = seen.gnss[run, sent, column, axis] if sent >= 0 else math.nan
-        poses.vector[X, block + axis] = 0.0 if math.isnan(fix) else fix
-        poses.cov[block + axis, block + axis] = noise.flat
-    poses.cov[block + HEADING, block + HEADING] = UNKNOWN_HEADING
+        fix = seen.own[run, sent, column, axis] if sent >= 0 else math.nan
+        vector[X, block + axis] = 0.0 if math.isnan(fix) else fix
+        cov[block + axis, block + axis] = noise.flat
+    cov[block + HEADING, block + HEADING] = UNKNOWN_HEADING
     for j in range(4, d):
-        poses.cov[block + j, block + j] = noise.lasting[j - 4]
+        cov[block + j, block + j] = noise.lasting[j - 4]
 
 
-@inside
+@storage
 def place_at(poses: Poses, seen: PoseSeen, begin: Floats, spread: Floats, run: int, d: int) -> None:
     """Begin the members of the first step at poses that are given."""
-    for k in range(seen.start[1] - seen.start[0]):
-        column = seen.member[seen.start[0] + k]
+    vector, cov, start = poses.vector, poses.cov, seen.start
+    for k in range(start[1] - start[0]):
+        column = seen.member[start[0] + k]
         for i in range(4):
             if not math.isnan(begin[run, column, i]):
-                poses.vector[X, k * d + i] = begin[run, column, i]
-                poses.cov[k * d + i, k * d + i] = spread[i] * spread[i]
+                vector[X, k * d + i] = begin[run, column, i]
+                cov[k * d + i, k * d + i] = spread[i] * spread[i]

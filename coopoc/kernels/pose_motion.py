@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..arrays import Floats
 from .compile import part
 from .pose_update import HEADING, Poses, X
@@ -82,7 +84,7 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
         vector[X, block + 4] *= noise.keep
         vector[X, block + 5] *= noise.keep
     effects = (east, north, up, scale, dt, noise.keep)
-    moved_rows(cov, (block, d), effects, (0, size))
+    moved_rows(cov, (block, d), effects, (np.int64(0), size))
     for i in range(block, block + d):
         for j in range(i + 1, block + d):
             cov[i, j], cov[j, i] = cov[j, i], cov[i, j]
@@ -105,7 +107,7 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
 
 
 @part
-def moved_rows(cov: Floats, member: tuple[int, int], effects: Any, columns: tuple[int, int]) -> None:
+def moved_rows(cov: Floats, member: tuple[int, int], effects: Any, columns: Any) -> None:
     """F P of some columns in the rows of a member; the transposed of it, moved once more, is F P F^T.
 
     Args:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from .compile import part
 from .pose_motion import PoseNoise
 from .pose_rows import update_relative
@@ -38,8 +40,8 @@ def fuse_pairs(poses: Poses, seen: Any, noise: PoseNoise, at: tuple[int, int], o
     """
     (run, t), d, size = at, options.d, options.d * (seen.start[at[1] + 1] - seen.start[at[1]])
     for k in range(seen.first[t], seen.first[t + 1]):
-        pair = (d * seen.observer[k], d * seen.other[k])
-        set_aside(poses, pair, d, True)
+        pair = (d * seen.ends[k, 0], d * seen.ends[k, 1])
+        set_aside(poses, pair, d, np.int64(1))
         tries = TRIED if options.fusion == 2 and pair[1] >= 0 else 0
         best, chosen = math.inf, 1.0
         for attempt in range(tries + 1):
@@ -49,14 +51,14 @@ def fuse_pairs(poses: Poses, seen: Any, noise: PoseNoise, at: tuple[int, int], o
                 take_block(poses, pair[0], d)
             elif found < best:
                 best, chosen = found, weight
-            set_aside(poses, pair, d, False)
+            set_aside(poses, pair, d, np.int64(0))
 
 
 @part
 def fuse(poses: Poses, seen: Any, noise: PoseNoise, at: Any, sizes: Any, weight: float, weighs: bool) -> float:
     """Weigh both blocks, add one relative measurement; sum of the observer's variances over those before."""
     (run, k), (d, size) = at, sizes
-    observer, other = d * seen.observer[k], d * seen.other[k]
+    observer, other = d * seen.ends[k, 0], d * seen.ends[k, 1]
     if weighs:
         for i in range(d):
             for j in range(d):
@@ -66,7 +68,7 @@ def fuse(poses: Poses, seen: Any, noise: PoseNoise, at: Any, sizes: Any, weight:
         poses.vector[AT, i] = poses.vector[X, i]
     place = (seen.place[k, 0], seen.place[k, 1], seen.place[k, 2])
     found = (seen.relative[run, k, 0], seen.relative[run, k, 1], seen.relative[run, k, 2])
-    update_relative(poses, size, (observer, other, 0), place, found, (noise.relative, noise.gate))
+    update_relative(poses, size, (observer, other, np.int64(0)), place, found, (noise.relative, noise.gate))
     settle(poses, size)
     total = 0.0
     for i in range(observer, observer + d):
@@ -76,8 +78,8 @@ def fuse(poses: Poses, seen: Any, noise: PoseNoise, at: Any, sizes: Any, weight:
 
 
 @part
-def set_aside(poses: Poses, pair: tuple[int, int], d: int, away: bool) -> None:
-    """Set the state and the covariance of two members aside, or bring them back."""
+def set_aside(poses: Poses, pair: tuple[int, int], d: int, away: Any) -> None:
+    """Set the state and the covariance of two members aside (1), or bring them back (0)."""
     for first in pair:
         for i in range(first, first + d if first >= 0 else first):
             poses.vector[KEPT if away else X, i] = poses.vector[X if away else KEPT, i]

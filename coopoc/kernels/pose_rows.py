@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from ..arrays import Floats
 from .compile import part
 from .pose_update import AT, HEADING, Poses, X, update_row
@@ -44,6 +46,7 @@ def update_fix(poses: Poses, size: int, block: int, fix: Any, way: Any, gate: fl
         gate: in standard deviations.
     """
     vector, (x, y, z, xx, yy, zz), (ahead, aside, up) = poses.vector, fix, way
+    ends = (block, np.int64(-1))
     for i in range(block, block + 4):
         vector[AT, i] = vector[X, i]
     cos, sin = math.cos(vector[X, block + HEADING]), math.sin(vector[X, block + HEADING])
@@ -55,15 +58,15 @@ def update_fix(poses: Poses, size: int, block: int, fix: Any, way: Any, gate: fl
             row, gap, variance = (1.0, 0.0, 0.0, north), x + east - px, xx
         elif axis == 1:
             row, gap, variance = (0.0, 1.0, 0.0, -east), y + north - py, yy
-        residual = linear_residual(poses, (block, -1), row, gap)
-        update_row(poses, size, (block, -1), row, (residual, variance), gate)
+        residual = linear_residual(poses, ends, row, gap)
+        update_row(poses, size, ends, row, (residual, variance), gate)
 
 
 @part
 def update_heading(poses: Poses, size: int, block: int, heading: float, variance: float, gate: float) -> None:
     """A compass heading rad."""
     residual = wrapped(heading - poses.vector[X, block + HEADING])
-    update_row(poses, size, (block, -1), (0.0, 0.0, 0.0, 1.0), (residual, variance), gate)
+    update_row(poses, size, (block, np.int64(-1)), (0.0, 0.0, 0.0, 1.0), (residual, variance), gate)
 
 
 @part

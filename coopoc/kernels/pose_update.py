@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Floats
-from .compile import part, storage
+from .compile import part
 from .lanes import LANES, subtract
 
 HEADING = 3
@@ -44,7 +44,6 @@ class Poses(NamedTuple):
     cov_memory: Floats
 
 
-@storage
 def new_poses(size: int) -> Poses:
     """Room for `size` numbers."""
     stride = (size + LANES - 1) // LANES * LANES

@@ -3,43 +3,35 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints, checked, number
 from ..errors import InputError
 from ..plugins import unknown
-from ..world.inbox import inbox
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.spherical import wrap
 from ..world.v2x import NO_MESSAGE, Message
 from . import pose_unit
-from .central_filter import CENTRE, centre
+from .central_filter import CENTRE
 from .options import check_options
-from .pose_begin import check_compass, first_poses, pose_egos
+from .pose_begin import first_poses, pose_egos
+from .pose_stream import PoseStream
 from .pose_unit import Members
+from .pose_units import each, whole
 from .track import Track
+
+if TYPE_CHECKING:
+    from ..kernels.pose_filter import PoseOptions
 
 Unit = Literal["solo", "star", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
 SPREAD = (1.0, 1.0, 1.0, 0.2)
 """m and rad, standard deviations of poses at the first step that are given."""
-
-
-class _Found(NamedTuple):
-    """Ego, its places among the members, all members' states and covariances, its links, and bytes (R,)."""
-
-    ego: int
-    place: Ints
-    x: Floats
-    covariance: Floats
-    neighbours: Floats
-    received: Floats
-    sent: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,11 +121,14 @@ class PoseFilter:
         began, recording = time.perf_counter(), check_recording(recording, body=True)
         columns = pose_egos(recording, egos)
         begin = first_poses(recording, self.begin, None if self.unit == "fleet" else columns)
-        units = self._fleet if self.unit == "fleet" else self._each
-        found = {one.ego: one for one in units(recording, columns, begin)}
-        each = [found[ego] for ego in columns]
-        x = np.stack([one.x[:, one.place] for one in each], axis=2)
-        cov = np.stack([one.covariance[:, one.place] for one in each], axis=2)
+        if self.unit == "fleet":
+            units = whole(self.follow, self.message, self.fusion == "joint", recording, columns, begin)
+        else:
+            units = each(self.follow, self.message, self.unit == "star", recording, columns, begin)
+        found = {one.ego: one for one in units}
+        mine = [found[ego] for ego in columns]
+        x = np.stack([one.x[:, one.place] for one in mine], axis=2)
+        cov = np.stack([one.covariance[:, one.place] for one in mine], axis=2)
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias") if self.lasting else (), 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
@@ -143,65 +138,59 @@ class PoseFilter:
             tuple(columns),
             x[..., :3],
             cov[..., :3, :3],
-            np.stack([one.received for one in each], axis=1),
-            np.stack([one.sent for one in each], axis=1),
+            np.stack([one.received for one in mine], axis=1),
+            np.stack([one.sent for one in mine], axis=1),
             time.perf_counter() - began,
-            np.concatenate([one.neighbours for one in each], axis=1),
+            np.concatenate([one.neighbours for one in mine], axis=1),
             notes,
             wrap(x[..., 3]),
             cov[..., 3, :4],
             extras,
         )
 
-    def _each(self, recording: Recording, columns: Sequence[int], begin: Floats) -> Iterator[_Found]:
-        """Egos one after the other."""
-        links = recording.links
-        none: Floats = np.zeros(recording.runs)
-        marks = np.isin(links.neighbour, recording.landmarks)
-        for ego in columns:
-            mine = links.of(ego)
-            if self.unit == "solo":
-                members = pose_unit.alone(recording, ego)
-                received = sent = none
-                x, cov, _ = self.follow(recording, members, mine[marks[mine]], begin)
-            else:
-                box = inbox(recording, ego, self.message)
-                members, received = pose_unit.star(recording, ego, box), box.received_bytes
-                check_compass(recording, np.unique(links.neighbour[mine[~marks[mine]]]))
-                x, cov, _ = self.follow(recording, members, mine, begin)
-                sent = none + box.sent_bytes
-            place = pose_unit.places_of(members, ego)
-            neighbours = np.full((recording.runs, len(mine), 3), np.nan)
-            if self.unit == "star":
-                others = np.setdiff1d(np.arange(len(members.column)), place)
-                neighbours[:, ~marks[mine]] = x[:, others, :3]
-            yield _Found(ego, place, x, cov, neighbours, received, sent)
+    def start(self, dt: float, begin: Floats | None = None, *, max_age: float = 1.0) -> PoseStream:
+        """This filter for a vehicle alone or a star that is fed as it drives, one `step` of dt s after the other.
 
-    def _fleet(self, recording: Recording, columns: Sequence[int], begin: Floats) -> Iterator[_Found]:
-        """All vehicles at once; a relative measurement counts if the message that it needs arrives at its step."""
-        links, members = recording.links, pose_unit.fleet(recording)
-        mine = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
-        kept = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
-        x, cov, _ = self.follow(recording, members, mine, begin, kept[:, mine])
-        each: Floats = np.ones(recording.runs)
-        met = centre(recording, self.message) if self.fusion == "joint" else None
-        for ego in columns:
-            neighbours = np.full((recording.runs, len(links.of(ego)), 3), np.nan)
-            if met is None:
-                box = inbox(recording, ego, self.message)
-                received, sent = box.received_bytes, each * box.sent_bytes
-            else:
-                received, sent = met.received_bytes[:, ego], met.sent_bytes[:, ego]
-            yield _Found(ego, pose_unit.places_of(members, ego), x, cov, neighbours, received, sent)
+        Args:
+            dt: s.
+            begin: (4,) m and rad, pose at the first step; None: its fix and compass.
+            max_age: s, older messages are not used.
+
+        Raises:
+            InputError: a filter of a fleet, or one without `assumed`.
+
+        >>> from coopoc import OwnMeasurement, Sensors
+        >>> stream = PoseFilter("solo", assumed=Sensors(heading_std=0.1)).start(dt=0.1)
+        >>> stream.step(OwnMeasurement([9.0, 0, 0], 0.0, gnss=[1.0, 2.0, 0.0], heading=0.5)).x.round(3).tolist()
+        [1.0, 2.0, 0.0, 0.5]
+        """
+        if self.unit == "fleet":
+            raise InputError("unit", self.unit, "has no stream", 'Take "solo" or "star".')
+        if self.assumed is None:
+            raise InputError("assumed", None, "is needed: a stream has no recording", "Give assumed=Sensors(...).")
+        dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
+        noise = pose_unit.pose_noise(self.assumed.check_assumed(), dt, self.gate)
+        given = np.full(4, np.nan) if begin is None else np.asarray(begin, dtype=float)
+        if given.shape != (4,):
+            raise InputError("begin", begin, "must be (x, y, z, heading)", "Give NaN for what is not known.")
+        first = given, np.array(self.spread, dtype=float)
+        return PoseStream(self.unit == "star", noise, self.options(), first, dt, max_age)
 
     def follow(
         self, recording: Recording, members: Members, links: Ints, begin: Floats, kept: Bools | None = None
     ) -> tuple[Floats, Floats, Floats]:
         """States, covariances, and cost and number of measurements of a unit, as of `kernels.pose_filter`."""
-        from ..kernels.pose_filter import PoseOptions, follow
+        from ..kernels.pose_filter import follow, follow_apart
 
         noise = pose_unit.pose_noise(self.assumed or recording.sensors, recording.dt, self.gate)
+        measured, options = pose_unit.seen(recording, members, links, kept), self.options()
+        memory = pose_unit.memory(int(np.diff(members.start).max()), options.d)
+        run = follow if self.fusion == "joint" else follow_apart
+        return run(measured, noise, begin, np.array(self.spread, dtype=float), options, memory)
+
+    def options(self) -> PoseOptions:
+        """As the kernel takes them."""
+        from ..kernels.pose_filter import PoseOptions
+
         fusion = get_args(Fusion).index(self.fusion)
-        options = PoseOptions(6 if self.lasting else 4, 1 + self.exact, self.invariant, fusion)
-        measured = pose_unit.seen(recording, members, links, kept)
-        return follow(measured, noise, begin, np.array(self.spread, dtype=float), options)
+        return PoseOptions(6 if self.lasting else 4, 1 + self.exact, self.invariant, fusion, 0)

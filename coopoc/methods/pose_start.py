@@ -9,7 +9,7 @@ from ..errors import InputError
 from ..world.frames import turned
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
-from ..world.spherical import to_vector
+from ..world.spherical import to_vector, wrap
 from . import pose_unit
 from .pose_begin import body_of
 from .pose_filter import PoseFilter
@@ -27,7 +27,8 @@ def pose_start(
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
     odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle;
-    the one whose innovations have the largest likelihood over the first seconds is kept. A compass leaves one.
+    the one whose innovations, and bearings of other vehicles from fix to fix, have the largest likelihood over the
+    first seconds is kept. A compass leaves one.
 
     Args:
         recording: in body frames.
@@ -67,7 +68,8 @@ def pose_start(
             filter_ = PoseFilter("solo", gate=gate, spread=spread, assumed=assumed)
             copies = part.of_runs(np.full(headings, run))
             _, _, cost = filter_.follow(copies, pose_unit.alone(copies, int(column)), links, tried)
-            begin[run, column] = tried[np.argmin(cost[:, 0]), column]
+            seen_from = _cost_of_bearings(part, run, int(column), angles, assumed or recording.sensors)
+            begin[run, column] = tried[np.argmin(cost[:, 0] + seen_from), column]
     return begin
 
 
@@ -75,6 +77,24 @@ def _spread(sensors: Sensors) -> tuple[float, float, float]:
     """Of a position from one fix or one landmark, whichever is worse, m."""
     x, y, z = (max(std, sensors.range_std) for std in sensors.fix_std)
     return 2 * x, 2 * y, 2 * z
+
+
+def _turns(recording: Recording, run: int, column: int) -> Floats:
+    """(T,) rad that a vehicle has turned since the first step, by its yaw rates."""
+    return np.append(0.0, np.cumsum(recording.dt * body_of(recording).yaw_rate[run, 1:, column]))
+
+
+def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Floats, noise: Sensors) -> Floats:
+    """(headings,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
+    links = recording.links.of(column)
+    links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
+    step, other = recording.links.step[links], recording.links.neighbour[links]
+    gap = recording.gnss[run, step, other] - recording.gnss[run, step, column]
+    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _turns(recording, run, column)[step]
+    residual = wrap(recording.relative[run, links, 1] + angles[:, None] - azimuth)
+    fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
+    found: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
+    return found
 
 
 def _hypotheses(recording: Recording, run: int, column: int, links: Ints, angles: Floats) -> Floats:
@@ -85,7 +105,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, angles
     if not len(fixes) and not len(seen):
         given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         raise InputError("seconds", given, "must hold one of the two", "Take more seconds, or give its pose.")
-    turns = np.append(0.0, np.cumsum(recording.dt * body.yaw_rate[run, 1:, column]))
+    turns = _turns(recording, run, column)
     middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
     way = recording.dt * turned(recording.velocity[run, :, column], middle)
     way[0] = 0.0

@@ -14,6 +14,7 @@ from ..world.v2x import Message
 from .star import ACCELERATION_STD, FORGOTTEN
 
 if TYPE_CHECKING:
+    from ..kernels.pose_filter import PoseMemory
     from ..kernels.pose_members import PoseSeen
     from ..kernels.pose_motion import PoseNoise
 
@@ -92,21 +93,38 @@ def seen(recording: Recording, members: Members, links: Ints, kept: Bools | None
     body = recording.body
     assert body is not None
     return PoseSeen(
-        recording.gnss,
-        recording.velocity,
-        body.yaw_rate,
-        body.heading,
+        np.concatenate([recording.gnss, body.heading[..., None], recording.velocity, body.yaw_rate[..., None]], axis=3),
         _packed(members.column),
         _packed(members.start),
         _packed(members.newest),
         _packed(members.fresh),
-        _packed(observer),
-        _packed(other),
+        _packed(np.stack([observer, other], axis=1)),
         np.searchsorted(step, np.arange(len(recording.t) + 1)),
         np.ascontiguousarray(recording.gnss[0, 0, recording.links.neighbour[links]]),
         np.ascontiguousarray(relative),
         recording.dt,
     )
+
+
+def memory(most: int, d: int) -> PoseMemory:
+    """Room for the state of `most` members of d numbers."""
+    from ..kernels.pose_filter import PoseMemory
+    from ..kernels.pose_update import new_poses
+
+    return PoseMemory(new_poses(max(most, 2) * d), np.zeros(2 * most))
+
+
+def grown(kept: PoseMemory, most: int, d: int) -> PoseMemory:
+    """The same memory with room for `most` members, itself where there is room."""
+    half = len(kept.uses) // 2
+    if most <= half:
+        return kept
+    found, size = memory(2 * most, d), half * d
+    found.poses.vector[:3, :size] = kept.poses.vector[:3, :size]
+    found.poses.vector[3, :2] = kept.poses.vector[3, :2]
+    found.poses.cov[:size, :size] = kept.poses.cov[:size, :size]
+    found.uses[:half], found.uses[2 * most : 2 * most + half] = kept.uses[:half], kept.uses[half:]
+    return found
 
 
 def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:

@@ -52,12 +52,12 @@ def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval
     return None if kept is None else results.interval(value, kept)
 
 
-def rms(results: Results, where: Where) -> float | None:
-    """sqrt(mean over runs of RT-LE^2), m, averaged over egos and training seeds: the quantity that the bound bounds."""
-    kept = present(results, where)
+def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
+    """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: the quantity that the bound bounds."""
+    kept = present(results, where, value)
     if kept is None:
         return None
-    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
+    frame = results.select(kept).assign(square=lambda rows: rows[value] ** 2)
     seeded = "train_seed" in frame and frame["train_seed"].notna().any()
     return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
 

@@ -57,6 +57,7 @@ METHODS = {
     "pose-solo": Look("Pose filter, solo", "#C98A00", "v"),
     "pose-star": Look("Pose filter, star", "#00785A", "h"),
     "pose-fleet": Look("Pose filter, one state", BLUE, "o"),
+    "pose-learned": Look("Pose filter, learned noise", "#009E73", "s"),
     "pose-naive": Look("Decentralised, naive", VERMILLION, "X"),
     "pose-intersection": Look("Decentralised, CI", "#7A3E1D", "<"),
     "pose-invariant": Look("Invariant EKF", PURPLE, "d"),

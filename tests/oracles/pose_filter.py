@@ -55,9 +55,9 @@ def pose_filter(seen, noise, begin, spread, options, run):  # type: ignore[no-un
             P_old = past["P"]
         for i in now:
             n, sent = seen.member[i], seen.newest[run, i]
-            u = np.append(seen.velocity[run, sent, n], seen.yaw_rate[run, sent, n])
+            u = np.append(seen.own[run, sent, n, 4:7], seen.own[run, sent, n, 7])
             if n not in old:
-                fix, compass = np.nan_to_num(seen.gnss[run, sent, n]), np.nan_to_num(seen.heading[run, sent, n])
+                fix, compass = np.nan_to_num(seen.own[run, sent, n, :3]), np.nan_to_num(seen.own[run, sent, n, 3])
                 state = np.concatenate(
                     [fix if sent >= 0 else [0, 0, 0], [compass if sent >= 0 else 0], np.zeros(d - 4)]
                 )
@@ -93,7 +93,7 @@ def pose_filter(seen, noise, begin, spread, options, run):  # type: ignore[no-un
         x, P = own(x, P, seen, noise, (run, t, d))
         links = range(seen.first[t], seen.first[t + 1])
         known = [P[d * k, d * k] < FLAT / 2 for k in range(len(now))]
-        links = [k for k in links if known[seen.observer[k]] and (seen.other[k] < 0 or known[seen.other[k]])]
+        links = [k for k in links if known[seen.ends[k, 0]] and (seen.ends[k, 1] < 0 or known[seen.ends[k, 1]])]
         if len(links):
             x, P = relative(x, P, seen, noise, (run, links, d), options.passes)
         rows = {seen.member[i]: np.arange(d * k, d * k + d) for k, i in enumerate(now)}
@@ -112,8 +112,8 @@ def own(x, P, seen, noise, where):  # type: ignore[no-untyped-def]
         n, sent = seen.member[i], seen.newest[run, i]
         if sent < 0 or not seen.fresh[run, i]:
             continue
-        late, u, b = seen.dt * (t - sent), seen.velocity[run, sent, n], d * k
-        w, compass, fix = seen.yaw_rate[run, sent, n], seen.heading[run, sent, n], seen.gnss[run, sent, n]
+        late, u, b = seen.dt * (t - sent), seen.own[run, sent, n, 4:7], d * k
+        w, compass, fix = seen.own[run, sent, n, 7], seen.own[run, sent, n, 3], seen.own[run, sent, n, :3]
         if np.isfinite(compass):
             variance = [noise.heading + late**2 * noise.yaw_rate]
             x, P = update(x, P, lambda s, b=b: s[b + 3 : b + 4], np.array([compass + late * w]), variance, [True])
@@ -135,9 +135,9 @@ def relative(x, P, seen, noise, where, passes):  # type: ignore[no-untyped-def]
     def h(s):  # type: ignore[no-untyped-def]
         found = []
         for k in links:
-            mine, other = s[d * seen.observer[k] :][:4], seen.place[k]
-            if seen.other[k] >= 0:
-                other = s[d * seen.other[k] :][:3]
+            mine, other = s[d * seen.ends[k, 0] :][:4], seen.place[k]
+            if seen.ends[k, 1] >= 0:
+                other = s[d * seen.ends[k, 1] :][:3]
             found.append(spherical(mine, other)[np.isfinite(seen.relative[run, k])])
         return np.concatenate(found)
 
