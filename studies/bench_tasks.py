@@ -26,7 +26,7 @@ class Task:
         data: bundled fleet.
         sensors: the noise that acts and that methods may know.
         v2x: neighbourhood and channel.
-        share: of the vehicles that broadcast false fixes; no method is told.
+        share: of the vehicles that broadcast false fixes; methods do not know of it.
         seed: of all draws.
         runs: noise draws.
         egos: evenly spaced over the fleet.

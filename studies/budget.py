@@ -178,7 +178,7 @@ STUDY = lineup.study(
     findings=_findings,
     limitations=(
         "A vehicle receives what its K neighbours send; what the others send fills the channel, too.",
-        "Under a cap the nearest neighbours are heard first where no other schedule is named.",
+        "Under a cap messages of the nearest neighbours pass first where no other schedule is named.",
         "Numbers count as float32; CAMs quantise positions and velocities instead.",
     ),
     minutes=13,

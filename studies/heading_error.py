@@ -167,7 +167,7 @@ STUDY = Study(
     figures={"heading": views.figure},
     findings=views.findings,
     limitations=(
-        "One convoy: the geometry decides how much a bearing tells.",
+        "One convoy: the geometry decides what a bearing is worth.",
         "One state needs a centre; the bound is that of all measurements of all vehicles.",
         "Of a drive its last instant is scored: first headings without a compass are sought in all of it.",
     ),

@@ -146,7 +146,7 @@ def _claim(gaps: list[Interval], name: str) -> str:
         return f"cannot be judged against {name}: too few seeds, egos or runs"
     if all(gap.high < 0 for gap in gaps):
         return f"beats {name}"
-    return f"is worse than {name}" if all(gap.low > 0 for gap in gaps) else f"cannot be told from {name}"
+    return f"is worse than {name}" if all(gap.low > 0 for gap in gaps) else f"cannot be distinguished from {name}"
 
 
 def _ends(gap: Interval) -> str:
