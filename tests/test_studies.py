@@ -166,11 +166,11 @@ def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
     [
         ((-0.1, -0.11, -0.12), 4, "beats the fitted KF"),
         ((0.1, 0.11, 0.12), 4, "is worse than the fitted KF"),
-        ((-0.1, 0.12, -0.05), 4, "cannot be told from the fitted KF"),
+        ((-0.1, 0.12, -0.05), 4, "cannot be distinguished from the fitted KF"),
         (
             (0.5, 0.01),
             4,
-            "cannot be told from the fitted KF",
+            "cannot be distinguished from the fitted KF",
         ),  # every run is worse, yet two seeds do not agree how much
         ((0.1,), 4, "of one training seed, whose spread is unknown"),
     ],
