@@ -83,7 +83,7 @@ def draw(
         found, gap = curves[name, 0.0]
         at = np.interp(central[name], found.sent_bytes, np.abs(gap))
         ax.plot(central[name] / 1e3, at, "o", color=COLORS[k])
-    ax.set(xlabel="Sent by all robots [kB]", ylabel="(cost - minimum) / minimum")
+    ax.set(xlabel="Sent by all robots [kB]", ylabel="Cost above the central minimum")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
     figure.savefig(target, dpi=150)

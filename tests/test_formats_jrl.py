@@ -222,5 +222,7 @@ def test_what_jrl_cannot_hold_is_refused(tmp_path: Path) -> None:
     for graph, message in cases:
         with pytest.raises(InputError, match=message):
             write_graph(graph, tmp_path / "no.jrl")
-    write_jrl(replace(two, relative_pose=edge), path := tmp_path / "yes.jrl", unit=0.25)
-    assert read_jrl(path, unit=0.25).relative_pose.stamps.tolist() == [0.25]
+    for stamp, unit in ((0.25, 0.25), (0.25, 1e-9), (1248362857.9, 1e-6), (1248362857.9, 1e-9)):  # since 1970
+        timed = replace(two, relative_pose=replace(edge, stamps=[stamp]))
+        write_jrl(timed, path := tmp_path / "yes.jrl", unit=unit)
+        assert read_jrl(path, unit=unit).relative_pose.stamps == pytest.approx([stamp], abs=5e-7)

@@ -95,7 +95,8 @@ def _vertex(graph: Graph, row: int) -> dict[str, Any]:
 def _whole(kind: str, stamps: Floats, unit: float) -> list[int]:
     """Stamps (M,) in units."""
     counted = np.rint(stamps / unit)
-    off = np.flatnonzero(~(np.abs(stamps / unit - counted) <= 1e-3) | ~(counted >= 0) | ~(counted < 2.0**64))
+    rounding = np.maximum(1e-3 * unit, 2.0 * np.spacing(np.abs(stamps)))  # of seconds since 1970: 5e-7 s
+    off = np.flatnonzero(~(np.abs(stamps - unit * counted) <= rounding) | ~(counted >= 0) | ~(counted < 2.0**64))
     if len(off):
         given = f"{stamps[off[0]]} s"
         allowed = f"must be a whole number >= 0 of {unit:g} s"

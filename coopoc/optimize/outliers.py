@@ -28,8 +28,12 @@ class Marked:
 
     def sums(self, values: Sequence[Floats]) -> Floats:
         """(B, G) sums over each group of one array (B, rows) or (rows,) per factor."""
-        found = [np.atleast_2d(values[k])[:, r] for k, r in zip(self.factor, self.row, strict=True)]
-        return np.stack(np.broadcast_arrays(*found), axis=1) @ np.eye(self.group.max() + 1)[self.group]
+        parts = {int(k): np.atleast_2d(values[k]) for k in np.unique(self.factor)}
+        total = np.zeros((int(self.group.max()) + 1, max(map(len, parts.values()))))
+        for k, part in parts.items():
+            here = self.factor == k
+            np.add.at(total, self.group[here], part[:, self.row[here]].T)
+        return total.T
 
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
