@@ -52,7 +52,7 @@ def seen(data: str, until: float, v2x: V2X, gate: float) -> tuple[Recording, Flo
 
 
 @lru_cache(maxsize=1)
-def learned(data: str, until: float, gate: float) -> Sensors:
+def learned(data: str, until: float, gate: float, evaluations: int) -> Sensors:
     """Noise learned on the part that calibrates, alone and together, with few landmarks and with all."""
     found, known = log(data, until)
     steps, settled, tasks = int(until / found.fleet.dt), int(SETTLED / found.fleet.dt), []
@@ -63,7 +63,7 @@ def learned(data: str, until: float, gate: float) -> Sensors:
         for landmarks in TRAINING:
             part = thinned(whole, landmarks, settled).between(0, steps)
             tasks.append(PoseTask(part, found.fleet.between(0, steps), found.fleet.ids, method, settled))
-    return fit_pose_noise(tasks, known.sensors)
+    return fit_pose_noise(tasks, known.sensors, evaluations)
 
 
 def channel(p: Params) -> V2X:
@@ -95,7 +95,7 @@ def cell(p: Params) -> list[Row]:
     start, block = int(until / fleet.dt), max(int(float(p["block_s"]) / fleet.dt), 1)
     unit: Any = "fleet" if p["max_neighbours"] else "solo"
     how = METHODS[p["method"]] if p["max_neighbours"] else {}
-    assumed = learned(data, until, gate) if p["method"] == views.LEARNED else None
+    assumed = learned(data, until, gate, int(p["evaluations"])) if p["method"] == views.LEARNED else None
     method = PoseFilter(unit, **how, lasting=True, gate=gate, begin=begin, assumed=assumed)
     recording = thinned(whole, int(p["landmarks"]), start)
     track = method(recording, fleet.ids)
@@ -135,7 +135,14 @@ STUDY = Study(
     "With nothing simulated and headings estimated, when does a neighbour replace a landmark?",
     cell,
     _grid(),
-    settings={"data": "MRCLAM_Dataset6", "calibrate_s": 300.0, "block_s": 30.0, "gate": 5.0, "loss": 0.0},
+    settings={
+        "data": "MRCLAM_Dataset6",
+        "calibrate_s": 300.0,
+        "block_s": 30.0,
+        "gate": 5.0,
+        "loss": 0.0,
+        "evaluations": 150,
+    },
     key=key,
     shares=("max_neighbours",),
     tables={
@@ -154,5 +161,5 @@ STUDY = Study(
         "One drive: an interval over blocks of time does not hold for other robots or rooms.",
         "With one state a centre receives all that is measured, at its step; late messages are lost.",
     ),
-    minutes=1,
+    minutes=3,
 )

@@ -6,16 +6,9 @@ from collections.abc import Callable, Mapping
 
 from ..errors import InputError
 from ..plugins import find
-from .cam import cam_encoded
 from .v2x import V2X
 
-CHANNELS: Mapping[str, Callable[[int], V2X]] = {
-    "ideal": V2X.ideal,
-    "cam": V2X.cam,
-    "bsm": V2X.bsm,
-    "cpm": V2X.cpm,
-    "cam_encoded": cam_encoded,
-}
+CHANNELS: Mapping[str, Callable[[int], V2X]] = {"ideal": V2X.ideal, "cam": V2X.cam, "bsm": V2X.bsm, "cpm": V2X.cpm}
 """Largest number of neighbours -> V2X. "ideal" counts payload only."""
 
 
