@@ -5,6 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import casadi
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -16,6 +17,7 @@ from coopoc.optimize.backends import casadi_programme
 from coopoc.optimize.backends.casadi_ import DENSE
 from coopoc.optimize.backends.casadi_programme import programme
 from coopoc.optimize.initial import initial_guess
+from coopoc.optimize.symbolic import _chart
 from coopoc.world.recording import Recording
 
 METHODS = ["auto", "fatrop", "ipopt"]
@@ -321,3 +323,12 @@ def test_wrong_options(options: dict[str, object], words: str) -> None:
 def test_a_truncated_loss_is_refused_with_the_way_out() -> None:
     with pytest.raises(InputError, match=r"loss truncated: cannot be solved by casadi, only by .*gauss-newton"):
         solve(robust(ranges_only(0), Loss("truncated", 3.0)), "casadi")
+
+
+@pytest.mark.parametrize("w", [(0.3, -0.2, 0.9), (1e-9, 0.0, 0.0), (-2.0, 1.0, 3.0)])
+def test_steps_of_a_rotation_are_scipys(w: tuple[float, float, float]) -> None:
+    """Cayley's map turns about w by 2 atan(|w| / 2), to first order by |w|."""
+    size = float(np.linalg.norm(w))
+    wanted = Rotation.from_rotvec(2.0 * np.arctan(size / 2.0) * np.array(w) / size).as_matrix()
+    found = np.array([[float(entry) for entry in row] for row in _chart([casadi.DM(value) for value in w])])
+    np.testing.assert_allclose(found, wanted, atol=1e-14)
