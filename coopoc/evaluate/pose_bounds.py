@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from ..methods.drift_state import require_white
 from ..plugins import unknown
@@ -61,6 +61,7 @@ def pose_bound(
     """
     if not isinstance(information, str) or information not in ("star", "fleet"):
         raise unknown("information", information, ("star", "fleet"), "For a vehicle alone give K = 0.")
+    instance("fleet", fleet, Fleet)
     column = fleet.index(ego)
     if not fleet.present[:, column].all():
         raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
@@ -90,7 +91,7 @@ def fleet_pose_bound(
     >>> bool(together < 0.1 * alone)  # a bearing of a neighbour with a fix gives a heading
     True
     """
-    marks = columns("landmarks", landmarks, fleet.ids)
+    marks = columns("landmarks", landmarks, instance("fleet", fleet, Fleet).ids)
     v2x = checked_noise(fleet, sensors, v2x, bool(marks))
     links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, sensors.min_range, marks)
     members = [np.setdiff1d(np.flatnonzero(row), marks) for row in fleet.present]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, number
+from ..arrays import Floats, instance, number
 from ..errors import InputError
 from .motion_history import fix_or_none, numbers, seconds, three
 
@@ -33,9 +33,9 @@ class OwnMeasurement:
     row: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        heading = np.nan if self.heading is None or np.isnan(self.heading) else self.heading
-        if np.isfinite(heading):
-            heading = number("heading", heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
+        heading = np.nan
+        if self.heading is not None and not (isinstance(self.heading, float) and np.isnan(self.heading)):
+            heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
         rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
         row = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], three("velocity", self.velocity), [rate]])
         object.__setattr__(self, "row", row)
@@ -65,6 +65,8 @@ class BodyMeasurement:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "age", seconds("age", self.age))
+        if self.message is not None:
+            instance("message", self.message, OwnMeasurement)
         for name in ("relative", "place"):
             given = getattr(self, name)
             values = None if given is None else numbers(given)
