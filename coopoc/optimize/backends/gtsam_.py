@@ -20,9 +20,14 @@ from ..backend import Backend, Capabilities, Options, Solver, SolverResult, loop
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..linear import Linear
 from ..problem import Problem
+from ..sparse import sparse
+from ..trust_region import arrive
 from .gtsam_forms import forms
 from .gtsam_native import estimate, fix_nodes, native_graph, values, which_turn
 from .gtsam_optimizers import OPTIMIZERS, all_native, as_it_comes, gnc, levenberg_marquardt
+
+PATIENCE = 40
+"""Steps of the elimination after GTSAM's own optimiser before the exact Hessian takes over."""
 
 
 def prepare(
@@ -39,8 +44,10 @@ def prepare(
         tolerance: m or rad, largest move of a node in the last step.
         optimizer: "lm" is GTSAM's own Levenberg-Marquardt on its own factors, for problems that have no others, to the
             last digit. "elimination" is our loop with GTSAM's elimination, for every problem. "auto" is GTSAM's own
-            with its own settings where it has every factor, and then "elimination" for the last digits; linear
-            problems, which are one elimination, and realisations are left to that. "gnc" is its graduated
+            with its own settings where it has every factor, and then "elimination" for the last digits; where its
+            J^T J creeps, as with large residuals, the last steps are those of the exact Hessian, which GTSAM does not
+            have (extras["newton_steps"]). Linear problems, which are one elimination, and realisations are left to
+            that. "gnc" is its graduated
             non-convexity for losses "truncated" or "geman-mcclure" of one scale, then "lm": it needs no good start to
             find the outliers; a factor without a loss is a known inlier, and extras["weights"] has the weights (M,) of
             each factor's measurements.
@@ -58,7 +65,14 @@ def prepare(
             used = 0
             if own and max_iterations:
                 x, used = _own_way(problem, x, max_iterations)
-            end = minimise(problem, step, x, max_iterations - used, tolerance)
+            left = max_iterations - used
+            patient = optimizer == "elimination" or left <= PATIENCE
+            system = None if patient else sparse(problem)
+            end = minimise(problem, step, x, left if system is None else PATIENCE, tolerance)
+            if system is not None and int(np.max(end.iterations)) >= PATIENCE:
+                more = arrive(system, end.x[0], left - PATIENCE, tolerance)
+                extras = end.extras | {"newton_steps": more.newton_steps}
+                end = replace(end, x=more.x[None], iterations=end.iterations + more.iterations, extras=extras)
             method = {"method": "lm", "lm_iterations": used} if own else {"method": "elimination"}
             return replace(end, iterations=end.iterations + used, extras=end.extras | method)
 
