@@ -12,6 +12,7 @@ from ..errors import InputError
 from .backend import SolverResult
 from .linear import Linear
 from .problem import Problem
+from .progress import progress
 
 Step = Callable[[Linear, Floats], Floats]
 """(linearisation, damping (B, n, dof)) -> dx (B, n, dof): (J^T J + diag(damping)) dx = -J^T r, else LinAlgError."""
@@ -81,32 +82,34 @@ def descend(
     active, now = np.arange(len(x)), problem
     linear, near = problem.linearise(best), tolerance / LINEAR if problem.linear else tolerance
     record: list[tuple[float, float, float]] = []
-    for _ in range(max_iterations):
-        dx, added, solved = _try(step, problem, linear, mu[active])
-        count[active] += 1
-        with np.errstate(all="ignore"):
-            trial = now.linearise(problem.space.retract(linear.x, dx))
-            small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
-            better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
-        promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx, added, exact)
-        share = _share(linear.cost, trial.cost, promised, exact)
-        if problem.batch is None:
-            record.append((linear.cost[0], mu[0], share[0]))
-        mu[active] = _damping(mu[active], better, share)
-        best[active[better]] = trial.x[better]
-        flat = solved & (promised <= FLAT * linear.cost) & (not problem.constraints)
-        there = (better & small) | flat
-        done[active[there]] = True
-        going = ~there & (mu[active] < GIVE_UP)
-        if not going.any():
-            break
-        if not better[going].all():
-            linear = now.linearise(best[active]).pick(going)
-        else:
-            linear = trial if going.all() else trial.pick(going)
-        if not going.all():
-            active = active[going]
-            now = problem.pick(active) if problem.batch else problem
+    with progress("solve") as counted:
+        for _ in range(max_iterations):
+            counted(float(linear.cost.sum()))
+            dx, added, solved = _try(step, problem, linear, mu[active])
+            count[active] += 1
+            with np.errstate(all="ignore"):
+                trial = now.linearise(problem.space.retract(linear.x, dx))
+                small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
+                better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
+            promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx, added, exact)
+            share = _share(linear.cost, trial.cost, promised, exact)
+            if problem.batch is None:
+                record.append((linear.cost[0], mu[0], share[0]))
+            mu[active] = _damping(mu[active], better, share)
+            best[active[better]] = trial.x[better]
+            flat = solved & (promised <= FLAT * linear.cost) & (not problem.constraints)
+            there = (better & small) | flat
+            done[active[there]] = True
+            going = ~there & (mu[active] < GIVE_UP)
+            if not going.any():
+                break
+            if not better[going].all():
+                linear = now.linearise(best[active]).pick(going)
+            else:
+                linear = trial if going.all() else trial.pick(going)
+            if not going.all():
+                active = active[going]
+                now = problem.pick(active) if problem.batch else problem
     return Descent(best, count, done, np.array(record).reshape(-1, 3))
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats
 from .descend import GIVE_UP, LEAST_DAMPING
+from .progress import progress
 from .sparse import Sparse
 from .tape import Model
 
@@ -69,40 +70,44 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     newton, converged, last, still = 0, False, np.inf, 0
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     scale = _scale(system, values)
-    while len(record) < max_iterations and not converged and mu < GIVE_UP:
-        newton += model == "newton"
-        definite = cholesky.factor(_damped(system, values, mu * scale))
-        if not definite:
-            record.append((cost, mu, np.nan))
-            if model == "newton":
-                doubt, model = -DOUBT, "gauss-newton"
-                cost, gradient, values = system.quadratic(x, model)
-            else:
+    with progress("solve") as counted:
+        while len(record) < max_iterations and not converged and mu < GIVE_UP:
+            counted(cost)
+            newton += model == "newton"
+            definite = cholesky.factor(_damped(system, values, mu * scale))
+            if not definite:
+                record.append((cost, mu, np.nan))
+                if model == "newton":
+                    doubt, model = -DOUBT, "gauss-newton"
+                    cost, gradient, values = system.quadratic(x, model)
+                else:
+                    mu = _grown(mu)
+                continue
+            dx = -cholesky.solve(gradient)
+            promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
+            there = system.retract(x, dx)
+            trial, used = system.quadratic(there, model), model
+            after = trial[0]
+            hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
+            share = 1.0 if hidden else (cost - after) / promised
+            still = still + 1 if hidden else 0
+            record.append((cost, mu, share))
+            converged = (
+                promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden) or still > STILL
+            )
+            if not share > 0.0:
                 mu = _grown(mu)
-            continue
-        dx = -cholesky.solve(gradient)
-        promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
-        there = system.retract(x, dx)
-        trial, used = system.quadratic(there, model), model
-        after = trial[0]
-        hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
-        share = 1.0 if hidden else (cost - after) / promised
-        still = still + 1 if hidden else 0
-        record.append((cost, mu, share))
-        converged = promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden) or still > STILL
-        if not share > 0.0:
-            mu = _grown(mu)
-            continue
-        x = there
-        mu = _next(mu, share)
-        if model == "gauss-newton":
-            off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
-            doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
-            model = "newton" if doubt >= DOUBT else model
-        last = promised
-        if not converged:
-            cost, gradient, values = trial if model == used else system.quadratic(x, model)
-            scale = _scale(system, values) if model == "gauss-newton" else scale
+                continue
+            x = there
+            mu = _next(mu, share)
+            if model == "gauss-newton":
+                off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
+                doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
+                model = "newton" if doubt >= DOUBT else model
+            last = promised
+            if not converged:
+                cost, gradient, values = trial if model == used else system.quadratic(x, model)
+                scale = _scale(system, values) if model == "gauss-newton" else scale
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 
 

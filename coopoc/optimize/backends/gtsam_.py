@@ -26,7 +26,7 @@ from .gtsam_forms import forms
 from .gtsam_native import estimate, fix_nodes, native_graph, values, which_turn
 from .gtsam_optimizers import OPTIMIZERS, all_native, as_it_comes, gnc, levenberg_marquardt
 
-PATIENCE = 40
+PATIENCE = 12
 """Steps of the elimination after GTSAM's own optimiser before the exact Hessian takes over."""
 
 
