@@ -13,6 +13,8 @@ import pytest
 from coopoc import Fleet, load_fleet
 from coopoc.data.table import write_table
 
+collect_ignore = ["fuzz"]
+"""Its programs need atheris; what they found is replayed by test_data_fuzz.py."""
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 

@@ -390,7 +390,7 @@ def test_documented_code_runs() -> None:
     """The blocks of docs/streaming.md on filters; those on files are run by the tests of the export."""
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "streaming.md").read_text(), flags=re.DOTALL)
     about_filters = [block for block in blocks if "onnx" not in block]
-    assert len(about_filters) == 2
+    assert len(about_filters) == 3
     for block in about_filters:
         found: dict[str, Any] = {}
         exec(block, found)

@@ -99,9 +99,9 @@ def test_a_caption_or_a_views_name_recomputes_nothing(tmp_path: Path) -> None:
 
 
 def test_bundled_cells_count_by_what_they_run() -> None:
-    """`heading_error` and `latency_loss` share their cell and none of their views; `real` has a cell of its own."""
-    codes = {name: code_of(find_study(name).cell) for name in ("heading_error", "latency_loss", "real")}
-    assert codes["heading_error"] == codes["latency_loss"] != codes["real"]
+    """`robustness` and `latency_loss` share their cell and none of their views; `real` has a cell of its own."""
+    codes = {name: code_of(find_study(name).cell) for name in ("robustness", "latency_loss", "real")}
+    assert codes["robustness"] == codes["latency_loss"] != codes["real"]
 
 
 def computed(p: object) -> list[dict[str, object]]:

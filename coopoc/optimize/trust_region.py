@@ -129,6 +129,6 @@ def _scale(system: Sparse, values: Floats) -> Floats:
 def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
     if not damping.any():
         return values
-    whole = values.copy()
+    whole = values.astype(np.float64)
     whole[system.entries.diagonal] += damping
     return whole

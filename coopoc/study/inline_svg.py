@@ -7,6 +7,7 @@ from xml.etree import ElementTree
 
 from markupsafe import Markup
 
+from ..escapes import visible
 from .marks import SERIES
 
 SVG = "http://www.w3.org/2000/svg"
@@ -86,7 +87,7 @@ def _attributes(element: ElementTree.Element, prefix: str) -> list[tuple[str, st
     found = []
     for name, value in element.attrib.items():
         if name == "id" and value.startswith(SERIES):
-            found.append(("data-series", value))
+            found.append(("data-series", visible(value)))
         elif name == "id":
             found.append(("id", f"{prefix}-{value}"))
         elif name in (LINK, "href") and value.startswith("#"):

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ..escapes import visible
 from .style import look
 
 SERIES = "series:"
@@ -25,7 +26,7 @@ def series(method: str, noise_model: str = "") -> str:
     >>> series("kalman", "fitted")
     'series:kalman/fitted'
     """
-    return f"{SERIES}{method}/{noise_model}"
+    return f"{SERIES}{visible(method)}/{visible(noise_model)}"
 
 
 def described(name: str) -> str:
@@ -70,7 +71,9 @@ def _points(axes: Axes, line: Line2D) -> list[tuple[float, float, str]]:
     ticks = {at: text for at, text in zip(axes.get_xticks(), texts, strict=False) if not _NUMBER.fullmatch(text)}
     pixels = axes.transData.transform(data) if len(data) else data
     y_label = axes.get_ylabel() or (axes.figure.axes[0].get_ylabel() if axes.figure else "")
-    words = [(_word(axes.get_xlabel(), ticks.get(x) or f"{x:.4g}"), _word(y_label, f"{y:.3g}")) for x, y in data]
+    words = [
+        (_word(visible(axes.get_xlabel()), ticks.get(x) or f"{x:.4g}"), _word(y_label, f"{y:.3g}")) for x, y in data
+    ]
     return [(px, py, f"{y} at {x}") for (px, py), (x, y) in zip(pixels, words, strict=True)]
 
 

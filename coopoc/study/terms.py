@@ -6,6 +6,8 @@ import re
 
 from markupsafe import Markup, escape
 
+from ..escapes import uncontrolled
+
 TERMS = {
     "RT-LE": "root of the time-averaged squared localization error, in metres, per run and ego",
     "NEES": "normalised estimation error squared: 3 on average for a consistent filter of a position",
@@ -48,4 +50,4 @@ def explained(text: object) -> Markup:
         seen.add(term)
         return f'<abbr title="{escape(TERMS[term])}">{term}</abbr>'
 
-    return Markup(_FOUND.sub(one, str(escape(text))))
+    return Markup(_FOUND.sub(one, str(escape(uncontrolled(str(text))))))
