@@ -55,7 +55,7 @@ def test_a_mutated_file_ends_in_our_exceptions(tmp_path: Path, name: str) -> Non
     reader = READERS[name]
     files = {file: text.encode() for file, text in reader.files.items()}
     assert not verdict(reader, packed(files), tmp_path)
-    reader.read(tmp_path)  # as it stands it is right
+    reader.read(tmp_path)  # as it stands it is right, which a verdict does not say
     found = {}
     for seed in range(int(os.environ.get("COOPOC_MUTANTS", "70"))):
         rng = np.random.default_rng([seed, len(name)])
