@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 OWN = "ADMM exchanges positions only: its covariance is that of each vehicle's own filter, without the neighbours' gain"
 
-PENALTY = 6.75
-"""Of a fix's information on its best axis. With more, vehicles stay near their own beliefs; with less, the first rounds
-weigh them too little."""
+LEAST, PENALTY = 3.0, 6.75
+"""1/m^2, and a multiple of a fix's information on its best axis: the larger of the two. With more, vehicles stay near
+their own beliefs; with less, three rounds do not agree, and weigh precise fixes too little."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ class ConsensusADMM:
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         rounds: iterations a step.
-        rho: 1/m^2, the penalty; any positive one converges. None: PENALTY times the information of a fix, so that few
-            rounds suffice however certain fixes are.
+        rho: 1/m^2, the penalty; any positive one converges. None: 3 1/m^2 or 6.75 times the information of a fix, the
+            larger, so that few rounds suffice however certain fixes are.
 
     References:
         Boyd et al., "Distributed Optimization and Statistical Learning via the ADMM", Foundations and Trends in Machine
@@ -83,7 +83,8 @@ class ConsensusADMM:
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
             from ..kernels.consensus import follow
 
-            rho = PENALTY / np.median(assumed.fix.min(axis=-1)) if self.rho is None else self.rho
+            certain = PENALTY / np.median(assumed.fix.min(axis=-1))
+            rho = max(LEAST, certain) if self.rho is None else self.rho
             found = follow(measured, pairs, assumed, int(self.rounds), float(rho))
             return Answer(*found, self.message.rounds, (OWN,))
 
