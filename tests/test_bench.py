@@ -116,6 +116,7 @@ def test_the_page_shows_the_committed_cards() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_bound_with_the_past_is_least() -> None:
     task = replace(PAPER, egos=1)
     levels = [bench_tasks.bound(task, each) for each in ("solo", "star", "past")]
@@ -140,6 +141,7 @@ class Own:
 """
 
 
+@pytest.mark.slow
 def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Path) -> None:
     """The row's RT-LE is that of a PoseFilter by hand; a method of one's own gets the first poses and the noise."""
     (tmp_path / "mine.py").write_text(OWN_POSES)

@@ -212,6 +212,7 @@ def _listen() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_one_readable_line(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("kill")
     done = coopoc("run", "small", "--jobs", "2", "--set", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)

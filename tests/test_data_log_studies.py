@@ -85,6 +85,7 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     assert {"innovation", "nis"} <= set(tables)
 
 
+@pytest.mark.slow
 def test_a_recording_is_a_setting(folders: Path, tmp_path: Path) -> None:
     log = load_log(folders / "with")
     paths = []

@@ -88,7 +88,9 @@ def assert_equivariant(
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "qcqp-relaxation" else name for name in METHODS]
+)
 def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fleet) -> None:
     """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
     if name in AXIS and change == "rotation":

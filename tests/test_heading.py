@@ -41,6 +41,7 @@ def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
     assert NoiseModel.nominal(Sensors()).sensors == Sensors()
 
 
+@pytest.mark.slow
 def test_the_study_shows_what_a_heading_costs(tmp_path: Path) -> None:
     wanted = {"runs": 4, "speed": "0.0,10.0", "after_s": "3.0,30.0", "max_neighbours": "0,2", "compass": "exact,3,none"}
     results = run_study("heading_error", tmp_path, settings=wanted, progress=False)

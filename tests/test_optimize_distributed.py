@@ -48,7 +48,7 @@ def test_a_linear_problem_ends_at_numpys_least_squares() -> None:
     assert found.robots == ("a", "b", "c")
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("ranges", [False, True])
 def test_robots_end_where_the_whole_is_solved(dimension: int, ranges: bool) -> None:
     """Referee: SciPy's least squares on the residuals, from the central answer; and the central answer itself."""

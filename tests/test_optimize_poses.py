@@ -81,7 +81,7 @@ def free(problem: Problem) -> np.ndarray:
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
-@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_scipy_finds_the_same_minimum_and_covariance(dimension: int, backend: str) -> None:
     problem, truth = everything(dimension)
     found = solve(problem, backend)

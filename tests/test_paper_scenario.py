@@ -26,7 +26,13 @@ def published(most: int, method: str, noise_model: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    "most", [0, 1, pytest.param(4, marks=pytest.mark.slow), pytest.param(10, marks=pytest.mark.slow)]
+    "most",
+    [
+        0,
+        pytest.param(1, marks=pytest.mark.slow),
+        pytest.param(4, marks=pytest.mark.slow),
+        pytest.param(10, marks=pytest.mark.slow),
+    ],
 )
 def test_an_independent_simulation_gives_the_published_errors(most: int) -> None:
     fleet = co.load_fleet("town10")

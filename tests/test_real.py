@@ -122,7 +122,7 @@ def other_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("which", ["set 6", "another"])
+@pytest.mark.parametrize("which", [pytest.param("set 6", marks=pytest.mark.slow), "another"])
 def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) -> None:
     data = FOLDER if which == "set 6" else other_set
     settings: dict[str, Any] = {"data": str(data), "max_neighbours": "0,4", "landmarks": "0,15", "calibrate_s": 200.0}

@@ -22,7 +22,7 @@ def test_every_page_has_a_place() -> None:
 
 @pytest.mark.parametrize(
     "tutorial",
-    [pytest.param(path, marks=pytest.mark.slow) if path.stem == "learned" else path for path in TUTORIALS],
+    [pytest.param(path, marks=pytest.mark.slow) if path.stem in ("learned", "compare") else path for path in TUTORIALS],
     ids=lambda path: path.stem,
 )
 def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:

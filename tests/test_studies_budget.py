@@ -96,6 +96,7 @@ def test_a_channel_that_is_not_there_is_named() -> None:
     )
 
 
+@pytest.mark.slow
 def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_town: str) -> None:
     """The row of a cap, by hand."""
     fleet = load_fleet(short_town)
@@ -118,6 +119,7 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
         assert f"{schedule} {error.mean():.3g} m" in said
 
 
+@pytest.mark.slow
 def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short_town: str) -> None:
     """From the card and a track, by hand: 20 rounds of 9 numbers and a loss up and 9 down; a CAM of 350 B and 32 B."""
     egos = scene.egos(short_town, "2")
@@ -135,6 +137,7 @@ def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short
     assert (tables.WORDS["ideal"], "on air, broadcast") not in body  # it has no air of its own
 
 
+@pytest.mark.slow
 def test_the_load_of_a_channel(tight: Results) -> None:
     """By hand: 300 x 8 x 350 B x 2.2 Hz of 6 Mb/s."""
     found = {row[:2]: row[2:] for row in rows(tables.load(tight))}

@@ -40,6 +40,7 @@ def test_a_choice_at_its_default_is_the_method_of_that_name(tmp_path: Path, shor
     assert "| default" in table
 
 
+@pytest.mark.slow
 def test_backends_are_held_against_scipy(tmp_path: Path, short_town: str) -> None:
     few = {"egos": "1", "samples": 2, "data": short_town, "max_neighbours": "2"}
     results = run_study("backends", tmp_path, settings=few, progress=False)

@@ -29,6 +29,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(folder)
 
 
+@pytest.mark.slow
 def test_views_say_what_was_run(tmp_path: Path, weights: str) -> None:
     """On eight vehicles of six seconds."""
     write_table(crossing_fleet(), tmp_path / "crossing.csv")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from coopoc import load_fleet, run_study
 from coopoc.studies import generalisation, scaling
@@ -43,6 +44,7 @@ def test_copies_do_not_see_each_other_and_cost_is_counted_per_vehicle(tmp_path: 
     assert "Largest / smallest" in (tmp_path / "scaling" / "tables" / "cost.md").read_text()
 
 
+@pytest.mark.slow
 def test_generalisation_is_relative_to_the_oracle_of_each_place(tmp_path: Path) -> None:
     wanted = {"runs": 2, "egos": "2", "method": "kalman,kalman-adaptive", "data": "town10,town04", "scenario": "2"}
     results = run_study("generalisation", tmp_path, settings=wanted, progress=False)

@@ -49,6 +49,7 @@ def mean(results: Results, **where: object) -> float:
     return results.interval("rt_le_m", measure="rt_le", **where).mean
 
 
+@pytest.mark.slow
 def test_without_privacy_it_is_federate_and_the_references_are_the_filters(ran: tuple[Path, Results], few: str) -> None:
     results = ran[1]
     assert results.failed == 0

@@ -12,6 +12,7 @@ from coopoc.study import numbers
 from coopoc.study.report import report
 
 
+@pytest.mark.slow
 def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str, capsys: pytest.CaptureFixture[str]) -> None:
     few = {
         "data": short_town,

@@ -154,6 +154,7 @@ def test_every_study_that_names_metrics_has_numbers_of_its_own_settings() -> Non
             assert {json.dumps(dict(n.where), sort_keys=True) for n in known.numbers} <= points
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHEAP)
 def test_committed_numbers_come_out_again(name: str, tmp_path: Path) -> None:
     study: Study = find("coopoc.studies", name)
