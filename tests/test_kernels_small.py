@@ -39,7 +39,7 @@ def drawn(d: int) -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.mark.parametrize("batched", [False, True])
-@pytest.mark.parametrize("d", [1, 2, 3, 4, 6])
+@pytest.mark.parametrize("d", [1, 2, 3, 4, pytest.param(6, marks=pytest.mark.slow)])
 def test_blocks_of_any_size(d: int, batched: bool) -> None:
     a, eta, process = drawn(d)
     shape = (lambda v: np.repeat(v[:, None], LANES, axis=1)) if batched else np.copy

@@ -32,6 +32,7 @@ def test_recovers_the_noise_of_a_linear_problem(start: str) -> None:
     assert found.validation_loss[-1] < found.validation_loss[0]
 
 
+@pytest.mark.slow
 def test_recovers_the_share_of_the_velocity() -> None:
     """Known: 10 % of each velocity component (the "axis" reading of the paper's training noise)."""
     t = np.arange(8100) / 10
@@ -62,6 +63,7 @@ def test_equals_filterpy() -> None:
         np.testing.assert_allclose(track.covariance[0, step, 0], theirs.P, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_trained_covariance_is_calibrated() -> None:
     """Mean NEES of a three-state filter with the right covariance is 3."""
     (client,) = clients(walk(8100), Sensors())

@@ -100,6 +100,7 @@ def test_pooled_data_costs_the_drive_and_the_net() -> None:
     assert row["received_kb"] == pytest.approx(4 * PARAMETERS / 1e3)
 
 
+@pytest.mark.slow
 def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
     wanted = {**TINY, "runs": 1, "method": "mean,8 bits,v2x,kalman,bound", "condition": "iid,poisoned update"}
     study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})

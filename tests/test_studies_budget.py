@@ -59,6 +59,7 @@ def at(**where: object) -> dict[str, object]:
     return {"max_neighbours": 2, **tables.FREE, "method": "joint", "noise_model": "nominal", **where}
 
 
+@pytest.mark.slow
 def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: str) -> None:
     """By hand: 32 B at 10 Hz from each of the neighbours that are there; a CAM carries 350 B more."""
     drive = load_fleet(short_town)
@@ -72,12 +73,14 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
     assert payload < 0.3 * near * 320  # 2.2 Hz and 2 % lost
 
 
+@pytest.mark.slow
 def test_channels_keep_their_order(results: Results) -> None:
     error = {name: numbers.mean(results, at(channel=name)) for name in CHANNELS}
     assert error["ideal"] == min(error.values())  # type: ignore[type-var]
     assert numbers.mean(results, at(method="bound", noise_model="with its past", channel="ideal")) is not None
 
 
+@pytest.mark.slow
 def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None:
     ran = study.choices(results)
     found = [study.best_under(ran, limit) for limit in (0.0, 300.0, 600.0, 5000.0)]

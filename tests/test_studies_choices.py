@@ -73,6 +73,7 @@ def test_ranges_keep_their_noise_and_lose_their_angles(short_town: str) -> None:
     assert ranged.std == pytest.approx(seen.sensors.range_std)
 
 
+@pytest.mark.slow
 def test_side_by_side_takes_any_methods_and_conditions(tmp_path: Path, short_town: str) -> None:
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
     results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,bound"}, progress=False)
