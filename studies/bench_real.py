@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Floats
+from coopoc.data.mrclam_poses import thinned
 from coopoc.data.recordings import load_log
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
@@ -93,7 +94,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         whole, begin = real.seen(str(path), until, v2x, GATE)
         fleet = real.log(str(path), until)[0].fleet
         start = int(until / fleet.dt)
-        return real.thinned(whole, 2, start), fleet, start, {"begin": begin}
+        return thinned(whole, 2, start), fleet, start, {"begin": begin}
     log = load_log(path)
     if log.truth is None or log.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
@@ -127,7 +128,7 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     account = of_track(track, recording, made.message)
     squares = np.square(_blocks(errors(track, fleet)[0], start, task.block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
-    row = {"task": task.name, "data": hashed(path)}
+    row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
     if track.heading is not None:
         turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))

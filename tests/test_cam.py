@@ -76,7 +76,7 @@ def test_asn1tools_writes_the_same_bytes(path: int) -> None:
         car = {
             "heading": {"value": int(state.heading), "confidence": 127},
             "speed": {"value": int(state.speed), "confidence": 127},
-            "direction": 0,
+            "direction": int(state.direction),
             "length": {"value": 45, "trailer": 0},
             "width": 18,
             "acceleration": {"value": 161, "confidence": 102},
@@ -115,7 +115,7 @@ def test_places_are_those_of_pymap3d() -> None:
 def test_a_receiver_has_all_but_half_a_unit() -> None:
     rng = np.random.default_rng(3)
     position, course = rng.uniform(-900, 900, (500, 3)), rng.uniform(-np.pi, np.pi, 500)
-    speed, rate = rng.uniform(0, 60, 500), rng.normal(0, 0.5, 500)
+    speed, rate = rng.uniform(-60, 60, 500), rng.normal(0, 0.5, 500)
     back = cam.from_elements(cam.to_elements(position, course, speed, rate, ORIGIN), ORIGIN)
     for found, given, unit in zip(
         back, (position, course, speed, rate), (0.0112, np.deg2rad(0.1), 0.01, np.deg2rad(0.01)), strict=True

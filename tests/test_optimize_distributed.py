@@ -130,6 +130,10 @@ def test_a_robust_loss_rejects_what_one_robot_measured_wrongly() -> None:
         ({"x0": None}, {}, "with an x0"),
         ({}, {"rho": 0.0}, "rho = 0.0: must be > 0"),
         ({}, {"loss": 1.0}, "loss = 1.0"),
+        ({}, {"loss": float("nan")}, "loss = nan"),
+        ({}, {"rounds": 1.5}, "rounds = 1.5"),
+        ({}, {"steps": 0}, "steps = 0"),
+        ({}, {"seed": "x"}, "seed = 'x'"),
         ({}, {"owner": "ab"}, "owner = 2 labels: must be 12"),
     ],
 )

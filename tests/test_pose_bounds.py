@@ -169,6 +169,7 @@ def test_more_knowledge_lowers_the_bound() -> None:
         (lambda f: co.fleet_pose_bound(f, NOISE, landmarks=["m9"]), "landmarks"),
         (lambda f: co.pose_bound(f, NOISE, "b"), "vehicle"),
         (lambda f: co.pose_bound(f, NOISE, "m0", landmarks=["m0"]), "is a landmark"),
+        (lambda f: co.pose_bound(f, NOISE, "m0", information="fleet", landmarks=["m0"]), "is a landmark"),
     ],
 )
 def test_mistakes_are_named(make: Any, words: str) -> None:

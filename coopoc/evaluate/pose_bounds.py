@@ -65,12 +65,12 @@ def pose_bound(
     column = fleet.index(ego)
     if not fleet.present[:, column].all():
         raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
-    if information == "fleet":
-        return fleet_pose_bound(fleet, sensors, v2x, landmarks=landmarks)[:, column]
     marks = columns("landmarks", landmarks, fleet.ids)
-    v2x = checked_noise(fleet, sensors, v2x, bool(marks))
     if column in marks:
         raise InputError("ego", fleet.ids[column], "is a landmark", "Its position is known.")
+    if information == "fleet":
+        return fleet_pose_bound(fleet, sensors, v2x, landmarks=landmarks)[:, column]
+    v2x = checked_noise(fleet, sensors, v2x, bool(marks))
     links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range, marks)
     near = links.neighbour[~np.isin(links.neighbour, marks)]
     step = links.step[~np.isin(links.neighbour, marks)]

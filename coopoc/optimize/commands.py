@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from .backend import backends
 from .graphs import Objective, read_graph
 from .problem import Problem
+from .race import expected as expected_cost
 from .search import Search
 from .solution import Solution, Status
 from .solve import solve
@@ -69,15 +70,15 @@ def solve_file(
 
 
 def misfit(problem: Problem, solution: Solution) -> float | None:
-    """Size of the residuals over their standard deviations, sqrt(2 cost / redundancy); 1 is as stated, None where the
-    measurements only just suffice.
+    """Size of the residuals over their standard deviations, the root of the cost over the expected one; 1 is as stated,
+    None where the measurements only just suffice.
 
     >>> misfit(tiny(), solve(tiny())) < 2
     True
     """
-    residual, jacobian = problem.whiten(solution.x)
-    redundant = residual.size - len(np.unique(jacobian.nonzero()[1]))
-    return float(np.sqrt(2.0 * solution.cost / redundant)) if redundant > 0 and np.isfinite(solution.cost) else None
+    size = len(problem.names) * problem.space.dof if problem.movable is None else int(problem.movable.sum())
+    mean = expected_cost(problem, size)
+    return float(np.sqrt(solution.cost / mean)) if mean > 0 and np.isfinite(solution.cost) else None
 
 
 def described(solution: Solution) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, number
 from ..errors import InputError
 from .agent import Agent, agents_of
 from .links import Link, links_of
@@ -71,8 +71,8 @@ def solve_distributed(
         seed: of the losses.
 
     Raises:
-        InputError: no x0, B realisations, constraints, rho not > 0, loss outside [0, 1), another number of owners, or a
-            kind of measurement that no tape can hold.
+        InputError: no x0, B realisations, constraints, rho not > 0, loss outside [0, 1), rounds, steps or a seed that
+            are no whole numbers, another number of owners, or a kind of measurement that no tape can hold.
 
     References:
         Boyd et al., Distributed Optimization and Statistical Learning via the ADMM, 2011, section 7; McGann, Lassak and
@@ -84,7 +84,13 @@ def solve_distributed(
     >>> solve_distributed(problem, owner="ab").x.round(3)[:, 0] + 0.0
     array([-1.,  5.])
     """
-    _check(problem, rho, loss)
+    _check(problem)
+    rho = number("rho", rho, 1e-12, allowed="> 0", hint="Leave it out for 0.3.")
+    loss = number("loss", loss, 0.0, 1.0 - 1e-12, allowed=">= 0 and < 1", hint="It is a probability.")
+    rounds, steps, seed = (
+        number(field, value, least, kind=int, allowed=f">= {least}")
+        for field, value, least in (("rounds", rounds, 0), ("steps", steps, 1), ("seed", seed, 0))
+    )
     labels = owners(problem) if owner is None else tuple(owner)
     links = links_of(problem, labels, rho)
     agents = {agent.robot: agent for agent in agents_of(problem, labels, links)}
@@ -136,11 +142,7 @@ def _agree(problem: Problem, link: Link, agents: Mapping[str, Agent]) -> float:
     return link.agree(problem.space, own, other)
 
 
-def _check(problem: Problem, rho: float, loss: float) -> None:
+def _check(problem: Problem) -> None:
     if problem.batch is not None or problem.constraints or problem.x0 is None:
         hint = "Pick one realisation, give an x0, and leave constraints to solve."
         raise InputError("problem", repr(problem), "must be a single one with an x0 and no constraints", hint)
-    if not rho > 0:
-        raise InputError("rho", rho, "must be > 0", "Leave it out for 0.3.")
-    if not 0 <= loss < 1:
-        raise InputError("loss", loss, "must be >= 0 and < 1", "It is a probability.")

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError, MissingLibraryError
-from .cam_structure import HEIGHTS, Elements, structure
+from .cam_structure import DIRECTIONS, HEIGHTS, Elements, structure
 from .v2x import FIX_AND_VELOCITY, V2X
 
 AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -23,8 +23,10 @@ Origin = tuple[float, float, float]
 """Latitude and longitude in degrees, and height in m, of the local frame."""
 
 
-UNAVAILABLE = Elements(np.array([900000001, 1800000001, 800001]), np.array(3601), np.array(16383), np.array(32767))
-LEAST = Elements(np.array([-900000000, -1800000000, -100000]), np.array(0), np.array(0), np.array(-32766))
+UNAVAILABLE = Elements(
+    np.array([900000001, 1800000001, 800001]), np.array(3601), np.array(16383), np.array(32767), np.array(2)
+)
+LEAST = Elements(np.array([-900000000, -1800000000, -100000]), np.array(0), np.array(0), np.array(-32766), np.array(0))
 
 
 def to_elements(position: Floats, course: Floats, speed: Floats, yaw_rate: Floats, origin: Origin) -> Elements:
@@ -33,7 +35,7 @@ def to_elements(position: Floats, course: Floats, speed: Floats, yaw_rate: Float
     Args:
         position: (..., 3) m, east, north, up; NaN where it is unavailable, also below.
         course: (...) rad from +x, anticlockwise.
-        speed: (...) m/s.
+        speed: (...) m/s, negative in reverse.
         yaw_rate: (...) rad/s, anticlockwise.
         origin: of the local frame.
 
@@ -43,24 +45,26 @@ def to_elements(position: Floats, course: Floats, speed: Floats, yaw_rate: Float
     """
     unit, start = _units(origin)
     heading = np.mod(np.rint(10.0 * (90.0 - np.rad2deg(course))), 3600.0)
-    exact = (position[..., [1, 0, 2]] / unit + start, heading, 100.0 * speed, 100.0 * np.rad2deg(yaw_rate))
+    back = np.where(np.isnan(speed), np.nan, np.less(speed, 0))
+    place, rate = position[..., [1, 0, 2]] / unit + start, 100.0 * np.rad2deg(yaw_rate)
+    exact = (place, heading, 100.0 * np.abs(speed), rate, back)
     return Elements(*map(_whole, exact, LEAST, UNAVAILABLE))
 
 
 def from_elements(elements: Elements, origin: Origin) -> tuple[Floats, Floats, Floats, Floats]:
-    """Position (..., 3) m, course rad, speed m/s and yaw rate rad/s that a receiver reads; NaN where unavailable.
+    """Position (..., 3) m, course rad, signed speed m/s and yaw rate rad/s as a receiver reads them; NaN: unavailable.
 
     >>> elements = to_elements(np.zeros(3), np.array(0.1), np.array(1.0), np.array(np.nan), (47, 8, 400))
     >>> [float(np.round(one, 4)) for one in from_elements(elements, (47, 8, 400))[1:]]
     [0.0995, 1.0, nan]
     """
-    place, heading, speed, rate = (
+    place, heading, speed, rate, back = (
         np.where(one == missing, np.nan, one) for one, missing in zip(elements, UNAVAILABLE, strict=True)
     )
     unit, start = _units(origin)
     position = ((place - start) * unit)[..., [1, 0, 2]]
     course = np.deg2rad(np.mod(270.0 - heading / 10.0, 360.0) - 180.0)
-    return position, course, speed / 100.0, np.deg2rad(rate / 100.0)
+    return position, course, (1.0 - 2.0 * np.nan_to_num(back)) * speed / 100.0, np.deg2rad(rate / 100.0)
 
 
 def confidence(std: tuple[float, float, float]) -> tuple[int, int]:
@@ -132,10 +136,11 @@ def decode(message: bytes) -> Elements:
         content = codec.get_val()["cam"]["camParameters"]
         place, fast = content["basicContainer"]["referencePosition"], content["highFrequencyContainer"][1]
         where = [place["latitude"], place["longitude"], place["altitude"]["altitudeValue"]]
-        rest = fast["heading"]["headingValue"], fast["speed"]["speedValue"], fast["yawRate"]["yawRateValue"]
+        heading, speed = fast["heading"]["headingValue"], fast["speed"]["speedValue"]
+        rate, direction = fast["yawRate"]["yawRateValue"], DIRECTIONS.index(fast["driveDirection"])
     except Exception as error:
         raise InputError("message", f"{len(message)} bytes", f"is no CAM ({error})", "Give PER unaligned.") from None
-    return Elements(np.array(where), *map(np.array, rest))
+    return Elements(np.array(where), np.array(heading), np.array(speed), np.array(rate), np.array(direction))
 
 
 def mean_size(rate: float, path: int = 10) -> float:

@@ -44,7 +44,7 @@ def cam_received(recording: Recording, ego: int | str, origin: Origin = (50.0, 8
         course, speed = np.arctan2(forward[..., 1], forward[..., 0]), np.hypot(forward[..., 0], forward[..., 1])
         rate: Floats = np.full(speed.shape, np.nan)
     else:
-        course, speed, rate = body.heading, np.maximum(forward[..., 0], 0.0), body.yaw_rate
+        course, speed, rate = body.heading, forward[..., 0], body.yaw_rate
     place, course, speed, rate = from_elements(to_elements(recording.gnss, course, speed, rate, origin), origin)
     along = (np.cos(course), np.sin(course)) if body is None else (np.ones(speed.shape), np.zeros(speed.shape))
     velocity = np.stack([speed * along[0], speed * along[1], 0.0 * speed], axis=-1)

@@ -13,6 +13,8 @@ POINT = {"pathPosition": {"deltaLatitude": 500, "deltaLongitude": 500, "deltaAlt
 HEIGHTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
 """m, the classes of an altitude's confidence, and their names."""
 CLASSES = tuple("alt-{:03d}-{:02d}".format(*divmod(round(100 * height), 100)) for height in HEIGHTS)
+DIRECTIONS = ("forward", "backward", "unavailable")
+"""Of the drive; a speed has no sign."""
 
 
 class Elements(NamedTuple):
@@ -23,12 +25,14 @@ class Elements(NamedTuple):
         heading: 0.1 degrees clockwise from north, 3601: unavailable.
         speed: cm/s, 16383: unavailable.
         yaw_rate: 0.01 degrees/s anticlockwise, 32767: unavailable.
+        direction: of the drive, 0 forward, 1 backward, 2: unavailable.
     """
 
     place: Ints
     heading: Ints
     speed: Ints
     yaw_rate: Ints
+    direction: Ints
 
 
 def structure(elements: Elements, confidence: tuple[int, int], instant: float, path: int) -> dict[str, Any]:
@@ -71,7 +75,7 @@ def _fast(elements: Elements) -> dict[str, Any]:
     return {
         "heading": {"headingValue": int(elements.heading), "headingConfidence": 127},
         "speed": {"speedValue": int(elements.speed), "speedConfidence": 127},
-        "driveDirection": "forward",
+        "driveDirection": DIRECTIONS[int(elements.direction)],
         "vehicleLength": {"vehicleLengthValue": 45, "vehicleLengthConfidenceIndication": "noTrailerPresent"},
         "vehicleWidth": 18,
         "longitudinalAcceleration": {
