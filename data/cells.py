@@ -17,7 +17,7 @@ from coopoc.formats.lines import LARGEST
 if TYPE_CHECKING:
     import pandas as pd
 
-TEXT = ("must be comma separated text with a header", "Export it again, with commas and decimal points.")
+TEXT = ("must be a table with a header and cells between commas, semicolons or tabs", "Export it again as CSV.")
 COLUMNS, CELLS, UNPACKED = 5000, 20_000_000, 2**30
 """Most columns of a table, most cells of a spreadsheet, and most bytes of one when it is unpacked."""
 
@@ -31,15 +31,18 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
 def read_csv(path: Path, *text: str) -> pd.DataFrame:
     """Table of a CSV file whose columns `text`, if it has them, are kept as they are written: "007" stays "007".
 
+    Between semicolons or tabs, as spreadsheets write them in half of Europe, decimal commas are numbers, too.
+
     Raises:
-        InputError: no commas, no header, two columns of one name, or a row that is longer than the header.
+        InputError: one column, no header, two columns of one name, or a row that is longer than the header.
     """
     import pandas as pd
 
-    header = _checked_rows(path)
+    separator, header = _checked_rows(path)
     keep: Any = {name: str.strip for name in header if name.strip() in text}
+    form: Any = {"sep": separator, "decimal": "." if separator == "," else ",", "encoding": "utf-8-sig"}
     try:
-        frame = pd.read_csv(path, skipinitialspace=True, converters=keep, index_col=False, encoding="utf-8-sig")
+        frame = pd.read_csv(path, skipinitialspace=True, converters=keep, index_col=False, **form)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeError, ValueError, OverflowError) as error:
         raise InputError(path.name, _line(error), *TEXT) from None
     return frame.rename(columns=lambda name: str(name).strip())
@@ -166,11 +169,22 @@ def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
     return [str(v).strip() for v in given.tolist()]
 
 
-def _checked_rows(path: Path) -> list[str]:
-    """Header of a CSV file, none of whose rows has more cells."""
+def separator_of(header: str) -> str:
+    """What separates the cells of a CSV file, by its first line: a comma, else a semicolon, else a tab.
+
+    >>> separator_of("t;vehicle;x;y")
+    ';'
+    """
+    return next((mark for mark in ",;\t" if mark in header), ",")
+
+
+def _checked_rows(path: Path) -> tuple[str, list[str]]:
+    """What separates the cells of a CSV file, and its header; no row has more cells."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.reader(file, skipinitialspace=True)
+            separator = separator_of(file.readline())
+            file.seek(0)
+            rows = csv.reader(file, skipinitialspace=True, delimiter=separator)
             header = next(rows, [])
             _check_header(path.name, header)
             count = 0
@@ -181,11 +195,11 @@ def _checked_rows(path: Path) -> list[str]:
                         f"{path.name}: row {count}",
                         f"{len(row)} cells under {len(header)} names",
                         "must have one cell per name in the header",
-                        "Name every column in the header, write decimal points, and quote text with commas.",
+                        "Name every column in the header; between commas, write decimal points and quote text.",
                     )
     except (csv.Error, UnicodeError) as error:
         raise InputError(path.name, _line(error), *TEXT) from None
-    return header
+    return separator, header
 
 
 def _check_header(file: str, header: list[str]) -> None:

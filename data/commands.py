@@ -71,6 +71,8 @@ def check(
     dt: float | None = None,
     max_gap: float | None = None,
     columns: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=HEADER ...")] = (),
+    kinds: Annotated[tuple[str, ...], tyro.conf.arg(metavar="WORD=KIND ...")] = (),
+    origin: Annotated[tuple[float, float, float] | None, tyro.conf.arg(metavar="LATITUDE LONGITUDE HEIGHT")] = None,
     clock: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VEHICLE=SECONDS ...")] = (),
     ignore: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KIND ...")] = (),
     truth: Path | None = None,
@@ -85,6 +87,8 @@ def check(
         dt: s, steps of the recording.
         max_gap: s, longest gap of a vehicle's odometry that is bridged.
         columns: names in the files, where they differ from the standard ones.
+        kinds: words in a column kind, or headers, where they differ from the standard ones.
+        origin: degrees, degrees and m, of the local frame; default: the first fix.
         clock: seconds by which clocks are ahead.
         ignore: kinds of measurements that are left out.
         truth: file of the truth, if it is not named truth in the folder.
@@ -99,6 +103,8 @@ def check(
         "dt": dt,
         "max_gap": max_gap,
         "columns": _pairs("--columns", columns),
+        "kinds": _pairs("--kinds", kinds),
+        "origin": origin,
         "clock": {name: _seconds(name, text) for name, text in _pairs("--clock", clock).items()},
         "ignore": ignore,
         "truth": truth,

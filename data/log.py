@@ -17,7 +17,7 @@ from coopoc.world.v2x import V2X
 
 from . import log_sensors
 from .bag import is_bag, read_bag
-from .log_files import files_of, rows_of_file
+from .log_files import check_headers, files_of, rows_of_file
 from .log_frame import local, on_one_clock, origin_of
 from .log_links import linked
 from .log_rows import Rows, check_arrivals, stacked
@@ -98,6 +98,7 @@ def read_log(
         true = None if truth is None else Path(truth)
     else:
         files, true = files_of(path, None if truth is None else Path(truth))
+        check_headers(columns or {}, [*files, *([true] if true else [])], path.name)
         rows, actual = stacked([rows_of_file(file, tally, columns, kinds, ignore) for file in files]), None
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from coopoc.errors import InputError
+from coopoc.plugins import suggestion
 
 from .bag import is_bag
+from .cells import read_xlsx, separator_of
 from .kinds import KINDS
 from .log_rows import Rows
 from .log_summary import Tally
@@ -41,23 +44,35 @@ def log_files(path: Path, columns: Mapping[str, str] | None = None) -> bool:
         return True
     if path.suffix.lower() not in TABLES:
         return False
-    return bool(set(columns or ()) & ({*LONG, *KINDS} - OF_FLEETS)) or bool(OF_LOGS & set(_header(path)))
+    return bool(set(columns or ()) & ({*LONG, *KINDS} - OF_FLEETS)) or bool(
+        OF_LOGS & {header.lower() for header in headers(path)}
+    )
 
 
-def _header(path: Path) -> list[str]:
-    """Column names of a table, none where the file cannot be read (its reader will name the fault)."""
-    if path.suffix.lower() == ".parquet":
-        from pyarrow import ArrowException
-        from pyarrow.parquet import read_schema
+def headers(path: Path) -> list[str]:
+    """Column names of a table; none where the file cannot be read: its reader will name the fault."""
+    try:
+        if path.suffix.lower() == ".parquet":
+            from pyarrow.parquet import read_schema
 
-        try:
-            return [str(name).lower() for name in read_schema(path).names]
-        except (OSError, ArrowException):
-            return []
-    if path.suffix.lower() != ".csv" or not path.is_file():
+            return [str(name) for name in read_schema(path).names]
+        if path.suffix.lower() == ".xlsx":
+            return [str(name) for name in read_xlsx(path).columns]
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            line = file.readline(10_000)
+            return [word.strip() for word in next(csv.reader([line], delimiter=separator_of(line)), [])]
+    except Exception:  # of Arrow, zlib, openpyxl, csv
         return []
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        return [word.strip().strip('"').lower() for word in file.readline(10_000).split(",")]
+
+
+def check_headers(columns: Mapping[str, str], tables: Sequence[Path], name: str) -> None:
+    """InputError for a name of a column that none of the tables of a log has."""
+    found = {header for table in tables if table.suffix.lower() in TABLES for header in headers(table)}
+    for key, header in columns.items():
+        if header not in found:
+            allowed = f"is in no table, which have {', '.join(sorted(found))}"
+            hint = suggestion(header, found, "Name a column of a table.")
+            raise InputError(f"{name}: columns[{key!r}]", repr(header), allowed, hint)
 
 
 def files_of(path: Path, truth: Path | None) -> tuple[list[Path], Path | None]:

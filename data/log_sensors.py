@@ -54,7 +54,7 @@ def assumed(given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, pl
                 tally.assume(f"one standard deviation of {names[0]} for all, {level:.3g} {unit}; the log has {what}")
             return level
         if used & set(names):
-            tally.assume(f"a standard deviation of {names[0]} of {default:.3g} {unit}: none was logged")
+            tally.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
         return default
 
     z = flat or of("z", default=base.gnss_std[2], unit="m")

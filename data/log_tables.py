@@ -29,6 +29,8 @@ USUAL = {
     "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
 }
 """Headers that others give to the columns."""
+DECIMAL_COMMA = r"^\s*(-?\d+),(\d+)\s*$"
+"""A number in text: a column that may hold words is read as it is written."""
 
 
 def read_rows(
@@ -43,7 +45,7 @@ def read_rows(
     Args:
         path: of the file. Without a column vehicle, the file is named after its vehicle.
         tally: counts what is not used.
-        columns: names in the file, as {"t": "time", "latitude": "lat"}.
+        columns: names in the file, as {"t": "time", "latitude": "lat"}; one that the file lacks is left out.
         kinds: names in the column kind, as {"uwb": "range"}.
         ignore: kinds in the file that are left out.
 
@@ -56,12 +58,7 @@ def read_rows(
         if key not in (*LONG, *KINDS) and key.removesuffix("_std") not in KINDS:
             raise unknown(f"{file}: key of columns", key, (*LONG, *KINDS), 'Give columns={"t": "name in the file"}.')
     frame = read_frame(path, *(names.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
-    for key, header in names.items():
-        if header not in frame.columns:
-            headers = [str(c) for c in frame.columns]
-            allowed = f"is not in the file, which has {', '.join(headers)}"
-            hint = suggestion(header, headers, "Name a column of the file.")
-            raise InputError(f"{file}: columns[{key!r}]", repr(header), allowed, hint)
+    names = {key: header for key, header in names.items() if header in frame.columns}
     frame = frame.rename(columns={header: key for key, header in names.items()})
     if twice := next((key for key in names if (frame.columns == key).sum() > 1), None):
         allowed = f"is not the only column {twice} then: the file has one of that name"
@@ -224,7 +221,7 @@ def _arrivals(frame: pd.DataFrame, file: str, row: Ints, message: Bools) -> Floa
     if there.any():
         part = frame[there].copy()
         if part["arrival"].dtype.kind in "OUT" or str(part["arrival"].dtype) == "str":
-            part["arrival"] = part["arrival"].astype(str)
+            part["arrival"] = part["arrival"].astype(str).str.replace(DECIMAL_COMMA, r"\1.\2", regex=True)
         out[there] = _times(part, "arrival", file, row[there])
     return out
 

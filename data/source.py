@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from coopoc.errors import InputError
 
-NUMBERS = ("dt", "max_gap", "vehicle_length")
-FLAGS = ("any_scale",)
-
 
 def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     """Name or path, and the reader's options behind a question mark, which every command with --data takes.
 
-    A path that exists is never split. dt, max_gap and vehicle_length are numbers, vehicles a whole number, any_scale is
-    true or false, columns is a list of name:header, and any other option is text.
+    A path that exists is never split. READ has the options that are more than text.
 
     Raises:
         InputError: an option without a value, twice, or with a value of another kind.
@@ -38,36 +34,51 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     return name, options
 
 
-def joined(name_or_path: str | Path, options: Mapping[str, Any]) -> str:
-    """The word that `split` takes apart.
-
-    >>> joined("drive.csv", {"dt": 0.1, "columns": {"t": "time"}, "max_gap": None})
-    'drive.csv?dt=0.1&columns=t:time'
-    """
-    words = []
-    for key, value in options.items():
-        if isinstance(value, Mapping):
-            words.append(f"{key}={','.join(f'{name}:{header}' for name, header in value.items())}")
-        elif value is not None:
-            words.append(f"{key}={value}")
-    return f"{name_or_path}?{'&'.join(words)}" if words else str(name_or_path)
-
-
 def _value(key: str, value: str) -> Any:
-    if key == "columns":
-        pairs = [pair.partition(":") for pair in value.split(",")]
-        if not all(name and colon and header for name, colon, header in pairs):
-            hint = "Write columns=t:time,id:car, the name here and the header in the file."
-            raise InputError(key, repr(value), "must be name:header pairs", hint)
-        return {name.strip(): header.strip() for name, _, header in pairs}
-    if key in FLAGS:
-        if value.lower() not in ("true", "false"):
-            raise InputError(key, repr(value), "must be true or false", f"Write {key}=true.")
-        return value.lower() == "true"
-    if key in NUMBERS or key == "vehicles":
-        try:
-            return int(value) if key == "vehicles" else float(value)
-        except ValueError:
-            kind = "a whole number" if key == "vehicles" else "a number of SI units"
-            raise InputError(key, repr(value), f"must be {kind}", f"Write {key}=0.1 or the like.") from None
-    return value
+    read, allowed, example = READ.get(key, (str, "", ""))
+    try:
+        return read(value)
+    except ValueError:
+        raise InputError(key, repr(value), f"must be {allowed}", f"Write {key}={example}.") from None
+
+
+def _pairs(text: str) -> dict[str, str]:
+    pairs = [pair.partition(":") for pair in text.split(",")]
+    if not all(name and colon and other for name, colon, other in pairs):
+        raise ValueError
+    return {name.strip(): other.strip() for name, _, other in pairs}
+
+
+def _seconds(text: str) -> dict[str, float]:
+    return {name: float(value) for name, value in _pairs(text).items()}
+
+
+def _flag(text: str) -> bool:
+    if text.lower() not in ("true", "false"):
+        raise ValueError
+    return text.lower() == "true"
+
+
+def _list(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(","))
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    latitude, longitude, height = map(float, text.split(","))
+    return latitude, longitude, height
+
+
+SI = (float, "a number of SI units", "0.1")
+READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
+    "dt": SI,
+    "max_gap": SI,
+    "vehicle_length": SI,
+    "vehicles": (int, "a whole number", "4"),
+    "any_scale": (_flag, "true or false", "true"),
+    "columns": (_pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
+    "kinds": (_pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
+    "clock": (_seconds, "vehicle:seconds pairs", "blue:0.35"),
+    "ignore": (_list, "words between commas", "imu,lidar"),
+    "origin": (_place, "latitude, longitude and height", "48.14,11.58,520"),
+}
+"""Option -> what makes its value of a text, what is allowed, an example; others stay text."""

@@ -92,7 +92,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     if not listed(found):
         return ""
     fed, centralised, oracle = (found[words] for words in ("federated", "centralised", "oracle KF"))
-    p = {**results.settings, **at}
+    p = scene.shown(results, **at)
     text = [scene.heading(p), f"RT-LE: {listed(found)}"]
     if fed and centralised:
         text.append(f"Federated against centralised: {100 * (fed / centralised - 1):+.1f} %")

@@ -64,7 +64,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     found = ran({words: mean(results, of(*pair, **at)) for words, pair in names.items()})
     if not found:
         return ""
-    fed, text = found.get("federated"), f"{scene.heading({**results.settings, **at})}. RT-LE: {listed(found)}"
+    fed, text = found.get("federated"), f"{scene.heading(scene.shown(results, **at))}. RT-LE: {listed(found)}"
     ratios = [f"{fed / value:.2f} x {words}" for words, value in found.items() if fed and words != "federated"]
     return text + (f"; federated is {', '.join(ratios)}." if ratios else ".")
 

@@ -15,6 +15,7 @@ from coopoc.arrays import Bools
 from coopoc.data.log import Log
 from coopoc.data.log_links import under
 from coopoc.data.registry import kind_of, load_fleet, load_log, recorder
+from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.environment import revision
@@ -175,7 +176,8 @@ def heading(p: Params) -> str:
     """Data, noise and start of a cell in a few words, for findings."""
     begin = "start at the " + ("first fix" if start(p) == "gnss" else "true position")
     if is_real(p["data"]):
-        return f"Real data, trained with velocity noise per {p['velocity_reading']}, {begin}"
+        trained = f"trained with velocity noise per {p['velocity_reading']}, " if p.get("train_seeds") else ""
+        return f"Real data, {trained}{begin}"
     noise = acting(p)
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
@@ -204,15 +206,22 @@ def conditions(p: Params) -> str:
     log = _log(p["data"])
     alike = log is not None and (log.messages or not channel(p).loss)
     runs = log.recording.runs if log is not None and alike else p["runs"]
-    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {Path(p['data']).name}"
+    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {Path(split(p['data'])[0]).name}"
     trained = f", {_count(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."
 
 
 def caption(results: Results, *texts: str, **at: Any) -> str:
     """The texts, which may name settings in braces, and the conditions of the study, or of the selection `at` of it."""
-    p = {**results.settings, **at}
+    p = shown(results, **at)
     return " ".join([*(text.format(**p) for text in texts), conditions(p)])
+
+
+def shown(results: Results, **at: Any) -> dict[str, Any]:
+    """Parameters of results, or of a selection; training seeds only where something was trained."""
+    frame = results.frame
+    trained = "train_seed" in frame and frame["train_seed"].notna().any()
+    return {**results.settings, **({} if trained else {"train_seeds": 0}), **at}
 
 
 def _count(number: int, noun: str) -> str:

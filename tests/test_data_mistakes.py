@@ -38,7 +38,7 @@ ROW3 = "0.0,red,vx,,8.0,0.1,"
 DEGREES = "t,vehicle,x,y\n" + "".join(f"{k},red,{11.58 + 1e-5 * k},{48.14 + 2e-5 * k}\n" for k in range(20))
 SWAPPED = "t,vehicle,latitude,longitude\n0,red,116.39,39.9\n1,red,116.3901,39.9\n"
 MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
-    "semicolons between cells": (GOOD.replace(",", ";"), {}, ""),
+    "spaces between cells": (GOOD.replace(",", " "), {}, ""),
     "decimal commas": (swap(ROW3, "0.0,red,vx,,8,0,0.1,"), {}, "row 3"),
     "no column of time": (swap("t,vehicle", "time,vehicle"), {}, "log.csv: column t"),
     "a header twice": (swap("std", "value"), {}, "log.csv: header"),

@@ -65,7 +65,7 @@ BAD = {
     "once": (GOOD + "c,0.2,0,0,0\n", "none for c at t = 0.2 s", "vx, vy, vz"),
     "empty": ("id,t,x,y,z\n", "0 rows", "complete"),
     "no header": ("", "header", "Export"),
-    "semicolons": (GOOD.replace(",", ";"), "comma separated", "commas and decimal points"),
+    "spaces": (GOOD.replace(",", " "), "between commas, semicolons or tabs", "CSV"),
     "more cells than names": (GOOD.replace("0\n", "0,9\n"), "6 cells under 5 names", "header"),
     "interleaved": (
         "id,t,x,y,z,vx,vy,vz\n" + "".join(f"{v},{k / 10 + s},{k},0,0,9,0,0\n" for k in range(4) for v, s in OFFSETS),
