@@ -442,3 +442,25 @@ def test_a_weak_measurement_is_no_free_node(weight: float) -> None:
     apart = solve(replace(problem, factors=(cut,)), throw=False)
     assert apart.status is Status.RANK_DEFICIENT
     assert set(apart.unobservable) == {f"A{k}" for k in range(50, 100)}
+
+
+@pytest.mark.parametrize("unseen", [1, 40])
+@pytest.mark.parametrize("steps", [60, 800])
+def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps: int, unseen: int) -> None:
+    """Beside a chain with loops stand landmarks without a measurement: they are free, and harm neither the minimum nor
+    the number of steps. Referee: the same graph without them."""
+    graph = random_graph(218, robots=1, steps=steps, landmarks=0, ranges=0, seen=0, loops=20)
+    alone = solve(from_graph(graph))
+    more = replace(
+        graph,
+        names=(*graph.names, *(f"L{k}" for k in range(unseen))),
+        position=np.concatenate([graph.position, np.zeros((unseen, 2))]),
+        orientation=np.concatenate([graph.orientation, np.zeros((unseen, 1))]),
+        stamps=np.concatenate([graph.stamps, np.full(unseen, np.nan)]),
+        is_pose=np.concatenate([graph.is_pose, np.zeros(unseen, dtype=bool)]),
+    )
+    found = solve(from_graph(more), throw=False)
+    assert found.status is Status.RANK_DEFICIENT
+    assert set(found.unobservable) == {f"L{k}" for k in range(unseen)}
+    assert found.cost == pytest.approx(alone.cost, rel=1e-9)
+    assert found.iterations <= alone.iterations + 2

@@ -218,26 +218,34 @@ def _diagonal_blocks(solve: Callable[[Floats], Floats], n: int, dof: int) -> Flo
 
 def _unobservable(problem: Problem, J: Any, active: Active | None) -> tuple[str, ...]:
     """Nodes that take part in a direction which no measurement sees: the null space of J with unit columns."""
-    ways = None if active is None else active.exact
-    null = _null_rows(J if ways is None else J @ ways)
-    null = null if ways is None else null @ ways.T
+    from scipy.sparse import eye_array
+
+    ways = eye_array(J.shape[1], format="csc") if active is None else active.exact
+    J = (J @ ways).tocsc()
+    length = np.sqrt(np.asarray(J.multiply(J).sum(axis=0)).ravel())
+    measured = length > 0
+    null = _null_rows(J[:, measured], length[measured]) @ ways[:, measured].T
+    moves = np.square(null).sum(axis=0) + np.asarray(ways[:, ~measured].power(2).sum(axis=1)).ravel()
     if problem.movable is not None:
-        null = null * problem.movable.ravel()
-    moves = np.square(null).sum(axis=0).reshape(len(problem.names), -1).sum(axis=1)
+        moves = moves * problem.movable.ravel()
+    moves = moves.reshape(len(problem.names), -1).sum(axis=1)
     return tuple(name for name, m in zip(problem.names, moves, strict=True) if m > 1e-6)
 
 
-def _null_rows(J: Any) -> Floats:
-    """Rows that span the null space of J with unit columns; where J is large, those that inverse iteration finds."""
+def _null_rows(J: Any, length: Floats) -> Floats:
+    """Rows that span the null space of J with unit columns; where J is large, those that inverse iteration finds.
+
+    Args:
+        J: (m, k) sparse.
+        length: (k,) of its columns, > 0.
+    """
     from scipy.sparse import diags_array
 
-    length = np.sqrt(np.asarray(J.multiply(J).sum(axis=0)).ravel())
-    unit = (J @ diags_array(1.0 / np.where(length > 0, length, 1.0))).tocsc()
-    if J.shape[1] <= 6 * SMALL:
-        _, values, rows = np.linalg.svd(unit.toarray(), full_matrices=True)
-        values = np.concatenate([values, np.zeros(len(rows) - len(values))])
-        return np.asarray(rows[values <= 1e-5 * values.max(initial=1.0)])
+    unit = (J @ diags_array(1.0 / length)).tocsc()
     square = unit.T @ unit
+    if len(length) <= SMALL:
+        values, ways = np.linalg.eigh(square.toarray())
+        return np.asarray(ways[:, values <= 1e-10 * values.max(initial=1.0)].T)
     factored = factorise(square + diags_array(np.full(len(length), 1e-12)), None)
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(3):

@@ -69,12 +69,12 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     record: list[tuple[float, float, float]] = []
     newton, converged, last, still = 0, False, np.inf, 0
     cost, gradient, values = system.quadratic(x, "gauss-newton")
-    scale = _scale(system, values)
+    scale, unmeasured = _scale(system, values)
     with progress("solve") as counted:
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
             counted(cost)
             newton += model == "newton"
-            definite = cholesky.factor(_damped(system, values, mu * scale))
+            definite = cholesky.factor(_damped(system, values, mu * scale + unmeasured))
             if not definite:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
@@ -107,7 +107,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             last = promised
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
-                scale = _scale(system, values) if model == "gauss-newton" else scale
+                scale, unmeasured = _scale(system, values) if model == "gauss-newton" else (scale, unmeasured)
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 
 
@@ -121,9 +121,10 @@ def _next(mu: float, share: float) -> float:
     return _grown(mu) if share < 0.25 else mu
 
 
-def _scale(system: Sparse, values: Floats) -> Floats:
-    """(m,) diagonal of J^T J."""
-    return np.maximum(values[system.entries.diagonal], LEAST_INFORMATION)
+def _scale(system: Sparse, values: Floats) -> tuple[Floats, Floats]:
+    """(m,) diagonal of J^T J of `values`, and 1 where it is zero: what nothing measures stays where it is."""
+    diagonal = values[system.entries.diagonal]
+    return np.maximum(diagonal, LEAST_INFORMATION), 1.0 * (diagonal == 0.0)
 
 
 def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
