@@ -248,7 +248,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
         return np.asarray(ways[:, values <= 1e-10 * values.max(initial=1.0)].T)
     factored = factorise(square + diags_array(np.full(len(length), 1e-12)), None)
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
-    for _ in range(3):
+    for _ in range(6):
         ways = np.linalg.qr(factored.solve(ways))[0]
     ways = ways @ np.linalg.eigh(ways.T @ (square @ ways))[1]
     return np.asarray(ways[:, ~_seen(unit, ways)].T)
@@ -265,5 +265,5 @@ def _seen(J: Any, ways: Floats) -> Bools:
     largest = abs(J).max(axis=1).toarray().ravel()
     rows = diags_array(1.0 / np.where(largest > 0, largest, 1.0)) @ J
     left, terms = np.abs(rows @ ways), abs(rows) @ np.abs(ways)
-    matters = terms > 1e-3 * terms.max(axis=0)
+    matters = terms > 1e-6 * terms.max(axis=0)  # a chain bends by angles that are small beside its length
     return np.asarray((matters & (left > CANCELLED * terms)).any(axis=0))
