@@ -3,6 +3,7 @@
 # make test-quick   a part of the tests, in a minute once the kernels are compiled
 # make test-slow   the tests that make test leaves out: strict types, deployments over TLS, clusters, kills, trainings
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
+# make test-lower   a part of the tests with the least version of each dependency, without torch, in build/lower
 # make fuzz    every text reader under coverage-guided fuzzing, MINUTES each (default 10); finds go to build/fuzz
 # make docs    the site in build/site, tutorials executed; a warning is an error
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
@@ -23,7 +24,9 @@ PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadf
 QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_small formats formats_errors data_readers data_log \
 	optimize_problem optimize_agreement statistics study_tables study_grid layering)
 
-.PHONY: paper test test-quick test-slow test-bounds fuzz docs benchmark help clean
+LOWER := build/lower
+
+.PHONY: paper test test-quick test-slow test-bounds test-lower fuzz docs benchmark help clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -42,6 +45,15 @@ test-slow: $(VENV)/.ready-dev
 test-bounds: $(VENV)/.ready-dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \
 		-n $(JOBS) --dist loadfile tests/test_memory_safety.py $(wildcard tests/test_kernels_s*.py)
+
+test-lower:
+	$(PYTHON) -m venv $(LOWER)
+	$(PYTHON) tests/lower_bounds.py > $(LOWER)/constraints.txt
+	$(LOWER)/bin/python -m pip install --quiet -c $(LOWER)/constraints.txt setuptools wheel
+	$(LOWER)/bin/python -m pip install --quiet -c $(LOWER)/constraints.txt --no-build-isolation --editable . \
+		pytest pytest-xdist filterpy pymap3d
+	NUMBA_CACHE_DIR=$(abspath $(LOWER))/cache OMP_NUM_THREADS=1 $(LOWER)/bin/python -m pytest \
+		-n $(JOBS) --dist loadfile $(QUICK)
 
 fuzz: $(VENV)/.ready-fuzz
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(VENV)/bin/python -m fuzz.every --minutes $(MINUTES)

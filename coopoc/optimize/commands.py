@@ -57,7 +57,8 @@ def solve_file(
         problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
     print(f"coopoc: {problem}", file=sys.stderr)
     solution = solve(problem, backend, throw=False)
-    summary = described(solution) | {"misfit": (size := misfit(problem, solution))}
+    summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
+    summary |= {"misfit": (size := misfit(problem, solution))}
     if output is not None:
         output.write_text(json.dumps(summary | nodes(solution)) + "\n")
         print(f"coopoc: the solution is in {output}", file=sys.stderr)
