@@ -20,6 +20,19 @@ def test_every_page_has_a_place() -> None:
     assert placed - pages == {"gallery.md"}
 
 
+def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
+    pytest.importorskip("mkdocs")
+    code = "import pages; print(pages._gallery())"
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "docs", capture_output=True, text=True, check=True)
+    studies = out.stdout.split("\n## ")[1:]
+    for study in studies:
+        assert "**" in study, study
+        page, _, place = re.findall(r"\[\w+\]\(([\w.]+)(#?)([\w-]*)\)", study)[0]
+        titles = re.findall(r"^#+ (.*)", (ROOT / "docs" / page).read_text(), flags=re.MULTILINE)
+        assert not place or place in {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+    assert len(studies) >= 20
+
+
 @pytest.mark.parametrize(
     "tutorial",
     [pytest.param(path, marks=pytest.mark.slow) if path.stem in ("learned", "compare") else path for path in TUTORIALS],
