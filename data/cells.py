@@ -42,7 +42,7 @@ def read_csv(path: Path, *text: str) -> pd.DataFrame:
     keep: Any = {name: str.strip for name in header if name.strip() in text}
     form: Any = {"sep": separator, "decimal": "." if separator == "," else ",", "encoding": "utf-8-sig"}
     try:
-        frame = pd.read_csv(path, skipinitialspace=True, converters=keep, index_col=False, **form)
+        frame: pd.DataFrame = pd.read_csv(path, skipinitialspace=True, converters=keep, index_col=False, **form)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeError, ValueError, OverflowError) as error:
         raise InputError(path.name, _line(error), *TEXT) from None
     return frame.rename(columns=lambda name: str(name).strip())

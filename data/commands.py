@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -76,6 +76,7 @@ def check(
     clock: Annotated[tuple[str, ...], tyro.conf.arg(metavar="VEHICLE=SECONDS ...")] = (),
     ignore: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KIND ...")] = (),
     truth: Path | None = None,
+    frame: Literal["world", "body"] = "world",
     picture: Path | None = None,
 ) -> None:
     """Check a log of your own: what was read, what was not and why, innovation statistics, and a picture.
@@ -92,12 +93,15 @@ def check(
         clock: seconds by which clocks are ahead.
         ignore: kinds of measurements that are left out.
         truth: file of the truth, if it is not named truth in the folder.
+        frame: body for pose filters: speed, yaw rate, compass and bearings stay as they were measured.
         picture: its file; default: the log's name with -check.png, in the working folder.
     """
     from tabulate import tabulate
 
     from .log_check import check as checked
     from .log_picture import draw
+    from .log_pose_picture import draw_poses
+    from .log_poses import PoseCheck, check_poses
 
     given = {
         "dt": dt,
@@ -108,22 +112,28 @@ def check(
         "clock": {name: _seconds(name, text) for name, text in _pairs("--clock", clock).items()},
         "ignore": ignore,
         "truth": truth,
+        "frame": "" if frame == "world" else frame,
     }
-    log = load_log(path, **{name: value for name, value in given.items() if value not in (None, (), {})})
+    log = load_log(path, **{name: value for name, value in given.items() if value not in (None, (), {}, "")})
     print(log.summary)
-    if log.recording.body is not None:
-        print("in body frames: no innovations of position filters, and no picture; take co.PoseFilter")
+    try:
+        found = checked(log) if log.recording.body is None else check_poses(log)
+    except InputError as error:
+        print(f"\ncheck: no filter follows it, no picture is drawn: {error}")
         return
-    found = checked(log)
+    against = "innovations against a solo Kalman filter"
+    if isinstance(found, PoseCheck):
+        against = f"residuals of the fleet's pose filter, {found.span}"
     for title, rows in (("Fixes", found.vehicles), ("Relative measurements", found.measurements)):
         if rows:
-            print(f"\n{title}: innovations against a solo Kalman filter")
+            print(f"\n{title}: {against}")
             print(tabulate(rows, headers="keys", tablefmt="github", floatfmt=".3g"))
     print()
     for doubt in found.doubts or ("nothing looks wrong",):
         print(f"check: {doubt}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
-    print(f"picture: {draw(log, found, out)}", file=sys.stderr)
+    drawn = draw_poses(found, out) if isinstance(found, PoseCheck) else draw(log, found, out)
+    print(f"picture: {drawn}", file=sys.stderr)
 
 
 def make(

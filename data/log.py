@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.plugins import unknown
+from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
@@ -17,6 +20,7 @@ from coopoc.world.v2x import V2X
 
 from . import log_sensors
 from .bag import is_bag, read_bag
+from .log_body import body_vehicle, seen_by_vehicles
 from .log_files import check_headers, files_of, rows_of_file
 from .log_frame import local, on_one_clock, origin_of
 from .log_links import linked
@@ -25,6 +29,8 @@ from .log_summary import Summary, Tally
 from .log_truth import truth_of
 from .log_vehicle import Vehicle, samples, vehicle
 from .scale import check_scale, check_size, check_time
+
+Frame = Literal["world", "body"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +65,7 @@ def read_log(
     truth: str | Path | None = None,
     sensors: Sensors | None = None,
     any_scale: bool = False,
+    frame: Frame = "world",
 ) -> Log:
     """Read a file or a folder of logged measurements: tables (CSV, Parquet, Excel), NMEA, or a ROS bag.
 
@@ -77,6 +84,8 @@ def read_log(
         truth: file of the truth, if it is not in the folder under that name.
         sensors: noise that methods may assume; None: the standard deviations in the log, else `Sensors()`.
         any_scale: True accepts positions that do not look like metres and seconds.
+        frame: "world", or "body" for pose filters: speed, yaw rate, compass and bearings stay as they were measured, a
+            vehicle needs no fix, and what has one fix and no odometry is a landmark.
 
     Returns:
         Log: recording, truth, summary.
@@ -92,7 +101,8 @@ def read_log(
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
     path, tally = Path(path), Tally()
-    _check_options(dt, max_gap, clock)
+    _check_options(dt, max_gap, clock, frame)
+    body = frame == "body"
     if is_bag(path):
         rows, actual = read_bag(path, tally)
         true = None if truth is None else Path(truth)
@@ -111,13 +121,14 @@ def read_log(
     planar = not (rows.kind == "z").any()
     _check_scale(rows, path.name, any_scale)
     grid = _grid(rows, dt, path.name)
-    ids = _ids(rows)
-    vehicles = {one: vehicle(one, rows.take(rows.vehicle == one), grid, max_gap, planar, tally) for one in ids}
+    ids, make = _ids(rows, body), body_vehicle if body else vehicle
+    vehicles = {one: make(one, rows.take(rows.vehicle == one), grid, max_gap, planar, tally) for one in ids}
+    marks = [k for k, one in enumerate(vehicles.values()) if body and one.station]
+    rows = seen_by_vehicles(rows, [ids[k] for k in marks], tally)
     found = linked(rows, vehicles, grid, planar, tally)
-    noise = log_sensors.assumed(given, sensors, rows, planar, tally)
-    most = (
-        int(np.bincount(found.links.step * len(ids) + found.links.observer).max(initial=0)) if len(found.links) else 0
-    )
+    noise = log_sensors.assumed(given, sensors, rows, planar, body, tally)
+    to_landmark = np.isin(found.links.neighbour, marks)
+    pairs = (found.links.step * len(ids) + found.links.observer)[~to_landmark]
     recording = Recording(
         ids=tuple(ids),
         t=grid,
@@ -125,22 +136,30 @@ def read_log(
         velocity=np.stack([one.velocity for one in vehicles.values()], axis=1)[None],
         links=found.links,
         relative=found.relative[None],
-        broadcasts=found.broadcasts,
-        arrival=found.arrival[None],
+        broadcasts=found.broadcasts & ~np.isin(np.arange(len(ids)), marks),
+        arrival=np.where(to_landmark, -1, found.arrival)[None],
         sensors=noise,
-        v2x=V2X(max_neighbours=most, radius=np.inf),
+        v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
         notes=(f"measurements of {path.name}, nothing is simulated", *tally.sentences),
+        body=_body(vehicles) if body else None,
+        landmarks=tuple(marks),
     )
     fleet = None if actual is None else truth_of(local(actual, origin), recording, max_gap, path.stem, true)
     return Log(recording, fleet, _summary(path, recording, vehicles, tally), "messages" in tally.read, origin)
+
+
+def _body(vehicles: Mapping[str, Vehicle]) -> Body:
+    both = [(one.yaw_rate, one.compass) for one in vehicles.values()]
+    rate, heading = (np.stack([np.asarray(part) for part in parts], axis=1)[None] for parts in zip(*both, strict=True))
+    return Body(rate, heading)
 
 
 def _check_scale(rows: Rows, name: str, any_scale: bool) -> None:
     if any_scale:
         return
     parts, begin, t, position = [], 0, [], []
-    for one in _ids(rows):
+    for one in _placed(rows):
         fixes, _ = samples(rows.take(rows.vehicle == one), ("x", "y"), Tally(), 2)
         parts.append(np.arange(begin, begin + len(fixes.t)))
         begin += len(fixes.t)
@@ -150,10 +169,18 @@ def _check_scale(rows: Rows, name: str, any_scale: bool) -> None:
         check_scale(np.concatenate(t), np.concatenate(position), parts, name)
 
 
-def _ids(rows: Rows) -> list[str]:
-    """Members that have fixes, in the order of their first row; the others cannot be placed."""
+def _placed(rows: Rows) -> list[str]:
+    """Members that have fixes, in the order of their first row."""
     placed = set(rows.vehicle[rows.kind == "x"].tolist())
-    ids = [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in placed]
+    return [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in placed]
+
+
+def _ids(rows: Rows, body: bool) -> list[str]:
+    """Members that can be placed: by fixes, or in body frames by odometry, too."""
+    if body:
+        known = set(rows.vehicle[np.isin(rows.kind, ["x", "speed", "yaw_rate"])].tolist())
+        return [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in known]
+    ids = _placed(rows)
     if not ids:
         hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once."
         raise InputError("fixes", "none", "must be there: a position in the local frame starts from one", hint)
@@ -187,7 +214,9 @@ def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
     return grid
 
 
-def _check_options(dt: float | None, max_gap: float | None, clock: Mapping[str, float] | None) -> None:
+def _check_options(dt: float | None, max_gap: float | None, clock: Mapping[str, float] | None, frame: str) -> None:
+    if frame not in get_args(Frame):
+        raise unknown("frame", frame, get_args(Frame))
     for field, value in (("dt", dt), ("max_gap", max_gap)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")

@@ -42,7 +42,8 @@ class Linked(NamedTuple):
 def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bool, tally: Tally) -> Linked:
     """Links of all relative measurements and messages, at the nearest step to their time.
 
-    A bearing becomes an azimuth by the heading of its observer at its own time. Of several measurements of a kind
+    A bearing becomes an azimuth by the heading of its observer at its own time; in body frames an azimuth becomes a
+    bearing by the heading that was measured. Of several measurements of a kind
     of one pair at a step the nearest in time is kept. Where heights are all 0, an inclination that was not measured is
     pi/2 beside a range and a direction. A message at a step without a measurement is a link without one. Where no
     message was logged at all, every vehicle sends at every step and all arrives at once.
@@ -60,6 +61,7 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
         relative[flat, 2] = np.pi / 2
         if flat.any():
             tally.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")
+    inside = any(one.yaw_rate is not None for one in vehicles.values())
     order = np.lexsort((np.where(np.isnan(relative[:, 0]), np.inf, relative[:, 0]), observer, step))
     if sent:
         arrival = np.array([arrival_of.get(key, -1) for key in keys], dtype=np.int64)
@@ -67,10 +69,9 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
         arrival, broadcasts = step.copy(), there
         if len(keys):
             tally.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
-    for name, column in zip(COMPONENTS, relative.T, strict=True):
-        tally.count(
-            f"{'inclinations or elevations' if name == 'inclination' else name + 's'}", _logged(rows, name, column)
-        )
+    words = ("ranges", "bearings" if inside else "azimuths", "inclinations or elevations")
+    for name, what, column in zip(COMPONENTS, words, relative.T, strict=True):
+        tally.count(what, _logged(rows, name, column))
     return Linked(Links(step[order], observer[order], neighbour[order]), relative[order], broadcasts, arrival[order])
 
 
@@ -121,10 +122,11 @@ def _measured(
     step, lag = _steps(rows.t, grid)
     value = rows.value.copy()
     component = np.array([_component(kind) for kind in rows.kind.tolist()], dtype=np.int64)
-    turned = rows.kind == "bearing"
+    body = any(one.yaw_rate is not None for one in vehicles.values())
+    turned = rows.kind == ("azimuth" if body else "bearing")
     for column, one in enumerate(vehicles.values()):
         mine = turned & (observer == column)
-        value[mine] += one.heading(rows.t[mine]) if one.heading is not None else np.nan
+        value[mine] += (-1 if body else 1) * one.heading(rows.t[mine]) if one.heading is not None else np.nan
         if mine.any() and one.course:
             tally.assume(COURSE.format("{}", one.course), ids[column])
     value[turned] = np.arctan2(np.sin(value[turned]), np.cos(value[turned]))
@@ -136,7 +138,7 @@ def _measured(
         (~known, "relative measurements of members without a position"),
         (known & ~inside, "relative measurements outside the recording"),
         (known & inside & ~both, "relative measurements while one of the two is absent"),
-        (both & np.isnan(value), "bearings at times without a heading"),
+        (both & np.isnan(value), f"{'azimuths' if body else 'bearings'} at times without a heading"),
     ):
         if wrong.any():
             tally.refuse(reason, int(wrong.sum()), rows.place(int(np.flatnonzero(wrong)[0])))

@@ -66,7 +66,7 @@ def draw(log: Log, found: Check, path: Path) -> Path:
             color=INK,
         )
         _map(grid["map"], log, found)
-        _time(grid["time"], rec)
+        times(grid["time"], rec)
         _fixes(grid["fixes"], rec, found)
         _relative(grid["relative"], found)
         figure.savefig(path)
@@ -102,7 +102,8 @@ def _map(axes: Axes, log: Log, found: Check) -> None:
         axes.legend(loc="best", ncols=2 if len(rec.ids) > 6 else 1, handlelength=1.2)
 
 
-def _time(axes: Axes, rec: Recording) -> None:
+def times(axes: Axes, rec: Recording) -> None:
+    """When each member was there, had a fix, measured another and received a message."""
     t = rec.t - rec.t[0]
     for column, _ in enumerate(rec.ids):
         there = np.isfinite(rec.velocity[0, :, column, 0]).astype(int)

@@ -16,6 +16,8 @@ from .log_summary import Tally
 
 PLANE_STD = 0.01
 """m, how well z = 0 is known where no height was logged; rad, the inclination that goes with it."""
+HEADING_STD = 0.05
+"""rad, of a compass in body frames whose noise was not logged."""
 VARIED = 1.5
 """Ratio of large to small standard deviations (98 and 2 %) beyond which one for all is worth a word."""
 
@@ -32,7 +34,9 @@ def stds(rows: Rows) -> Mapping[str, Floats]:
     return {name: np.concatenate(parts) for name, parts in found.items()}
 
 
-def assumed(given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, planar: bool, tally: Tally) -> Sensors:
+def assumed(
+    given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, planar: bool, body: bool, tally: Tally
+) -> Sensors:
     """Sensors of a log: those that are given, else the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and said.
@@ -70,4 +74,12 @@ def assumed(given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, pl
         heading_std=of("heading", default=0.0, unit="rad") if "heading" in given and "bearing" in used else 0.0,
         min_range=0.0,
     )
+    if body:
+        found = replace(
+            found,
+            velocity_reading="speed",
+            yaw_rate_std=of("yaw_rate", default=base.yaw_rate_std, unit="rad/s"),
+            heading_std=of("heading", default=HEADING_STD, unit="rad"),
+            compass="heading" in used,
+        )
     return found if speed is None else replace(found, velocity_std_ratio=0.0, velocity_floor=speed)

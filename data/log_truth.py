@@ -9,6 +9,7 @@ import numpy as np
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
+from coopoc.world.spherical import wrap
 
 from .log_rows import Rows
 from .log_summary import Tally
@@ -25,19 +26,27 @@ def truth_of(rows: Rows, recording: Recording, max_gap: float | None, name: str,
         allowed = f"must name vehicles of the log: {', '.join(recording.ids)}"
         raise InputError(where, ", ".join(sorted(known)), allowed, "Rename them, or leave the truth out.")
     planar = not (rows.kind == "z").any()
+    heading, start = np.full(position.shape[:2], np.nan), recording.t[0]
     for column, one in enumerate(recording.ids):
         true, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Tally(), 2 if planar else 3)
         if len(true.t) > 1:
             value = np.nan_to_num(true.value)
             gap = max_gap or max(5 * recording.dt, 0.5, 1.5 * true.interval)
-            start = recording.t[0]
             position[:, column] = interpolate(true.t - start, value, recording.t - start, gap)
         elif len(true.t) == 1:
             position[:, column] = np.nan_to_num(true.value[0])
+        facing, _ = samples(rows.take(rows.vehicle == one), ("heading",), Tally(), 1)
+        if len(facing.t) > 1:
+            value = np.unwrap(facing.value, axis=0)
+            gap = max_gap or max(5 * recording.dt, 0.5, 1.5 * facing.interval)
+            heading[:, column] = wrap(interpolate(facing.t - start, value, recording.t - start, gap)[:, 0])
     there = np.isfinite(position[..., 0])
     alone = there.copy()
     alone[1:] &= ~there[:-1]
     alone[:-1] &= ~there[1:]
     position[alone] = np.nan
     velocity = backward_difference(recording.t, position, recording.ids)
-    return Fleet(recording.ids, recording.t, position, velocity, name=name, source=f"truth of {name}")
+    known_heading = heading if np.isfinite(heading).any() else None
+    return Fleet(
+        recording.ids, recording.t, position, velocity, name=name, source=f"truth of {name}", heading=known_heading
+    )

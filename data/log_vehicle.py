@@ -32,6 +32,8 @@ class Vehicle:
         text: what was read, in words.
         station: whether it stands, as a road-side unit does.
         course: what its heading is the course of, "" where it was measured.
+        yaw_rate: (T,) rad/s as velocity, in body frames.
+        compass: (T,) rad, NaN without a heading, in body frames.
     """
 
     gnss: Floats
@@ -40,6 +42,8 @@ class Vehicle:
     text: str
     station: bool = False
     course: str = ""
+    yaw_rate: Floats | None = None
+    compass: Floats | None = None
 
 
 def samples(rows: Rows, names: Sequence[str], tally: Tally, required: int) -> tuple[Signal, Ints]:
@@ -92,14 +96,12 @@ def vehicle(name: str, rows: Rows, grid: Floats, max_gap: float | None, planar: 
         fixes = Signal(fixes.t, np.column_stack([fixes.value[:, :2], np.zeros(len(fixes.t))]))
     odometry = np.isin(rows.group, ["odometry"])
     if not odometry.any() and len(fixes.t) == 1:
-        still = np.zeros((len(grid), 3))
-        text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
-        return Vehicle(still + fixes.value[0], still, _course_of_nothing(rows, grid, tally), text, station=True)
+        return standing(rows, fixes, grid, tally)
     velocity, heading, text, course = _motion(name, rows, fixes, dt, max_gap, tally)
     gap = motion.bridged(velocity, dt, max_gap)
     there = motion.covered(velocity, grid, gap, max(dt, 0.6 * velocity.interval))
     u = motion.step_means(velocity, grid)
-    gnss = _on_steps(rows, fixes, first, grid, u, there, tally)
+    gnss = on_steps(rows, fixes, first, grid, u, there, tally)
     begun = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
     early = there & ~begun
     if early.any() and begun.any():
@@ -118,19 +120,10 @@ def _motion(
     world, _ = samples(rows, ("vx", "vy", "vz"), tally, 2)
     speed, first = samples(rows, ("speed",), tally, 1)
     turn, _ = samples(rows, ("yaw_rate",), tally, 1)
-    measured, _ = samples(rows, ("heading",), tally, 1)
     rate = turn if len(turn.t) > 1 else None
     derived = motion.velocity_of_fixes(fixes, motion.bridged(fixes, dt, max_gap)) if len(fixes.t) > 1 else None
-    heading, source, course = None, "", ""
-    if len(measured.t):
-        heading, source = motion.heading_at(measured, rate, motion.bridged(measured, dt, max_gap)), "heading measured"
-    else:
-        for moves, what in ((world, "odometry"), (derived, "fixes")):
-            way = motion.course(moves) if moves is not None and len(moves.t) else None
-            if way is not None and len(way.t):
-                heading, course = motion.heading_at(way, rate, np.inf), what
-                source = f"heading from the course of the {what}"
-                break
+    moves = ((world, "odometry"), (derived, "fixes"))
+    heading, source, course = facing(rows, rate, moves, dt, max_gap, tally)
     if len(world.t):
         if len(speed.t):
             tally.refuse("speeds where a world velocity is given", len(speed.t), rows.place(first[0]))
@@ -161,7 +154,26 @@ def _motion(
     return derived, heading, ", ".join(filter(None, ["velocity derived from them", source])), course
 
 
-def _on_steps(
+def facing(
+    rows: Rows,
+    rate: Signal | None,
+    moves: Sequence[tuple[Signal | None, str]],
+    dt: float,
+    max_gap: float | None,
+    tally: Tally,
+) -> tuple[HeadingAt | None, str, str]:
+    """Heading that was measured, else the course of the first of `moves` that moves; in words; whose course it is."""
+    measured, _ = samples(rows, ("heading",), tally, 1)
+    if len(measured.t):
+        return motion.heading_at(measured, rate, motion.bridged(measured, dt, max_gap)), "heading measured", ""
+    for moved, what in moves:
+        way = motion.course(moved) if moved is not None and len(moved.t) else None
+        if way is not None and len(way.t):
+            return motion.heading_at(way, rate, np.inf), f"heading from the course of the {what}", what
+    return None, "", ""
+
+
+def on_steps(
     rows: Rows, fixes: Signal, first: Ints, grid: Floats, velocity: Floats, there: Bools, tally: Tally
 ) -> Floats:
     """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
@@ -187,7 +199,10 @@ def _on_steps(
     return gnss
 
 
-def _course_of_nothing(rows: Rows, grid: Floats, tally: Tally) -> HeadingAt | None:
-    """Heading of a road-side unit: one that was measured holds throughout."""
+def standing(rows: Rows, fixes: Signal, grid: Floats, tally: Tally) -> Vehicle:
+    """What has one fix and no odometry; a heading that was measured holds throughout."""
+    still = np.zeros((len(grid), 3))
+    text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
     measured, _ = samples(rows, ("heading",), tally, 1)
-    return motion.heading_at(measured, None, np.inf) if len(measured.t) else None
+    heading = motion.heading_at(measured, None, np.inf) if len(measured.t) else None
+    return Vehicle(still + fixes.value[0], still, heading, text, station=True)

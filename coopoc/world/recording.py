@@ -271,7 +271,7 @@ def check_recording(value: Any, body: bool = False) -> Recording:
     if (found.body is None) == body:
         hints = (
             "Take a pose filter, or co.in_world(recording) where there is a compass.",
-            'observe(..., frame="body").',
+            'observe(..., frame="body"), read_log(..., frame="body").',
         )
         frames = ("the world frame", "body frames")
         raise InputError("recording", f"in {frames[not body]}", f"must be in {frames[body]} here", hints[body])

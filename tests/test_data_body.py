@@ -1,0 +1,187 @@
+"""Logs in body frames: speed, yaw rate, compass and bearings stay as they were measured, for pose filters."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import coopoc as co
+from coopoc.data.recordings import load_log
+
+T = np.round(np.arange(0, 40, 0.1), 1)
+CARS = {"red": (0.0, 12.0, 0.10), "blue": (1.0, 16.0, 0.08), "green": (2.5, 20.0, 0.09)}
+MAST = (25.0, 3.0)
+STD = {"speed": 0.05, "yaw_rate": 0.01, "x": 0.5, "y": 0.5, "range": 0.1, "bearing": 0.03, "heading": 0.05}
+
+
+def wrapped(angle: Any) -> Any:
+    return np.mod(np.asarray(angle) + np.pi, 2 * np.pi) - np.pi
+
+
+def drives() -> dict[str, tuple[Any, Any, float, float]]:
+    """Places (T, 2) m, headings (T,) rad, speed and yaw rate of cars on circles: all closed forms."""
+    out = {}
+    for name, (start, radius, rate) in CARS.items():
+        angle = start + rate * T
+        place = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        out[name] = place, wrapped(angle + np.pi / 2), radius * rate, rate
+    return out
+
+
+def table(noise: float = 0.0, mirrored: bool = False, compass: bool = True) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """A log and its truth; the mast measures ranges."""
+    rng, rows, truth, cars = np.random.default_rng(5), [], [], drives()
+
+    def add(t: float, name: str, kind: str, value: float, partner: str = "") -> None:
+        rows.append((t, name, kind, partner, value + noise * rng.normal(0, STD[kind]), STD[kind]))
+
+    for name, (place, heading, speed, rate) in cars.items():
+        for i, t in enumerate(T):
+            truth.append((t, name, *place[i], heading[i]))
+            add(t, name, "speed", speed)
+            add(t, name, "yaw_rate", rate)
+            if i % 10 == 0:
+                add(t, name, "x", place[i, 0])
+                add(t, name, "y", place[i, 1])
+            if compass and i % 5 == 0:
+                add(t, name, "heading", heading[i])
+            if i % 4 == 0:
+                for other in cars:
+                    if other != name:
+                        apart = cars[other][0][i] - place[i]
+                        turned = wrapped(np.arctan2(apart[1], apart[0]) - heading[i])
+                        add(t, name, "bearing", -turned if mirrored else turned, other)
+                        add(t, name, "range", float(np.hypot(*apart)), other)
+                add(t, "mast", "range", float(np.hypot(*(place[i] - MAST))), name)
+    rows += [(0.0, "mast", "x", "", MAST[0], 0.01), (0.0, "mast", "y", "", MAST[1], 0.01)]
+    log = pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value", "std"])
+    return log, pd.DataFrame(truth, columns=["t", "vehicle", "x", "y", "heading"])
+
+
+def written(folder: Path, **options: Any) -> Path:
+    log, truth = table(**options)
+    folder.mkdir(exist_ok=True)
+    log.to_csv(folder / "log.csv", index=False)
+    truth.to_csv(folder / "truth.csv", index=False)
+    return folder
+
+
+def test_what_was_measured_is_what_the_recording_holds(tmp_path: Path) -> None:
+    log = load_log(f"{written(tmp_path / 'log')}?frame=body")
+    rec, cars = log.recording, drives()
+    assert rec.body is not None
+    assert set(rec.ids) == {*CARS, "mast"}
+    mast = rec.ids.index("mast")
+    assert rec.landmarks == (mast,)
+    for name, (place, heading, speed, rate) in cars.items():
+        k = rec.ids.index(name)
+        np.testing.assert_allclose(rec.velocity[0, :, k], np.tile([speed, 0, 0], (len(T), 1)), atol=1e-12)
+        np.testing.assert_allclose(rec.body.yaw_rate[0, :, k], rate, atol=1e-12)
+        np.testing.assert_allclose(rec.gnss[0, ::10, k, :2], place[::10], atol=1e-12)
+        assert np.isnan(rec.gnss[0, 1:10, k]).all()
+        np.testing.assert_allclose(wrapped(rec.body.heading[0, ::5, k] - heading[::5]), 0, atol=1e-12)
+        assert np.isnan(rec.body.heading[0, 1:5, k]).all()
+    for step, observer, neighbour, relative in zip(
+        rec.links.step, rec.links.observer, rec.links.neighbour, rec.relative[0], strict=True
+    ):
+        place, heading = cars[rec.ids[observer]][:2]
+        other = np.array(MAST) if neighbour == mast else cars[rec.ids[neighbour]][0][step]
+        apart = other - place[step]
+        assert relative[0] == pytest.approx(np.hypot(*apart))
+        if neighbour == mast:  # it measured the range, which a filter needs from the vehicle
+            assert np.isnan(relative[1])
+        else:
+            assert wrapped(relative[1] - np.arctan2(apart[1], apart[0]) + heading[step]) == pytest.approx(0, abs=1e-9)
+    assert (rec.links.observer != mast).all()
+    assert log.truth is not None
+    assert log.truth.heading is not None
+    np.testing.assert_allclose(wrapped(log.truth.heading[:, rec.ids.index("blue")] - cars["blue"][1]), 0, atol=1e-9)
+
+
+def test_pose_filters_run_on_a_log_and_cooperation_helps(tmp_path: Path) -> None:
+    log = co.read_log(written(tmp_path / "log", noise=1.0), frame="body")
+    assert log.truth is not None
+    filters = (co.PoseFilter("solo"), co.PoseFilter("star"), co.PoseFilter("fleet"))
+    tracks = [one(log.recording, list(CARS)) for one in filters]
+    errors = [co.rt_le(track, log.truth).mean() for track in tracks]
+    assert errors[1] < 0.9 * errors[0]
+    assert errors[2] < 0.9 * errors[0]
+    assert 1.5 < np.nanmean(co.pose_nees(tracks[2], log.truth)) < 5
+
+
+def test_an_azimuth_becomes_a_bearing_by_the_compass(tmp_path: Path) -> None:
+    frame, _ = table()
+    heading = {name: dict(zip(T, way, strict=True)) for name, (_, way, _, _) in drives().items()}
+    turned = frame["kind"] == "bearing"
+    here = [heading[v][t] for t, v in frame.loc[turned, ["t", "vehicle"]].to_numpy().tolist()]
+    world = frame.copy()
+    world.loc[turned, "value"] = wrapped(frame.loc[turned, "value"] + np.array(here))
+    world.loc[turned, "kind"] = "azimuth"
+    for name, part in (("a", frame), ("b", world), ("c", world[world["kind"] != "heading"])):
+        part.to_csv(tmp_path / f"{name}.csv", index=False)
+    a, b, c = (co.read_log(tmp_path / f"{name}.csv", frame="body") for name in "abc")
+    both = a.recording.relative, b.recording.relative
+    assert (np.isnan(both[0]) == np.isnan(both[1])).all()
+    np.testing.assert_allclose(np.nan_to_num(wrapped(both[0] - both[1])), 0, atol=1e-9)
+    assert any("azimuths at times without a heading" in why for why in c.summary.refused)
+
+
+def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counted(tmp_path: Path) -> None:
+    frame, _ = table()
+    frame = frame[~frame["kind"].isin(["x", "y"]) | (frame["vehicle"] == "mast")]
+    more = [(0.4, "mast", "bearing", "red", 0.3, 0.1), (0.4, "red", "vx", "", 1.0, 0.1)]
+    pd.concat([frame, pd.DataFrame(more, columns=frame.columns)]).to_csv(tmp_path / "log.csv", index=False)
+    log = co.read_log(tmp_path / "log.csv", frame="body")
+    columns = [log.recording.ids.index(name) for name in CARS]
+    assert np.isnan(log.recording.gnss[:, :, columns]).all()
+    assert log.summary.refused["messages of landmarks, and what they measured but ranges to vehicles"][0] == 1
+    assert log.summary.refused["world velocities in body frames"][0] == 1
+    begin = np.full((4, 4), np.nan)
+    begin[columns] = [[*place[0], 0.0, heading[0]] for place, heading, _, _ in drives().values()]
+    track = replace(co.PoseFilter("fleet"), begin=begin)(log.recording, list(CARS))
+    truth = np.stack([place for place, _, _, _ in drives().values()], axis=1)
+    assert np.abs(track.x[0, ..., :2] - truth).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("drop", "options", "message"),
+    [
+        ("yaw_rate", {"frame": "body"}, "no yaw_rate: must have speeds and yaw rates"),
+        ("speed", {"frame": "body"}, "no speed: must have speeds and yaw rates"),
+        ("", {"frame": "boddy"}, "Did you mean body"),
+    ],
+)
+def test_mistakes_are_named(tmp_path: Path, drop: str, options: dict[str, Any], message: str) -> None:
+    frame, _ = table()
+    frame[(frame["kind"] != drop) | (frame["vehicle"] != "red")].to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(co.InputError, match=message):
+        co.read_log(tmp_path / "log.csv", **options)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path, mirrored: bool) -> None:
+    folder = written(tmp_path / "log", noise=1.0, mirrored=mirrored, compass=False)
+    command = [sys.executable, "-W", "error", "-m", "coopoc.cli", "data", "check", str(folder), "--frame", "body"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "residuals of the fleet's pose filter, throughout" in done.stdout
+    assert "bearing" in done.stdout
+    assert ("bearings miss the filter's estimates" in done.stdout) == mirrored
+    assert ("nothing looks wrong" in done.stdout) != mirrored
+    assert (tmp_path / "log-check.png").stat().st_size > 20_000
+
+
+def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
+    frame, _ = table(compass=False)
+    frame = frame[~frame["kind"].isin(["x", "y"]) & (frame["vehicle"] != "mast")]
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    command = [sys.executable, "-m", "coopoc.cli", "data", "check", "log.csv", "--frame", "body"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "400 yaw rates" in done.stdout
+    assert "no filter follows it" in done.stdout
