@@ -39,7 +39,7 @@ FOUND = {
     ),
     "backends": (
         "optimize.md#what-each-backend-is-for",
-        "**All backends find the same positions**, within 0.4 µm of SciPy's trust-region least squares; they "
+        "**All backends find the same positions**, within 5 µm of SciPy's trust-region least squares; they "
         "differ in time.",
     ),
     "convergence": (

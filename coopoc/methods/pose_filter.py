@@ -20,9 +20,9 @@ from . import pose_unit
 from .central_filter import CENTRE
 from .options import check_options
 from .pose_begin import first_poses, pose_egos
+from .pose_estimates import each, whole
 from .pose_stream import PoseStream
 from .pose_unit import Members
-from .pose_units import each, whole
 from .track import Track
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Units of the pose filter over a recording: vehicles alone, stars, the whole fleet."""
+"""Estimates of a pose filter over a recording: of vehicles alone, of stars, of the whole fleet."""
 
 from __future__ import annotations
 
