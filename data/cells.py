@@ -41,6 +41,8 @@ def read_csv(path: Path, *text: str) -> pd.DataFrame:
     separator, header = _checked_rows(path)
     keep: Any = {name: str.strip for name in header if name.strip() in text}
     form: Any = {"sep": separator, "decimal": "." if separator == "," else ",", "encoding": "utf-8-sig"}
+    if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
+        form |= {"float_precision": "round_trip"}  # the default became exact in 3.1
     try:
         frame: pd.DataFrame = pd.read_csv(path, skipinitialspace=True, converters=keep, index_col=False, **form)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeError, ValueError, OverflowError) as error:
