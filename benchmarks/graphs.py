@@ -107,11 +107,11 @@ def row(name: str, graph: Graph) -> list[object]:
     return [*cells, problem.cost(x), iterations, time.process_time() - began, error(graph, x[:, : graph.dimension])]
 
 
-def unseen() -> Iterator[list[object]]:
+def unseen(seeds: int = 3) -> Iterator[list[object]]:
     """A row per family and seed."""
     row("warm", FAMILIES["marine"](0))
     for name, make in FAMILIES.items():
-        for seed in range(3):
+        for seed in range(seeds):
             yield row(f"{name}, seed {seed}", make(seed))
 
 

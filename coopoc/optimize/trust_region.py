@@ -19,8 +19,9 @@ DOUBT = 2
 GROWTH, DECAY = 10.0, 5.0
 """Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
 middle where a step overshoots."""
-FIRST = 1e-4
-"""Damping once some is needed."""
+FIRST = 1e-8
+"""Damping once some is needed, relative to the diagonal: the smooth modes of a chain of thousands of poses, which need
+it first, have that share of a pose's information."""
 FLAT = 1e-18
 """Share of the cost whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is taken."""
 LEAST_INFORMATION = 1e-9
@@ -29,6 +30,8 @@ SLOW = 0.2
 """A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
+LAST = 1e-3
+"""Where that is hidden the exact Hessian makes the last steps, unless J^T J's promise fell to this share or less."""
 STILL = 12
 """Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
@@ -103,6 +106,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             if model == "gauss-newton":
                 off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
                 doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
+                doubt = DOUBT if hidden and doubt >= 0 and promised > LAST * last else doubt
                 model = "newton" if doubt >= DOUBT else model
             last = promised
             if not converged:
