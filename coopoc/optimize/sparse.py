@@ -59,8 +59,10 @@ class Sparse:
 
     def retract(self, x: Floats, step: Floats) -> Floats:
         """x after a step (m,)."""
-        wide = np.append(step, 0.0)[self.entries.number]
-        return self.space.retract(x, wide)
+        number = self.entries.number
+        if len(step) == number.size:
+            return self.space.retract(x, step.reshape(number.shape))
+        return self.space.retract(x, np.append(step, 0.0)[number])
 
 
 LARGE = 60

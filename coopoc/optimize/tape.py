@@ -50,7 +50,7 @@ class Written(NamedTuple):
     Attributes:
         tape: for the kernel.
         entries: (outputs, 2); the cost has -1 twice.
-        function: the same as CasADi's Function of (inputs,) -> (outputs,).
+        function: the same as CasADi's Function of (nodes, numbers) -> outputs.
     """
 
     tape: Tape
@@ -104,8 +104,10 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.substitute(ca.vertcat(*outputs), steps, zero)
     here = ca.cse(here)
     kept = [k for k in range(here.size1()) if not here[k].is_zero()]
-    function = ca.Function("tape", [ca.vertcat(nodes, number)], [ca.vertcat(*(ca.densify(here[k]) for k in kept))])
-    return Written(_tape(function), np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
+    found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found))
+    function = ca.Function("tape", [nodes, number], found)
+    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
 
 
 def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:

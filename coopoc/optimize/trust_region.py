@@ -23,7 +23,8 @@ FIRST = 1e-8
 """Damping once some is needed, relative to the diagonal: the smooth modes of a chain of thousands of poses, which need
 it first, have that share of a pose's information."""
 FLAT = 1e-18
-"""Share of the cost whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is taken."""
+"""Share of the cost, or of 1, whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is
+taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 SLOW = 0.2
@@ -71,23 +72,23 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
     newton, converged, last, still = 0, False, np.inf, 0
-    cost, gradient, values = system.quadratic(x, "gauss-newton")
-    scale = _scale(system, values)
+    cost, gradient, values = known = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted:
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
             counted(cost)
             newton += model == "newton"
-            definite = cholesky.factor(_damped(system, values, mu * scale))
+            damping = mu * _scale(system, known[2]) if mu else None
+            definite = cholesky.factor(values if damping is None else _damped(system, values, damping))
             if not definite:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
                     doubt, model = -DOUBT, "gauss-newton"
-                    cost, gradient, values = system.quadratic(x, model)
+                    cost, gradient, values = known = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
                 continue
             dx = -cholesky.solve(gradient)
-            promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
+            promised = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx)
             there = system.retract(x, dx)
             trial, used = system.quadratic(there, model), model
             after = trial[0]
@@ -96,7 +97,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             still = still + 1 if hidden else 0
             record.append((cost, mu, share))
             converged = (
-                promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden) or still > STILL
+                promised <= FLAT * max(cost, 1.0) or still > STILL or (hidden and np.abs(dx).max(initial=0.0) <= tolerance)
             )
             if not share > 0.0:
                 mu = _grown(mu)
@@ -111,7 +112,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             last = promised
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
-                scale = _scale(system, values) if model == "gauss-newton" else scale
+                known = (cost, gradient, values) if model == "gauss-newton" else known
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 
 
@@ -126,13 +127,11 @@ def _next(mu: float, share: float) -> float:
 
 
 def _scale(system: Sparse, values: Floats) -> Floats:
-    """(m,) diagonal of J^T J."""
+    """(m,) diagonal of J^T J of `values`."""
     return np.maximum(values[system.entries.diagonal], LEAST_INFORMATION)
 
 
 def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
-    if not damping.any():
-        return values
     whole = values.astype(np.float64)
     whole[system.entries.diagonal] += damping
     return whole
