@@ -134,27 +134,35 @@ def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
 
 def _tape(function: Any) -> Tape:
     """The operations of a CasADi function of one vector."""
-    import casadi as ca
-
     from ..kernels.graph_tape import Tape
     from ..kernels.operations import Operation
 
-    known = {getattr(ca, f"OP_{operation.name}"): operation for operation in Operation}
-    known |= {ca.OP_SQ: Operation.MUL, ca.OP_TWICE: Operation.ADD}  # of one slot, which is read twice
+    known, constant, read_in, write_out = _known(), int(Operation.CONST), int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
     code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
     for k in range(count):
         found = function.instruction_id(k)
         if found not in known:
             raise NoTape(f"no tape has CasADi's operation {found}")
-        code[k] = known[found]
+        code[k] = operation = known[found]
         read, written = function.instruction_input(k), function.instruction_output(k)
-        if code[k] == Operation.CONST:
+        if operation == constant:
             place[k, 0], value[k] = written[0], function.instruction_constant(k)
-        elif code[k] == Operation.INPUT:
+        elif operation == read_in:
             place[k, :2] = written[0], read[1]
-        elif code[k] == Operation.OUTPUT:
+        elif operation == write_out:
             place[k, :2] = written[1], read[0]
         else:
             place[k] = written[0], read[0], read[-1]
     return Tape(code, place, value, function.sz_w())
+
+
+@lru_cache(maxsize=1)
+def _known() -> dict[int, int]:
+    """CasADi's number of an operation -> ours."""
+    import casadi as ca
+
+    from ..kernels.operations import Operation
+
+    known = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
+    return known | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}  # of one slot, which is read twice

@@ -97,7 +97,9 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             still = still + 1 if hidden else 0
             record.append((cost, mu, share))
             converged = (
-                promised <= FLAT * max(cost, 1.0) or still > STILL or (hidden and np.abs(dx).max(initial=0.0) <= tolerance)
+                promised <= FLAT * max(cost, 1.0)
+                or still > STILL
+                or (hidden and np.abs(dx).max(initial=0.0) <= tolerance)
             )
             if not share > 0.0:
                 mu = _grown(mu)
