@@ -55,7 +55,9 @@ def form_of(problem: Problem, factor: Factor) -> Form:
         return "GTSAM has no such factor"
     kinds, form = [(False,) * factor.nodes.shape[1]], FORMS[factor.kind]
     if problem.poses:
-        kinds = [tuple(row) for row in np.unique(np.isin(factor.nodes, problem.poses), axis=0).tolist()]
+        posed = np.zeros(len(problem.names), dtype=bool)
+        posed[list(problem.poses)] = True
+        kinds = sorted(set(map(tuple, posed[factor.nodes].tolist())))
         form = OF_POSES.get(factor.kind, form) if all(map(all, kinds)) else form
     parts = form(factor, _root(factor), problem.dimension)
     if isinstance(parts, str):
