@@ -151,9 +151,9 @@ def _own(drive: Drive, step: int, columns: Sequence[int], place: Mapping[int, in
         )
     headed = [c for c in columns if np.isfinite(compass[c])]
     if headed:
-        std = max(float(np.hypot(noise.heading_std, noise.heading_bias_std)), LEAST_HEADING_STD)
+        turn = max(float(np.hypot(noise.heading_std, noise.heading_bias_std)), LEAST_HEADING_STD)
         z = pose(np.zeros((len(headed), 2)), compass[headed])
-        found.append(Factor("pose", _column([place[c] for c in headed]), z, np.array([np.inf, np.inf, std])))
+        found.append(Factor("pose", _column([place[c] for c in headed]), z, np.array([np.inf, np.inf, turn])))
     given = drive.begin[:, [0, 1, 3]]
     begun = [c for c in columns if step == 0 and np.isfinite(given[c]).any()]
     if begun:

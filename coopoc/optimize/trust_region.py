@@ -31,8 +31,10 @@ SLOW = 0.2
 """A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
+NEAR = 1e-3
+"""Share of the cost from which on the exact Hessian makes the last steps, unless J^T J's promise fell to LAST."""
 LAST = 1e-3
-"""Where that is hidden the exact Hessian makes the last steps, unless J^T J's promise fell to this share or less."""
+"""Share of the promise before: J^T J converges as fast."""
 STILL = 12
 """Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
@@ -60,10 +62,10 @@ class Arrival:
 def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> Arrival:
     """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
 
-    H = J^T J, until two of its promises failed by more than a fifth or hardly fell; then the exact Hessian, with which
-    the last steps converge quadratically however large the residuals are. Where that is not positive definite J^T J
-    takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where less than a quarter of
-    the promised decrease comes true and falls where more than three quarters do.
+    H = J^T J, until two of its promises failed by more than a fifth or hardly fell, or the end is NEAR; then the exact
+    Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
+    positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
+    less than a quarter of the promised decrease comes true and falls where more than three quarters do.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
@@ -109,7 +111,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             if model == "gauss-newton":
                 off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
                 doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
-                doubt = DOUBT if hidden and doubt >= 0 and promised > LAST * last else doubt
+                doubt = DOUBT if promised <= NEAR * cost and doubt >= 0 and promised > LAST * last else doubt
                 model = "newton" if doubt >= DOUBT else model
             last = promised
             if not converged:
