@@ -90,16 +90,13 @@ class Factor:
     @cached_property
     def batch(self) -> int | None:
         """B, or None for a single realisation."""
-        if self.z.ndim < 3 and (self.std.ndim < 3 if self.std is not None else np.ndim(self.sqrt_information) < 4):
+        arrays = (self.z, 3), (self.std, 3), (self.sqrt_information, 4)
+        sizes = {len(a) for a, rank in arrays if a is not None and a.ndim == rank}
+        if not sizes:
             return None
-        sizes = {
-            len(a)
-            for a, rank in ((self.z, 3), (self.std, 3), (self.sqrt_information, 4))
-            if a is not None and a.ndim == rank
-        }
         if len(sizes - {1}) > 1:
             raise InputError("std", f"for {sorted(sizes)} realisations", "must agree with z", "Give one axis B.")
-        return max(sizes) if sizes else None
+        return max(sizes)
 
     @property
     def informative(self) -> Bools:
