@@ -127,11 +127,11 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
 
 def _body_spherical(factor: Factor, W: Floats, d: int) -> Form:
-    """GTSAM's errors are bearing and range, ours range and bearing."""
+    """GTSAM's errors are bearing and range, ours range and bearing; in its order a diagonal W stays one."""
     if d == 3:
         return "GTSAM weighs a bearing in space by its tangent plane, not by azimuth and inclination"
     names: Names = {(POSE, POINT): "BearingRangeFactor2D", (POSE, POSE): "BearingRangeFactorPose2"}
-    return [Part(names, lambda gtsam: [(gtsam.Rot2(angle), far) for far, angle in factor.z], W[:, :, ::-1])]
+    return [Part(names, lambda gtsam: [(gtsam.Rot2(angle), far) for far, angle in factor.z], W[:, ::-1, ::-1])]
 
 
 def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
