@@ -78,9 +78,11 @@ def sparse(problem: Problem, least: int = LARGE) -> Sparse | None:
     size = len(problem.names)
     if size * problem.space.dof > layouts.DENSE and (problem.separator or size <= least):
         return None
-    if problem not in _KEPT:
-        _KEPT[problem] = _made(problem)
-    return _KEPT[problem]
+    try:
+        return _KEPT[problem]
+    except KeyError:
+        made = _KEPT[problem] = _made(problem)
+        return made
 
 
 def keep(former: Problem, problem: Problem) -> Problem:
