@@ -18,6 +18,7 @@ import numpy as np
 from backends_casadi import PLAIN, casadi_exact
 from backends_convex import cvxpy_linear, osqp_linear
 from backends_gtsam import fixed_lag, gtsam_exact, gtsam_linear
+from backends_poses import pose_lag
 from backends_single import one_by_one
 from backends_star import Job, star
 from tabulate import tabulate
@@ -36,6 +37,7 @@ def jobs(runs: int = RUNS, steps: int = STEPS) -> list[Job]:
         gtsam_linear(linear),
         gtsam_exact(exact),
         fixed_lag(linear, steps),
+        pose_lag(),
         *(casadi_exact(exact, method) for method in PLAIN),
         osqp_linear(linear),
         cvxpy_linear(linear),

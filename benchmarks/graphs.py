@@ -3,7 +3,7 @@
 Run:  python benchmarks/graphs.py                            (every PyFG file in ../shared/data/pyfg, if it is there)
       python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
       python benchmarks/graphs.py folder --hard              (any folder of PyFG, g2o and JRL files, with hard variants)
-      python benchmarks/graphs.py --unseen                   (kinds of graphs that no file holds, three seeds each)
+      python benchmarks/graphs.py --unseen 1                 (kinds of graphs that no file holds; a seed, or three)
 
 GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
 as it comes, from chained odometry. It has no factor for a landmark's position in a pose's frame with our weights, so
@@ -107,11 +107,11 @@ def row(name: str, graph: Graph) -> list[object]:
     return [*cells, problem.cost(x), iterations, time.process_time() - began, error(graph, x[:, : graph.dimension])]
 
 
-def unseen() -> Iterator[list[object]]:
+def unseen(seeds: int = 3) -> Iterator[list[object]]:
     """A row per family and seed."""
     row("warm", FAMILIES["marine"](0))
     for name, make in FAMILIES.items():
-        for seed in range(3):
+        for seed in range(seeds):
             yield row(f"{name}, seed {seed}", make(seed))
 
 
@@ -132,13 +132,16 @@ def rows(files: list[Path], hard: bool) -> Iterator[list[object]]:
 def main(*arguments: str) -> None:
     """Print the table, and the totals."""
     given = [a for a in arguments if not a.startswith("--")]
-    folder = Path(given[0]) if given else FOLDER
-    if "--unseen" not in arguments and not folder.is_dir():
-        print(f"no folder {folder}", file=sys.stderr)
-        return
-    files = sorted(f for f in folder.rglob("*") if f.suffix in GRAPHS)
-    files = [f for f in files if not given[1:] or f.stem in given[1:]]
-    found = list(unseen() if "--unseen" in arguments else rows(files, "--hard" in arguments))
+    if "--unseen" in arguments:
+        found = list(unseen(*map(int, given)))
+    else:
+        folder = Path(given[0]) if given else FOLDER
+        if not folder.is_dir():
+            print(f"no folder {folder}", file=sys.stderr)
+            return
+        files = sorted(f for f in folder.rglob("*") if f.suffix in GRAPHS)
+        files = [f for f in files if not given[1:] or f.stem in given[1:]]
+        found = list(rows(files, "--hard" in arguments))
     total: list[object] = [
         "total",
         "",

@@ -38,6 +38,7 @@ from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.pose_filter import PoseFilter as PoseFilter
 from .methods.pose_measurement import BodyMeasurement as BodyMeasurement
 from .methods.pose_measurement import OwnMeasurement as OwnMeasurement
+from .methods.pose_smoother import PoseSmoother as PoseSmoother
 from .methods.pose_start import pose_start as pose_start
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement

@@ -36,6 +36,7 @@ from coopoc.optimize.search import Search
 from coopoc.optimize.sparse import Sparse, _made, sparse
 from coopoc.optimize.starts import chained
 from coopoc.optimize.trilateration import located
+from coopoc.optimize.trust_region import arrive
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
@@ -302,6 +303,24 @@ def test_no_minimum_lies_above_gtsams(seed: int) -> None:
     found = solve(from_graph(graph))
     assert found.status is Status.SOLVED
     assert found.cost <= native.error(theirs) * (1 + 1e-9)
+
+
+def test_a_drive_of_thousands_of_poses_needs_few_factorisations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """GTSAM's Levenberg-Marquardt from the same chained odometry needs five; damping that begins at 1e-4 needs 50."""
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    from unseen_graphs import range_aided
+
+    problem = from_graph(range_aided(0), start="odometry")
+    system = sparse(problem)
+    assert system is not None
+    end = arrive(system, problem.x0, 100, 1e-8)
+    native = native_graph(problem, forms(problem)).graph
+    fix_nodes(problem, native)
+    at = values(problem.space, which_turn(problem), problem.x0, range(len(problem.names)))
+    theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams())
+    assert system.cost(end.x) <= native.error(theirs.optimize()) * (1 + 1e-9)
+    assert end.converged
+    assert end.iterations <= 3 * theirs.iterations()
 
 
 def test_what_is_kept_of_a_problem_goes_with_it() -> None:

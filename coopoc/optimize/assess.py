@@ -91,24 +91,24 @@ def _as_graph(problem: Problem, system: Sparse, x: Floats) -> Assessment:
     """The assessment of a problem by tapes and its own factors."""
     cholesky = system.cholesky
     cost, gradient, values = system.quadratic(x, "gauss-newton")
-    size = float(np.linalg.norm(gradient))
-    unknown = np.full((len(x), problem.space.dof, problem.space.dof), np.nan)
+    size = float(np.sqrt(gradient @ gradient))
+
+    def failed(known: tuple[str, ...] | None = None) -> Assessment:
+        nodes = _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None) if known is None else known
+        return Assessment(cost, size, np.full((len(x), problem.space.dof, problem.space.dof), np.nan), np.nan, nodes)
+
     if not np.isfinite(values).all():
-        return Assessment(cost, size, unknown, np.nan)
+        return failed(())
     if not cholesky.factor(values):
-        return Assessment(
-            cost, size, unknown, np.nan, _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None)
-        )
+        return failed()
     dx = -cholesky.solve(gradient)
     free, rows, columns = system.entries.own
     cov = np.zeros(free.shape)
     cov[free] = cholesky.inverse(rows, columns)
     inflation = np.einsum("nii->ni", cov)[system.entries.number >= 0] * values[system.entries.diagonal]
     remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
-    if not (inflation < INFLATION).all() and (
-        free_nodes := _unobservable(problem, problem.jacobian(problem.linearise(x[None])), None)
-    ):
-        return Assessment(cost, size, unknown, np.nan, free_nodes)
+    if not (inflation < INFLATION).all() and (without := failed()).unobservable:
+        return without
     return Assessment(cost, size, cov, remaining, promised=promised)
 
 

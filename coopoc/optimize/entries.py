@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Bools, Ints
+
+AT_ONCE = 100_000
+"""Places that are found at a time: many at once take memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +52,7 @@ class Entries:
         return upper, lower, offset[np.searchsorted(key, upper * len(self.number) + lower)]
 
     def places(self, pair: tuple[Ints, Ints, Ints], one: Ints, other: Ints) -> Ints:
-        """(M,) where the product of two unknowns of a pair's nodes belongs, -1 where one is -1."""
+        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where one is -1."""
         upper, lower, offset = pair
         low, high = np.minimum(one, other), np.maximum(one, other)
         within = high - self.first[upper]
@@ -125,14 +129,15 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
         written: (outputs, 2), see `Written`.
     """
     m, nowhere, dof = entries.size, entries.size + 1 + len(entries.indices), entries.number.shape[1]
-    columns = [entries.number[node, k] for node in nodes.T for k in range(dof)]
-    pairs = {(i, j): entries.pair(nodes[:, i], nodes[:, j]) for j in range(nodes.shape[1]) for i in range(j + 1)}
+    columns = np.concatenate([entries.number[node].T for node in nodes.T])
     goal = np.zeros((len(written), len(nodes)), dtype=np.int32)
-    for out, (i, j) in enumerate(written.tolist()):
-        if i < 0:
-            continue
-        at, base = (
-            (columns[i], 1) if j < 0 else (entries.places(pairs[i // dof, j // dof], columns[i], columns[j]), 1 + m)
-        )
-        goal[out] = np.where(at < 0, nowhere, base + at)
+    i, j = written.T
+    gradient = (i >= 0) & (j < 0)
+    goal[gradient] = np.where(columns[i[gradient]] < 0, nowhere, 1 + columns[i[gradient]])
+    for first, last in combinations_with_replacement(range(nodes.shape[1]), 2):
+        which = np.flatnonzero((j >= 0) & (i // dof == first) & (j // dof == last))
+        pair = entries.pair(nodes[:, first], nodes[:, last])
+        for some in np.array_split(which, 1 + which.size * len(nodes) // AT_ONCE):
+            at = entries.places(pair, columns[i[some]], columns[j[some]])
+            goal[some] = np.where(at < 0, nowhere, 1 + m + at)
     return goal

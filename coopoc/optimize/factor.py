@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import InitVar, dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -90,14 +90,13 @@ class Factor:
     @cached_property
     def batch(self) -> int | None:
         """B, or None for a single realisation."""
-        sizes = {
-            len(a)
-            for a, rank in ((self.z, 3), (self.std, 3), (self.sqrt_information, 4))
-            if a is not None and a.ndim == rank
-        }
+        arrays = (self.z, 3), (self.std, 3), (self.sqrt_information, 4)
+        sizes = {len(a) for a, rank in arrays if a is not None and a.ndim == rank}
+        if not sizes:
+            return None
         if len(sizes - {1}) > 1:
             raise InputError("std", f"for {sorted(sizes)} realisations", "must agree with z", "Give one axis B.")
-        return max(sizes) if sizes else None
+        return max(sizes)
 
     @property
     def informative(self) -> Bools:
@@ -152,9 +151,14 @@ class Factor:
 def unchecked(factor: Factor, **changes: Any) -> Factor:
     """The factor with changes that come from checked arrays and need not be checked again."""
     changed = object.__new__(Factor)
-    for field in fields(Factor):
-        object.__setattr__(changed, field.name, changes.get(field.name, getattr(factor, field.name)))
+    kept = factor.__dict__
+    changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
     return changed
+
+
+@cache
+def _fields() -> tuple[str, ...]:
+    return tuple(field.name for field in fields(Factor))
 
 
 def _pick(array: Floats, rank: int, which: Ints | int) -> Floats:

@@ -21,10 +21,11 @@ def fused(problem: Problem) -> Problem:
     """
     if problem.batch is not None:
         return problem
-    order = sorted(range(len(problem.factors)), key=lambda k: _form(problem.factors[k]))
-    groups = [list(group) for _, group in groupby(order, key=lambda k: _form(problem.factors[k]))]
-    if len(groups) == len(problem.factors):
+    forms = [_form(factor) for factor in problem.factors]
+    if len(set(forms)) == len(forms):
         return problem
+    order = sorted(range(len(forms)), key=forms.__getitem__)
+    groups = [list(group) for _, group in groupby(order, key=forms.__getitem__)]
     groups.sort(key=min)
     return problem.replace_unchecked(factors=tuple(_one([problem.factors[k] for k in group]) for group in groups))
 

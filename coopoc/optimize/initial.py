@@ -44,9 +44,13 @@ def initial_guess(problem: Problem) -> Floats:
     x: Floats = np.zeros((batch, len(problem.names), problem.dimension))
     if linear.factors and (system := sparse(linear)) is not None:
         _, gradient, values = system.quadratic(x[0], "gauss-newton")
-        values[system.entries.diagonal] += RIDGE
+        own = system.entries.diagonal
+        every = bool((values[own] > 0.0).all())
+        values[own] += RIDGE
         system.cholesky.factor(values)
         x = system.retract(x[0], -system.cholesky.solve(gradient))[None]
+        if every:  # a linear factor touches each
+            return x
     elif linear.factors:
         x = damped_step(linear, linear.linearise(x), np.full_like(x, RIDGE))
     return _apart(problem, linear, x)

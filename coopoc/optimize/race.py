@@ -15,7 +15,8 @@ from .trust_region import Arrival, arrive
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
 ROUNDS = ((3.0, 25), (1.25, 200))
-"""Those whose cost is within the first number of the least go on by as many steps as the second says."""
+"""Those whose cost is within the first number of the least go on by as many steps as the second says, of several with
+the same cost the cheapest alone."""
 SAME = 1e-3
 """Share by which costs may differ and count as the same minimum: the cheaper start then stays."""
 TOLERANCE = 1e-3
@@ -58,6 +59,7 @@ def race(
     for within, steps in ROUNDS:
         if all(cost <= (1.0 + SAME) * least for cost, _ in tried.values()):
             break
+        tried = _distinct(tried)
         close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
         if len(close) > 1:
             ends = {name: arrive(system, x, steps, TOLERANCE) for name, x in close.items()}
@@ -73,8 +75,17 @@ def race(
             grown, steps = growing(problem)
             end = arrive(system, grown, MORE, TOLERANCE)
             taken += steps + end.iterations
-            name, x = ("incremental", end.x) if system.cost(end.x) < system.cost(x) else (name, x)
+            name, x = ("incremental", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
     return keep(problem, problem.replace_unchecked(x0=frozen(x))), Search(name, taken)
+
+
+def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:
+    """Those whose cost differs from that of every one before, which is cheaper."""
+    found: dict[str, tuple[float, Floats]] = {}
+    for name, (cost, x) in tried.items():
+        if all(abs(cost - other) > SAME * min(cost, other) for other, _ in found.values()):
+            found[name] = cost, x
+    return found
 
 
 def expected(problem: Problem, unknowns: int) -> float:

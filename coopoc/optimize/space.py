@@ -66,7 +66,7 @@ class Space:
         if not self.has_rotation:
             return np.asarray(position, dtype=np.float64)
         turned = np.eye(self.dimension) if rotation is None else np.asarray(rotation, dtype=np.float64)
-        flat = turned.reshape(*turned.shape[:-2], -1)
+        flat = turned.reshape(*turned.shape[:-2], self.dimension**2)
         return np.concatenate([position, np.broadcast_to(flat, (*np.shape(position)[:-1], flat.shape[-1]))], axis=-1)
 
     def retract(self, x: Floats, step: Floats) -> Floats:

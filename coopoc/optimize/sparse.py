@@ -59,8 +59,10 @@ class Sparse:
 
     def retract(self, x: Floats, step: Floats) -> Floats:
         """x after a step (m,)."""
-        wide = np.append(step, 0.0)[self.entries.number]
-        return self.space.retract(x, wide)
+        number = self.entries.number
+        if len(step) == number.size:
+            return self.space.retract(x, step.reshape(number.shape))
+        return self.space.retract(x, np.append(step, 0.0)[number])
 
 
 LARGE = 60
@@ -76,9 +78,11 @@ def sparse(problem: Problem, least: int = LARGE) -> Sparse | None:
     size = len(problem.names)
     if size * problem.space.dof > layouts.DENSE and (problem.separator or size <= least):
         return None
-    if problem not in _KEPT:
-        _KEPT[problem] = _made(problem)
-    return _KEPT[problem]
+    try:
+        return _KEPT[problem]
+    except KeyError:
+        made = _KEPT[problem] = _made(problem)
+        return made
 
 
 def keep(former: Problem, problem: Problem) -> Problem:

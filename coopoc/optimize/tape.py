@@ -50,7 +50,7 @@ class Written(NamedTuple):
     Attributes:
         tape: for the kernel.
         entries: (outputs, 2); the cost has -1 twice.
-        function: the same as CasADi's Function of (inputs,) -> (outputs,).
+        function: the same as CasADi's Function of (nodes, numbers) -> outputs.
     """
 
     tape: Tape
@@ -104,8 +104,10 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.substitute(ca.vertcat(*outputs), steps, zero)
     here = ca.cse(here)
     kept = [k for k in range(here.size1()) if not here[k].is_zero()]
-    function = ca.Function("tape", [ca.vertcat(nodes, number)], [ca.vertcat(*(ca.densify(here[k]) for k in kept))])
-    return Written(_tape(function), np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
+    found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found))
+    function = ca.Function("tape", [nodes, number], found)
+    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
 
 
 def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
@@ -132,27 +134,35 @@ def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
 
 def _tape(function: Any) -> Tape:
     """The operations of a CasADi function of one vector."""
-    import casadi as ca
-
     from ..kernels.graph_tape import Tape
     from ..kernels.operations import Operation
 
-    known = {getattr(ca, f"OP_{operation.name}"): operation for operation in Operation}
-    known |= {ca.OP_SQ: Operation.MUL, ca.OP_TWICE: Operation.ADD}  # of one slot, which is read twice
+    known, constant, read_in, write_out = _known(), int(Operation.CONST), int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
     code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
     for k in range(count):
         found = function.instruction_id(k)
         if found not in known:
             raise NoTape(f"no tape has CasADi's operation {found}")
-        code[k] = known[found]
+        code[k] = operation = known[found]
         read, written = function.instruction_input(k), function.instruction_output(k)
-        if code[k] == Operation.CONST:
+        if operation == constant:
             place[k, 0], value[k] = written[0], function.instruction_constant(k)
-        elif code[k] == Operation.INPUT:
+        elif operation == read_in:
             place[k, :2] = written[0], read[1]
-        elif code[k] == Operation.OUTPUT:
+        elif operation == write_out:
             place[k, :2] = written[1], read[0]
         else:
             place[k] = written[0], read[0], read[-1]
     return Tape(code, place, value, function.sz_w())
+
+
+@lru_cache(maxsize=1)
+def _known() -> dict[int, int]:
+    """CasADi's number of an operation -> ours."""
+    import casadi as ca
+
+    from ..kernels.operations import Operation
+
+    known = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
+    return known | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}  # of one slot, which is read twice

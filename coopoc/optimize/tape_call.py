@@ -24,36 +24,32 @@ class TapeCall:
     """
 
     def __init__(self, written: Sequence[Written], nodes: Sequence[Ints], places: Sequence[Ints], length: int) -> None:
-        self._calls, self._length = [], length
-        self._out = np.empty(sum(place.size for place in places))
+        self._length = length
+        self._touched = np.concatenate([np.empty(0, np.int64), *(touched.ravel() for touched in nodes)])
         self._places = np.concatenate([np.empty(0, np.int64), *(place.T.ravel() for place in places)])
-        end = 0
+        ambient = written[0].function.size1_in(0) // nodes[0].shape[1] if written else 0
+        self._local, self._out = np.empty((len(self._touched), ambient)), np.empty(len(self._places))
+        self._numbers, self._triggers, self._buffers = [], [], []
+        top = end = 0
         for tape, touched, place in zip(written, nodes, places, strict=True):
-            end, begin = end + place.size, end
-            self._calls.append(_Call(tape.function.map(len(touched)), touched, self._out[begin:end]))
+            top, first, end, begin = top + touched.size, top, end + place.size, end
+            number = np.empty((len(touched), tape.function.size1_in(1)))
+            buffer, trigger = tape.function.map(len(touched)).buffer()
+            for k, memory in enumerate((self._local[first:top], number)):
+                buffer.set_arg(k, _bound(memory.reshape(-1)))
+            buffer.set_res(0, _bound(self._out[begin:end]))
+            self._numbers.append(number.T)
+            self._triggers.append(trigger)
+            self._buffers.append(buffer)
 
     def __call__(self, x: Floats, numbers: Sequence[Floats]) -> Floats:
-        for call, own in zip(self._calls, numbers, strict=True):
-            call.run(x, own)
+        x.take(self._touched, 0, self._local, "clip")  # without "clip" NumPy copies through a buffer
+        for own, given, trigger in zip(self._numbers, numbers, self._triggers, strict=True):
+            own[:] = given
+            trigger()
         total: Any = np.bincount(self._places, self._out, self._length)
         return np.asarray(total)
 
 
-class _Call:
-    """A CasADi function of (inputs, M) numbers whose memory is bound once."""
-
-    def __init__(self, function: Any, nodes: Ints, out: Floats) -> None:
-        self._nodes, self._width = nodes, function.size1_in(0)
-        self._inputs = np.empty((len(nodes), self._width))
-        flat: Any = self._inputs.reshape(-1)
-        held: Any = out
-        self._buffer, self._trigger = function.buffer()
-        self._buffer.set_arg(0, memoryview(flat))
-        self._buffer.set_res(0, memoryview(held))
-
-    def run(self, x: Floats, numbers: Floats) -> None:
-        """Fill the outputs."""
-        split = self._width - len(numbers)
-        self._inputs[:, :split] = x[self._nodes].reshape(len(self._nodes), -1)
-        self._inputs[:, split:] = numbers.T
-        self._trigger()
+def _bound(memory: Any) -> Any:
+    return memoryview(memory)

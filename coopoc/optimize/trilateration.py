@@ -6,6 +6,11 @@ import numpy as np
 
 from ..arrays import Floats
 
+STEPS = 50
+"""Of each descent."""
+TOLERANCE = 1e-6
+"""m, a step that ends it."""
+
 
 def located(places: Floats, ranges: Floats) -> Floats:
     """(d,) minimum of sum (|l - p_k| - r_k)^2, the lowest of those that three guesses lead to.
@@ -20,8 +25,6 @@ def located(places: Floats, ranges: Floats) -> Floats:
     >>> located(np.array([[0.0, 0], [8, 0], [4, 1]]), np.array([5.0, 5, 2])).round(6)
     array([4., 3.])
     """
-    from scipy.optimize import least_squares
-
     d, middle = places.shape[1], places.mean(axis=0)
     p = places - middle
     if len(p) <= d:
@@ -32,13 +35,30 @@ def located(places: Floats, ranges: Floats) -> Floats:
     flat = guess - normal * (guess @ normal)
     height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
 
-    def residual(at: Floats) -> Floats:
-        return np.asarray(np.linalg.norm(at - p, axis=1) - ranges)
+    ends = [_descended(p, ranges, at) for at in (guess, flat + height * normal, flat - height * normal)]
+    return np.asarray(min(ends, key=lambda end: end[0])[1] + middle)
 
-    def jacobian(at: Floats) -> Floats:
-        gap = at - p
-        return np.asarray(gap / np.maximum(np.linalg.norm(gap, axis=1, keepdims=True), 1e-12))
 
-    guesses = (guess, flat + height * normal, flat - height * normal)
-    ends = [least_squares(residual, at, jacobian, method="lm", max_nfev=30) for at in guesses]
-    return np.asarray(min(ends, key=lambda end: float(end.cost)).x + middle)
+def _descended(p: Floats, ranges: Floats, at: Floats) -> tuple[float, Floats]:
+    """Cost and place of a minimum from `at`, by Levenberg-Marquardt steps."""
+    mu, (cost, residual, jacobian) = 1e-3, _linear(p, ranges, at)
+    for _ in range(STEPS):
+        hessian = jacobian.T @ jacobian
+        damping = mu * np.maximum(hessian.diagonal(), 1e-9)
+        dx = -np.linalg.solve(hessian + np.diag(damping), jacobian.T @ residual)
+        trial = _linear(p, ranges, at + dx)
+        if trial[0] < cost:
+            at, (cost, residual, jacobian), mu = at + dx, trial, 0.1 * mu
+        else:
+            mu *= 10.0
+        if float(dx @ dx) < TOLERANCE**2:
+            break
+    return cost, at
+
+
+def _linear(p: Floats, ranges: Floats, at: Floats) -> tuple[float, Floats, Floats]:
+    """Cost, residuals (K,) and Jacobian (K, d) at a place."""
+    gap = at - p
+    distance = np.sqrt(np.square(gap).sum(axis=1))
+    residual = distance - ranges
+    return float(residual @ residual), residual, gap / np.maximum(distance, 1e-12)[:, None]

@@ -19,16 +19,22 @@ DOUBT = 2
 GROWTH, DECAY = 10.0, 5.0
 """Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
 middle where a step overshoots."""
-FIRST = 1e-4
-"""Damping once some is needed."""
+FIRST = 1e-8
+"""Damping once some is needed, relative to the diagonal: the smooth modes of a chain of thousands of poses, which need
+it first, have that share of a pose's information."""
 FLAT = 1e-18
-"""Share of the cost whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is taken."""
+"""Share of the cost, or of 1, whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is
+taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 SLOW = 0.2
 """A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
+NEAR = 1e-3
+"""Share of the cost from which on the exact Hessian makes the last steps, unless J^T J's promise fell to LAST."""
+LAST = 1e-3
+"""Share of the promise before: J^T J converges as fast."""
 STILL = 12
 """Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
@@ -56,10 +62,10 @@ class Arrival:
 def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> Arrival:
     """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
 
-    H = J^T J, until two of its promises failed by more than a fifth or hardly fell; then the exact Hessian, with which
-    the last steps converge quadratically however large the residuals are. Where that is not positive definite J^T J
-    takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where less than a quarter of
-    the promised decrease comes true and falls where more than three quarters do.
+    H = J^T J, until two of its promises failed by more than a fifth or hardly fell, or the end is NEAR; then the exact
+    Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
+    positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
+    less than a quarter of the promised decrease comes true and falls where more than three quarters do.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
@@ -68,23 +74,23 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
     newton, converged, last, still = 0, False, np.inf, 0
-    cost, gradient, values = system.quadratic(x, "gauss-newton")
-    scale, unmeasured = _scale(system, values)
+    cost, gradient, values = known = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted:
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
             counted(cost)
             newton += model == "newton"
-            definite = cholesky.factor(_damped(system, values, mu * scale + unmeasured))
+            damping = _damping(system, known[2], mu)
+            definite = cholesky.factor(values if damping is None else _damped(system, values, damping))
             if not definite:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
                     doubt, model = -DOUBT, "gauss-newton"
-                    cost, gradient, values = system.quadratic(x, model)
+                    cost, gradient, values = known = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
                 continue
             dx = -cholesky.solve(gradient)
-            promised = 0.5 * float(mu * scale @ (dx * dx) - gradient @ dx)
+            promised = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx)
             there = system.retract(x, dx)
             trial, used = system.quadratic(there, model), model
             after = trial[0]
@@ -93,7 +99,9 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             still = still + 1 if hidden else 0
             record.append((cost, mu, share))
             converged = (
-                promised <= FLAT * cost or (np.abs(dx).max(initial=0.0) <= tolerance and hidden) or still > STILL
+                promised <= FLAT * max(cost, 1.0)
+                or still > STILL
+                or (hidden and np.abs(dx).max(initial=0.0) <= tolerance)
             )
             if not share > 0.0:
                 mu = _grown(mu)
@@ -103,11 +111,12 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             if model == "gauss-newton":
                 off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
                 doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
+                doubt = DOUBT if promised <= NEAR * cost and doubt >= 0 and promised > LAST * last else doubt
                 model = "newton" if doubt >= DOUBT else model
             last = promised
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
-                scale, unmeasured = _scale(system, values) if model == "gauss-newton" else (scale, unmeasured)
+                known = (cost, gradient, values) if model == "gauss-newton" else known
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 
 
@@ -121,15 +130,17 @@ def _next(mu: float, share: float) -> float:
     return _grown(mu) if share < 0.25 else mu
 
 
-def _scale(system: Sparse, values: Floats) -> tuple[Floats, Floats]:
-    """(m,) diagonal of J^T J of `values`, and 1 where it is zero: what nothing measures stays where it is."""
+def _damping(system: Sparse, values: Floats, mu: float) -> Floats | None:
+    """(m,) mu times the diagonal of J^T J of `values`, and 1 where that is zero: what nothing measures stays where it
+    is. None where all is zero."""
     diagonal = values[system.entries.diagonal]
-    return np.maximum(diagonal, LEAST_INFORMATION), 1.0 * (diagonal == 0.0)
+    unmeasured = diagonal == 0.0
+    if not mu and not unmeasured.any():
+        return None
+    return mu * np.maximum(diagonal, LEAST_INFORMATION) + unmeasured
 
 
 def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
-    if not damping.any():
-        return values
     whole = values.astype(np.float64)
     whole[system.entries.diagonal] += damping
     return whole

@@ -55,7 +55,9 @@ def form_of(problem: Problem, factor: Factor) -> Form:
         return "GTSAM has no such factor"
     kinds, form = [(False,) * factor.nodes.shape[1]], FORMS[factor.kind]
     if problem.poses:
-        kinds = [tuple(row) for row in np.unique(np.isin(factor.nodes, problem.poses), axis=0).tolist()]
+        posed = np.zeros(len(problem.names), dtype=bool)
+        posed[list(problem.poses)] = True
+        kinds = sorted(set(map(tuple, posed[factor.nodes].tolist())))
         form = OF_POSES.get(factor.kind, form) if all(map(all, kinds)) else form
     parts = form(factor, _root(factor), problem.dimension)
     if isinstance(parts, str):
@@ -125,11 +127,11 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
 
 def _body_spherical(factor: Factor, W: Floats, d: int) -> Form:
-    """GTSAM's errors are bearing and range, ours range and bearing."""
+    """GTSAM's errors are bearing and range, ours range and bearing; in its order a diagonal W stays one."""
     if d == 3:
         return "GTSAM weighs a bearing in space by its tangent plane, not by azimuth and inclination"
     names: Names = {(POSE, POINT): "BearingRangeFactor2D", (POSE, POSE): "BearingRangeFactorPose2"}
-    return [Part(names, lambda gtsam: [(gtsam.Rot2(angle), far) for far, angle in factor.z], W[:, :, ::-1])]
+    return [Part(names, lambda gtsam: [(gtsam.Rot2(angle), far) for far, angle in factor.z], W[:, ::-1, ::-1])]
 
 
 def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
