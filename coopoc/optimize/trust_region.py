@@ -137,7 +137,7 @@ def _damping(system: Sparse, values: Floats, mu: float) -> Floats | None:
     unmeasured = diagonal == 0.0
     if not mu and not unmeasured.any():
         return None
-    return mu * np.maximum(diagonal, LEAST_INFORMATION) + unmeasured
+    return np.asarray(mu * np.maximum(diagonal, LEAST_INFORMATION) + unmeasured)
 
 
 def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
