@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from random_graphs import random_graph
 
 from coopoc.cli import main
 from coopoc.formats import write_graph
 from coopoc.formats.edges import PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import backends
-from random_graphs import random_graph
 
 ROOT = Path(__file__).resolve().parents[1]
 PYFG = ROOT / "../shared/data/pyfg"
