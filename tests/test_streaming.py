@@ -317,7 +317,7 @@ def test_history_is_as_long_as_asked_for() -> None:
 
 
 def test_the_motion_that_is_kept_is_its_integral() -> None:
-    """Closed form: the summed motion, interpolated at any age, while a ring of steps wraps around, grows and shrinks."""
+    """Closed form: the summed motion, interpolated at any age, while the ring of steps wraps around and grows."""
     rng, history = np.random.default_rng(0), MotionHistory(10.0)
     dt = np.concatenate([rng.uniform(0.2, 0.9, 100), rng.uniform(0.01, 0.05, 500), rng.uniform(0.2, 0.9, 50)])
     moved, variance = rng.normal(size=(len(dt), 3)), rng.uniform(size=(len(dt), 3))
