@@ -140,7 +140,7 @@ def tests_of(file: str) -> list[str]:
         for test, text in texts.items():
             shared = set(used.stem.split("_")) & set(Path(test).stem.split("_")[1:])
             scores[test] += weight * (len(words.findall(text)) + 10 * len(shared))
-    return [file, *(test for test, score in scores.most_common(MOST_TESTS) if score)]
+    return [*(test for test, score in scores.most_common(MOST_TESTS) if score), file]
 
 
 @cache
