@@ -25,7 +25,7 @@ from coopoc.optimize.convex.manifold import minimise, tangent
 from coopoc.optimize.convex.newton import minimise_sparsely, tangent_basis
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers
 from coopoc.optimize.convex.quadratic import quadratic
-from coopoc.optimize.convex.relaxation import polished, shor
+from coopoc.optimize.convex.relaxation import first_vectors, polished, shor
 from coopoc.optimize.convex.schur import Dense, Sparse
 from coopoc.optimize.convex.staircase import scaled_bound, staircase
 from coopoc.optimize.graphs import from_graph
@@ -400,3 +400,13 @@ def test_a_certificate_takes_the_time_it_is_given() -> None:
     assert 0.8 * solution.cost < later.lower_bound <= solution.cost * (1 + 1e-6)
     with pytest.raises(InputError, match="positive"):
         staircase(problem, seconds=0.0)
+
+
+def test_the_first_vectors_are_those_of_the_nearest_matrix_of_their_rank() -> None:
+    """Eckart and Young: what is left over has the other eigenvalues; the gap is the first of them over the last kept."""
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((7, 7)))[0]
+    Z = (turn * [9.0, 6.0, 3.0, 2.0, 1.0, 0.5, 0.1]) @ turn.T
+    X, gap = first_vectors(Z, 2)
+    left = np.linalg.eigvalsh(Z - X @ X.T)
+    np.testing.assert_allclose(left, [0, 0, 0.1, 0.5, 1, 2, 3], atol=1e-12)
+    assert gap == pytest.approx(0.5)
