@@ -403,7 +403,7 @@ def test_a_certificate_takes_the_time_it_is_given() -> None:
 
 
 def test_the_first_vectors_are_those_of_the_nearest_matrix_of_their_rank() -> None:
-    """Eckart and Young: what is left over has the other eigenvalues; the gap is the first of them over the last kept."""
+    """Eckart and Young: what is left has the other eigenvalues; the gap is the first of them over the last kept."""
     turn = np.linalg.qr(np.random.default_rng(0).standard_normal((7, 7)))[0]
     Z = (turn * [9.0, 6.0, 3.0, 2.0, 1.0, 0.5, 0.1]) @ turn.T
     X, gap = first_vectors(Z, 2)
