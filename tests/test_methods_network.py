@@ -505,6 +505,7 @@ def test_bad_settings_are_named() -> None:
         (ConsensusADMM, {"rounds": 1.5}),
         (Diffusion, {"rounds": -1}),
         (BatchSmoother, {"exact_steps": -1}),
+        (BatchSmoother, {"settle": 0.0}),
         (Message, {"name": "x", "numbers": -1}),
     ):
         field = next(name for name in bad if name != "name")
