@@ -16,12 +16,14 @@ import csv
 import os
 import random
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -160,25 +162,16 @@ def _importers(file: Path) -> tuple[Path, ...]:
 
 def found_by(mutant: Mutant, limit: int, more: list[str]) -> str:
     """The test that fails with the mutant in its place; "" if all of the file's tests and `more` pass, UNFINISHED if
-    they take longer than `limit` s of CPU.
-
-    The machine code of the unchanged file stays: a changed kernel compiles into a cache of its own.
-    """
+    they take longer than `limit` s of CPU."""
     file = ROOT / mutant.file
     original, times = file.read_bytes(), file.stat()
     names = dict.fromkeys([*tests_of(mutant.file), *more])
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *names]
-    with tempfile.TemporaryDirectory() as cache:
-        own = {"NUMBA_CACHE_DIR": cache} if _is_compiled(file.parent) else {}
+    with _machine_code(file.parent):
         try:
             file.write_text(mutant.text)
             done = subprocess.run(
-                ["prlimit", f"--cpu={limit}", *command],
-                cwd=ROOT,
-                env=os.environ | own,
-                capture_output=True,
-                text=True,
-                check=False,
+                ["prlimit", f"--cpu={limit}", *command], cwd=ROOT, capture_output=True, text=True, check=False
             )
         finally:
             file.write_bytes(original)
@@ -189,9 +182,18 @@ def found_by(mutant: Mutant, limit: int, more: list[str]) -> str:
     return "" if done.returncode == 0 else failed[1] if failed else f"exit {done.returncode}"
 
 
-def _is_compiled(folder: Path) -> bool:
-    """Whether a folder holds kernels, which compile anew after a change of any file beside them."""
-    return any(re.search(r"import .*\b(compiled|as_written)\b", file.read_text()) for file in folder.glob("*.py"))
+@contextmanager
+def _machine_code(folder: Path) -> Iterator[None]:
+    """Keep the machine code of a folder, whose kernels compile anew after a change of any of its files."""
+    cache = folder / "__pycache__"
+    cache.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as kept:
+        shutil.copytree(cache, kept, dirs_exist_ok=True)
+        try:
+            yield
+        finally:
+            shutil.rmtree(cache)
+            shutil.copytree(kept, cache)
 
 
 def main() -> None:

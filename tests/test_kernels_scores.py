@@ -7,6 +7,7 @@ import pytest
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Sensors, Track, observe
 from coopoc.evaluate.metrics import errors, nees, neighbour_rt_le
+from coopoc.evaluate.scores import scored
 
 S2 = Sensors.paper_scenario2()
 
@@ -34,6 +35,12 @@ def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet) -> None:
     gap = theirs[1, : len(links)] - crossing.position[seen.links.step[links], seen.links.neighbour[links]]
     assert found[1, 0] == pytest.approx(np.sqrt(np.nanmean((gap**2).sum(axis=-1))), rel=1e-13)
     assert np.isnan(found[2]).all()
+
+
+def test_neighbours_are_counted_per_step(crossing: Fleet) -> None:
+    """All eight are within the radius at every step, and the three nearest are linked."""
+    seen = observe(crossing, S2, V2X(max_neighbours=3, radius=1e4), runs=2)
+    assert scored(JointFilter(), seen, ["c0", "c5"], crossing)["neighbours_mean"].tolist() == [[3.0, 3.0]] * 2
 
 
 def test_a_start_that_is_known_has_no_nees(crossing: Fleet) -> None:

@@ -430,6 +430,16 @@ def test_who_is_seen_may_answer() -> None:
     assert far == 0.09  # whom b sees comes first and takes the whole cap; ten messages are in the bucket at first
 
 
+def test_a_cap_takes_first_the_nearest_and_of_others_the_first() -> None:
+    """Four see c as their nearest, c sees a alone; its bucket holds three messages at the first step."""
+    fleet = still([[9, 0, 0], [-10, 0, 0], [0, 0, 0], [0, 10, 0], [0, -10, 0]])
+    capped = observe(fleet, S2, V2X(max_neighbours=1, bytes_per_second=300.0))
+    met = exchange(capped, Message("word", 25, unicast=True))
+    now = met.step == 0
+    at_c = np.where(met.first == 2, met.at_first, met.at_second)[0, now] == 0
+    assert np.where(met.first == 2, met.second, met.first)[now][at_c].tolist() == [0, 1, 3]
+
+
 def test_loss_is_that_of_the_channel(formation: Fleet) -> None:
     lossy = observe(formation.between(0, 200), S2, V2X(max_neighbours=10, radius=1e3, loss=0.3), runs=2)
     met = exchange(lossy, GaussianBeliefPropagation().message)
@@ -495,6 +505,7 @@ def test_bad_settings_are_named() -> None:
         (ConsensusADMM, {"rounds": 1.5}),
         (Diffusion, {"rounds": -1}),
         (BatchSmoother, {"exact_steps": -1}),
+        (BatchSmoother, {"settle": 0.0}),
         (Message, {"name": "x", "numbers": -1}),
     ):
         field = next(name for name in bad if name != "name")

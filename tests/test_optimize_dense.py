@@ -99,3 +99,25 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes() -> None:
     problem = problem.add("range", [("a", "v")], z[:, None, None], std=1.0)
     found = solve_batch(problem, backend="gauss-newton").x[:, 1]
     assert found == pytest.approx(np.column_stack([0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)]), abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_unit_of_the_noise_changes_no_step(seed: int) -> None:
+    """A law of damped least squares: all standard deviations times c divide every cost by c^2, and nothing else."""
+    rng, names = np.random.default_rng(seed), list("abcde")
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    truth, start = rng.normal(0, 10, (2, 5, 3))
+    distance = np.linalg.norm([truth[i] - truth[j] for i, j in pairs], axis=1) + rng.normal(0, 0.5, (3, 10))
+
+    def solved(unit: float) -> tuple[list[int], list[float]]:
+        problem = Problem(names, x0=start).add("position", names, truth, std=2.0 * unit)
+        ends = [(names[i], names[j]) for i, j in pairs]
+        one = solve(problem.add("range", ends, distance[0], std=0.1 * unit))
+        many = solve_batch(problem.add("range", ends, distance[..., None], std=0.1 * unit))
+        cost = np.append(one.cost, many.cost) * unit**2
+        return [one.iterations, *many.iterations.tolist()], cost.tolist()
+
+    steps, cost = solved(1.0)
+    assert min(steps) > 8  # far from the minimum, so that the damping matters
+    for unit in (1e-4, 1e4):
+        assert solved(unit) == (steps, pytest.approx(cost, rel=1e-9))

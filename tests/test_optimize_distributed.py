@@ -89,6 +89,14 @@ def test_bytes_are_those_of_the_copies() -> None:
     assert found.sent_bytes.tolist() == [64 * k for k in range(6)]
 
 
+def test_a_landmark_with_a_prior_goes_to_the_robot_that_measured_it_first() -> None:
+    problem = from_graph(random_graph(3, robots=2, steps=20, landmarks=4, loops=0, ranges=20, seen=0, priors=True))
+    pairs = np.concatenate([factor.nodes for factor in problem.factors if factor.nodes.shape[1] == 2])
+    for node, (name, owner) in enumerate(zip(problem.names, owners(problem), strict=True)):
+        first = pairs[(pairs == node).any(axis=1)][0]
+        assert owner == (name[0] if node in problem.poses else problem.names[first[first != node][0]][0])
+
+
 def test_a_pose_that_is_only_ranged_is_shared_without_its_rotation() -> None:
     graph = random_graph(2, robots=2, steps=10, landmarks=0, seen=0, loops=0, ranges=15)
     problem = from_graph(graph, start="odometry")

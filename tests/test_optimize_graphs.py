@@ -34,7 +34,7 @@ from coopoc.optimize.local_problem import LocalProblem
 from coopoc.optimize.marginals import bayes_tree_marginals
 from coopoc.optimize.search import Search
 from coopoc.optimize.sparse import Sparse, _made, sparse
-from coopoc.optimize.starts import chained
+from coopoc.optimize.starts import chained, separated
 from coopoc.optimize.trilateration import located
 from coopoc.optimize.trust_region import arrive
 
@@ -382,6 +382,10 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken() -> None:
     assert np.linalg.norm(gap) > 0
     start = from_graph(together, start="odometry").x0[:, :2]  # every pose without odometry is a root at the origin
     assert np.linalg.norm(start[c] - start[b]) > 0
+    x0[c, :2] = x0[b, :2]  # far from the origin
+    moved = separated(together, x0.copy())
+    assert np.flatnonzero((moved != x0).any(axis=1)).tolist() == [c]
+    assert 0 < np.linalg.norm(moved[c] - x0[c]) < 0.01 * ranges.distance[1]
 
 
 def test_each_part_has_a_fixed_pose_unless_it_has_a_prior() -> None:

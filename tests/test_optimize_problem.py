@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
-from coopoc.optimize import MEASUREMENTS, Factor, Problem, SolveError, Status, solve, solve_batch
+from coopoc.optimize import MEASUREMENTS, Factor, Problem, SolveError, Status, pose, solve, solve_batch
 from coopoc.optimize.initial import converted, initial_guess
 from coopoc.optimize.window import relative_std
 from coopoc.world.recording import Recording
@@ -365,3 +365,12 @@ def test_many_single_measurements_are_one_line() -> None:
     for k in range(50):
         problem = problem.add("range", ("a", "b"), 1.0 + k, std=0.5)
     assert repr(problem) == "Problem(2 points; 50 range)"
+
+
+@pytest.mark.parametrize("poses", [(), (1,), (0, 2)])
+def test_a_point_among_poses_has_no_rotation_to_move(poses: tuple[int, ...]) -> None:
+    x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
+    problem = Problem("abc", x0=x0, dimension=2, poses=poses)
+    wanted = np.full(3, 2) + np.isin(range(3), poses)
+    free = np.ones((3, problem.space.dof)) if problem.movable is None else problem.movable
+    assert free.sum(axis=1).tolist() == wanted.tolist()

@@ -64,7 +64,8 @@ def test_a_star_may_grow() -> None:
     """Nine neighbours join a star that began with two: still the Track's numbers."""
     fleet = convoy(10, 30)
     sensors = WHITE
-    seen = co.observe(fleet, sensors, co.V2X(9, 60.0), frame="body", observers=[0])
+    seen = co.observe(fleet, sensors, co.V2X(9, 100.0), frame="body", observers=[0])
+    assert len(seen.links) == 9 * 30
     kept = (seen.links.step > 10) | (np.arange(len(seen.links)) % 9 < 2)
     links = co.Links(seen.links.step[kept], seen.links.observer[kept], seen.links.neighbour[kept])
     from dataclasses import replace

@@ -187,7 +187,10 @@ def test_vehicle_ids_do_not_lead_out_of_the_folder(tmp_path: Path, kind: str) ->
     )
     with pytest.raises(InputError, match=r"id = .*must be a file name.*Write a \.csv or \.parquet"):
         convert(f"{tmp_path / 'mine.py'}:FLEET", tmp_path / "deep" / "tum")
-    assert files(tmp_path) - before == {tmp_path / "mine.py"}
+    written = {
+        path for path in files(tmp_path) - before if path.suffix != ".pyc"
+    }  # Python may keep bytecode of mine.py
+    assert written == {tmp_path / "mine.py"}
     assert Fleet((IDS[kind], "b"), t, x, x).ids[0] == IDS[kind]  # any id is allowed in memory and in a table
 
 

@@ -18,6 +18,7 @@ from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sens
 from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.adaptive import AdaptiveKalman
+from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.methods.variational import VariationalKalman
 from coopoc.world.inbox import Inbox, inbox
@@ -313,6 +314,24 @@ def test_history_is_as_long_as_asked_for() -> None:
     assert len(stream.history) == 5
     with pytest.raises(InputError, match=r"fix_age = 0.61: must be in 0..0.5 s"):
         stream.step(Z, U, 0.1, fix_age=0.61)
+
+
+def test_the_motion_that_is_kept_is_its_integral() -> None:
+    """Closed form: the summed motion, interpolated at any age, while the ring of steps wraps around and grows."""
+    rng, history = np.random.default_rng(0), MotionHistory(10.0)
+    dt = np.concatenate([rng.uniform(0.2, 0.9, 100), rng.uniform(0.01, 0.05, 500), rng.uniform(0.2, 0.9, 50)])
+    moved, variance = rng.normal(size=(len(dt), 3)), rng.uniform(size=(len(dt), 3))
+    end, sums = np.append(0.0, np.cumsum(dt)), np.zeros((len(dt) + 1, 6))
+    sums[1:] = np.cumsum(np.hstack([moved, variance]), axis=0)
+    for k, step in enumerate(dt, start=1):
+        reach = history.reach(step)
+        history.push(step, moved[k - 1], variance[k - 1])
+        assert history.seen == pytest.approx(reach) == pytest.approx(end[k] - end[k - len(history)])
+        assert history.seen == pytest.approx(end[k]) or history.seen - dt[k - len(history)] < 10.0 <= history.seen
+        for age in (0.0, 0.31 * history.seen, history.seen):
+            since = sums[k] - [np.interp(end[k] - age, end, column) for column in sums.T]
+            fix, late = history.forward([5.0, 0.0, -1.0], age)
+            np.testing.assert_allclose([*(fix - [5.0, 0.0, -1.0]), *late], since, atol=1e-9)
 
 
 def test_bad_starts_are_named() -> None:

@@ -33,6 +33,7 @@ def solve_file(
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
     start: Literal["auto", "odometry", "tree", "linear", "incremental", "apart", "file", "relaxed"] = "auto",
+    seconds: Annotated[float, arg(metavar="S")] = np.inf,
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
     """Solve the factor graph of a PyFG, g2o or JRL file.
@@ -46,6 +47,7 @@ def solve_file(
         start: odometry chained from each robot's first vertex, a spanning tree over loops too, rotations relaxed
             (linear), growing along the odometry (incremental), the lowest of these (auto), from a ring (apart), the
             file's vertices, or the rounded point of a convex relaxation that needs no start (relaxed).
+        seconds: after which a relaxed start is the point that was reached; without it the relaxation is solved.
         output: the solution as JSON; without it a summary goes to stdout.
     """
     problem = read_graph(file, objective, "apart" if start == "relaxed" else start)
@@ -53,7 +55,7 @@ def solve_file(
         from .convex import staircase
 
         began = time.perf_counter()
-        problem = replace(problem, x0=staircase(problem, refine=False).x)
+        problem = replace(problem, x0=staircase(problem, refine=False, seconds=seconds).x)
         problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
     print(f"coopoc: {problem}", file=sys.stderr)
     solution = solve(problem, backend, throw=False)

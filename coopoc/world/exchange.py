@@ -62,7 +62,7 @@ def exchange(recording: Recording, message: Message) -> Exchange:
     """Contacts of all vehicles when each sends `message` to those in contact with it.
 
     A cap on bytes applies to each receiver as in its inbox: nearest first and vehicles that it does not measure last,
-    or in turns.
+    in their order, or in turns.
 
     Args:
         recording: observed by all vehicles.

@@ -216,8 +216,8 @@ def _chordal_prior(factor: Factor, W: Floats, d: int) -> Form:
 
 def _apart(W: Floats, d: int) -> bool:
     """Whether position and rotation are independent."""
-    coupled = max(np.abs(W[:, :d, d:]).max(initial=0.0), np.abs(W[:, d:, :d]).max(initial=0.0))
-    return bool(coupled <= SAME * np.abs(W).max(initial=0.0))
+    coupled = max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max())
+    return bool(coupled <= SAME * np.abs(W).max())
 
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
