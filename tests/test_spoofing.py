@@ -168,6 +168,21 @@ def test_where_every_fix_is_rejected_all_of_them_count(formation: Fleet) -> None
     assert track.notes == ("5 problems whose GNC weights rejected every fix were solved with all of them",)
 
 
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
+def test_an_egos_odometry_is_no_candidate_unless_asked_for(formation: Fleet, backend: str) -> None:
+    """A step that slips by 30 m moves a window of fixes; only an ego that doubts itself leaves the step out."""
+    clean = observe(formation.between(0, 6), S2, V2X(max_neighbours=0), observers=[0])
+    velocity = clean.velocity.copy()
+    velocity[:, 3, 0] += 300.0
+    slipped = replace(clean, velocity=velocity)
+    plain, sure, unsure = (
+        CooperativeMAP(window=3, backend=backend, **how)(slipped, [0]).x
+        for how in ({}, {"robust": "truncated"}, {"robust": "truncated", "ego_candidates": True})
+    )
+    assert sure == pytest.approx(plain, abs=1e-6)
+    assert np.linalg.norm(unsure - plain, axis=-1).max() > 1.0
+
+
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "outlier_attack.py"
 
 
