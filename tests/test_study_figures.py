@@ -69,6 +69,7 @@ def all_plots(results: Results, rounds: Results) -> dict[str, Callable[[], Plot]
     noise = np.random.default_rng(1).normal(0, 0.1, 500)
     return {
         "sweep": lambda: figures.sweep(results, "max_neighbours", log=True),
+        "facets": lambda: figures.sweep(results, "max_neighbours", facet="noise_model"),
         "pareto": lambda: figures.pareto(results, training={"fedkalmannet": 3e6}),
         "cdf": lambda: figures.cdf(results, where={"max_neighbours": 2}),
         "convergence": lambda: figures.convergence(rounds, levels={"client 1": 1.4, "client 2": 1.41}),
@@ -77,7 +78,7 @@ def all_plots(results: Results, rounds: Results) -> dict[str, Callable[[], Plot]
     }
 
 
-@pytest.mark.parametrize("name", ["sweep", "pareto", "cdf", "convergence", "paths", "innovations"])
+@pytest.mark.parametrize("name", ["sweep", "facets", "pareto", "cdf", "convergence", "paths", "innovations"])
 def test_the_same_numbers_give_the_same_bytes(results: Results, rounds: Results, tmp_path: Path, name: str) -> None:
     make = all_plots(results, rounds)[name]
     assert make().save(tmp_path / "a") == make().save(tmp_path / "b") != ""
@@ -106,6 +107,22 @@ def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
     np.testing.assert_allclose(drawn[look("joint").color].get_ydata(), expected.to_numpy())
     assert drawn[look("bound").color].get_linestyle() == "--"
     assert len(axes.collections) == 3
+
+
+def test_facets_are_panels_of_one_scale_and_the_caption_names_the_selection(results: Results) -> None:
+    where = {"noise_model": ["identity", "fitted"], "method": "kalman"}
+    plot = figures.sweep(results, "max_neighbours", where=where, facet="noise_model")
+    identity, fitted = plot.figure.axes
+    assert {identity.get_title(), fitted.get_title()} == {"identity", "fitted"}
+    for axes in (identity, fitted):
+        expected = (
+            results.select(**{**where, "noise_model": axes.get_title()}).groupby("max_neighbours")["rt_le_m"].mean()
+        )
+        (line,) = axes.lines
+        np.testing.assert_allclose(line.get_ydata(), expected.to_numpy())
+    assert identity.get_ylim() == fitted.get_ylim()
+    assert [text.get_text() for text in fitted.get_legend().get_texts()] == ["KF"]
+    assert "at Noise model = identity or fitted, Method = KF." in plot.caption
 
 
 def test_knowledge_is_told_by_the_line_style(results: Results) -> None:

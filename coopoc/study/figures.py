@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,9 +13,11 @@ from .front import pareto
 from .plot import Plot, apart, canvas, groups, legend, line_names, plain_log, strokes
 from .results import SEED
 from .scenes import innovations, paths
-from .style import look, words
+from .style import SYMBOLS, label, look, title, words
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from .results import Results
 
 __all__ = ["Plot", "cdf", "convergence", "innovations", "pareto", "paths", "sweep"]
@@ -24,7 +26,13 @@ Where = Mapping[str, Any] | None
 
 
 def sweep(
-    results: Results, x: str, y: str = "rt_le_m", where: Where = None, caption: str = "", log: bool = False
+    results: Results,
+    x: str,
+    y: str = "rt_le_m",
+    where: Where = None,
+    caption: str = "",
+    log: bool = False,
+    facet: str = "",
 ) -> Plot:
     """Plot a metric against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
 
@@ -35,33 +43,55 @@ def sweep(
         x: column of the horizontal axis.
         y: metric.
         where: column -> value or values.
-        caption: under the figure; default the metric and the axis.
+        caption: under the figure; default the metric, the axis and what `where` selects.
         log: logarithmic vertical axis.
+        facet: column of which each value has a panel of its own.
 
     Raises:
         InputError: as `Results.summary`.
     """
-    by = line_names(results, x)
-    summary = results.summary([*by, x], y, where)
-    drawn = []
-    with canvas() as (figure, axes):
-        for names, group in groups(summary, by):
-            group = group.sort_values(x)
-            options = strokes(names)
-            axes.plot(group[x], group["mean"], **options)
-            band = {"color": options["color"], "gid": options["gid"], "linewidth": 0}
-            axes.fill_between(group[x], group["low"], group["high"], alpha=0.15, **band)
-            drawn.append(names)
+    by = [name for name in line_names(results, x, facet) if name != facet]
+    summary = results.summary([*by, *([facet] if facet else []), x], y, where)
+    panels = list(summary.groupby(facet)) if facet else [("", summary)]
+    drawn: list[dict[str, Any]] = []
+    size = {"width": 6.4 if len(panels) == 1 else 2.2 + 2.6 * len(panels)}
+    with canvas(1, len(panels), squeeze=False, sharex=True, sharey=True, **size) as (figure, ((*grid,),)):
+        for axes, (value, part) in zip(grid, panels, strict=True):
+            drawn += [names for names in _bands(axes, part, by, x) if names not in drawn]
+            axes.set(xlabel=words(x), title=title(facet, value) if facet else "")
         ticks = sorted(summary[x].unique())
         if len(ticks) <= 12:
-            axes.set_xticks(ticks)
+            grid[0].set_xticks(ticks)
         if log:
-            plain_log(axes.yaxis)
+            plain_log(grid[0].yaxis)
         else:
-            axes.set_ylim(bottom=0)
-        axes.set(xlabel=words(x), ylabel=words(y))
-        legend(axes, drawn)
-    return Plot(figure, caption or f"{words(y)} against {words(x)}. Bands: 95 % intervals over egos, then runs.")
+            grid[0].set_ylim(bottom=0)
+        grid[0].set(ylabel=words(y))
+        legend(grid[-1], drawn)
+    text = f"{words(y)} against {words(x)}{_selected(where)}. Bands: 95 % intervals over egos, then runs."
+    return Plot(figure, caption or text)
+
+
+def _bands(axes: Axes, summary: pd.DataFrame, by: Sequence[str], x: str) -> list[dict[str, Any]]:
+    """Draw the lines of a panel with their bands; their names."""
+    drawn = []
+    for names, group in groups(summary, by):
+        group = group.sort_values(x)
+        options = strokes(names)
+        axes.plot(group[x], group["mean"], **options)
+        band = {"color": options["color"], "gid": options["gid"], "linewidth": 0}
+        axes.fill_between(group[x], group["low"], group["high"], alpha=0.15, **band)
+        drawn.append(names)
+    return drawn
+
+
+def _selected(where: Where) -> str:
+    """What a figure is restricted to, for its caption."""
+    found = []
+    for column, value in (where or {}).items():
+        values = value if isinstance(value, list | tuple) else [value]
+        found.append(f"{SYMBOLS.get(column, words(column))} = {' or '.join(label(column, one) for one in values)}")
+    return f" at {', '.join(found)}" if found else ""
 
 
 def cdf(
@@ -99,7 +129,10 @@ def cdf(
         else:
             axes.set_xlim(left=0)
         legend(axes, drawn, text)
-    return Plot(figure, caption or "Cumulative distribution of the error. Markers: mean of the per-run maxima.")
+    return Plot(
+        figure,
+        caption or f"Cumulative distribution of the error{_selected(where)}. Markers: mean of the per-run maxima.",
+    )
 
 
 def convergence(
@@ -148,7 +181,8 @@ def convergence(
         low, high = axes.get_ylim()
         axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend above the curves
         legend(axes, drawn, inside=True)
-    return Plot(figure, caption or f"{words(y)} after every round: mean over training seeds; bands: lowest to highest.")
+    text = f"{words(y)} after every round{_selected(where)}: mean over training seeds; bands: lowest to highest."
+    return Plot(figure, caption or text)
 
 
 def _maximum(before: str, worst: float) -> str:
@@ -159,12 +193,12 @@ def _levels(axes: Axes, levels: Mapping[str, float]) -> None:
     color = look("individual").color
     low, high = axes.get_ylim()
     heights = apart(levels, 0.045 * (max(high, *levels.values()) - low) if levels else 0.0)
-    for label, level in levels.items():
+    for name, level in levels.items():
         axes.axhline(level, color=color, linewidth=0.9, linestyle=(0, (6, 2)))
         axes.annotate(
-            label,
+            name,
             (1.0, level),
-            (1.015, heights[label]),
+            (1.015, heights[name]),
             ("axes fraction", "data"),
             fontsize=7,
             va="center",
