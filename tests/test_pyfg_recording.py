@@ -55,11 +55,12 @@ def test_ranges_alone_and_one_anchor_beat_dead_reckoning(tiers: tuple[co.Recordi
     assert together < error(seen, unit="fleet", fusion="intersection") < dead
 
 
-def test_the_command_says_what_was_read(shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data_check(str(shared / "pyfg" / "tiers.pyfg"))
+def test_the_command_says_what_was_read(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data_check(str(shared / "pyfg" / "tiers.pyfg"), picture=tmp_path / "tiers.png")
     said = capsys.readouterr().out
     assert "read: 7092 ranges" in said
-    assert "in body frames" in said
+    assert "residuals of the fleet's pose filter, throughout, from the truth's first poses" in said
+    assert "nothing looks wrong" in said
 
 
 def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:

@@ -43,7 +43,8 @@ class TapeCall:
             self._buffers.append(buffer)
 
     def __call__(self, x: Floats, numbers: Sequence[Floats]) -> Floats:
-        x.take(self._touched, 0, self._local, "clip")  # without "clip" NumPy copies through a buffer
+        if self._buffers:
+            x.take(self._touched, 0, self._local, "clip")  # without "clip" NumPy copies through a buffer
         for own, given, trigger in zip(self._numbers, numbers, self._triggers, strict=True):
             own[:] = given
             trigger()
