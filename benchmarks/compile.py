@@ -44,7 +44,8 @@ def method(name: str) -> Call:
 def pose(unit: str, **options: object) -> Call:
     """The pose filter of a unit."""
     sensors = co.Sensors(heading_std=0.05, yaw_rate_std=0.02)
-    seen = co.observe(drive(), sensors, co.V2X(max_neighbours=3), runs=2, observers=[24], frame="body")
+    who = None if unit == "fleet" else [24]
+    seen = co.observe(drive(), sensors, co.V2X(max_neighbours=3), runs=2, observers=who, frame="body")
     return lambda: co.PoseFilter(unit, **options)(seen, [24])  # type: ignore[arg-type]
 
 
@@ -94,6 +95,8 @@ def main() -> None:
         print(spent(sys.argv[2:]))
         return
     names = sys.argv[1:] or [*METHODS, *OTHERS]
+    if unknown := set(names) - {*METHODS, *OTHERS}:
+        sys.exit(f"{', '.join(sorted(unknown))}: must be among {', '.join([*METHODS, *OTHERS])}")
     rows = [(name, anew([name])) for name in names]
     rows.append(("all in one process", anew(names)))
     print(tabulate([(name, f"{s:.1f}") for name, s in rows], ["first call of", "CPU s"], "github"))
