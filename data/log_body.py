@@ -13,7 +13,7 @@ from coopoc.errors import InputError
 from . import motion
 from .log_rows import Rows
 from .log_summary import Tally
-from .log_vehicle import Vehicle, facing, on_steps, samples, standing
+from .log_vehicle import Vehicle, begun, described, facing, fixes_of, on_steps, samples, standing, stands
 from .motion import Signal
 from .nearest import nearest, steps_of
 
@@ -34,10 +34,8 @@ def body_vehicle(name: str, rows: Rows, grid: Floats, max_gap: float | None, pla
     Raises:
         InputError: no speeds, or no yaw rates.
     """
-    fixes, first = samples(rows, ("x", "y", "z"), tally, 2 if planar else 3)
-    if planar:
-        fixes = Signal(fixes.t, np.column_stack([fixes.value[:, :2], np.zeros(len(fixes.t))]))
-    if not (rows.group == "odometry").any() and len(fixes.t) == 1:
+    fixes, first = fixes_of(rows, planar, tally)
+    if stands(rows, fixes):
         found = standing(rows, fixes, grid, tally)
         return replace(found, heading=None, yaw_rate=np.zeros(len(grid)), compass=np.full(len(grid), np.nan))
     dt = float(grid[1] - grid[0])
@@ -52,24 +50,27 @@ def body_vehicle(name: str, rows: Rows, grid: Floats, max_gap: float | None, pla
     there = np.ones(len(grid), dtype=bool)
     for signal in (speed, turn):
         there &= motion.covered(signal, grid, motion.bridged(signal, dt, max_gap), max(dt, 0.6 * signal.interval))
-    derived = motion.velocity_of_fixes(fixes, motion.bridged(fixes, dt, max_gap)) if len(fixes.t) > 1 else None
-    course = facing(rows, turn, ((derived, "fixes"),), dt, max_gap, tally)[0]
-    ahead = np.zeros(len(grid)) if course is None else course(grid)
-    moved = u * np.where(np.isnan(ahead) | (course is None), 0.0, [np.cos(ahead), np.sin(ahead), 0.0 * ahead]).T
-    gnss = on_steps(rows, fixes, first, grid, moved, there, tally)
+    gnss = on_steps(rows, fixes, first, grid, _moved(rows, fixes, turn, grid, u[:, 0], max_gap), there, tally)
     if np.isfinite(gnss[:, 0]).any():
-        begun = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
-        tally.refuse(f"steps of {name} before its first fix", int((there & ~begun).sum()))
-        there &= begun
-    compass = _compass(measured, grid, rate)
-    compass[~there] = np.nan
-    parts = [
-        f"{int(np.isfinite(gnss[:, 0]).sum())} fixes, {len(speed.t)} speeds, {len(turn.t)} yaw rates",
-        f"{int(np.isfinite(compass).sum())} headings",
-        "throughout" if there.all() else f"{there.mean():.0%} of the time",
-    ]
+        there &= begun(name, gnss, there, tally)
+    compass = np.where(there, _compass(measured, grid, rate), np.nan)
+    text = f"{len(speed.t)} speeds, {len(turn.t)} yaw rates, {int(np.isfinite(compass).sum())} headings"
     velocity = np.where(there[:, None], np.column_stack([u, 0 * u, 0 * u]), np.nan)
-    return Vehicle(gnss, velocity, heading, ", ".join(parts), yaw_rate=np.where(there, rate, np.nan), compass=compass)
+    rate = np.where(there, rate, np.nan)
+    return Vehicle(gnss, velocity, heading, described(gnss, text, there), yaw_rate=rate, compass=compass)
+
+
+def _moved(rows: Rows, fixes: Signal, turn: Signal, grid: Floats, speed: Floats, max_gap: float | None) -> Floats:
+    """(T, 3) m/s in the world by the heading that was measured, else the course of the fixes; 0 where both are unknown:
+    it brings a fix to its step."""
+    dt = float(grid[1] - grid[0])
+    derived = motion.velocity_of_fixes(fixes, motion.bridged(fixes, dt, max_gap)) if len(fixes.t) > 1 else None
+    heading = facing(rows, turn, ((derived, "fixes"),), dt, max_gap, Tally())[0]
+    if heading is None:
+        return np.zeros((len(grid), 3))
+    ahead = heading(grid)
+    moved = np.column_stack([speed * np.cos(ahead), speed * np.sin(ahead), 0.0 * speed])
+    return np.where(np.isnan(ahead)[:, None], 0.0, moved)
 
 
 def _compass(measured: Signal, grid: Floats, rate: Floats) -> Floats:

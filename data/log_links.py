@@ -50,7 +50,8 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
     """
     ids = list(vehicles)
     there = np.stack([np.isfinite(one.velocity[:, 0]) for one in vehicles.values()], axis=1)
-    measured = _measured(rows, vehicles, ids, grid, there, tally)
+    body = any(one.yaw_rate is not None for one in vehicles.values())
+    measured = _measured(rows, vehicles, grid, there, body, tally)
     messages = rows.take(rows.kind == "message")
     sent, arrival_of, broadcasts = _messages(messages, ids, grid, there, tally)
     keys = sorted(set(measured) | set(arrival_of))
@@ -61,7 +62,6 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
         relative[flat, 2] = np.pi / 2
         if flat.any():
             tally.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")
-    inside = any(one.yaw_rate is not None for one in vehicles.values())
     order = np.lexsort((np.where(np.isnan(relative[:, 0]), np.inf, relative[:, 0]), observer, step))
     if sent:
         arrival = np.array([arrival_of.get(key, -1) for key in keys], dtype=np.int64)
@@ -69,7 +69,7 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
         arrival, broadcasts = step.copy(), there
         if len(keys):
             tally.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
-    words = ("ranges", "bearings" if inside else "azimuths", "inclinations or elevations")
+    words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
     for name, what, column in zip(COMPONENTS, words, relative.T, strict=True):
         tally.count(what, _logged(rows, name, column))
     return Linked(Links(step[order], observer[order], neighbour[order]), relative[order], broadcasts, arrival[order])
@@ -112,9 +112,10 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
 
 
 def _measured(
-    rows: Rows, vehicles: Mapping[str, Vehicle], ids: Sequence[str], grid: Floats, there: Bools, tally: Tally
+    rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, there: Bools, body: bool, tally: Tally
 ) -> dict[tuple[int, int, int], list[float]]:
-    """(step, observer, neighbour) -> range m, azimuth rad, inclination rad."""
+    """(step, observer, neighbour) -> range m, azimuth rad (in body frames bearing), inclination rad."""
+    ids = list(vehicles)
     rows = rows.take(rows.group == "relative")
     number = {name: k for k, name in enumerate(ids)}
     observer = np.array([number.get(name, -1) for name in rows.vehicle.tolist()], dtype=np.int64)
@@ -122,7 +123,6 @@ def _measured(
     step, lag = _steps(rows.t, grid)
     value = rows.value.copy()
     component = np.array([_component(kind) for kind in rows.kind.tolist()], dtype=np.int64)
-    body = any(one.yaw_rate is not None for one in vehicles.values())
     turned = rows.kind == ("azimuth" if body else "bearing")
     for column, one in enumerate(vehicles.values()):
         mine = turned & (observer == column)

@@ -52,7 +52,7 @@ def check_poses(log: Log) -> PoseCheck:
         log: in body frames.
 
     Raises:
-        InputError: the vehicles share no two steps, or a start that nothing tells.
+        InputError: the vehicles share no two steps, or first poses are not known.
     """
     log, span = _together(log)
     rec = log.recording
@@ -99,7 +99,8 @@ def _together(log: Log) -> tuple[Log, str]:
 
 
 def _begin(log: Log, who: list[int]) -> tuple[Floats | None, str]:
-    """First poses: fixes and compasses, what the first seconds tell, or the truth; and which, where it is the last."""
+    """First poses: fixes and compasses, those found in the first seconds, or the truth's; and which, where it is the
+    last."""
     rec, truth = log.recording, log.truth
     assert rec.body is not None
     first = np.concatenate([rec.gnss[0, 0], rec.body.heading[0, 0, :, None]], axis=1)

@@ -91,26 +91,44 @@ def vehicle(name: str, rows: Rows, grid: Floats, max_gap: float | None, planar: 
         InputError: neither odometry nor two fixes, or a speed without a heading.
     """
     dt = float(grid[1] - grid[0])
-    fixes, first = samples(rows, ("x", "y", "z"), tally, 2 if planar else 3)
-    if planar:
-        fixes = Signal(fixes.t, np.column_stack([fixes.value[:, :2], np.zeros(len(fixes.t))]))
-    odometry = np.isin(rows.group, ["odometry"])
-    if not odometry.any() and len(fixes.t) == 1:
+    fixes, first = fixes_of(rows, planar, tally)
+    if stands(rows, fixes):
         return standing(rows, fixes, grid, tally)
     velocity, heading, text, course = _motion(name, rows, fixes, dt, max_gap, tally)
     gap = motion.bridged(velocity, dt, max_gap)
     there = motion.covered(velocity, grid, gap, max(dt, 0.6 * velocity.interval))
     u = motion.step_means(velocity, grid)
     gnss = on_steps(rows, fixes, first, grid, u, there, tally)
-    begun = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
-    early = there & ~begun
-    if early.any() and begun.any():
-        tally.refuse(f"steps of {name} before its first fix", int(early.sum()))
-    there &= begun
-    count = int(np.isfinite(gnss[:, 0]).sum())
-    share = there.mean()
-    span = "throughout" if share == 1 else f"{share:.0%} of the time"
-    return Vehicle(gnss, np.where(there[:, None], u, np.nan), heading, f"{count} fixes, {text}, {span}", course=course)
+    there &= begun(name, gnss, there, tally)
+    text = described(gnss, text, there)
+    return Vehicle(gnss, np.where(there[:, None], u, np.nan), heading, text, course=course)
+
+
+def fixes_of(rows: Rows, planar: bool, tally: Tally) -> tuple[Signal, Ints]:
+    """Fixes (M, 3) m of a vehicle, of height 0 where none was measured, and the first row (M,) of each."""
+    fixes, first = samples(rows, ("x", "y", "z"), tally, 2 if planar else 3)
+    if planar:
+        fixes = Signal(fixes.t, np.column_stack([fixes.value[:, :2], np.zeros(len(fixes.t))]))
+    return fixes, first
+
+
+def stands(rows: Rows, fixes: Signal) -> bool:
+    """Whether it has fixes at one instant only, and no odometry."""
+    return len(fixes.t) == 1 and not (rows.group == "odometry").any()
+
+
+def begun(name: str, gnss: Floats, there: Bools, tally: Tally) -> Bools:
+    """(T,) True from the first fix (T, 3) on; steps before it are counted."""
+    known: Bools = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
+    if known.any():
+        tally.refuse(f"steps of {name} before its first fix", int((there & ~known).sum()))
+    return known
+
+
+def described(gnss: Floats, text: str, there: Bools) -> str:
+    """What was read of a vehicle, and how long it was there, in words."""
+    span = "throughout" if there.all() else f"{there.mean():.0%} of the time"
+    return f"{int(np.isfinite(gnss[:, 0]).sum())} fixes, {text}, {span}"
 
 
 def _motion(
