@@ -113,6 +113,16 @@ def test_the_linearised_measurement_is_the_spherical_measurement() -> None:
         assert eta == pytest.approx(np.zeros(3), abs=1e-9)
 
 
+@pytest.mark.parametrize("distance", [0.02, 0.5, 2.5])
+def test_a_measured_range_near_zero_makes_no_angle_exact(distance: float) -> None:
+    """Independent check: the converted covariance, whose angles are those of `min_range` at least."""
+    relative = np.array([distance, -0.8, 1.2])
+    seen = tuple(components(relative[None, None], np.array([0]))[0, 0].tolist())
+    weight, _ = measurement(tuple(to_vector(relative).tolist()), seen, S2.relative_std, S2.min_range, True)
+    cov = np.linalg.inv(np.reshape(weight, (3, 3)))
+    assert cov == pytest.approx(vector_cov(relative, S2.relative_std, S2.min_range), rel=1e-9)
+
+
 @pytest.mark.parametrize("fleet", ["whole", "gappy"])
 def test_linear_smoother_and_filter_equal_the_dense_least_squares(fleet: str, crossing: Fleet) -> None:
     """Independent check: numpy.linalg.lstsq of the whole drive and of the drive up to a step, covariances too."""

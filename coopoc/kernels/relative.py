@@ -144,14 +144,12 @@ def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
 
 @inner
 def at_measurement(seen: Any, std: Any, least: float) -> Any:
-    """The information of `exact`, upper triangle, at the measured vector itself."""
-    x, y, z = vector(seen)
-    d = max(seen[0], least)
-    ground = max(abs(seen[0] * seen[3]), 1e-3 * d)
-    a, b = 1.0 / std[0], 1.0 / (ground * ground * std[1])
-    c = 1.0 / (ground * d * d * std[2])
-    ax, ay, az, bx, by = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4], -b * y, b * x
-    cx, cy, cz = c * x * z, c * y * z, -c * ground * ground
+    """The information of `exact`, upper triangle, at the measured vector itself; its distance is at least `least`."""
+    d, level = max(seen[0], least), max(abs(seen[3]), 1e-3)
+    a, b, c = 1.0 / std[0], seen[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
+    ax, ay, az, bx, by = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4], -b * seen[1], b * seen[2]
+    tilt = c * seen[3] * seen[4]
+    cx, cy, cz = tilt * seen[2], tilt * seen[1], -c * level * level
     return (
         dot(ax, ax, bx, bx, cx, cx),
         dot(ax, ay, bx, by, cx, cy),

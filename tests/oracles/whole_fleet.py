@@ -97,11 +97,12 @@ def rows(vector, seen, sensors, converted):  # type: ignore[no-untyped-def]
     there, least = np.isfinite(seen), sensors.min_range if sensors else 0.0
     seen = np.where(there, seen, np.array(spherical(*vector)))
     at = to_vector(seen) if converted or sensors is None else vector
-    r, ground = np.linalg.norm(at), np.hypot(at[0], at[1])
+    r = np.linalg.norm(at)
     d = max(r, least)
-    ground = max(ground, 1e-3 * d)
-    J = np.array([at / r, [-at[1] / ground**2, at[0] / ground**2, 0.0], [0.0, 0.0, -ground / d**2]])
-    J[2, :2] = at[:2] * at[2] / (ground * d**2)
+    far = at * d / r if converted else at  # angles of a measured range near zero are those of the least one
+    ground = max(np.hypot(far[0], far[1]), 1e-3 * d)
+    J = np.array([at / r, [-far[1] / ground**2, far[0] / ground**2, 0.0], [0.0, 0.0, -ground / d**2]])
+    J[2, :2] = far[:2] * far[2] / (ground * d**2)
     if sensors is None:
         J /= np.linalg.norm(J, axis=1)[:, None]
         return J[there], J[there] @ (at - vector)
