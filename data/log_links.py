@@ -78,6 +78,8 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
 def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logged: bool = True) -> Recording:
     """A real recording with the nearest K neighbours of a channel, and the logged messages, else those of the channel.
 
+    Landmarks of a recording in body frames are no neighbours: all that are measured stay, and they send nothing.
+
     Args:
         recording: of a log, in one run.
         v2x: K, radius m, and the channel.
@@ -86,11 +88,12 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
         logged: whether the recording's messages are real, and stay as they are.
     """
     links, reach = recording.links, recording.relative[0, :, 0]
-    near = np.flatnonzero(~(reach > v2x.radius))
+    marked = np.isin(links.neighbour, recording.landmarks)
+    near = np.flatnonzero(~(reach > v2x.radius) & ~marked)
     key = links.step[near] * len(recording.ids) + links.observer[near]
     first = np.append(True, np.diff(key) != 0)[: len(key)]
     rank = np.arange(len(key)) - np.maximum.accumulate(np.where(first, np.arange(len(key)), 0))
-    kept = near[rank < v2x.max_neighbours]
+    kept = np.union1d(near[rank < v2x.max_neighbours], np.flatnonzero(marked))
     fewer = Links(links.step[kept], links.observer[kept], links.neighbour[kept])
     parts: dict[str, Any] = {
         "gnss": recording.gnss,
@@ -104,8 +107,10 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
         times = v2x.loss > 0 and recording.runs == 1
         runs = runs if times else recording.runs
         fleet = Fleet(recording.ids, recording.t, still, still)
-        broadcasts, parts["arrival"] = schedule(fleet, fewer, v2x, runs, seed)
+        broadcasts, arrival = schedule(fleet, fewer, v2x, runs, seed)
+        parts["arrival"] = np.where(np.isin(fewer.neighbour, recording.landmarks), -1, arrival)
         broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
+        broadcasts[..., list(recording.landmarks)] = False
         if times:
             parts = {name: np.broadcast_to(part, (runs, *part.shape[1:])) for name, part in parts.items()}
     return replace(recording, links=fewer, broadcasts=broadcasts, v2x=v2x, **parts)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,10 +55,10 @@ def check_poses(log: Log) -> PoseCheck:
     Raises:
         InputError: the vehicles share no two steps, or first poses are not known.
     """
-    log, span = _together(log)
+    log, span = together(log)
     rec = log.recording
     who = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
-    begin, start = _begin(log, who)
+    begin, start = begin_of(log, who, GATE)
     track = PoseFilter("fleet", gate=GATE, begin=begin)(rec, who)
     vehicles, doubts = [], []
     for k, column in enumerate(who):
@@ -82,8 +83,12 @@ def check_poses(log: Log) -> PoseCheck:
     return PoseCheck(log, f"{span}{start}", track, vehicles, measurements, doubts)
 
 
-def _together(log: Log) -> tuple[Log, str]:
-    """The longest part of a log in which all its vehicles are there, and where that is in words."""
+def together(log: Log) -> tuple[Log, str]:
+    """The longest part of a log in which all its vehicles are there, and where that is in words.
+
+    Raises:
+        InputError: the vehicles share no two steps.
+    """
     rec = log.recording
     moving = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
     there = np.isfinite(rec.velocity[0, :, moving, 0]).all(axis=0)
@@ -98,16 +103,25 @@ def _together(log: Log) -> tuple[Log, str]:
     return replace(log, recording=rec.between(first, last), truth=truth), span
 
 
-def _begin(log: Log, who: list[int]) -> tuple[Floats | None, str]:
-    """First poses: fixes and compasses, those found in the first seconds, or the truth's; and which, where it is the
-    last."""
+def begin_of(log: Log, who: Sequence[int], gate: float) -> tuple[Floats | None, str]:
+    """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; and which,
+    where it is the last.
+
+    Args:
+        log: in body frames, all vehicles there at its first step.
+        who: columns of the vehicles.
+        gate: of the filters that find them.
+
+    Raises:
+        InputError: a vehicle that has neither a fix nor sees a landmark in the first seconds, nor a true pose.
+    """
     rec, truth = log.recording, log.truth
     assert rec.body is not None
     first = np.concatenate([rec.gnss[0, 0], rec.body.heading[0, 0, :, None]], axis=1)
     if np.isfinite(first[who]).all():
         return None, ""
     try:
-        return pose_start(rec), ""
+        return pose_start(rec, gate=gate), ""
     except InputError:
         if truth is None or truth.heading is None:
             raise

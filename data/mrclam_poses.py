@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from coopoc.arrays import Floats
@@ -79,23 +77,6 @@ def surveyed(log: MrclamLog) -> Floats:
     if not len(log.landmarks):
         raise InputError("folder", log.fleet.name, "has no Landmark_Groundtruth.dat", "Unpack the set again.")
     return log.landmarks
-
-
-def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
-    """The recording with some of its landmarks from a step on, spread over those that there are.
-
-    Args:
-        recording: of `pose_recording`.
-        landmarks: how many stay.
-        start: step.
-    """
-    marks = np.array(recording.landmarks)
-    every = len(marks) / max(landmarks, 1)
-    chosen = marks[(every * np.arange(landmarks)).astype(np.int64)]
-    links = recording.links
-    gone = np.isin(links.neighbour, marks) & ~np.isin(links.neighbour, chosen) & (links.step >= start)
-    fewer = Links(links.step[~gone], links.observer[~gone], links.neighbour[~gone])
-    return replace(recording, links=fewer, relative=recording.relative[:, ~gone], arrival=recording.arrival[:, ~gone])
 
 
 def _robots(log: MrclamLog, v2x: V2X) -> Floats:

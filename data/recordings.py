@@ -53,7 +53,7 @@ def format_of(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """ "log" or "recording" for measurements, "" for anything else; MR.CLAM is found before."""
     if path.suffix == ".npz":
         return "recording" if is_recording(path) else ""
-    return "log" if log_files(path, columns) else ""
+    return "log" if path.suffix == ".pyfg" or log_files(path, columns) else ""
 
 
 def recorder(name_or_path: str | Path, format: str) -> Callable[..., Recording]:

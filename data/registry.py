@@ -195,8 +195,8 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
         raise InputError(
             "data",
             path.name,
-            "must end in .csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag or .npz, or be a folder of TUM, MR.CLAM "
-            "or log files",
+            "must end in .csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag, .pyfg or .npz, or be a folder of TUM, "
+            "MR.CLAM or log files",
             f"Pass format= one of {', '.join(READERS)}.",
         )
     return known[path.suffix]

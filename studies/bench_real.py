@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.data.mrclam_poses import thinned
-from coopoc.data.recordings import load_log
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors
@@ -27,7 +25,8 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import V2X
 
-from . import real
+from . import pose_drives
+from .pose_drives import thinned
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
@@ -39,8 +38,6 @@ POSES: Mapping[str, Mapping[str, Any]] = {
 GATE = 5.0
 RANGE_STD = 0.3
 """m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
-SPREAD = (0.05, 0.05, 0.01, 0.05)
-"""m, m, m and rad of the first poses where they are the file's truth."""
 BEST: Mapping[str, float] = {
     "mrclam5a.pyfg": 69.10353,
     "mrclam6.pyfg": 3144.2650,
@@ -91,17 +88,15 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
     if task.name == "robots":
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
-        whole, begin = real.seen(str(path), until, v2x, GATE)
-        fleet = real.log(str(path), until)[0].fleet
-        start = int(until / fleet.dt)
-        return thinned(whole, 2, start), fleet, start, {"begin": begin}
-    log = load_log(path)
-    if log.truth is None or log.truth.heading is None:
+        drive = pose_drives.drive(str(path), until, v2x, GATE)
+        assert drive.truth is not None
+        start = int(until / drive.truth.dt)
+        return thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
+    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
+    if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
-    begin = np.column_stack([log.truth.position[0], log.truth.heading[0]])
-    begin[list(log.recording.landmarks)] = np.nan
-    noise = replace(log.recording.sensors, range_std=RANGE_STD)
-    return log.recording, log.truth, 0, {"begin": begin, "spread": SPREAD, "assumed": noise}
+    noise = replace(drive.recording.sensors, range_std=RANGE_STD)
+    return drive.recording, drive.truth, 0, {"begin": drive.begin, "spread": drive.spread, "assumed": noise}
 
 
 def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc.data.source import split
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.marks import series
-from coopoc.study.numbers import Number, difference, interval, mean, present, sentence
+from coopoc.study.numbers import Number, difference, interval, mean, present, ran, sentence
 from coopoc.study.pivot import crossed, pivot
 from coopoc.study.style import look
+
+from . import pose_drives
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -23,18 +26,28 @@ if TYPE_CHECKING:
 METHODS = ("pose-fleet", "pose-intersection", "pose-naive")
 LEARNED = "pose-learned"
 """One state with the noise that is learned on the first part."""
+FEW = 4
+"""Landmarks whose number a finding compares with, at most."""
 LANDMARKS, NEIGHBOURS = (0, 1, 2, 4, 15), (0, 1, 2, 3, 4)
 FLEET = {"method": "pose-fleet"}
 NOTE = (
-    "Wheel odometry, ranges and bearings of {data}; no fix, no compass. Noise is calibrated and poses are found in the "
-    "first {calibrate_s:g} s, with all landmarks; then the landmarks are thinned and the rest is scored. Intervals are "
-    "over robots, then blocks of {block_s:g} s."
+    "Poses are found with all landmarks; then the landmarks are thinned and the rest is scored. Intervals are over "
+    "vehicles, then blocks of {:.3g} s."
 )
 
 
 def _caption(results: Results, text: str) -> str:
-    given = {**results.settings, "data": Path(str(results.settings["data"])).name}
-    return f"{text} {NOTE.format(**given)}"
+    p = results.settings
+    data = str(p["data"])
+    what = pose_drives.described(data).format(Path(split(data)[0]).name, pose_drives.calibrated(p))
+    marks = pose_drives.counts(data)[1]
+    all_of = f" A number of landmarks above {marks} is all that there are." if marks < max(LANDMARKS) else ""
+    return f"{text} {what} {NOTE.format(pose_drives.block(p))}{all_of}"
+
+
+def _most(results: Results, axis: str) -> int:
+    """The largest number that was run."""
+    return int(results.frame[axis].max())
 
 
 def table(results: Results, value: str, text: str, **options: Any) -> Table | None:
@@ -44,9 +57,12 @@ def table(results: Results, value: str, text: str, **options: Any) -> Table | No
 
 
 def fusions(results: Results, value: str, text: str, **options: Any) -> Table | None:
-    where = {"max_neighbours": max(NEIGHBOURS)}
+    if present(results, {}, value) is None or not _most(results, "max_neighbours"):
+        return None
+    where = {"max_neighbours": _most(results, "max_neighbours")}
     if present(results, where, value) is None:
         return None
+    text = f"{text}, K = {where['max_neighbours']}."
     return pivot(results, "method", "landmarks", value, where, _caption(results, text), **options)
 
 
@@ -60,7 +76,7 @@ def learned(results: Results) -> Table | None:
         return difference(results, {**where, "method": LEARNED}, where)
 
     columns: list[tuple[str, Number]] = [
-        ("Calibrated", mean),
+        ("As assumed", mean),
         ("Learned", other(mean)),
         ("Difference", gap),
         ("NEES", partial(mean, value="nees")),
@@ -68,17 +84,20 @@ def learned(results: Results) -> Table | None:
     ]
     if present(results, {"method": LEARNED}) is None:
         return None
-    rows = [((k, n), {**FLEET, "max_neighbours": k, "landmarks": n}) for k in (0, max(NEIGHBOURS)) for n in LANDMARKS]
-    text = "RT-LE [m] with noise calibrated by its sums, and learned by the log score of the poses, on the same part."
+    ks, marks = (sorted(results.frame[axis].unique()) for axis in ("max_neighbours", "landmarks"))
+    rows = [((k, n), {**FLEET, "max_neighbours": k, "landmarks": n}) for k in ks for n in marks]
+    rows = [row for row in rows if present(results, {**row[1], "method": LEARNED}) is not None]
+    text = "RT-LE [m] with the noise above, and with noise learned by the log score of the poses on the first part."
     return crossed(results, ("K", "Landmarks"), rows, columns, _caption(results, text), best=None, decimals=3)
 
 
 def bytes(results: Results) -> Table | None:
     """What a robot sends and receives, by K and way of fusion, with all landmarks."""
     rows = [
-        ((look(name).label, k), {"method": name, "max_neighbours": k, "landmarks": max(LANDMARKS)})
+        ((look(name).label, k), {"method": name, "max_neighbours": k, "landmarks": _most(results, "landmarks")})
         for name in METHODS
-        for k in NEIGHBOURS[1:]
+        for k in sorted(results.frame["max_neighbours"].unique())
+        if k
     ]
     columns: list[tuple[str, Number]] = [
         ("Sent [B/s]", partial(mean, value="sent_bytes_per_second")),
@@ -96,15 +115,16 @@ def figure(results: Results) -> Plot | None:
 
     if present(results, FLEET) is None:
         return None
-    at = {n: place for place, n in enumerate(LANDMARKS)}
+    at = {n: place for place, n in enumerate(sorted(results.frame["landmarks"].unique().tolist()))}
+    ks = sorted(results.frame["max_neighbours"].unique().tolist())
     with canvas(1, 2, width=6.6, sharey=True) as (figure, (left, right)):
-        lines = [(f"K = {k}", {**FLEET, "max_neighbours": k}, colormaps["viridis"](k / 4.6)) for k in NEIGHBOURS]
-        most = {"max_neighbours": max(NEIGHBOURS)}
+        lines = [(f"K = {k}", {**FLEET, "max_neighbours": k}, colormaps["viridis"](k / 4.6)) for k in ks]
+        most = {"max_neighbours": ks[-1]}
         others = [(look(name).label, {"method": name, **most}, look(name).color) for name in METHODS]
         for axis, shown in ((left, lines), (right, others)):
             for label, where, color in shown:
                 gid = series(label)
-                each = {n: interval(results, {**where, "landmarks": n}) for n in LANDMARKS}
+                each = {n: interval(results, {**where, "landmarks": n}) for n in at}
                 ran = {at[n]: value for n, value in each.items() if value is not None}
                 if ran:
                     axis.plot(
@@ -116,7 +136,7 @@ def figure(results: Results) -> Plot | None:
             plain_log(axis.yaxis)
             axis.legend()
         left.set(ylabel="RT-LE [m]", title="One state, K neighbours")
-        right.set(title=f"Ways of fusion, K = {max(NEIGHBOURS)}")
+        right.set(title=f"Ways of fusion, K = {ks[-1]}")
     return Plot(figure, _caption(results, "RT-LE against the number of landmarks; bands: 95 % intervals."))
 
 
@@ -126,21 +146,33 @@ def findings(results: Results) -> dict[str, str]:
     def of(k: int, n: int, value: str = "rt_le_m") -> float | None:
         return mean(results, {**FLEET, "max_neighbours": k, "landmarks": n}, value)
 
+    if present(results, FLEET) is None:
+        return {}
+    ks, marks = (sorted(results.frame[axis].unique().tolist()) for axis in ("max_neighbours", "landmarks"))
     found = {}
-    for k in (1, 4):
+    alone = ran({n: of(0, n) for n in marks})
+    for k in dict.fromkeys((*ks[1:2], ks[-1])):
         together = of(k, 0)
-        alone = {n: of(0, n) for n in LANDMARKS}
-        better = [n for n, value in alone.items() if together is not None and value is not None and value < together]
-        worth = f"fewer than {min(better)} landmarks" if better else "more than all of them"
-        template = "K = {k} without a landmark: {together:.2f} m; alone {none:.2f} m, with 4 landmarks {four:.2f} m."
-        text = sentence(template, k=k, together=together, none=alone[0], four=alone[4])
-        found[f"worth, K = {k}"] = text and f"{text} It replaces {worth}."
-    best = {"alone": of(0, 15), "together": of(4, 15)}
-    found["all landmarks"] = sentence("With 15 landmarks: alone {alone:.3f} m, K = 4 {together:.3f} m.", **best)
-    nees = [of(k, n, "nees") for k in NEIGHBOURS for n in LANDMARKS]
+        if not k or together is None or 0 not in alone:
+            continue
+        text = f"K = {k} without a landmark: {together:.2f} m; alone {alone[0]:.2f} m"
+        few = max((n for n in alone if 0 < n <= FEW), default=0)
+        text += f", with {_landmarks(few)} {alone[few]:.2f} m." if few else "."
+        better = [n for n, value in alone.items() if value < together]
+        worth = f"It replaces fewer than {_landmarks(min(better))}." if better else "It replaces more than all of them."
+        found[f"worth, K = {k}"] = text if len(alone) == 1 else f"{text} {worth}"
+    if len(marks) > 1 and ks[-1]:
+        best = {"alone": of(0, marks[-1]), "together": of(ks[-1], marks[-1])}
+        template = f"With {_landmarks(marks[-1])}: alone {{alone:.3f}} m, K = {ks[-1]} {{together:.3f}} m."
+        found["all landmarks"] = sentence(template, **best)
+    nees = [of(k, n, "nees") for k in ks for n in marks]
     values = [value for value in nees if value is not None]
     if values:
         inside = sum(2 <= value <= 5 for value in values)
         text = f"Mean NEES of a pose (3 is consistent): {np.mean(values):.1f} over {len(values)} cells"
         found["nees"] = f"{text}, {inside} of them in 2..5, the largest {max(values):.1f}."
     return found
+
+
+def _landmarks(number: int) -> str:
+    return "1 landmark" if number == 1 else f"{number} landmarks"

@@ -55,8 +55,18 @@ def fleet(data: str) -> Fleet:
 
 @lru_cache(maxsize=2)
 def _log(data: str) -> Log | None:
-    """The log of a name or a path that holds one; None for anything else, MR.CLAM included."""
-    return load_log(data) if kind_of(data) in ("log", "recording") else None
+    """The log of a name or a path that holds one; None for anything else, MR.CLAM included.
+
+    Raises:
+        InputError: one in body frames.
+    """
+    if kind_of(data) not in ("log", "recording"):
+        return None
+    log = load_log(data)
+    if log.recording.body is not None:
+        hint = f"Take coopoc run real --data {data!r}, whose filters estimate headings."
+        raise InputError("data", repr(data), "is a log in body frames, and methods here follow positions", hint)
+    return log
 
 
 def is_real(data: str) -> bool:

@@ -14,6 +14,8 @@ import pytest
 
 import coopoc as co
 from coopoc.data.recordings import load_log
+from coopoc.evaluate.innovations import innovation_columns, normalised_innovations
+from coopoc.study.run import find_study
 
 T = np.round(np.arange(0, 40, 0.1), 1)
 CARS = {"red": (0.0, 12.0, 0.10), "blue": (1.0, 16.0, 0.08), "green": (2.5, 20.0, 0.09)}
@@ -185,3 +187,59 @@ def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "400 yaw rates" in done.stdout
     assert "no filter follows it" in done.stdout
+
+
+def test_innovations_of_poses_are_consistent_where_all_is_white() -> None:
+    """Closed form: normalised innovations of a right filter average 1 (Bar-Shalom et al. 2001, section 5.4)."""
+    fleet = co.load_fleet("town10").between(0, 300)
+    noise = co.Sensors(gnss_std=(1.0, 1.0, 1.0), heading_std=0.1, yaw_rate_std=0.05)
+    rec = co.observe(fleet, noise, co.V2X(max_neighbours=2), runs=20, seed=1, observers=["town10-24"], frame="body")
+    for unit in ("solo", "star"):
+        track = co.PoseFilter(unit)(rec, ["town10-24"])  # type: ignore[arg-type]
+        assert float(np.nanmean(innovation_columns(track, rec)["nis"])) == pytest.approx(1.0, abs=0.03)
+    alone = replace(track, covariance=track.covariance, heading_covariance=None)
+    sure = normalised_innovations(alone, rec)
+    whole = normalised_innovations(track, rec)
+    assert sure is not None
+    assert whole is not None
+    assert np.nanmean(sure) > np.nanmean(whole)
+
+
+def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path) -> None:
+    """What the filter alone, called here, does with the same log is in the study's rows."""
+    data = f"{written(tmp_path / 'log', noise=1.0)}?frame=body"
+    settings = {"data": data, "evaluations": 5, "calibrate_s": 10.0, "block_s": 5.0}
+    results = co.run_study("real", tmp_path, settings=settings, progress=False)
+    assert results.failed == 0
+    frame = results.frame
+    assert set(frame["max_neighbours"]) == {0, 1, 2}
+    assert set(frame["landmarks"]) == {0, 1}
+    assert set(frame.loc[frame["method"] == "pose-learned", "max_neighbours"]) == {0, 2}
+    log = load_log(data)
+    alone = co.PoseFilter("solo", gate=5.0)(log.recording, list(CARS))
+    apart = np.linalg.norm(alone.x[0, 100:150, 1] - np.pad(drives()["blue"][0][100:150], ((0, 0), (0, 1))), axis=1)
+    found = results.select(method="pose-fleet", max_neighbours=0, landmarks=1, ego="blue", run=0)["rt_le_m"]
+    assert found.tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-9)
+    error = results.select(method="pose-fleet").groupby("max_neighbours")["rt_le_m"].mean()
+    assert error[2] < 0.8 * error[0]
+    assert "600 bearings" in (tmp_path / "real" / "tables" / "rt_le.md").read_text()
+    assert any(text.startswith("K = 1 without a landmark") for text in find_study("real").found(results).values())
+
+
+def test_without_a_truth_the_study_scores_innovations(tmp_path: Path) -> None:
+    folder = written(tmp_path / "log", noise=1.0)
+    (folder / "truth.csv").unlink()
+    settings = {"data": f"{folder}?frame=body", "max_neighbours": "0,2", "landmarks": "1"}
+    results = co.run_study("real", tmp_path, settings=settings, progress=False)
+    assert results.failed == 0
+    assert "rt_le_m" not in results.frame
+    assert set(results.frame["method"]) == {"pose-fleet", "pose-intersection", "pose-naive"}
+    assert {file.stem for file in (tmp_path / "real" / "tables").glob("*.md")} == {"innovation", "bytes"}
+
+
+def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:
+    folder = written(tmp_path / "log")
+    with pytest.raises(co.InputError, match=r"Read it so: --data .*frame=body"):
+        co.run_study("real", tmp_path, settings={"data": str(folder)}, progress=False)
+    with pytest.raises(co.InputError, match="Take coopoc run real"):
+        co.run_study("side_by_side", tmp_path, settings={"data": f"{folder}?frame=body"}, progress=False)

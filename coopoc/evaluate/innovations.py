@@ -6,11 +6,14 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..methods.track import Track
+from ..world.frames import turned
 from ..world.recording import Recording
 
 
 def fix_innovations(track: Track, recording: Recording) -> Floats:
     """Fix less prediction, z_t - (x_{t-1} + dt u_t), (R, T, E, 3) m; NaN without a fix, and at the first step.
+
+    In body frames u_t is turned by the heading in the middle of the step, h_{t-1} + dt w_t / 2.
 
     Args:
         track: of the recording.
@@ -23,7 +26,7 @@ def fix_innovations(track: Track, recording: Recording) -> Floats:
     """
     egos = list(track.egos)
     found = np.full(track.x.shape, np.nan)
-    moved = recording.dt * recording.velocity[:, 1:, egos]
+    moved = recording.dt * turned(recording.velocity[:, 1:, egos], _halfway(track, recording))
     found[:, 1:] = recording.gnss[:, 1:, egos] - (track.x[:, :-1] + moved)
     return found
 
@@ -32,7 +35,7 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     """d^T S^-1 d / n of the innovations d, (R, T, E): 1 on average if the assumed noise is right and white.
 
     S = P_{t-1} + dt^2 diag(sigma_u^2) + diag(sigma_fix^2), with the standard deviations that the recording states and
-    its `dimensions` n.
+    its `dimensions` n. In body frames sigma_u is turned as u is, and the heading of the track adds its part of S.
 
     Returns:
         None for a method without a covariance.
@@ -44,16 +47,29 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
         return None
     egos, noise = list(track.egos), recording.sensors
     innovation = fix_innovations(track, recording)
-    moving = np.nan_to_num(noise.assumed_velocity_std(recording.velocity[:, 1:, egos]))
-    variance = (recording.dt * moving) ** 2 + np.square(noise.fix_std)
-    covariance = np.array(track.covariance[:, :-1])
-    covariance[..., range(3), range(3)] += variance
+    u, angle = recording.velocity[:, 1:, egos], _halfway(track, recording)
+    axes = turned(np.eye(3), angle[..., None])  # rows: the axes of sigma_u
+    moving = recording.dt * np.nan_to_num(noise.assumed_velocity_std(u))[..., None] * axes
+    covariance = track.covariance[:, :-1] + np.einsum("...ki,...kj->...ij", moving, moving)
+    covariance[..., range(3), range(3)] += np.square(noise.fix_std)
+    if track.heading_covariance is not None:
+        shared, variance = track.heading_covariance[:, :-1, :, :3], track.heading_covariance[:, :-1, :, 3, None, None]
+        aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])
+        cross = shared[..., :, None] * aside[..., None, :]
+        covariance += cross + np.swapaxes(cross, -1, -2) + variance * aside[..., :, None] * aside[..., None, :]
     there: Bools = np.asarray(np.isfinite(innovation[:, 1:]).all(axis=-1))
     found = np.full(innovation.shape[:3], np.nan)
     d = np.where(there[..., None], innovation[:, 1:], 0.0)
     square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
     found[:, 1:] = np.where(there, square / dimensions(recording), np.nan)
     return found
+
+
+def _halfway(track: Track, recording: Recording) -> Floats:
+    """(R, T-1, E) rad from the frame of odometry to the world in the middle of each step; 0 in the world frame."""
+    if recording.body is None or track.heading is None:
+        return np.zeros(track.x[:, 1:, :, 0].shape)
+    return track.heading[:, :-1] + 0.5 * recording.dt * recording.body.yaw_rate[:, 1:, list(track.egos)]
 
 
 def dimensions(recording: Recording) -> int:

@@ -138,7 +138,10 @@ class Study:
                 grid = _narrow(grid, name, value)
             else:
                 raise unknown("setting", name, [*settings, *self.axes])
-        return replace(self, settings=settings, grid=grid)
+        found = replace(self, settings=settings, grid=grid)
+        for name in changes.keys() - settings.keys():
+            _check_used(found, name)
+        return found
 
 
 def _named(study: Study, params: Mapping[str, Scalar], code: str) -> Cell:
@@ -157,6 +160,17 @@ def _expand(study: Study) -> list[Mapping[str, Scalar]]:
     if isinstance(grid, Mapping):
         grid = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
     return [p for p in grid if study.where is None or study.where({**study.settings, **p})]
+
+
+def _check_used(study: Study, name: str) -> None:
+    """InputError for a value on an axis that leads to no cell."""
+    if study.where is None or not isinstance(study.grid, Mapping):
+        return
+    used = {p[name] for p in _expand(study)}
+    for value in study.grid[name]:
+        if used and value not in used:
+            rest = ",".join(map(str, dict.fromkeys(v for v in study.grid[name] if v in used)))
+            raise InputError(name, repr(value), "leads to no cell under these settings", f"Write {name}={rest}.")
 
 
 def _narrow(grid: Any, name: str, value: Any) -> Any:

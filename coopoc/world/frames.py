@@ -44,7 +44,7 @@ def turned(vector: Floats, angle: Floats) -> Floats:
     [0.0, 1.0, 2.0]
     """
     (x, y, z), cos, sin = np.moveaxis(vector, -1, 0), np.cos(angle), np.sin(angle)
-    return np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+    return np.stack(np.broadcast_arrays(cos * x - sin * y, sin * x + cos * y, z), axis=-1)
 
 
 def midway(heading: Floats) -> Floats:

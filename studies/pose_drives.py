@@ -1,0 +1,215 @@
+"""Real drives whose headings are estimated: what was measured, where filters start, the truth, and what is scored."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from coopoc.arrays import Floats
+from coopoc.data.log import Log
+from coopoc.data.log_links import under
+from coopoc.data.log_poses import GATE, begin_of, together
+from coopoc.data.mrclam import MrclamLog, read_mrclam
+from coopoc.data.mrclam_calibration import Calibration, calibrate
+from coopoc.data.mrclam_poses import pose_recording, surveyed
+from coopoc.data.registry import kind_of, load_log
+from coopoc.data.source import split
+from coopoc.errors import InputError
+from coopoc.methods.pose_filter import SPREAD
+from coopoc.methods.pose_start import pose_start
+from coopoc.study.study import Params
+from coopoc.world.fleet import Fleet
+from coopoc.world.links import Links
+from coopoc.world.recording import Recording
+from coopoc.world.storage import digest
+from coopoc.world.v2x import V2X
+
+LONGEST, SHARE = 300.0, 0.4
+"""s, and share of the drive, that calibrate where the settings leave it open."""
+BLOCK, BLOCKS = 30.0, 4
+"""s of a block of time, and the least number of blocks, where the settings leave it open."""
+
+SURE = (0.05, 0.05, 0.01, 0.05)
+"""m, m, m and rad of first poses that are the truth's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One run of real measurements in body frames.
+
+    Args:
+        recording: with all its landmarks.
+        begin: first poses (1, N, 4) m and rad, None where first fixes and compasses give them.
+        truth: on the steps of the recording, None if there is none.
+        lasting: whether scale and bias of the odometry are states.
+        spread: m, m, m and rad of the first poses.
+    """
+
+    recording: Recording
+    begin: Floats | None
+    truth: Fleet | None
+    lasting: bool
+    spread: tuple[float, ...] = SPREAD
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """Of those that move."""
+        marks = self.recording.landmarks
+        return tuple(name for k, name in enumerate(self.recording.ids) if k not in marks)
+
+
+def calibrated(p: Params) -> float:
+    """s of the first part, which calibrates and starts: of the settings, else 40 % of the drive, 300 s at most.
+
+    Raises:
+        InputError: nothing is left to be scored.
+    """
+    seconds = length(str(p["data"]))
+    until = min(LONGEST, SHARE * seconds) if p["calibrate_s"] is None else float(p["calibrate_s"])
+    if not 0 <= until < seconds:
+        allowed = f"must be 0 or more and end before the drive, {seconds:g} s"
+        raise InputError("calibrate_s", f"{until:g} s", allowed, "Leave a part to score.")
+    return until
+
+
+def block(p: Params) -> float:
+    """s of a block of time, which errors are averaged over: set, else 30 s, a quarter of the rest at most."""
+    left = length(str(p["data"])) - calibrated(p)
+    return min(BLOCK, left / BLOCKS) if p["block_s"] is None else float(p["block_s"])
+
+
+def length(data: str) -> float:
+    """s of the part of a drive in which all vehicles are there."""
+    log = _log(data)
+    t = log.fleet.t if isinstance(log, MrclamLog) else log.recording.t
+    return float(t[-1] - t[0])
+
+
+def counts(data: str) -> tuple[int, int]:
+    """Numbers of vehicles and of landmarks."""
+    log = _log(data)
+    if isinstance(log, MrclamLog):
+        return len(log.fleet.ids), len(surveyed(log))
+    marks = len(log.recording.landmarks)
+    return len(log.recording.ids) - marks, marks
+
+
+def taught(data: str) -> bool:
+    """Whether true poses are known, from which noise is learned."""
+    log = _log(data)
+    return isinstance(log, MrclamLog) or (log.truth is not None and log.truth.heading is not None)
+
+
+def check(data: str, until: float, gate: float) -> None:
+    """Read all that cells share.
+
+    Args:
+        data: as of `drive`.
+        until: as of `drive`.
+        gate: as of `drive`.
+
+    Raises:
+        InputError: as of `drive`.
+    """
+    log = _log(data)
+    if isinstance(log, MrclamLog):
+        surveyed(log), _calibration(data, until)
+    else:
+        _begin(data, gate)
+
+
+@lru_cache(maxsize=2)
+def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
+    """All that was measured, under a channel.
+
+    Args:
+        data: a folder of MR.CLAM, whose first part calibrates its sensors, or a log in body frames, which states them.
+        until: s, of that part.
+        v2x: K, radius and channel.
+        gate: of the filters that find first poses.
+
+    Raises:
+        InputError: a log in the world's frame, or one that cannot be followed.
+    """
+    log = _log(data)
+    if isinstance(log, MrclamLog):
+        recording = pose_recording(log, v2x, _calibration(data, until))
+        return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
+    recording = under(log.recording, v2x, logged=log.messages)
+    lasting = recording.sensors.speed_scale_std > 0 or recording.sensors.yaw_rate_bias_std > 0
+    begin, where = _begin(data, gate)
+    return Drive(recording, begin, log.truth, lasting, SURE if where else SPREAD)
+
+
+def described(data: str) -> str:
+    """What was measured, and where its noise comes from, for captions."""
+    log = _log(data)
+    if isinstance(log, MrclamLog):
+        return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:g} s calibrate the noise."
+    read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
+    begin = _begin(data, GATE)[1]
+    return f"What {{}} holds ({read}), with the noise that it states{begin}; the first {{:g}} s are not scored."
+
+
+def digests(data: str) -> dict[str, str]:
+    """Digest of all that the numbers of a drive are made of."""
+    log = _log(data)
+    if not isinstance(log, MrclamLog):
+        truth = "" if log.truth is None else log.truth.digest
+        return {"log": digest(log.recording), "truth": truth}
+    sha = hashlib.sha256()
+    for file in sorted(Path(data).glob("*.dat")):
+        sha.update(file.name.encode() + file.read_bytes())
+    return {"log": sha.hexdigest()}
+
+
+def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
+    """The recording with some of its landmarks from a step on, spread over those that there are.
+
+    Args:
+        recording: in body frames.
+        landmarks: how many stay, at most.
+        start: step.
+    """
+    marks = np.array(recording.landmarks, dtype=np.int64)
+    landmarks = min(landmarks, len(marks))
+    every = len(marks) / max(landmarks, 1)
+    chosen = marks[(every * np.arange(landmarks)).astype(np.int64)]
+    links = recording.links
+    gone = np.isin(links.neighbour, marks) & ~np.isin(links.neighbour, chosen) & (links.step >= start)
+    fewer = Links(links.step[~gone], links.observer[~gone], links.neighbour[~gone])
+    return replace(recording, links=fewer, relative=recording.relative[:, ~gone], arrival=recording.arrival[:, ~gone])
+
+
+@lru_cache(maxsize=2)
+def _log(data: str) -> MrclamLog | Log:
+    name, kind = split(data)[0], kind_of(data)
+    if kind == "mrclam":
+        return read_mrclam(Path(name))
+    if kind not in ("log", "recording"):
+        hint = "Check it; a log may hold what vehicles measured (docs/your_data.md), a folder a set of MR.CLAM."
+        raise InputError("data", repr(data), "must be the path of measurements, not only of drives", hint)
+    log = load_log(data)
+    if log.recording.body is None:
+        hint = f'Read it so: --data "{name}?frame=body".'
+        raise InputError("data", repr(data), "must be a log in body frames, for poses", hint)
+    return together(log)[0]
+
+
+@lru_cache(maxsize=2)
+def _calibration(data: str, until: float) -> Calibration:
+    log = _log(data)
+    assert isinstance(log, MrclamLog)
+    return calibrate(log, until)
+
+
+@lru_cache(maxsize=2)
+def _begin(data: str, gate: float) -> tuple[Floats | None, str]:
+    log = _log(data)
+    assert isinstance(log, Log)
+    moving = [k for k in range(len(log.recording.ids)) if k not in log.recording.landmarks]
+    return begin_of(log, moving, gate)
