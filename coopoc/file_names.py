@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -9,6 +10,20 @@ from .errors import InputError
 
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{digit}" for port in ("COM", "LPT") for digit in range(1, 10))}
 _LONGEST = 200
+
+
+def given_path(path: object) -> Path:
+    """A path from text or a Path.
+
+    Raises:
+        InputError: anything else.
+
+    >>> given_path("town.pyfg").suffix
+    '.pyfg'
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise InputError("path", repr(path)[:60], "must be text or a Path", 'Give for example "graph.pyfg".')
+    return Path(path)
 
 
 def file_name(field: str, name: object, hint: str) -> str:

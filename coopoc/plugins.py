@@ -115,6 +115,18 @@ def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
     return f"Did you mean {near[0]}?" if near else otherwise
 
 
+def one_of(noun: str, name: object, known: Iterable[str]) -> str:
+    """`name` if it is one of the words; else the error of `unknown`.
+
+    >>> one_of("frame", "body", ("world", "body"))
+    'body'
+    """
+    known = tuple(known)
+    if not isinstance(name, str) or name not in known:
+        raise unknown(noun, name, known)
+    return name
+
+
 def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None = None) -> InputError:
     """The error for an unknown name: lists the known ones and proposes the nearest.
 

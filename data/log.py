@@ -11,7 +11,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.plugins import unknown
+from coopoc.plugins import one_of
 from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
@@ -215,8 +215,7 @@ def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
 
 
 def _check_options(dt: float | None, max_gap: float | None, clock: Mapping[str, float] | None, frame: str) -> None:
-    if frame not in get_args(Frame):
-        raise unknown("frame", frame, get_args(Frame))
+    one_of("frame", frame, get_args(Frame))
     for field, value in (("dt", dt), ("max_gap", max_gap)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")

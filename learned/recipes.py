@@ -13,7 +13,7 @@ import torch
 from coopoc.errors import InputError
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
-from coopoc.plugins import find, unknown
+from coopoc.plugins import find, one_of, unknown
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, VelocityReading
 
@@ -69,8 +69,7 @@ class Recipe:
     options: tuple[tuple[str, Any], ...] = ()
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise unknown("kind of recipe", self.kind, KINDS)
+        one_of("kind of recipe", self.kind, KINDS)
 
 
 RECIPES: dict[str, Recipe] = {
@@ -191,6 +190,11 @@ def jobs_of(name: str, setting: Setting, fleet: Fleet, aggregate: str | None = N
     return [Job(name, recipe, setting, client) for client in range(1, len(fleet.ids) + 1)]
 
 
+def shipped_weights() -> dict[str, Path]:
+    """Name -> file of the weights that come with the package."""
+    return {path.stem: path for path in sorted(WEIGHTS.glob("*.safetensors"))}
+
+
 def load_method(name_or_path: Path | str, net: str = "") -> Method:
     """The method of a checkpoint file, or of weights that come with the package by their name.
 
@@ -201,7 +205,7 @@ def load_method(name_or_path: Path | str, net: str = "") -> Method:
     Raises:
         InputError: neither a file nor a shipped name.
     """
-    shipped = {path.stem: path for path in sorted(WEIGHTS.glob("*.safetensors"))}
+    shipped = shipped_weights()
     path = shipped.get(str(name_or_path), Path(name_or_path))
     if not path.is_file():
         raise unknown("learned method", str(name_or_path), shipped)

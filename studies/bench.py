@@ -40,7 +40,7 @@ def benchmark(
         tasks: some of the tasks; all without it.
         table: print the table of the folder's cards, worst last.
     """
-    from .bench_cards import card, page, simulated
+    from .bench_cards import card, method, page, simulated
     from .bench_tasks import TASKS, VALIDATION
 
     known = {task.name: task for task in (VALIDATION if validation else TASKS)}
@@ -49,11 +49,14 @@ def benchmark(
             raise InputError("tasks", repr(name), f"must be of {', '.join(known)}", "Leave it out for all.")
     if not methods and not table:
         raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
+    for name in methods:
+        if data is None and not simulated(name):
+            raise InputError("data", None, f"must name the folder of measurements for {name}", "Add --data FOLDER.")
+        if simulated(name):
+            method(name)
     failed = 0
     for name in methods:
         began = time.perf_counter()
-        if data is None and not simulated(name):
-            raise InputError("data", None, f"must name the folder of measurements for {name}", "Add --data FOLDER.")
         made = card(name, [known[task] for task in tasks or known] if simulated(name) else [], data)
         failed += sum("failed" in row for row in made["tasks"])
         folder = out / "validation" if validation else out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -15,8 +14,8 @@ from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
-from coopoc.one_file import in_file
-from coopoc.plugins import find, names
+from coopoc.one_file import file_digest, in_file
+from coopoc.plugins import find, names, unknown
 from coopoc.study.environment import environment
 
 from .bench_tasks import VERSION, Task, bound, recording
@@ -33,12 +32,18 @@ def method(name: str, late: bool = False) -> Method:
     Args:
         name: of the method.
         late: whether messages are: then the cooperative gain sends its newest fix, for sums must come in time.
+
+    Raises:
+        InputError: an unknown name.
     """
     if in_file(name) or name in names("coopoc.methods"):
         made: Method = find("coopoc.methods", name)("nominal")
         return made
     from coopoc.learned import CooperativeGain, load_method
+    from coopoc.learned.recipes import shipped_weights
 
+    if name not in shipped_weights() and not Path(name).is_file():
+        raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
     learned = load_method(name)
     return CooperativeGain(learned.model, not late, name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]
 
@@ -115,7 +120,7 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str
         tasks: simulated ones.
         data: folder of the real measurements; None leaves these tasks out.
     """
-    digest = hashlib.sha256(Path(name.rpartition(":")[0]).read_bytes()).hexdigest() if in_file(name) else ""
+    digest = file_digest(name, "method") if in_file(name) else ""
     with tqdm(list(tasks), desc=name, unit="task", delay=2.0) as bar:
         rows = [tried(name, task) for task in bar]
     rows += [] if data is None else measured(name, data)

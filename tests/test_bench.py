@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 import coopoc as co
 from coopoc.data.recordings import load_log
 from coopoc.errors import InputError
-from coopoc.studies import bench, bench_cards, bench_real, bench_tasks
+from coopoc.studies import bench, bench_cards, bench_real, bench_tasks, pose_drives
 from coopoc.studies.bench_tasks import TASKS, VALIDATION, VERSION
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -78,7 +79,8 @@ def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None,
     assert bench.benchmark((name,), out=tmp_path) == 1
     (file,) = tmp_path.glob("*.json")
     card = json.loads(file.read_text())
-    assert len(card["source"]) == 64
+    assert len(card["source"]) == 20
+    assert hashlib.sha256(OWN.encode()).hexdigest().startswith(card["source"])
     rows = {row["task"]: row for row in card["tasks"]}
     assert rows["alone"]["failed"] == "ValueError: neighbours are missing"
     assert rows["paper"]["rt_le_m"][0] == pytest.approx(6.06, abs=0.1)
@@ -165,7 +167,7 @@ def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Pa
         first = range(0, len(error) - size + 1, size)
         return float(np.mean([np.sqrt(np.mean(error[k : k + size] ** 2, axis=0)) for k in first]))
 
-    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=bench_real.SPREAD, assumed=noise)
+    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=pose_drives.SURE, assumed=noise)
     assert whole["rt_le_m"][0] == pytest.approx(by_hand(fleet), abs=2e-4)
     own = rows[f"{tmp_path / 'mine.py'}:Own"]
     mine = co.PoseFilter("solo", begin=begin, assumed=noise)
@@ -182,3 +184,10 @@ def test_graphs_are_tasks_for_backends(shared: Path) -> None:
     assert "1 SOLVED" in shown
     with pytest.raises(InputError, match="must name the folder of measurements for gauss-newton"):
         bench.benchmark(("gauss-newton",))
+
+
+def test_unknown_methods_are_named_before_anything_runs(tmp_path: Path) -> None:
+    for name, words in (("jointt", "Did you mean joint"), ("mine.py:Own", "is not there"), ("pose-solo", "--data")):
+        with pytest.raises(co.InputError, match=words):
+            bench.benchmark((name,), out=tmp_path)
+    assert not list(tmp_path.iterdir())

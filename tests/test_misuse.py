@@ -5,12 +5,16 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import coopoc as co
+from coopoc import optimize
+from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg, write_g2o, write_graph, write_jrl, write_pyfg
+from coopoc.formats.graph import Graph
 
 WRONG: tuple[Any, ...] = (
     None,
@@ -141,4 +145,58 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     swept(co.BodyMeasurement, {"id": "b", "relative": [9.0, 0.1, 1.57], "age": 0.0})
     swept(co.bound_rt_le, {"cov": np.eye(3)[None]})
     swept(co.paired_difference, {"a": [1.0, 2.0], "b": [2.0, 4.0], "level": 0.95, "resamples": 100, "seed": 0})
+    swept(co.break_even, {"training": None, "online": None, "kind": "payload", "way": "per receiver"})
+    swept(co.cam_received, {"recording": RECORDING, "ego": 0, "origin": (47.0, 8.0, 400.0)})
+    swept(RECORDING.between, {"start": 0, "stop": 3})
+    swept(RECORDING.neighbours, {"ego": 0})
+    swept(RECORDING.links.of, {"observer": 0})
     swept(co.channel_load, {"position": np.zeros((2, 3)), "size": [100.0, 100.0], "rate": [1.0, 1.0]})
+
+
+PROBLEM = co.Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+
+
+def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
+    whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
+    solution = co.solve(whole)
+    swept(co.solve, {"problem": whole, "backend": "gauss-newton", "throw": True})
+    swept(optimize.solve_batch, {"problem": whole, "backend": "gauss-newton"})
+    swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
+    swept(optimize.solve_gnc_batch, {"problem": whole, "candidates": [0], "groups": None, "backend": "gauss-newton"})
+    swept(optimize.solve_distributed, {"problem": whole, "owner": "ab", "rounds": 1, "rho": 0.3, "loss": 0.0})
+    swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
+    swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))})
+    swept(co.pose, {"position": np.zeros((4, 2)), "turn": 0.1})
+    swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
+    swept(PROBLEM.add, {"kind": "range", "nodes": ("a", "b"), "z": 9.0, "std": 1.0, "loss": None})
+    swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0})
+    window = {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None}
+    swept(co.Problem.from_window, window)
+    swept(co.Problem.from_steps, {"steps": [], "sensors": SENSORS, "names": None})
+    named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}
+    swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
+
+
+def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) -> None:
+    for read in (
+        co.read_graph,
+        load_graph,
+        read_g2o,
+        read_jrl,
+        read_pyfg,
+        co.load_fleet,
+        co.load_recording,
+        co.read_log,
+    ):
+        swept(lambda path, read=read: read(path), {"path": "nowhere.pyfg"})
+    graph = Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]])
+    for write, name in ((write_graph, "a.pyfg"), (write_g2o, "b.g2o"), (write_jrl, "c.jrl"), (write_pyfg, "d.pyfg")):
+        swept(lambda graph, write=write, name=name: write(graph, tmp_path / name), {"graph": graph})
+        for value in (None, 1.5, object(), ["a"]):
+            with pytest.raises(co.InputError, match=r"path|stamp|fixed"):
+                write(graph, value)
+    for value in (None, 1, [], b"x"):
+        with pytest.raises(co.InputError, match="study"):
+            co.run_study(value, tmp_path, progress=False)  # type: ignore[arg-type]
+        with pytest.raises(co.InputError, match="path"):
+            co.run_study("backends", value, progress=False)  # type: ignore[arg-type]

@@ -107,6 +107,7 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
     2.0
     """
     v2x = checked_noise(fleet, sensors, v2x)
+    instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     everyone = range(len(fleet.ids))
     links = find_links(fleet, everyone, v2x.max_neighbours, v2x.radius, sensors.min_range)
     members = [np.flatnonzero(row) for row in fleet.present]

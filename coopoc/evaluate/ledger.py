@@ -10,10 +10,10 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, refuse
+from ..arrays import Floats, checked, instance, refuse
 from ..errors import InputError
 from ..methods.track import Track
-from ..plugins import unknown
+from ..plugins import one_of
 from ..world.recording import Recording
 from ..world.v2x import Message
 
@@ -167,6 +167,8 @@ def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Wa
     >>> break_even(of_training(["a", "b"], [400.0, 0.0], [0.0, 400.0]), drive)
     1.5625
     """
+    instance("training", training, Ledger)
+    instance("online", online, Ledger)
     bytes_ = training.per_vehicle("training", kind, way)
     if not bytes_ > 0:
         raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
@@ -213,6 +215,5 @@ def of_drive(
 
 def _place(allowed: object, name: str, value: str) -> int:
     known = get_args(allowed)
-    if value not in known:
-        raise unknown(name, value, known)
+    one_of(name, value, known)
     return known.index(value)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints, checked, number
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 
 Unit = Literal["steps", "m"]
 
@@ -34,8 +34,7 @@ def relative_error(
     >>> relative_error(moved, still)
     array([1., 1.])
     """
-    if unit not in ("steps", "m"):
-        raise unknown("unit", unit, ("steps", "m"))
+    one_of("unit", unit, ("steps", "m"))
     x, r = (checked("estimate", part) for part in estimate)
     y, q = (checked("truth", part) for part in truth)
     if not (x.shape == y.shape == (len(x), 3) and r.shape == q.shape == (len(x), 3, 3)):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints, number
 from ..errors import InputError
-from ..plugins import suggestion, unknown
+from ..plugins import one_of, suggestion
 from .alignment import Alignment, align
 from .association import associated
 from .relative_error import Unit, ends, relative_error
@@ -99,8 +99,7 @@ def scores(
     >>> round(row.rt_le_m.mean, 6)
     0.5
     """
-    if aligned not in ("none", "each", "team"):
-        raise unknown("aligned", aligned, ("none", "each", "team"))
+    one_of("aligned", aligned, ("none", "each", "team"))
     blocks = number("blocks", blocks, 2, kind=int, allowed=">= 2")
     alone = len(estimates) == len(truths) == 1
     named = {name: _truth(name, truths, alone) for name in estimates}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arrays import instance
 from ..errors import InputError
+from ..file_names import given_path
 from ..plugins import suggestion
 from .g2o import read_g2o, write_g2o
 from .graph import Graph
@@ -34,11 +36,11 @@ def write_graph(graph: Graph, path: str | Path) -> None:
     Raises:
         InputError: another suffix, or what `write_pyfg`, `write_g2o` and `write_jrl` raise.
     """
-    GRAPHS[_suffix(path)][1](graph, path)
+    GRAPHS[_suffix(path)][1](instance("graph", graph, Graph), path)
 
 
 def _suffix(path: str | Path) -> str:
-    suffix = Path(path).suffix
+    suffix = given_path(path).suffix
     if suffix not in GRAPHS:
         hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
         raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..arrays import instance
 from ..errors import InputError
+from ..file_names import given_path
 from .check import NAME
 from .compose import to_lines
 from .graph import Graph
@@ -76,7 +78,7 @@ def read_g2o(path: str | Path) -> Graph:
     >>> read_g2o(file).relative_pose.covariance[0].diagonal()
     array([0.25, 0.25, 0.01])
     """
-    path = Path(path)
+    path = given_path(path)
     lines = list(read_words(path))
     records = [line for line in lines if line[1][0] not in GRAMMAR.others]
     identity = _identities(path.name, [line for line in lines if line[1][0] == "PARAMS_SE3OFFSET"])
@@ -95,7 +97,7 @@ def write_g2o(graph: Graph, path: str | Path) -> None:
     Raises:
         InputError: a graph with stamps, which g2o has not, a singular covariance, or a vertex without a position.
     """
-    numbers = {name[1:] for name in graph.names}
+    numbers = {name[1:] for name in instance("graph", graph, Graph).names}
     plain = len(numbers) == len(graph.names) and all(graph.names[k][0] == "A" for k in np.flatnonzero(graph.is_pose))
     point = {name for name, pose in zip(graph.names, graph.is_pose, strict=True) if not pose}
 
@@ -107,7 +109,7 @@ def write_g2o(graph: Graph, path: str | Path) -> None:
     if graph.dimension == 3 and (len(graph.relative_point) or len(graph.pose_prior)):
         lines.insert(0, "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1")
     lines += [f"FIX {label(graph.names[k])}" for k in graph.fixed.tolist()]
-    Path(path).write_text("\n".join([*lines, ""]))
+    given_path(path).write_text("\n".join([*lines, ""]))
 
 
 def _identities(file: str, lines: list[tuple[int, list[str]]]) -> dict[str, bool]:

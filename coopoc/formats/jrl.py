@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..file_names import given_path
 from ..plugins import suggestion
 from .edges import PointEdges, PoseEdges, RangeEdges
 from .graph import Graph
@@ -67,7 +68,7 @@ def read_jrl(path: str | Path, unit: float = 1.0) -> Graph:
     >>> read_jrl(file)
     Graph(2-D: 2 poses of 2 robots, 0 points; 1 ranges)
     """
-    path, log = Path(path), _Log()
+    path, log = given_path(path), _Log()
     whole = _parsed(path)
     for place, robot, stamp, one in _measurements(path.name, whole):
         _measure(log, place, robot, unit * stamp, one)

@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, instance
 from ..errors import InputError
+from ..file_names import given_path
 from .edges import ENDS, PoseEdges, RangeEdges
 from .graph import Graph
 from .jrl_values import TYPES, key_of, write_covariance, write_value
@@ -41,6 +42,7 @@ def write_jrl(
     >>> json.loads(file.read_text())["measurements"]["a"][0]["stamp"]
     3
     """
+    instance("graph", graph, Graph)
     for field, count in (("fixed", len(graph.fixed)), ("relative_point", len(graph.relative_point))):
         if count:
             raise InputError(field, f"{count} of them", "JRL has no record for it", f"Write the graph without {field}.")
@@ -55,12 +57,12 @@ def write_jrl(
             for k in nodes:
                 maker[k] = maker[k] or robot  # a landmark belongs to the robot that measures it first
             entries[robot].setdefault(stamps[row], []).append(_measurement(graph, kind, row))
-    whole: dict[str, Any] = {"name": Path(path).stem, "robots": robots, "measurements": {}, values: {}}
+    whole: dict[str, Any] = {"name": given_path(path).stem, "robots": robots, "measurements": {}, values: {}}
     for robot in robots:
         own = [row for row, letter in enumerate(maker) if (letter or robots[0]) == robot]
         whole["measurements"][robot] = [{"stamp": t, "measurements": m} for t, m in sorted(entries[robot].items())]
         whole[values][robot] = [_vertex(graph, row) for row in own if np.isfinite(graph.position[row]).all()]
-    Path(path).write_text(json.dumps(whole) + "\n")
+    given_path(path).write_text(json.dumps(whole) + "\n")
 
 
 def _measurement(graph: Graph, kind: str, row: int) -> dict[str, Any]:

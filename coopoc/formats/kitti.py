@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..file_names import given_path
 from .lines import read_table, to_text
 from .trajectory import Trajectory
 
@@ -32,7 +33,7 @@ def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:
     >>> read_kitti(file).position
     array([[5., 6., 7.]])
     """
-    path = Path(path)
+    path = given_path(path)
     lines, table = read_table(path, FORM)
     stamps = None if times is None else read_table(Path(times), "t")[1][:, 0]
     if stamps is not None and len(stamps) != len(table):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ..arrays import instance
 from ..errors import InputError
+from ..file_names import given_path
 from .check import NAME
 from .compose import to_lines
 from .graph import Graph
@@ -55,7 +57,8 @@ def read_pyfg(path: str | Path) -> Graph:
     >>> read_pyfg(file).ranges.distance
     array([2.])
     """
-    return to_graph(Path(path).name, read_words(Path(path)), GRAMMAR)
+    path = given_path(path)
+    return to_graph(path.name, read_words(path), GRAMMAR)
 
 
 def write_pyfg(graph: Graph, path: str | Path) -> None:
@@ -65,7 +68,7 @@ def write_pyfg(graph: Graph, path: str | Path) -> None:
         InputError: a pose or measurement without a stamp, a vertex without a position, or fixed vertices, for which
             PyFG has no record.
     """
-    if len(graph.fixed):
+    if len(instance("graph", graph, Graph).fixed):
         raise InputError(
             "fixed",
             f"{len(graph.fixed)} vertices",
@@ -73,4 +76,4 @@ def write_pyfg(graph: Graph, path: str | Path) -> None:
             "Write dataclasses.replace(graph, fixed=()), or a pose prior.",
         )
     lines = to_lines(graph, GRAMMAR, lambda name: name)
-    Path(path).write_text("\n".join([*lines, ""]))
+    given_path(path).write_text("\n".join([*lines, ""]))

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from ..errors import InputError
-from ..plugins import unknown
+from ..file_names import given_path
+from ..plugins import one_of
 from .lines import read_table, to_text
 from .rotations import UNIT, to_orientation, to_rotation
 from .trajectory import Trajectory
@@ -33,9 +34,8 @@ def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse")
     >>> read_tum(file).stamps
     array([0. , 0.1])
     """
-    if repeats not in ("refuse", "drop"):
-        raise unknown("repeats", repeats, ("refuse", "drop"))
-    path = Path(path)
+    one_of("repeats", repeats, ("refuse", "drop"))
+    path = given_path(path)
     lines, table = read_table(path, "t x y z qx qy qz qw")
     off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > UNIT)
     if len(off):

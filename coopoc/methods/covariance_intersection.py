@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..kernels.intersection import follow
-from ..plugins import unknown
+from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
@@ -56,8 +56,7 @@ class CovarianceIntersection:
 
     def __post_init__(self) -> None:
         check_options(self)
-        if self.criterion not in ("trace", "det"):
-            raise unknown("criterion", self.criterion, ("trace", "det"))
+        one_of("criterion", self.criterion, ("trace", "det"))
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.

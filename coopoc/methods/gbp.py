@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 from ..world.exchange import exchange
 from ..world.recording import Recording
 from ..world.v2x import Message
@@ -65,8 +65,7 @@ class GaussianBeliefPropagation:
             raise InputError("rounds", self.rounds, "must be a whole number >= 1", "Use 1 for one exchange a step.")
         if not 0 <= self.damping < 1:
             raise InputError("damping", self.damping, "must be in [0, 1)", "Use 0 for none, 0.4 to 0.6 for hard loops.")
-        if self.carry not in ("own", "belief"):
-            raise unknown("carry", self.carry, ("own", "belief"))
+        one_of("carry", self.carry, ("own", "belief"))
 
     @property
     def message(self) -> Message:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..kernels.lkf_sa import follow
-from ..plugins import unknown
+from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -45,8 +45,7 @@ class LKFSA:
     def __post_init__(self) -> None:
         check_options(self)
         for field, allowed in (("transition", ("identity", "ones")), ("membership", ("keep", "reset"))):
-            if getattr(self, field) not in allowed:
-                raise unknown(field, getattr(self, field), allowed)
+            one_of(field, getattr(self, field), allowed)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -59,8 +59,7 @@ class MDS:
             value = getattr(self, field)
             if value < 0:
                 raise InputError(field, value, "must be a whole number >= 0", "Use 0 for none.")
-        if self.missing not in ("paths", "angles"):
-            raise unknown("missing", self.missing, ("paths", "angles"))
+        one_of("missing", self.missing, ("paths", "angles"))
 
     @property
     def message(self) -> Message:

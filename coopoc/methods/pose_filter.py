@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, checked, number
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.spherical import wrap
@@ -84,8 +84,7 @@ class PoseFilter:
     def __post_init__(self) -> None:
         check_options(self)
         for field, words in (("unit", get_args(Unit)), ("fusion", get_args(Fusion))):
-            if getattr(self, field) not in words:
-                raise unknown(field, getattr(self, field), words)
+            one_of(field, getattr(self, field), words)
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         if self.invariant and (self.unit != "solo" or self.exact):

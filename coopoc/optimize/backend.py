@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError, MissingLibraryError
 from ..one_file import in_file
-from ..plugins import find, names, suggestion
+from ..plugins import find, names, suggestion, unknown
 from .problem import Problem
 
 Options: TypeAlias = dict[str, Any]
@@ -172,6 +172,8 @@ def require_backend(backend: str | Backend) -> Backend:
     """
     if isinstance(backend, str):
         backend = _checked(backend) if in_file(backend) else _registered(backend)
+    elif not isinstance(backend, Backend):
+        raise unknown("backend", backend, backends())
     if not backend.installed:
         raise MissingLibraryError(str(backend.library), f"backend {backend.name!r}", str(backend.library))
     return backend

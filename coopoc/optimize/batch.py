@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
 from .arrowhead import Arrow, marginals, structure
 from .assess import bounded
@@ -59,6 +59,7 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
     (2, 1, 3)
     """
     known = require_backend(backend)
+    instance("problem", problem, Problem)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if problem.constraints:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, Ints, number
+from ..arrays import Floats, Ints, instance, number
 from ..errors import InputError
 from .agent import Agent, agents_of
 from .links import Link, links_of
@@ -143,6 +143,7 @@ def _agree(problem: Problem, link: Link, agents: Mapping[str, Agent]) -> float:
 
 
 def _check(problem: Problem) -> None:
+    instance("problem", problem, Problem)
     if problem.batch is not None or problem.constraints or problem.x0 is None:
         hint = "Pick one realisation, give an x0, and leave constraints to solve."
         raise InputError("problem", repr(problem), "must be a single one with an x0 and no constraints", hint)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, instance, number
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 from .backend import Backend
 from .batch import Batch, solve_batch
 from .outliers import Candidates, Marked, bounds, mark, reweigh, squares
@@ -127,7 +127,7 @@ def solve_gnc(
     >>> float(solution.x[0, 0].round(3)), solution.extras["weights"]
     (0.5, array([1., 1., 0.]))
     """
-    if problem.batch is not None:
+    if instance("problem", problem, Problem).batch is not None:
         hint = "Pick one with problem.pick(0), or use solve_gnc_batch."
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
     each: list[Solution] = []
@@ -231,9 +231,8 @@ def _sharpen(problem: Problem, marked: Marked, loss: str, threshold: float, inne
 
 def surrogate_of(loss: str, threshold: float) -> Surrogate:
     """The surrogate of a loss; InputError if there is none, or if the threshold is no probability in (0, 1)."""
-    if loss not in SURROGATES:
-        raise unknown("loss", loss, SURROGATES)
-    if not 0 < threshold < 1:
+    one_of("loss", loss, SURROGATES)
+    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
         hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
         raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
     return SURROGATES[loss]

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..formats import load_graph
 from ..formats.edges import ENDS
 from ..formats.graph import Graph
-from ..plugins import unknown
+from ..plugins import one_of
 from .factor import Factor
 from .incremental_start import incremental_start
 from .linear_start import parts
@@ -64,8 +64,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     Problem(2 nodes in the plane; 1 range)
     """
     for name, value, allowed in (("objective", objective, Objective), ("start", start, Start)):
-        if value not in get_args(allowed):
-            raise unknown(name, value, get_args(allowed))
+        one_of(name, value, get_args(allowed))
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
     _refuse_exact(graph, objective)
     factors = _factors(graph, objective)

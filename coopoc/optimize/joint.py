@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
 from .assess import factorise
 from .problem import Problem
@@ -40,12 +40,16 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
     array([[1., 1.],
            [1., 2.]])
     """
+    instance("problem", problem, Problem)
+    given: Any = getattr(solution, "x", None)
+    x = checked("solution", given, "(n, ambient)", (len(problem.names), problem.space.ambient))
     if problem.constraints or problem.batch is not None:
-        given = "constraints" if problem.constraints else f"{problem.batch} realisations"
-        raise InputError("problem", given, "must be a single one without constraints", "Pick one: problem.pick(0).")
-    places = [problem.index(node) for node in nodes]
+        what = "constraints" if problem.constraints else f"{problem.batch} realisations"
+        raise InputError("problem", what, "must be a single one without constraints", "Pick one: problem.pick(0).")
+    listed = nodes if isinstance(nodes, Iterable) else [nodes]
+    places = [problem.index(node) for node in listed]
     dof = problem.space.dof
-    number, solve_one = _solver(problem.replace_unchecked(separator=()), solution.x)
+    number, solve_one = _solver(problem.replace_unchecked(separator=()), x)
     wanted = number[places].ravel()
     moving = np.flatnonzero(wanted >= 0)
     whole = np.zeros((len(wanted), len(wanted)))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 
 Curve = Callable[[Floats, float], Floats]
 Shape = tuple[Curve, Curve, Curve]
@@ -59,8 +59,7 @@ class Loss:
     scale: float
 
     def __post_init__(self) -> None:
-        if self.name not in LOSSES:
-            raise unknown("loss", self.name, LOSSES)
+        one_of("loss", self.name, LOSSES)
         if not 0 < self.scale < np.inf:
             raise InputError("scale", self.scale, "must be > 0 and finite", "It counts standard deviations: 1.5 to 3.")
 

@@ -8,10 +8,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Bools, Floats, instance, number
 from ..errors import InputError
 from ..one_file import in_file
-from ..plugins import find, names, unknown
+from ..plugins import find, names, one_of, unknown
 from ..world import spherical as polar
 from . import dual
 from .space import Space, exp
@@ -188,14 +188,16 @@ def measurement(
     array([1.])
     """
 
-    if arity not in (1, 2):
+    instance("name", name, str, 'Give the kind of its factors, such as "range".')
+    if isinstance(arity, bool) or not isinstance(arity, int) or arity not in (1, 2):
         raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
-    if not components or not set(components) <= set(get_args(Component)):
+    given = components if isinstance(components, tuple | list) else ()
+    if not given or not all(isinstance(one, str) and one in get_args(Component) for one in given):
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
-    if frame not in get_args(Frame):
-        raise unknown("frame", frame, get_args(Frame))
-    if linear and (components != ("coordinate",) * 3 or frame != "world"):
+    one_of("frame", frame, get_args(Frame))
+    constants = number("constants", constants, 0, kind=int, allowed=">= 0", hint="How many numbers each one carries.")
+    if instance("linear", linear, bool) and (tuple(components) != ("coordinate",) * 3 or frame != "world"):
         raise InputError(
             "linear", linear, "means that the formula is the vector itself, in the world frame", "Leave it out."
         )
@@ -204,7 +206,7 @@ def measurement(
         if name in MEASUREMENTS and not _edited(MEASUREMENTS[name].formula, formula):
             raise InputError("measurement", repr(name), "is registered already", "Choose another name.")
         MEASUREMENTS[name] = Measurement(
-            name, arity, frame, components, formula, linear, plane, constants, compares_poses
+            name, arity, frame, tuple(components), formula, linear, plane, constants, compares_poses
         )
         return formula
 
@@ -217,6 +219,8 @@ def lookup(kind: str) -> Measurement:
     Raises:
         InputError: no such kind (lists the kinds and the nearest one), or the object is no measurement.
     """
+    if not isinstance(kind, str):
+        raise unknown("kind", kind, sorted(MEASUREMENTS))
     if kind in MEASUREMENTS:
         return MEASUREMENTS[kind]
     if not in_file(kind) and kind not in names("coopoc.measurements"):

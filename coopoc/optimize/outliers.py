@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
 from .factor import unchecked
 from .local import local
@@ -38,10 +38,11 @@ class Marked:
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
     """The candidates, checked."""
+    instance("problem", problem, Problem)
     places: list[tuple[int, int]] = []
-    for item in candidates:
-        k, rows = item if isinstance(item, tuple | list) else (item, None)
-        if not 0 <= k < len(problem.factors):
+    for item in candidates if isinstance(candidates, Sequence) else [candidates]:
+        k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
+        if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 0 <= k < len(problem.factors):
             allowed = f"must be a factor in 0..{len(problem.factors) - 1} or (factor, rows)"
             raise InputError("candidates", repr(item), allowed, "See problem.factors.")
         factor = problem.factors[k]
@@ -49,7 +50,7 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
             raise InputError(
                 "candidates", repr(factor), f"has a {factor.loss.name} loss already", "Leave its loss out."
             )
-        chosen = range(len(factor.nodes)) if rows is None else [int(r) for r in rows]
+        chosen = range(len(factor.nodes)) if rows is None else checked("candidates", rows, "(M,)", (-1,), int).tolist()
         if bad := [r for r in chosen if not 0 <= r < len(factor.nodes)]:
             raise InputError("candidates", bad[:3], f"must be rows of {factor!r}", "Rows count from 0.")
         places += [(int(k), r) for r in chosen]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Ints, frozen
+from ..arrays import Bools, Floats, Ints, frozen, instance
 from ..errors import InputError
+from ..world.sensors import Sensors
 from .constraint import Constraint
 from .factor import Factor
 from .growing import Growing
@@ -26,7 +27,6 @@ from .window import Noise, WindowStep, recorded_steps, window_factors
 
 if TYPE_CHECKING:
     from ..world.recording import Recording
-    from ..world.sensors import Sensors
     from .losses import Loss
 
 Nodes = str | int | Sequence[str | int] | Sequence[Sequence[str | int]]
@@ -72,6 +72,9 @@ class Problem:
     search: Search = Search()
 
     def __post_init__(self) -> None:
+        for field in ("names", "factors", "separator", "poses", "fixed", "constraints"):
+            if not isinstance(value := getattr(self, field), Iterable):
+                raise InputError(field, repr(value)[:60], "must be a sequence", "Give a tuple, () for none.")
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))
         if len(self._place) != len(self.names):
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
@@ -304,6 +307,12 @@ class Problem:
             sensors: relative noise; None: unit covariance of the converted vectors.
             names: of the points, step by step; default their numbers.
         """
+        if not isinstance(steps, Sequence) or not steps:
+            raise InputError("steps", repr(steps)[:60], "must be one or more", "Give WindowSteps, oldest first.")
+        for step in steps:
+            instance("steps", step, WindowStep)
+        if sensors is not None:
+            instance("sensors", sensors, Sensors)
         count, factors, ego = window_factors(steps, sensors)
         return cls(tuple(names or map(str, range(count))), factors, separator=ego)
 

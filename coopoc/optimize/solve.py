@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from .active import constraint_rows
 from .assess import Assessment, assess
@@ -57,6 +57,8 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
     array([-0.333,  9.333])
     """
     known = require_backend(backend)
+    instance("problem", problem, Problem)
+    instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
     if problem.batch is not None:
         hint = "Pick one with problem.pick(0), or use solve_batch."
         raise InputError("problem", repr(problem), "must be a single realisation", hint)

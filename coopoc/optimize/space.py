@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, checked, number, refuse
 from ..errors import InputError
 
 
@@ -30,8 +30,7 @@ class Space:
     has_rotation: bool = False
 
     def __post_init__(self) -> None:
-        if self.dimension not in (2, 3):
-            raise InputError("dimension", self.dimension, "must be 2 or 3", "Roads are flat (2) or not (3).")
+        number("dimension", self.dimension, 2, 3, kind=int, allowed="2 or 3", hint="Roads are flat (2) or not (3).")
 
     @property
     def ambient(self) -> int:
@@ -122,8 +121,15 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     >>> pose([1.0, 2.0], np.pi / 2).round(3) + 0.0
     array([ 1.,  2.,  0., -1.,  1.,  0.])
     """
-    at = np.asarray(position, dtype=np.float64)
+    at, w = checked("position", position), checked("turn", turn)
+    refuse("turn", w, ~np.isfinite(w), "must be finite", "Give rad.")
+    if not at.ndim or at.shape[-1] not in (2, 3):
+        allowed = "must have shape (..., 2) or (..., 3)"
+        raise InputError("position", f"shape {at.shape}", allowed, "Give x, y or x, y, z of each.")
     space = Space(at.shape[-1], has_rotation=True)
-    w = np.asarray(turn, dtype=np.float64)
+    wanted = at.shape[:-1] if space.dimension == 2 else (*at.shape[:-1], 3)
+    if w.ndim > len(wanted) or any(n not in (1, m) for n, m in zip(w.shape[::-1], wanted[::-1], strict=False)):
+        hint = "A heading for each position in the plane, a rotation vector in space."
+        raise InputError("turn", f"shape {w.shape}", f"must fit to {wanted}", hint)
     w = np.broadcast_to(w[..., None], (*at.shape[:-1], 1)) if space.dimension == 2 else w
     return space.join(at, exp(np.broadcast_to(w, (*at.shape[:-1], space.angles))))

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, number
 from ..errors import InputError
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.spherical import to_vector
 from .factor import Factor
 
 
+@runtime_checkable
 class Noise(Protocol):
     """Protocol of a noise model; `coopoc.methods.NoiseModel` is one."""
 
@@ -137,7 +138,10 @@ def recorded_steps(
 
     Arguments and errors as `Problem.from_window`.
     """
+    check_recording(recording)
     (column,) = recording.observing([ego])
+    if noise is not None and not isinstance(noise, Noise):
+        raise InputError("noise", repr(noise)[:60], "must be a noise model", "Give NoiseModel.nominal(sensors).")
     _check(recording, step, length, run)
     steps, names, before = [], [], np.empty(0, np.int64)
     for s in range(step - length + 1, step + 1):
@@ -168,6 +172,8 @@ def _recorded(
 
 
 def _check(recording: Recording, step: int, length: int, run: int | None) -> None:
+    for name, value in (("step", step), ("length", length), *(() if run is None else (("run", run),))):
+        number(name, value, -(2**62), 2**62, kind=int, allowed="counted from 0", hint="Give a whole number.")
     if not 0 <= step < len(recording.t):
         raise InputError("step", step, f"must be in 0..{len(recording.t) - 1}", "The drive has no other steps.")
     if not 1 <= length <= step + 1:

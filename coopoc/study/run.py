@@ -11,7 +11,9 @@ from typing import Any
 from tqdm import tqdm
 
 from .. import plugins
+from ..arrays import instance
 from ..errors import InputError
+from ..file_names import given_path
 from ..one_file import in_file
 from . import store
 from .cell import Cell
@@ -181,7 +183,8 @@ def _keep(folder: Path, outcome: Outcome) -> bool:
 
 
 def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:
-    found = find_study(study) if isinstance(study, str) else study
+    found = find_study(study) if isinstance(study, str) else instance("study", study, Study)
+    given_path(out)
     check_views(found)
     found = found.override({name: data_path(name, value, out) for name, value in (settings or {}).items()})
     return found, found.cells(), Path(out) / found.name

@@ -14,7 +14,7 @@ from tabulate import tabulate
 from ..errors import InputError
 from ..escapes import markdown, spreadsheet, tex, visible
 from ..evaluate.statistics import Interval
-from ..plugins import unknown
+from ..plugins import one_of
 from .style import METHODS
 
 Entry: TypeAlias = Interval | float | int | str | None
@@ -84,8 +84,7 @@ class Table:
 
     def render(self, form: str) -> str:
         """The table in one of FORMATS; InputError for another."""
-        if form not in FORMATS:
-            raise unknown("format", form, FORMATS)
+        one_of("format", form, FORMATS)
         text: str = getattr(self, f"to_{form}")()
         return text
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, checked, instance
 from .body import Body
 from .cam import Origin, from_elements, received_std, to_elements
 from .recording import Recording
@@ -37,6 +37,9 @@ def cam_received(recording: Recording, ego: int | str, origin: Origin = (50.0, 8
     >>> bool(np.abs(found.gnss - seen.gnss).max() < 0.01), found.velocity[0, 0, 1, 2]
     (True, np.float64(0.0))
     """
+    instance("recording", recording, Recording)
+    latitude, longitude, height = checked("origin", origin, "(3,)", (3,)).tolist()
+    origin = (latitude, longitude, height)
     (own,) = recording.observing([ego])
     kept = [own, *recording.landmarks]
     forward, body = recording.velocity, recording.body

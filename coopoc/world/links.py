@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..arrays import Ints, checked, refuse
+from ..arrays import Ints, checked, number, refuse
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +51,7 @@ class Links:
 
     def of(self, observer: int) -> Ints:
         """Indices of the links of one observer, in time order and nearest first within a step."""
+        number("observer", observer, -(2**62), 2**62, kind=int, allowed="a column", hint="Count columns from 0.")
         order, start = self._by_observer
         if not 0 <= observer < len(start) - 1:
             return np.empty(0, dtype=np.int64)

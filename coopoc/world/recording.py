@@ -125,6 +125,8 @@ class Recording:
         >>> len(observe(fleet, Sensors()).between(1, 3).t)
         2
         """
+        for name, step in (("start", start), ("stop", stop)):
+            number(name, step, 0, 2**62, kind=int, allowed="a step, >= 0", hint="Count steps from 0.")
         kept = np.flatnonzero((self.links.step >= start) & (self.links.step < stop))
         links, arrival, body = self.links, self.arrival[:, kept], self.body
         return replace(
@@ -180,9 +182,10 @@ class Recording:
                 "Take a filter, a learned gain or the joint filter, which do without.",
             )
 
-    def neighbours(self, ego: int) -> Ints:
+    def neighbours(self, ego: int | str) -> Ints:
         """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
-        return np.bincount(self.links.step[self.links.of(ego)], minlength=len(self.t)).astype(np.int64)
+        (column,) = columns("ego", [ego], self.ids)
+        return np.bincount(self.links.step[self.links.of(column)], minlength=len(self.t)).astype(np.int64)
 
     def observing(self, egos: Sequence[int | str]) -> list[int]:
         """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""

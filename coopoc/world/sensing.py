@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Bools, Floats, Ints, instance, number
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 from .axes import columns
 from .body_sensing import body_measurements, gauss_markov, in_body
 from .fleet import Fleet
@@ -76,8 +76,8 @@ def observe(
     seed = number("seed", seed, 0, 2**63, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
-    if frame not in get_args(Frame):
-        raise unknown("frame", frame, get_args(Frame))
+    one_of("frame", frame, get_args(Frame))
+    assumed = sensors.without_bias() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
     links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range, standing)
     broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
@@ -104,7 +104,7 @@ def observe(
         relative=relative,
         broadcasts=broadcasts,
         arrival=arrival,
-        sensors=assumed or sensors.without_bias(),
+        sensors=assumed,
         v2x=v2x,
         observers=watching,
         body=body,

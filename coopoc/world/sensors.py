@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, number
 from ..errors import InputError
-from ..plugins import unknown
+from ..plugins import one_of
 
 BiasMode = Literal["run", "sample"]
 VelocityReading = Literal["axis", "speed"]
@@ -73,8 +73,7 @@ class Sensors:
         for field in fields(self):
             name, value = field.name, getattr(self, field.name)
             if name in words:
-                if not isinstance(value, str) or value not in words[name]:
-                    raise unknown(name, value, words[name])
+                one_of(name, value, words[name])
             elif isinstance(field.default, bool):
                 if not isinstance(value, bool):
                     raise InputError(name, repr(value), "must be True or False", "Say whether there is one.")

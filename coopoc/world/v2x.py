@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..arrays import AnyArray, Bools, Floats, number
-from ..plugins import unknown
+from ..plugins import one_of
 
 Schedule = Literal["nearest", "round robin", "most informative"]
 
@@ -41,8 +41,7 @@ class V2X:
     "most informative", which lowers the bound of its position most (`coopoc.world.informative`)."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.schedule, str) or self.schedule not in get_args(Schedule):
-            raise unknown("schedule", self.schedule, get_args(Schedule))
+        one_of("schedule", self.schedule, get_args(Schedule))
         limits: dict[str, tuple[float, float, str]] = {
             "max_neighbours": (0, 1e6, ">= 0"),
             "radius": (0, np.inf, ">= 0 m"),

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from coopoc.arrays import Bools, Floats
 from coopoc.errors import InputError
-from coopoc.plugins import unknown
+from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 
 from .guard import screen
@@ -71,8 +71,7 @@ class Pairs(Topology):
         there = np.zeros((len(names), len(names)), dtype=bool)
         for pair in self.pairs:
             for name in pair:
-                if name not in names:
-                    raise unknown("pairs", name, names)
+                one_of("pairs", name, names)
             i, j = (list(names).index(name) for name in pair)
             there[i, j] = there[j, i] = i != j
         return there

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
-from coopoc.plugins import unknown
+from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensing import observe
@@ -203,8 +203,7 @@ def clients(
     [(2, 1)]
     """
     for name, value, allowed in (("noise", noise, get_args(Noise)), ("start", start, get_args(Start))):
-        if value not in allowed:
-            raise unknown(name, value, allowed)
+        one_of(name, value, allowed)
     if piece < 2 or not 0 < split < 1:
         raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
     sensors = sensors or Sensors.paper_training()

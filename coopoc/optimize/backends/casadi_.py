@@ -18,7 +18,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...plugins import unknown
+from ...plugins import one_of
 from ..active import steerable
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
@@ -56,8 +56,7 @@ def prepare(
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    if method not in METHODS:
-        raise unknown("method", method, METHODS)
+    one_of("method", method, METHODS)
     form, sides = structure_of(structure), _sides(structure)
     if method == "fatrop" and not np.array_equal(*sides):
         raise InputError("method", repr(method), "does not hold inequalities", "Leave it out: ipopt takes those.")

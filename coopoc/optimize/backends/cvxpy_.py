@@ -17,7 +17,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...plugins import unknown
+from ...plugins import one_of
 from ..backend import Backend, Capabilities, Solver, SolverResult, looped
 from ..convex.qcqp import Multipliers
 from ..convex.quadratic import TERMS, quadratic
@@ -42,8 +42,7 @@ def prepare(structure: Problem, relaxation: str = "auto", refine: bool = True) -
     Raises:
         InputError: an unknown relaxation, or a problem that it cannot take: it lists what it can.
     """
-    if relaxation not in RELAXATIONS:
-        raise unknown("relaxation", relaxation, RELAXATIONS)
+    one_of("relaxation", relaxation, RELAXATIONS)
     convex = structure.linear and not structure.poses
     if relaxation == "qp" and not convex:
         raise InputError("relaxation", "'qp'", "needs points and only position and displacement", "Use sdp.")

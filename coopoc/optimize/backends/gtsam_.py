@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ...plugins import unknown
+from ...plugins import one_of
 from ..backend import Backend, Capabilities, Options, Solver, SolverResult, looped
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..linear import Linear
@@ -56,8 +56,7 @@ def prepare(
         InputError: an unknown optimizer, factors that GTSAM lacks (they are named).
     """
     check_limits(max_iterations, tolerance)
-    if optimizer not in OPTIMIZERS:
-        raise unknown("optimizer", optimizer, OPTIMIZERS)
+    one_of("optimizer", optimizer, OPTIMIZERS)
     if optimizer in ("auto", "elimination"):
         step, own = linear_step(structure), optimizer == "auto" and _own(structure)
 
