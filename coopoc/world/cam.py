@@ -168,7 +168,9 @@ def _units(origin: Origin) -> tuple[Floats, Floats]:
     sine, eccentric = np.sin(np.deg2rad(latitude)), FLATTENING * (2 - FLATTENING)
     across = AXIS / np.sqrt(1 - eccentric * sine * sine)
     along = across * (1 - eccentric) / (1 - eccentric * sine * sine)
-    unit = np.deg2rad(1e-7) * np.array([along, across * np.cos(np.deg2rad(latitude)), 0.0]) + [0.0, 0.0, 0.01]
+    radii = height + np.array([along, across])
+    metres = np.deg2rad(1e-7) * radii * [1.0, np.cos(np.deg2rad(latitude))]
+    unit = np.append(metres, 0.01)
     return unit, np.array([latitude * 1e7, longitude * 1e7, height * 100.0])
 
 
