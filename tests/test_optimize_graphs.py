@@ -32,6 +32,7 @@ from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
 from coopoc.optimize.marginals import bayes_tree_marginals
+from coopoc.optimize.race import expected
 from coopoc.optimize.search import Search
 from coopoc.optimize.sparse import Sparse, _made, sparse
 from coopoc.optimize.starts import chained, separated
@@ -487,3 +488,29 @@ def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps: in
     assert set(found.unobservable) == {f"L{k}" for k in range(unseen)}
     assert found.cost == pytest.approx(alone.cost, rel=1e-9)
     assert found.iterations <= alone.iterations + 2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension: int) -> None:
+    """Closed form: half a chi-square, whose angles count twice in the plane; mean and spread over 40 graphs."""
+    found, known = [], (0.0, 0.0)
+    for seed in range(40):
+        graph = random_graph(seed, dimension, robots=1, landmarks=0, ranges=0, seen=0, loops=40)
+        problem = from_graph(graph, start="file")
+        found.append(solve(problem, throw=False).cost)
+        free = len(problem.names) - len(problem.fixed)
+        known = expected(problem, free * problem.space.dof)
+    mean, variance = known
+    assert np.mean(found) == pytest.approx(mean, abs=4 * np.sqrt(variance / len(found)))
+    assert np.std(found) == pytest.approx(np.sqrt(variance), rel=0.4)
+
+
+def test_a_start_that_leads_smoothly_to_a_poor_minimum_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The truth leads lower: a robot in space with ranges, whose chained odometry meets no trouble on its way."""
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    from unseen_graphs import drone
+
+    graph = drone(51)
+    best = solve(from_graph(graph, start="file"), throw=False).cost
+    assert solve(from_graph(graph, start="odometry"), throw=False).cost > 1.3 * best
+    assert solve(from_graph(graph), throw=False).cost == pytest.approx(best, rel=1e-6)

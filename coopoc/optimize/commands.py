@@ -80,7 +80,7 @@ def misfit(problem: Problem, solution: Solution) -> float | None:
     True
     """
     size = len(problem.names) * problem.space.dof if problem.movable is None else int(problem.movable.sum())
-    mean = expected_cost(problem, size)
+    mean, _ = expected_cost(problem, size)
     return float(np.sqrt(solution.cost / mean)) if mean > 0 and np.isfinite(solution.cost) else None
 
 

@@ -23,8 +23,8 @@ TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
 
 
-EXCESS = 1.5
-"""Cost over that of the measurements' own noise from which a minimum is not believed."""
+EXCESS = 5.0
+"""Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
 MORE = 50
 """Steps before it is judged."""
 
@@ -36,9 +36,10 @@ def race(
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
-    A start from which no step was refused and no promise failed by half ends the search: others are tried where the
-    first had trouble, and all whose costs are near the least go on (ROUNDS). Where the end is far above the noise of
-    the measurements, the growing start is tried, too. A problem that is not large takes the first.
+    A start from which no step was refused and no promise failed by half, and that leads to a cost which the assumed
+    noise explains, ends the search. Others are tried where the first had trouble, and all whose costs are near
+    the least go on (ROUNDS). Where the noise does not explain the end, the growing start is tried, too. A problem that
+    is not large takes the first.
 
     Args:
         problem: at any start.
@@ -46,13 +47,17 @@ def race(
         growing: problem -> x0 and iterations of a start that is tried last, "incremental".
     """
     system, tried, taken = sparse(problem), {}, 0
+    limit = np.inf
+    if system is not None:
+        mean, variance = expected(problem, system.size)
+        limit = mean + EXCESS * np.sqrt(variance)
     for name, start in starts.items():
         x = start()
         if system is None:
             return problem.replace_unchecked(x0=frozen(x)), Search(name)
         end = arrive(system, x, STEPS, TOLERANCE)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
-        if smooth(end):
+        if smooth(end) and tried[name][0] <= limit:
             return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
     assert system is not None
     least = min(cost for cost, _ in tried.values())
@@ -67,7 +72,6 @@ def race(
             taken += sum(end.iterations for end in ends.values())
             least = min(cost for cost, _ in tried.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    limit = EXCESS * expected(problem, system.size)
     if growing is not None and system.cost(x) > limit:
         end = arrive(system, x, MORE, TOLERANCE)
         x, taken = end.x, taken + end.iterations
@@ -88,15 +92,21 @@ def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, 
     return found
 
 
-def expected(problem: Problem, unknowns: int) -> float:
-    """Half the numbers measured beyond the unknowns: the mean of the cost at its minimum under the noise it assumes.
+def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
+    """Mean and variance of the cost at its minimum under the noise that it assumes.
 
-    The entries of a rotation matrix that is measured count as the angles that they hold.
+    Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation matrix count as the
+    angles that they hold; in the plane kappa |R_j - R_i R_ij|_F^2 is twice the square of the angle's error over its
+    variance, and adds 1 and 2.
     """
     d, angles = problem.dimension, problem.space.angles
-    more = {"pose_chordal": d * d - angles, "relative_pose_chordal": d * d - angles}
-    spare = sum(len(f.nodes) * (f.size - more.get(f.kind, 0)) for f in problem.factors)
-    return 0.5 * max(spare - unknowns, 0)
+    matrices = [f for f in problem.factors if f.kind in ("pose_chordal", "relative_pose_chordal")]
+    spare = sum(len(f.nodes) * f.size for f in problem.factors)
+    spare -= (d * d - angles) * sum(len(f.nodes) for f in matrices) + unknowns
+    turns = sum(len(f.nodes) for f in matrices) - len({*problem.poses} - {*problem.fixed})
+    twice = max(turns, 0) if d == 2 and matrices else 0
+    mean = 0.5 * (max(spare, 0) + twice)
+    return mean, mean + twice
 
 
 def smooth(end: Arrival) -> bool:
