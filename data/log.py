@@ -24,7 +24,7 @@ from .log_body import body_vehicle, seen_by_vehicles
 from .log_files import check_headers, files_of, rows_of_file
 from .log_frame import local, on_one_clock, origin_of
 from .log_links import linked
-from .log_rows import Rows, check_arrivals, stacked
+from .log_rows import Rows, check_arrivals, stacked, stamped
 from .log_summary import Summary, Tally
 from .log_truth import truth_of
 from .log_vehicle import Vehicle, samples, vehicle
@@ -76,7 +76,7 @@ def read_log(
         dt: s, steps of the recording; None: the median interval of the densest odometry (else of the densest fixes).
         max_gap: s, the longest gap of a vehicle's odometry that is bridged; it is absent in longer ones. None: the
             largest of 5 dt, 0.5 s and 1.5 times its own median interval.
-        columns: names in the files, as {"t": "timestamp", "latitude": "lat"}.
+        columns: names in the files, as {"t": "timestamp", "vehicle": "car|from"}, where tables differ.
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out.
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
@@ -112,10 +112,10 @@ def read_log(
         rows, actual = stacked([rows_of_file(file, tally, columns, kinds, ignore) for file in files]), None
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
-    rows = on_one_clock(rows, clock or {}, path.name)
+    rows = on_one_clock(stamped(rows), clock or {}, path.name)
     check_time(rows.t, path.name)
     check_arrivals(rows)
-    actual = rows_of_file(true, Tally(), columns, kinds, ()) if true else actual
+    actual = stamped(rows_of_file(true, Tally(), columns, kinds, ())) if true else actual
     origin = origin_of(rows, origin)
     rows, given = local(rows, origin), log_sensors.stds(rows)
     planar = not (rows.kind == "z").any()

@@ -14,7 +14,7 @@ from .cells import read_xlsx, separator_of
 from .kinds import KINDS
 from .log_rows import Rows
 from .log_summary import Tally
-from .log_tables import LONG, read_rows
+from .log_tables import LONG, named, read_rows
 from .nmea import read_nmea
 
 TABLES, NMEA = (".csv", ".parquet", ".xlsx"), (".nmea", ".nme")
@@ -68,11 +68,12 @@ def headers(path: Path) -> list[str]:
 def check_headers(columns: Mapping[str, str], tables: Sequence[Path], name: str) -> None:
     """InputError for a name of a column that none of the tables of a log has."""
     found = {header for table in tables if table.suffix.lower() in TABLES for header in headers(table)}
-    for key, header in columns.items():
-        if header not in found:
-            allowed = f"is in no table, which have {', '.join(sorted(found))}"
-            hint = suggestion(header, found, "Name a column of a table.")
-            raise InputError(f"{name}: columns[{key!r}]", repr(header), allowed, hint)
+    for key, given in columns.items():
+        for header in named(given):
+            if header not in found:
+                allowed = f"is in no table, which have {', '.join(sorted(found))}"
+                hint = suggestion(header, found, "Name a column of a table.")
+                raise InputError(f"{name}: columns[{key!r}]", repr(header), allowed, hint)
 
 
 def files_of(path: Path, truth: Path | None) -> tuple[list[Path], Path | None]:

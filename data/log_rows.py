@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,9 +12,6 @@ from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.errors import InputError
 
 from .kinds import KINDS
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +64,13 @@ def stacked(parts: Sequence[Rows]) -> Rows:
     """All rows of several files."""
     fields = Rows.__dataclass_fields__
     return Rows(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
+
+
+def stamped(rows: Rows) -> Rows:
+    """Rows without a time, those of places, at the first instant of the others."""
+    if np.isnan(rows.t).all():
+        raise InputError("t", "in no file", "must be a column of some table", "Give the times of what was measured.")
+    return replace(rows, t=np.where(np.isnan(rows.t), np.nanmin(rows.t), rows.t))
 
 
 def rows_of(

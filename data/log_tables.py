@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ from coopoc.errors import InputError
 from coopoc.plugins import suggestion, unknown
 
 from .cells import numeric, read_frame, seconds, words
-from .kinds import KINDS
+from .kinds import ANGLES, KINDS
 from .log_summary import Tally
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ def read_rows(
     Args:
         path: of the file. Without a column vehicle, the file is named after its vehicle.
         tally: counts what is not used.
-        columns: names in the file, as {"t": "time", "latitude": "lat"}; one that the file lacks is left out.
+        columns: names in the file, as {"t": "time", "latitude": "lat"}; one that the file lacks is left out. "car|from"
+            is whichever of the two the file has.
         kinds: names in the column kind, as {"uwb": "range"}.
         ignore: kinds in the file that are left out.
 
@@ -53,20 +55,48 @@ def read_rows(
         InputError: with the row and the column, a cell that is no number, no time or no name, an unknown kind, a kind
             without its partner, a value that belongs to another unit.
     """
-    names, file = dict(columns or {}), path.name
-    for key in names:
+    given, file = dict(columns or {}), path.name
+    for key in given:
         if key not in (*LONG, *KINDS) and key.removesuffix("_std") not in KINDS:
             raise unknown(f"{file}: key of columns", key, (*LONG, *KINDS), 'Give columns={"t": "name in the file"}.')
-    frame = read_frame(path, *(names.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
-    names = {key: header for key, header in names.items() if header in frame.columns}
+    text = [header for key in ("vehicle", "partner", "kind", "arrival") for header in named(given.get(key, key))]
+    frame = read_frame(path, *text)
+    names: dict[str, str] = {}
+    for key, header in given.items():
+        there = [one for one in named(header) if one in frame.columns]
+        if len(there) > 1:
+            hint = "Name the one that is meant."
+            raise InputError(f"{file}: columns[{key!r}]", repr(header), f"are both there: {', '.join(there)}", hint)
+        if there:
+            names[key] = there[0]
     frame = frame.rename(columns={header: key for key, header in names.items()})
     if twice := next((key for key in names if (frame.columns == key).sum() > 1), None):
         allowed = f"is not the only column {twice} then: the file has one of that name"
         raise InputError(f"{file}: columns[{twice!r}]", repr(names[twice]), allowed, "Rename or remove one of the two.")
     if "t" not in frame.columns:
-        raise _no_column(file, "t", frame)
+        if not _are_places(frame):
+            raise _no_column(file, "t", frame)
+        frame.insert(0, "t", 0.0)
+        tally.assume("members of a table without times stand where it says, from the first instant on")
+        rows = _wide(frame, path, tally, {}, ignore)
+        return _checked(replace(rows, t=np.full(len(rows), np.nan)))
     read = _long if {"kind", "value"} <= set(frame.columns) or "kind" in frame.columns else _wide
     return _checked(read(frame, path, tally, dict(kinds or {}), ignore))
+
+
+def named(header: str) -> list[str]:
+    """The headers that a word of `columns` names: itself, or those between "|".
+
+    >>> named("car|from")
+    ['car', 'from']
+    """
+    return [one.strip() for one in header.split("|")]
+
+
+def _are_places(frame: pd.DataFrame) -> bool:
+    """Whether a table without times holds one place for each of its members."""
+    placed = {"x", "y"} <= set(frame.columns) or {"latitude", "longitude"} <= set(frame.columns)
+    return placed and "vehicle" in frame.columns and bool(frame["vehicle"].is_unique)
 
 
 def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
@@ -145,6 +175,7 @@ def _checked(rows: Rows) -> Rows:
         far = here[np.abs(value) > k.limit]
         if len(far):
             hint = f"Is it in another unit? Other kinds: {', '.join(n for n in KINDS if KINDS[n].name == k.name)}."
+            hint += " Or counted on over several turns? Write it within one." if k.name in ANGLES else ""
             allowed = f"must be within +-{k.limit:.4g}"
             raise InputError(f"{rows.place(far[0])}, {kind}", f"{rows.value[far[0]]:.10g}", allowed, hint)
         bound = {"range": "> 0", "inclination": ">= 0"}.get(kind)
@@ -246,7 +277,8 @@ def _no_column(file: str, column: str, frame: pd.DataFrame) -> InputError:
     if column == "kind":
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)}); the file has {', '.join(headers)}"
     else:
-        allowed = f"is needed; the file has {', '.join(headers)}"
+        places = "; one of places alone has vehicle, x, y, each vehicle once" if column == "t" else ""
+        allowed = f"is needed{places}; the file has {', '.join(headers)}"
     near = [h for h in headers if h.lower() in USUAL.get(column, ())]
     wanted = f'columns={{"{column}": "{near[0] if near else "..."}"}}'
     hint = (

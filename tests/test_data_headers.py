@@ -84,3 +84,39 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> N
     ):
         with pytest.raises(co.InputError, match=message):
             load_log(f"{tmp_path / 'a.csv'}?{words}")
+
+
+def test_one_name_may_have_another_header_in_each_table(tmp_path: Path) -> None:
+    folder = parts(tmp_path / "log")
+    text = (folder / "radio.csv").read_text().replace("vehicle", "from", 1)
+    (folder / "radio.csv").write_text(text)
+    (tmp_path / "whole.csv").write_text(GOOD)
+    log = load_log(f"{folder}?columns=vehicle:car|from,partner:peer&kinds=uwb:range")
+    assert same(log.recording, co.load_recording(tmp_path / "whole.csv"))
+    with pytest.raises(co.InputError, match=r"columns\['vehicle'\] = 'form': is in no table.* Did you mean from"):
+        co.read_log(folder, columns={"vehicle": "car|form", "partner": "peer"}, kinds={"uwb": "range"})
+    with pytest.raises(
+        co.InputError, match=r"radio.csv: columns\['vehicle'\] = 'peer\|from': are both there: peer, from"
+    ):
+        co.read_log(folder, columns={"vehicle": "peer|from", "partner": "peer"}, kinds={"uwb": "range"})
+
+
+def test_places_need_no_times(tmp_path: Path) -> None:
+    """The same log, once with the mast's place at the first instant, once in a table of its own without one."""
+    head, *rows = GOOD.splitlines()
+    begin = min(float(row.split(",")[0]) for row in rows)
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "log.csv").write_text("\n".join([head, *rows]))
+    (tmp_path / "a" / "mast.csv").write_text(f"t,vehicle,x,y,z\n{begin},mast,5,6,0\n")
+    (tmp_path / "b" / "mast.csv").write_text("vehicle,x,y,z\nmast,5,6,0\n")
+    a, b = (co.read_log(tmp_path / name) for name in "ab")
+    assert same(a.recording, b.recording)
+    assert "mast" in b.recording.ids
+    assert any("without times" in text for text in b.summary.assumed)
+    (tmp_path / "b" / "mast.csv").write_text("vehicle,x,y,z\nmast,5,6,0\nmast,7,6,0\n")
+    with pytest.raises(co.InputError, match=r"mast.csv: column t = missing: is needed; one of places alone has"):
+        co.read_log(tmp_path / "b")
+    (tmp_path / "c.csv").write_text("vehicle,x,y\nmast,5,6\npost,7,6\n")
+    with pytest.raises(co.InputError, match="t = in no file"):
+        co.read_log(tmp_path / "c.csv")
