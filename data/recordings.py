@@ -21,16 +21,21 @@ from .log_links import under
 from .log_summary import Summary
 from .mrclam import read_mrclam
 from .mrclam_recording import recording
+from .part import parted
 from .pyfg_recording import graph_recording
 from .source import split
 
 
-def load_log(name_or_path: str | Path, **options: Any) -> Log:
+def load_log(
+    name_or_path: str | Path, *, since: float | None = None, until: float | None = None, **options: Any
+) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
         name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of
             `save_recording`; options may stand behind a question mark, as in "drive?dt=0.1".
+        since: s after the first step, where the part begins that is kept.
+        until: s after the first step, where it ends.
         options: of the reader.
 
     Raises:
@@ -38,6 +43,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """
     word, given = split(name_or_path)
     path, options = Path(word), {**given, **options}
+    begin, end = (options.pop(name, value) for name, value in (("since", since), ("until", until)))
     read: Callable[..., Log] = read_log
     if path.suffix == ".npz" and is_recording(path):
         read = _of_file
@@ -46,7 +52,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     elif (path / "Barcodes.dat").is_file():
         read = _of_mrclam
     found: Log = _with(read, path, options)
-    return found
+    return found.part(begin, end)
 
 
 def format_of(path: Path, columns: Mapping[str, str] | None = None) -> str:
@@ -65,7 +71,9 @@ def recorder(name_or_path: str | Path, format: str) -> Callable[..., Recording]:
     """
     word, options = split(name_or_path)
     if format == "mrclam":
-        return partial(recording, _with(read_mrclam, Path(word), options))
+        part = {name: options.pop(name, None) for name in ("since", "until")}
+        log_of_all = _with(read_mrclam, Path(word), options)
+        return lambda *args, **draws: parted(recording(log_of_all, *args, **draws), **part)
     log = load_log(name_or_path)
     return partial(under, log.recording, logged=log.messages)
 

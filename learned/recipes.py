@@ -14,12 +14,12 @@ from coopoc.errors import InputError
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find, unknown
-from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import load
 from .nets.gain import Gain
 from .training.clients import Client, Noise, Start, clients
+from .training.measured import Drives, MeasuredDrives, measured_clients
 from .training.schedule import Epoch, Schedule
 
 REVISION = 6
@@ -40,7 +40,7 @@ class Recipe:
         local_epochs: of a federation, per round.
         local_epoch: of a federation, a "pass" through the client's segments or a "step".
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives, "static", "fresh" or "wide".
+        noise: of the training drives, "static", "fresh" or "wide", where it is simulated.
         piece: steps of a segment.
         split: share of the segments that train.
         net: the net, an entry point in `coopoc.nets` or "mine.py:NAME".
@@ -133,7 +133,7 @@ class Job:
         name = f"{Path(path).stem}.{held}" if path else held
         return f"{name}{self.client or ''}-{self.setting.start}-{self.setting.reading}-{self.setting.seed}"
 
-    def key(self, fleet: Fleet) -> str:
+    def key(self, fleet: Drives) -> str:
         """Hash of everything that changes the weights."""
         facts = {
             "recipe": asdict(self.recipe),
@@ -175,7 +175,7 @@ def recipe_of(name: str) -> Recipe:
     return found
 
 
-def jobs_of(name: str, setting: Setting, fleet: Fleet, aggregate: str | None = None) -> list[Job]:
+def jobs_of(name: str, setting: Setting, fleet: Drives, aggregate: str | None = None) -> list[Job]:
     """The checkpoints of a recipe in a setting: one, or one per vehicle of the fleet for individual nets.
 
     Raises:
@@ -209,9 +209,12 @@ def load_method(name_or_path: Path | str, net: str = "") -> Method:
     return checkpoint.model.method(str(checkpoint.card.get("recipe", path.stem)))
 
 
-def job_clients(job: Job, fleet: Fleet) -> tuple[Client, ...]:
-    """The vehicles of a fleet as clients, with the noise, the split and the start of the job."""
+def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
+    """The vehicles of a fleet as clients, with the noise, the split and the start of the job; of measured drives with
+    what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
+    if isinstance(fleet, MeasuredDrives):
+        return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
     return clients(
         fleet,
         sensors(setting),

@@ -22,7 +22,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain, over_time, seed_of, size
+from .gain import Gain, error, known, over_axes, over_time, seed_of, size
 from .stack import flatten, layers, named
 
 MEMORY = 100.0
@@ -158,8 +158,9 @@ class NoiseNet(Gain):
         velocity = torch.cat([batch.velocity[:1], batch.velocity])
         noise = self.variances(theta, gnss, velocity, batch.dt)
         x, relative = filtered(gnss, velocity, noise, batch.dt, batch.known)
-        error = (x[1:] - batch.truth).square()
-        return over_time(0.5 * (error / relative[1:] + relative[1:].log()).sum(-1))
+        squares = error(x[1:], batch.truth).square()
+        terms = over_axes(0.5 * (squares / relative[1:] + relative[1:].log()), batch.truth)
+        return over_time(terms, known(batch.truth))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`NoiseFilter` with this net."""

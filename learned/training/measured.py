@@ -1,0 +1,200 @@
+"""Clients of measured drives: the fixes and odometry of a recording in pieces, with its truth as the target."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Protocol, TypeAlias, cast, get_args
+
+import numpy as np
+import torch
+
+from coopoc.arrays import Floats
+from coopoc.errors import InputError
+from coopoc.plugins import unknown
+from coopoc.world.axes import columns
+from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording, check_recording
+from coopoc.world.storage import digest
+
+from .clients import LONG, Client, Segments, Start, check_pieces
+
+Drives: TypeAlias = "Fleet | MeasuredDrives"
+"""What clients are made of: a fleet, whose measurements are simulated, or what was measured."""
+Cut = tuple[int, int]
+"""Run and first step of a piece."""
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredDrives:
+    """What vehicles measured and where they truly were, to train on in place of a fleet whose measurements are drawn.
+
+    Args:
+        recording: in the world frame; every run of it is used.
+        truth: of the same members at the same steps, NaN where it is not known.
+        ids: of the vehicles that train; empty: all that move.
+
+    Raises:
+        InputError: no truth, or one of other members or steps; a vehicle without any truth.
+
+    >>> from coopoc import Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.ones((2, 1, 3)))
+    >>> MeasuredDrives(observe(fleet, Sensors()), fleet).ids
+    ('a',)
+    """
+
+    recording: Recording
+    truth: Fleet
+    ids: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        seen, truth = check_recording(self.recording), self.truth
+        if not isinstance(truth, Fleet):
+            hint = "Add a table named truth to the folder of the log, or name one: read_log(..., truth=)."
+            raise InputError("truth", repr(truth), "must be a Fleet: a net learns from where vehicles truly were", hint)
+        if truth.ids != seen.ids or len(truth.t) != len(seen.t):
+            hint = "Give the truth on the steps of the recording, as read_log does."
+            raise InputError("truth", repr(truth), "must hold the members and steps of the recording", hint)
+        moving = np.nan_to_num(seen.velocity).any(axis=(0, 1, 3))
+        wanted = self.ids or [name for name, moves in zip(seen.ids, moving, strict=True) if moves]
+        cols = columns("vehicles", wanted, seen.ids)
+        for column in cols:
+            if not truth.present[:, column].any():
+                hint = "Add its truth, or name those that have one: MeasuredDrives(recording, truth, ids=...)."
+                raise InputError("truth", f"none of {seen.ids[column]}", "must be there for all that train", hint)
+        object.__setattr__(self, "ids", tuple(seen.ids[column] for column in cols))
+
+    @property
+    def name(self) -> str:
+        """Of the drives, for cards."""
+        return self.truth.name
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of measurements, truth and vehicles."""
+        parts = digest(self.recording), self.truth.digest, *self.ids
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    def select(self, vehicles: Sequence[str]) -> MeasuredDrives:
+        """The same drives with these vehicles as the only clients."""
+        return replace(self, ids=tuple(vehicles))
+
+
+class Logged(Protocol):
+    """What `coopoc.read_log` returns, as far as training needs it."""
+
+    @property
+    def recording(self) -> Recording:
+        """What was measured."""
+
+    @property
+    def truth(self) -> Fleet | None:
+        """Where vehicles were, None if that is not known."""
+
+
+def drives_of(data: Drives | Logged) -> Drives:
+    """What a training takes: a Fleet or MeasuredDrives as it is, of a log its measurements and truth.
+
+    Args:
+        data: any of these.
+
+    Raises:
+        InputError: anything else; a log without a truth, or in body frames.
+    """
+    if isinstance(data, Fleet | MeasuredDrives):
+        return data
+    if hasattr(data, "recording") and hasattr(data, "truth"):
+        return MeasuredDrives(data.recording, cast(Fleet, data.truth))
+    hint = "Take coopoc.load_fleet(...), or coopoc.read_log(...) of a log with a truth."
+    raise InputError("data", repr(data)[:60], "must be a Fleet, or a log with its truth", hint)
+
+
+def measured_clients(
+    drives: MeasuredDrives,
+    *,
+    start: Start = "gnss",
+    piece: int = 100,
+    split: float = 0.8,
+) -> tuple[Client, ...]:
+    """Every vehicle of measured drives as a client: its own fixes and odometry in pieces, `split` of them for training.
+
+    A piece begins at a fix and has odometry throughout; fixes may be missing in it, and steps without a truth have no
+    loss. So it is what vehicles measured that trains, with its outliers, its correlated errors and its rates. The last
+    pieces validate: errors of neighbouring pieces are correlated, so that pieces from between those that train would
+    hardly be new.
+
+    Args:
+        drives: what was measured, and the truth.
+        start: of a piece, at its first fix ("gnss") or at the truth ("true").
+        piece: steps of a segment.
+        split: share of the segments that train.
+
+    Raises:
+        InputError: a choice that does not exist, or a vehicle with fewer than two pieces.
+
+    >>> from coopoc import Sensors, observe
+    >>> t = np.arange(303) / 10
+    >>> line = Fleet(("a",), t, np.zeros((303, 1, 3)), np.ones((303, 1, 3)))
+    >>> [(len(c.training), len(c.validation)) for c in measured_clients(MeasuredDrives(observe(line, Sensors()), line))]
+    [(2, 1)]
+    """
+    if start not in get_args(Start):
+        raise unknown("start", start, get_args(Start))
+    check_pieces(piece, split)
+    cols = columns("vehicles", drives.ids, drives.recording.ids)
+    cuts = {n: [list(_cuts(drives, column, n * piece, start)) for column in cols] for n in range(1, LONG + 1)}
+    for name, pieces in zip(drives.ids, cuts[1], strict=True):
+        if len(pieces) < 2:
+            hint = f"It takes {2 * (piece + 1)} steps with odometry, fixes and truth: give more, or shorten the pieces."
+            raise InputError("recording", f"{name} with {len(pieces)} pieces of {piece}", "needs at least two", hint)
+    longest = max(n for n, pieces in cuts.items() if all(pieces))
+    found = []
+    for name, column, pieces, long in zip(drives.ids, cols, cuts[1], cuts[longest], strict=True):
+        count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
+        parts = (pieces[:count], piece), (pieces[count:], piece), (long, longest * piece)
+        found.append(Client(name, *(_segments(drives, column, *part, start) for part in parts)))
+    return tuple(found)
+
+
+def _cuts(drives: MeasuredDrives, column: int, piece: int, start: Start) -> Iterator[Cut]:
+    """Pieces of `piece` + 1 steps of a vehicle, one after the other, each from a fix and with some truth."""
+    there = drives.truth.present[:, column]
+    for run, fixes in enumerate(np.isfinite(drives.recording.gnss[:, :, column, 0])):
+        starts = fixes & there if start == "true" else fixes
+        for first, stop in drives.recording.stretches(column, piece + 1):
+            at = first
+            while (at := _next(starts, at)) + piece < stop:
+                if there[at + 1 : at + piece + 1].any():
+                    yield run, at
+                at += piece + 1
+
+
+def _next(true: Any, at: int) -> int:
+    """First step from `at` on where it is true, else one beyond the end."""
+    return at + int(np.argmax(true[at:])) if true[at:].any() else len(true)
+
+
+def _segments(drives: MeasuredDrives, column: int, cuts: Sequence[Cut], piece: int, start: Start) -> Segments:
+    """Segments of these pieces, each relative to its first fix; of a drive in one plane the height has no loss."""
+    seen, truth = drives.recording, drives.truth
+    flat = not np.nan_to_num(seen.gnss[..., 2]).any() and not np.nan_to_num(seen.velocity[..., 2]).any()
+    target = np.where([False, False, flat], np.nan, truth.position)[None]
+    origin = np.stack([seen.gnss[run, at, column] for run, at in cuts])[:, None]
+
+    def tensor(values: Floats, origin: Floats | float = 0.0) -> torch.Tensor:
+        rows = np.stack([values[min(run, len(values) - 1), at : at + piece + 1, column] for run, at in cuts])
+        return torch.tensor(rows - origin, dtype=torch.float32)
+
+    shape = (len(cuts), piece + 1, 3)
+    return Segments(
+        gnss=tensor(seen.gnss, origin),
+        velocity=tensor(seen.velocity),
+        truth=tensor(target, origin),
+        true_velocity=tensor(truth.velocity[None]),
+        gnss_std=torch.tensor(seen.sensors.fix_std, dtype=torch.float32).expand(shape),
+        velocity_std=tensor(seen.sensors.velocity_std(seen.velocity)),
+        true_start=torch.full((len(cuts),), start == "true"),
+        dt=seen.dt,
+    )
