@@ -17,7 +17,8 @@ from coopoc.evaluate.metrics import nees_inside
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.federation.federated import federate
 from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
-from coopoc.learned.nets.noise_net import NoiseFilter, NoiseNet, Variances, filtered, guess, lanes
+from coopoc.learned.nets.noise_guess import guess
+from coopoc.learned.nets.noise_net import NoiseFilter, NoiseNet, Variances, filtered, lanes
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch, clients
 from coopoc.learned.training.schedule import Schedule
