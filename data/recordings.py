@@ -26,24 +26,20 @@ from .pyfg_recording import graph_recording
 from .source import split
 
 
-def load_log(
-    name_or_path: str | Path, *, since: float | None = None, until: float | None = None, **options: Any
-) -> Log:
+def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
         name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of
             `save_recording`; options may stand behind a question mark, as in "drive?dt=0.1".
-        since: s after the first step, where the part begins that is kept.
-        until: s after the first step, where it ends.
-        options: of the reader.
+        options: of the reader; of all, since and until, s after the first step, of the part that is kept.
 
     Raises:
         InputError: no such path, an unknown option, or a file with a fault.
     """
     word, given = split(name_or_path)
     path, options = Path(word), {**given, **options}
-    begin, end = (options.pop(name, value) for name, value in (("since", since), ("until", until)))
+    part = {name: options.pop(name, None) for name in ("since", "until")}
     read: Callable[..., Log] = read_log
     if path.suffix == ".npz" and is_recording(path):
         read = _of_file
@@ -52,7 +48,7 @@ def load_log(
     elif (path / "Barcodes.dat").is_file():
         read = _of_mrclam
     found: Log = _with(read, path, options)
-    return found.part(begin, end)
+    return found.part(**part)
 
 
 def format_of(path: Path, columns: Mapping[str, str] | None = None) -> str:

@@ -94,7 +94,8 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     name, given = split(name_or_path)
     options = {**given, **options}
     part = {option: options.pop(option, None) for option in ("since", "until")}
-    return parted(_whole(name, options.pop("format", format), options), **part)
+    fleet: Fleet = parted(_whole(name, options.pop("format", format), options), **part)
+    return fleet
 
 
 def _whole(name: str, format: str | None, options: dict[str, Any]) -> Fleet:

@@ -253,7 +253,7 @@ def test_zero_noise_is_zero_error(crossing: Fleet) -> None:
 def test_bytes_are_those_of_what_arrived(crossing: Fleet) -> None:
     seen = drive(crossing, V2X(4, loss=0.5), observers=[2])
     assert CooperativeGain(net())(seen, [2]).received_bytes[:, 0].tolist() == [
-        56 * (row[seen.links.of(2)] >= 0).sum() for row in seen.arrival
+        68 * (row[seen.links.of(2)] >= 0).sum() for row in seen.arrival
     ]
 
 

@@ -61,17 +61,25 @@ def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:
 
 
 def test_pieces_are_what_was_measured_from_a_fix_on() -> None:
+    """Ten fixes at every seventh step are 70 steps; the next piece begins at the first fix after that."""
     recording, fleet = walk(every=7)
-    first = measured_clients(MeasuredDrives(recording, fleet), piece=30)[0]
+    first = measured_clients(MeasuredDrives(recording, fleet), piece=10)[0]
     pieces = Segments.join([first.training, first.validation])
-    starts = [0, 35, 70]  # the first fixes at or after the end of the piece before
+    starts = [0, 77, 154, 231, 308]
     for row, at in enumerate(starts):
         origin = recording.gnss[0, at, 0]
         for ours, theirs in ((pieces.gnss, recording.gnss[0]), (pieces.truth, fleet.position)):
-            np.testing.assert_allclose(ours[row], theirs[at : at + 31, 0] - origin, atol=1e-5, equal_nan=True)
-        np.testing.assert_allclose(pieces.velocity[row], recording.velocity[0, at : at + 31, 0], atol=1e-6)
-    assert len(first.training) == int(0.8 * len(pieces))
-    assert first.long.truth.shape[1] == 9 * 30 + 1
+            np.testing.assert_allclose(ours[row], theirs[at : at + 71, 0] - origin, atol=1e-5, equal_nan=True)
+        np.testing.assert_allclose(pieces.velocity[row], recording.velocity[0, at : at + 71, 0], atol=1e-6)
+    assert (len(first.training), len(first.validation)) == (4, 1)
+    assert first.long.truth.shape[1] == 5 * 70 + 1
+
+
+def test_pieces_are_shorter_where_a_vehicle_would_have_few() -> None:
+    """400 steps with 58 fixes hold no five pieces of 30 fixes, but five of 79 steps; of 100 steps at the least."""
+    drives = MeasuredDrives(*walk(every=7))
+    for piece, steps in ((10, 70), (30, 79), (100, 100)):
+        assert measured_clients(drives, piece=piece)[0].training.truth.shape[1] == steps + 1
 
 
 def test_a_gap_of_the_odometry_is_in_no_piece_and_one_of_the_truth_has_no_loss() -> None:
@@ -136,7 +144,7 @@ def test_the_scan_without_fixes_is_filterpys_prediction() -> None:
 
 def test_recovers_known_noise_where_fixes_are_rare() -> None:
     """0.2 m a step and 1.5 m, with a fix at every fifth step: the numbers that `walk` was made with."""
-    (client,) = measured_clients(MeasuredDrives(*walk(16000, 1, every=5)), piece=200)
+    (client,) = measured_clients(MeasuredDrives(*walk(16000, 1, every=5)), piece=40)
     found = fit_okf(client.training, client.validation, steps=100, velocity_part=False).method
     np.testing.assert_allclose(found.process_std, 0.2, rtol=0.15)
     np.testing.assert_allclose(found.gnss_std, 1.5, rtol=0.08)

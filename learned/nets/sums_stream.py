@@ -32,7 +32,7 @@ Noise: TypeAlias = "Callable[[Floats, Floats], object]"
 
 def net_noise(model: nn.Module) -> Noise:
     """The noise that a NoiseNet estimates of one vehicle from now on."""
-    weights = {name: value.detach().double().numpy() for name, value in model.named_parameters()}
+    weights: dict[str, Floats] = {name: value.detach().double().numpy() for name, value in model.named_parameters()}
     net, memory = packed(weights), new_memory()
     return lambda given, out: noise_step(net, memory, given, out)
 
@@ -102,8 +102,9 @@ class SumsStream:
         self.slots: dict[str, int] = {}
         self.members: list[str] = []
         self._known, self._variances, self._answer = np.zeros(7), np.zeros(6), np.zeros(12)
-        self._numbers, self._index = np.zeros(0), np.zeros(3, np.int64)
-        self._accounts, self._fixes = np.zeros(0), np.ones((1, 1, 0, 3))
+        self._numbers: Floats = np.zeros(0)
+        self._accounts: Floats = np.zeros(0)
+        self._index, self._fixes = np.zeros(3, np.int64), np.ones((1, 1, 0, 3))
         self._reserve(16, 8)
 
     def _reserve(self, vehicles: int, most: int) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeAlias, cast, get_args
 import numpy as np
 import torch
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, instance
 from coopoc.errors import InputError
 from coopoc.plugins import unknown
 from coopoc.world.axes import columns
@@ -23,6 +23,8 @@ from .clients import LONG, Client, Segments, Start, check_pieces
 
 Drives: TypeAlias = "Fleet | MeasuredDrives"
 """What clients are made of: a fleet, whose measurements are simulated, or what was measured."""
+FEWEST = 5
+"""Pieces of a vehicle of which one validates."""
 Cut = tuple[int, int]
 """Run and first step of a piece."""
 
@@ -50,15 +52,13 @@ class MeasuredDrives:
     ids: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        seen, truth = check_recording(self.recording), self.truth
-        if not isinstance(truth, Fleet):
-            hint = "Add a table named truth to the folder of the log, or name one: read_log(..., truth=)."
-            raise InputError("truth", repr(truth), "must be a Fleet: a net learns from where vehicles truly were", hint)
+        hint = "Add a table named truth to the folder of the log, or name one: read_log(..., truth=)."
+        seen, truth = check_recording(self.recording), instance("truth", self.truth, Fleet, hint)
         if truth.ids != seen.ids or len(truth.t) != len(seen.t):
             hint = "Give the truth on the steps of the recording, as read_log does."
             raise InputError("truth", repr(truth), "must hold the members and steps of the recording", hint)
-        moving = np.nan_to_num(seen.velocity).any(axis=(0, 1, 3))
-        wanted = self.ids or [name for name, moves in zip(seen.ids, moving, strict=True) if moves]
+        moving = np.flatnonzero(np.abs(np.nan_to_num(seen.velocity)).max(axis=(0, 1, 3)))
+        wanted = self.ids or moving.tolist()
         cols = columns("vehicles", wanted, seen.ids)
         for column in cols:
             if not truth.present[:, column].any():
@@ -121,14 +121,15 @@ def measured_clients(
     """Every vehicle of measured drives as a client: its own fixes and odometry in pieces, `split` of them for training.
 
     A piece begins at a fix and has odometry throughout; fixes may be missing in it, and steps without a truth have no
-    loss. So it is what vehicles measured that trains, with its outliers, its correlated errors and its rates. The last
+    loss. It is as long as `piece` fixes take at their median interval, since a filter needs fixes to leave its start
+    behind; shorter, but no less than `piece` steps, where a vehicle would have fewer than FEWEST pieces. The last
     pieces validate: errors of neighbouring pieces are correlated, so that pieces from between those that train would
     hardly be new.
 
     Args:
         drives: what was measured, and the truth.
         start: of a piece, at its first fix ("gnss") or at the truth ("true").
-        piece: steps of a segment.
+        piece: fixes of a segment.
         split: share of the segments that train.
 
     Raises:
@@ -144,6 +145,7 @@ def measured_clients(
         raise unknown("start", start, get_args(Start))
     check_pieces(piece, split)
     cols = columns("vehicles", drives.ids, drives.recording.ids)
+    piece = _steps(drives.recording, cols, piece)
     cuts = {n: [list(_cuts(drives, column, n * piece, start)) for column in cols] for n in range(1, LONG + 1)}
     for name, pieces in zip(drives.ids, cuts[1], strict=True):
         if len(pieces) < 2:
@@ -156,6 +158,14 @@ def measured_clients(
         parts = (pieces[:count], piece), (pieces[count:], piece), (long, longest * piece)
         found.append(Client(name, *(_segments(drives, column, *part, start) for part in parts)))
     return tuple(found)
+
+
+def _steps(recording: Recording, cols: Sequence[int], piece: int) -> int:
+    """Steps of a piece of so many fixes."""
+    there = np.isfinite(recording.gnss[:, :, cols, 0]).transpose(0, 2, 1).reshape(-1, len(recording.t))
+    gaps = np.concatenate([np.diff(np.flatnonzero(row)) for row in there])
+    total = min(sum(stop - first for first, stop in recording.stretches(column)) for column in cols)
+    return max(piece, min(piece * int(np.median(gaps)), recording.runs * total // FEWEST - 1)) if len(gaps) else piece
 
 
 def _cuts(drives: MeasuredDrives, column: int, piece: int, start: Start) -> Iterator[Cut]:
