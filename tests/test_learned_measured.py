@@ -62,23 +62,22 @@ def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:
 
 def test_pieces_are_what_was_measured_from_a_fix_on() -> None:
     """Ten fixes at every seventh step are 70 steps; the next piece begins at the first fix after that."""
-    recording, fleet = walk(every=7)
+    recording, fleet = walk(1700, every=7)
     first = measured_clients(MeasuredDrives(recording, fleet), piece=10)[0]
     pieces = Segments.join([first.training, first.validation])
-    starts = [0, 77, 154, 231, 308]
-    for row, at in enumerate(starts):
+    for row, at in enumerate(range(0, 22 * 77, 77)):
         origin = recording.gnss[0, at, 0]
         for ours, theirs in ((pieces.gnss, recording.gnss[0]), (pieces.truth, fleet.position)):
             np.testing.assert_allclose(ours[row], theirs[at : at + 71, 0] - origin, atol=1e-5, equal_nan=True)
         np.testing.assert_allclose(pieces.velocity[row], recording.velocity[0, at : at + 71, 0], atol=1e-6)
-    assert (len(first.training), len(first.validation)) == (4, 1)
-    assert first.long.truth.shape[1] == 5 * 70 + 1
+    assert (len(first.training), len(first.validation)) == (17, 5)
+    assert first.long.truth.shape[1] == 9 * 70 + 1
 
 
 def test_pieces_are_shorter_where_a_vehicle_would_have_few() -> None:
-    """400 steps with 58 fixes hold no five pieces of 30 fixes, but five of 79 steps; of 100 steps at the least."""
-    drives = MeasuredDrives(*walk(every=7))
-    for piece, steps in ((10, 70), (30, 79), (100, 100)):
+    """1700 steps with 243 fixes hold twenty pieces of 84 steps, not of 30 fixes; they have 100 at the least."""
+    drives = MeasuredDrives(*walk(1700, every=7))
+    for piece, steps in ((10, 70), (30, 84), (100, 100)):
         assert measured_clients(drives, piece=piece)[0].training.truth.shape[1] == steps + 1
 
 

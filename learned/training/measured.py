@@ -23,8 +23,8 @@ from .clients import LONG, Client, Segments, Start, check_pieces
 
 Drives: TypeAlias = "Fleet | MeasuredDrives"
 """What clients are made of: a fleet, whose measurements are simulated, or what was measured."""
-FEWEST = 5
-"""Pieces of a vehicle of which one validates."""
+FEWEST = 20
+"""Pieces of a vehicle, of which four validate: fewer, longer ones hold too few errors that are independent."""
 Cut = tuple[int, int]
 """Run and first step of a piece."""
 
