@@ -98,6 +98,14 @@ def test_guess_finds_the_noise_that_acts(reading: str, shares: tuple[float, floa
     assert (axis, speed) == pytest.approx(shares, abs=0.035)  # a share is never negative, so none is found as a few %
 
 
+def test_guess_finds_the_noise_of_fixes_once_a_second() -> None:
+    """Known: 3.5 m, with odometry at 10 Hz. Each fix is compared with the one before, moved by ten steps."""
+    seen = drive(around(600), V2X(max_neighbours=0), 50)
+    rare = np.where((np.arange(600) % 10 == 0)[:, None, None], seen.gnss, np.nan)
+    found = guess(lanes(rare), lanes(seen.velocity), 0.1).gnss[-1]
+    assert float((2.0 * found).exp().mean().sqrt()) == pytest.approx(3.5, rel=0.07)
+
+
 def test_loss_is_the_log_likelihood_of_the_true_error() -> None:
     given, model = batch(), net()
     theta = flatten([model, model]).double()

@@ -29,6 +29,7 @@ from coopoc.learned.checkpoint import read_card
 from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.okf import scan
 from coopoc.learned.nets.stack import flatten
+from coopoc.learned.recipes import MEASURED, RECIPES, Setting, jobs_of
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.measured import MeasuredDrives, measured_clients
 from coopoc.learned.training.okf_fit import fit_okf
@@ -165,6 +166,16 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
         MeasuredDrives(body, fleet)
     with pytest.raises(InputError, match="a log with its truth"):
         train_all(recording, "nowhere")  # type: ignore[arg-type]
+
+
+def test_the_recursive_gain_takes_larger_steps_on_measured_drives() -> None:
+    """Its recipe takes one step per pass there; the shipped weights keep that."""
+    recording, fleet = walk()
+    measured, simulated = (
+        jobs_of("recursive", Setting(), data)[0].recipe.schedule for data in (MeasuredDrives(recording, fleet), fleet)
+    )
+    assert (simulated, measured) == (RECIPES["recursive"].schedule, MEASURED["recursive"])
+    assert measured.learning_rate > simulated.learning_rate
 
 
 @pytest.fixture(scope="module")
