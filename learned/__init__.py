@@ -19,8 +19,9 @@ from .privacy.secure import SecureAggregation
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
 from .training.clients import Client, Segments, clients
+from .training.drives import MeasuredDrives
 from .training.fit import Fit, fit
-from .training.measured import MeasuredDrives, measured_clients
+from .training.measured import measured_clients
 from .training.okf_fit import fit_okf
 from .training.schedule import Schedule
 

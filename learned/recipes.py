@@ -19,7 +19,8 @@ from coopoc.world.sensors import Sensors, VelocityReading
 from .checkpoint import load
 from .nets.gain import Gain
 from .training.clients import Client, Noise, Start, clients
-from .training.measured import Drives, MeasuredDrives, measured_clients
+from .training.drives import Drives, MeasuredDrives
+from .training.measured import measured_clients
 from .training.schedule import Epoch, Schedule
 
 REVISION = 6

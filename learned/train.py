@@ -20,9 +20,9 @@ from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federated import Plan, federate_many
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
 from .training.clients import Client, Segments, Start
+from .training.drives import Drives, Logged, MeasuredDrives, drives_of
 from .training.fit import Fit, Task, fit_many
 from .training.machine import reporting_on
-from .training.measured import Drives, Logged, MeasuredDrives, drives_of
 from .training.okf_fit import fit_okf_many
 
 

@@ -23,7 +23,7 @@ from .scene import Start, fleet, is_real, start
 if TYPE_CHECKING:
     from coopoc.evaluate.ledger import Ledger
     from coopoc.learned.checkpoint import Checkpoint
-    from coopoc.learned.training.measured import Drives
+    from coopoc.learned.training.drives import Drives
     from coopoc.study.results import Results
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
@@ -67,7 +67,7 @@ def drives(clients: str) -> Drives:
     """What nets are trained on: a fleet, whose measurements are simulated, or of real data its own measurements."""
     if not is_real(clients):
         return fleet(clients)
-    from coopoc.learned.training.measured import drives_of
+    from coopoc.learned.training.drives import drives_of
 
     return drives_of(load_log(clients))
 

@@ -31,7 +31,8 @@ from coopoc.learned.nets.okf import scan
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import MEASURED, RECIPES, Setting, jobs_of
 from coopoc.learned.training.clients import Batch
-from coopoc.learned.training.measured import MeasuredDrives, measured_clients
+from coopoc.learned.training.drives import MeasuredDrives
+from coopoc.learned.training.measured import measured_clients
 from coopoc.learned.training.okf_fit import fit_okf
 
 NETS = (GainNet(2, 1), GainNet(2, 1, magnitudes=True), SplitGain(4), RecursiveGain(4), NoiseNet(4), NoiseParameters())
@@ -161,6 +162,8 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
     assert MeasuredDrives(recording, without_truth(fleet, slice(None), 1), ids=("v0",)).ids == ("v0",)
     with pytest.raises(InputError, match="v0 with 1 pieces of 40"):
         measured_clients(MeasuredDrives(recording, fleet), piece=40)
+    with pytest.raises(InputError, match="has no vehicle that moves"):
+        MeasuredDrives(replace(recording, velocity=0 * recording.velocity), fleet)
     body = observe(fleet, Sensors(), V2X(max_neighbours=0), frame="body")
     with pytest.raises(InputError, match="body frames"):
         MeasuredDrives(body, fleet)

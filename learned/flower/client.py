@@ -16,9 +16,9 @@ from coopoc.fleets import load_fleet, read_log
 from ..federation.local import local_fit
 from ..recipes import Job, job_clients, untrained
 from ..training.clients import Client
+from ..training.drives import drives_of
 from ..training.fit import Judge
 from ..training.machine import one_core
-from ..training.measured import drives_of
 from .job import job_of, local
 from .wire import Report, answer, asked, require_flower
 

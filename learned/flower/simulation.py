@@ -21,8 +21,8 @@ from coopoc.errors import MissingLibraryError
 from ..checkpoint import Checkpoint, load, read_card, save
 from ..recipes import Job, job_clients
 from ..training.clients import Client
+from ..training.drives import Drives
 from ..training.machine import watched
-from ..training.measured import Drives
 from .ask import Wait
 from .client import Source, client_app
 from .rows import Row, checkpoint
