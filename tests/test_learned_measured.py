@@ -13,6 +13,7 @@ import torch
 from filterpy.kalman import KalmanFilter
 
 import coopoc as co
+import coopoc.learned.recipes as recipes
 from coopoc import V2X, Fleet, InputError, Recording, Sensors, observe
 from coopoc.cli import main
 from coopoc.learned import (
@@ -20,6 +21,7 @@ from coopoc.learned import (
     NoiseNet,
     NoiseParameters,
     RecursiveGain,
+    Schedule,
     Segments,
     SplitGain,
     load_method,
@@ -240,3 +242,23 @@ def test_a_log_trains_and_its_rest_scores(log: Path, tmp_path: Path, capsys: pyt
     rest = co.read_log(settings["data"])
     alone = co.rt_le(load_method(file)(rest.recording, ["a", "b"]), rest.truth)
     np.testing.assert_allclose(found.frame[found.frame["method"] == "okf"]["rt_le_m"], alone[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_every_recipe_trains_on_a_log_and_follows_the_rest(
+    name: str, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few steps, with fixes at every fifth step, in one plane: losses and estimates stay finite, and weights move."""
+    quick = replace(RECIPES[name], schedule=Schedule(epochs=4, batch=2, checks=2), rounds=2, local_epochs=1)
+    monkeypatch.setitem(RECIPES, name, quick)
+    monkeypatch.setattr(recipes, "MEASURED", {})
+    whole = co.read_log(log)
+    first, rest = whole.part(until=65), whole.part(since=65)
+    made = train_all(first, tmp_path, recipes=[name], seeds=[0], progress=False)
+    assert len(made) == (2 if name == "individual" else 1)
+    for checkpoint in made.values():
+        assert np.isfinite(checkpoint.card.get("validation_loss", 0.0)).all()
+        assert all(np.isfinite(row["validation_loss"]).all() for row in checkpoint.card.get("history", ()))
+        assert checkpoint.history is None or not torch.equal(checkpoint.history[0], checkpoint.history[-1])
+        track = checkpoint.model.method(name)(rest.recording, ["a", "b"])
+        assert co.rt_le(track, rest.truth).max() < 10.0

@@ -118,8 +118,9 @@ def filtered(
         if whole:
             x = torch.addcmul(x, relative, z - x)
         else:
-            x = torch.where(z.isfinite(), torch.addcmul(x, relative, z - x), x)
-            relative = torch.where(z.isfinite(), relative, p / fix)
+            there = z.isfinite()
+            x = torch.addcmul(x, relative, torch.where(there, z - x, 0.0))
+            relative = torch.where(there, relative, p / fix)
         xs.append(x)
         ps.append(relative * fix)
     return torch.stack(xs), torch.stack(ps)
