@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -28,6 +28,7 @@ from .log_rows import Rows, check_arrivals, stacked, stamped
 from .log_summary import Summary, Tally
 from .log_truth import truth_of
 from .log_vehicle import Vehicle, samples, vehicle
+from .part import parted
 from .scale import check_scale, check_size, check_time
 
 Frame = Literal["world", "body"]
@@ -50,6 +51,15 @@ class Log:
     summary: Summary
     messages: bool
     origin: tuple[float, float, float] | None = None
+
+    def part(self, since: float | None = None, until: float | None = None) -> Log:
+        """The same log from `since` to `until` s after its first step, such as a part to train on and the rest.
+
+        Raises:
+            InputError: a part of fewer than two steps.
+        """
+        truth = parted(self.truth, since, until) if self.truth is not None else None
+        return replace(self, recording=parted(self.recording, since, until), truth=truth)
 
 
 def read_log(

@@ -21,6 +21,7 @@ from .log_links import under
 from .log_summary import Summary
 from .mrclam import read_mrclam
 from .mrclam_recording import recording
+from .part import parted
 from .pyfg_recording import graph_recording
 from .source import split
 
@@ -31,13 +32,14 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     Args:
         name_or_path: tables and NMEA (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of
             `save_recording`; options may stand behind a question mark, as in "drive?dt=0.1".
-        options: of the reader.
+        options: of the reader; of all, since and until, s after the first step, of the part that is kept.
 
     Raises:
         InputError: no such path, an unknown option, or a file with a fault.
     """
     word, given = split(name_or_path)
     path, options = Path(word), {**given, **options}
+    part = {name: options.pop(name, None) for name in ("since", "until")}
     read: Callable[..., Log] = read_log
     if path.suffix == ".npz" and is_recording(path):
         read = _of_file
@@ -46,7 +48,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     elif (path / "Barcodes.dat").is_file():
         read = _of_mrclam
     found: Log = _with(read, path, options)
-    return found
+    return found.part(**part)
 
 
 def format_of(path: Path, columns: Mapping[str, str] | None = None) -> str:
@@ -65,7 +67,9 @@ def recorder(name_or_path: str | Path, format: str) -> Callable[..., Recording]:
     """
     word, options = split(name_or_path)
     if format == "mrclam":
-        return partial(recording, _with(read_mrclam, Path(word), options))
+        part = {name: options.pop(name, None) for name in ("since", "until")}
+        log_of_all = _with(read_mrclam, Path(word), options)
+        return lambda *args, **draws: parted(recording(log_of_all, *args, **draws), **part)
     log = load_log(name_or_path)
     return partial(under, log.recording, logged=log.messages)
 

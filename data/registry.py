@@ -23,6 +23,7 @@ from .carla import read_carla
 from .fcd import read_fcd
 from .log import Log
 from .mrclam import read_mrclam
+from .part import parted
 from .recordings import format_of
 from .recordings import load_log as load_log
 from .recordings import recorder as real_recorder
@@ -81,7 +82,8 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
             CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
             (`load_log`). Options may stand behind a question mark, as in "drive.csv?dt=0.1&columns=t:time".
         format: one of READERS, instead of the one found from name and contents.
-        options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness.
+        options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness; of all, since and
+            until, s after the first step, of the part that is kept.
 
     Raises:
         InputError: an unknown name (the message lists all), an unknown format or option, or a file with a fault.
@@ -91,7 +93,13 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     """
     name, given = split(name_or_path)
     options = {**given, **options}
-    format = options.pop("format", format)
+    part = {option: options.pop(option, None) for option in ("since", "until")}
+    fleet: Fleet = parted(_whole(name, options.pop("format", format), options), **part)
+    return fleet
+
+
+def _whole(name: str, format: str | None, options: dict[str, Any]) -> Fleet:
+    """The fleet of a name, from its first step to its last."""
     if format is None and (in_file(name) or name in names("coopoc.datasets")):
         return _resampled(_made(find("coopoc.datasets", name), name), **options)
     path = Path(name)

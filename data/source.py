@@ -72,6 +72,8 @@ SI = (float, "a number of SI units", "0.1")
 READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
     "dt": SI,
     "max_gap": SI,
+    "since": SI,
+    "until": SI,
     "vehicle_length": SI,
     "vehicles": (int, "a whole number", "4"),
     "any_scale": (_flag, "true or false", "true"),

@@ -13,12 +13,15 @@ from .nets.noise_net import NoiseNet
 from .nets.okf import NoiseParameters, OptimisedKF
 from .nets.recursive import RecursiveFilter, RecursiveGain
 from .nets.split import SplitGain
+from .nets.sums_stream import SumsMeasurement
 from .privacy.differential import Privacy
 from .privacy.secure import SecureAggregation
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
 from .training.clients import Client, Segments, clients
+from .training.drives import MeasuredDrives
 from .training.fit import Fit, fit
+from .training.measured import measured_clients
 from .training.okf_fit import fit_okf
 from .training.schedule import Schedule
 
@@ -33,6 +36,7 @@ __all__ = [
     "Gain",
     "GainNet",
     "LearnedGain",
+    "MeasuredDrives",
     "NoiseNet",
     "NoiseParameters",
     "OptimisedKF",
@@ -47,6 +51,7 @@ __all__ = [
     "Segments",
     "Setting",
     "SplitGain",
+    "SumsMeasurement",
     "clients",
     "federate",
     "fit",
@@ -54,6 +59,7 @@ __all__ = [
     "ledger",
     "load",
     "load_method",
+    "measured_clients",
     "save",
     "train_all",
 ]

@@ -14,12 +14,13 @@ from coopoc.errors import InputError
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find, one_of, unknown
-from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import load
 from .nets.gain import Gain
 from .training.clients import Client, Noise, Start, clients
+from .training.drives import Drives, MeasuredDrives
+from .training.measured import measured_clients
 from .training.schedule import Epoch, Schedule
 
 REVISION = 6
@@ -40,7 +41,7 @@ class Recipe:
         local_epochs: of a federation, per round.
         local_epoch: of a federation, a "pass" through the client's segments or a "step".
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives, "static", "fresh" or "wide".
+        noise: of the training drives, "static", "fresh" or "wide", where it is simulated.
         piece: steps of a segment.
         split: share of the segments that train.
         net: the net, an entry point in `coopoc.nets` or "mine.py:NAME".
@@ -105,6 +106,10 @@ RECIPES: dict[str, Recipe] = {
     ),
 }
 
+MEASURED: dict[str, Schedule] = {"recursive": Schedule(batch=4, learning_rate=0.01, mirror=False)}
+"""Schedules on measured drives in place of the recipe's. In simulation the recursive gain starts at its optimum, and a
+hundred small steps are enough; what is measured has more to teach."""
+
 
 @dataclass(frozen=True)
 class Setting:
@@ -132,7 +137,7 @@ class Job:
         name = f"{Path(path).stem}.{held}" if path else held
         return f"{name}{self.client or ''}-{self.setting.start}-{self.setting.reading}-{self.setting.seed}"
 
-    def key(self, fleet: Fleet) -> str:
+    def key(self, fleet: Drives) -> str:
         """Hash of everything that changes the weights."""
         facts = {
             "recipe": asdict(self.recipe),
@@ -174,7 +179,7 @@ def recipe_of(name: str) -> Recipe:
     return found
 
 
-def jobs_of(name: str, setting: Setting, fleet: Fleet, aggregate: str | None = None) -> list[Job]:
+def jobs_of(name: str, setting: Setting, fleet: Drives, aggregate: str | None = None) -> list[Job]:
     """The checkpoints of a recipe in a setting: one, or one per vehicle of the fleet for individual nets.
 
     Raises:
@@ -185,6 +190,8 @@ def jobs_of(name: str, setting: Setting, fleet: Fleet, aggregate: str | None = N
         if recipe.kind != "federated":
             raise InputError("aggregate", aggregate, f"goes with federations, {name} is {recipe.kind}", "Leave it out.")
         recipe = replace(recipe, aggregate=aggregate)
+    if isinstance(fleet, MeasuredDrives):
+        recipe = replace(recipe, schedule=MEASURED.get(name, recipe.schedule))
     if recipe.kind != "individual":
         return [Job(name, recipe, setting)]
     return [Job(name, recipe, setting, client) for client in range(1, len(fleet.ids) + 1)]
@@ -213,9 +220,12 @@ def load_method(name_or_path: Path | str, net: str = "") -> Method:
     return checkpoint.model.method(str(checkpoint.card.get("recipe", path.stem)))
 
 
-def job_clients(job: Job, fleet: Fleet) -> tuple[Client, ...]:
-    """The vehicles of a fleet as clients, with the noise, the split and the start of the job."""
+def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
+    """The vehicles of a fleet as clients, with the noise, the split and the start of the job; of measured drives with
+    what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
+    if isinstance(fleet, MeasuredDrives):
+        return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
     return clients(
         fleet,
         sensors(setting),

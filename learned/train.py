@@ -14,20 +14,20 @@ import torch
 
 from coopoc.one_file import in_file
 from coopoc.workers import leave_with
-from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federated import Plan, federate_many
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
 from .training.clients import Client, Segments, Start
+from .training.drives import Drives, Logged, MeasuredDrives, drives_of
 from .training.fit import Fit, Task, fit_many
 from .training.machine import reporting_on
 from .training.okf_fit import fit_okf_many
 
 
 def train_all(
-    fleet: Fleet,
+    data: Drives | Logged,
     out: Path | str,
     *,
     seeds: Sequence[int] = range(5),
@@ -45,7 +45,8 @@ def train_all(
     not at all.
 
     Args:
-        fleet: the clients' drives, such as the bundled "town10-clients".
+        data: the clients' drives: a fleet, such as the bundled "town10-clients", whose measurements are simulated, or a
+            log with its truth (`coopoc.read_log`), whose own fixes and odometry train.
         out: folder of the checkpoints.
         seeds: of the settings; every combination with starts and readings is trained.
         starts: of the filter, "gnss" or "true".
@@ -59,8 +60,9 @@ def train_all(
         Checkpoints by label, such as "fedkalmannet-gnss-axis-0".
 
     Raises:
-        InputError: an unknown recipe.
+        InputError: an unknown recipe; a log without a truth.
     """
+    fleet = drives_of(data)
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     wanted = {
         name: [job for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
@@ -88,13 +90,13 @@ def _loaded(job: Job, path: Path) -> Checkpoint:
     return load(path, job.recipe.net if in_file(job.recipe.net) else "")
 
 
-def _train(group: Sequence[Job], fleet: Fleet, out: Path, progress: bool) -> None:
+def _train(group: Sequence[Job], fleet: Drives, out: Path, progress: bool) -> None:
     """Train and save the checkpoints of one recipe."""
     for job, checkpoint in zip(group, trained(group, fleet, progress), strict=True):
         save(out / f"{job.label}.safetensors", checkpoint)
 
 
-def trained(group: Sequence[Job], fleet: Fleet, progress: bool = True) -> list[Checkpoint]:
+def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[Checkpoint]:
     """Checkpoints of jobs of one recipe, trained together now."""
     data = {job.setting: job_clients(job, fleet) for job in group}
     found = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
@@ -104,7 +106,7 @@ def trained(group: Sequence[Job], fleet: Fleet, progress: bool = True) -> list[C
     ]
 
 
-def _in_worker(group: Sequence[Job], fleet: Fleet, out: Path, line: int | None, parent: int) -> None:
+def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, line: int | None, parent: int) -> None:
     leave_with(parent)
     with reporting_on(line or 0):
         _train(group, fleet, out, line is not None)
@@ -118,13 +120,13 @@ def _made(path: Path, key: str) -> bool:
     return path.is_file() and read_card(path).get("key") == key
 
 
-def _card(job: Job, fleet: Fleet, data: Sequence[Client]) -> dict[str, Any]:
+def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
     used = [c for i, c in enumerate(data) if job.client in (None, i + 1)]
     return {
         "key": job.key(fleet),
         "recipe": job.name,
         "settings": asdict(job.recipe) | asdict(job.setting),
-        "noise": asdict(sensors(job.setting)),
+        "noise": "measured" if isinstance(fleet, MeasuredDrives) else asdict(sensors(job.setting)),
         "client": job.client,
         "fleet": fleet.name,
         "digest": fleet.digest,

@@ -87,7 +87,7 @@ def key(p: Params) -> dict[str, str]:
     if p.get("metric"):
         find("coopoc.metrics", p["metric"])
     if p.get("noise_model") == "fitted":
-        found["clients"] = scene.fleet(p["clients"]).digest
+        found["clients"] = weights.drives(p["clients"]).digest
     return found
 
 

@@ -25,9 +25,12 @@ def train(
 
     Example: coopoc train fedkalmannet --seed 0
 
+    Example: coopoc train okf --data "mylog?until=300" --out runs/mylog
+
     Args:
         recipe: a name such as fedkalmannet (see coopoc list), or mine.py:NAME, a recipe or a net of yours.
-        data: fleet of the clients, a name or a path.
+        data: fleet of the clients, a name or a path; of a log with its truth the measured fixes and odometry train,
+            "mylog?until=300" is its first 300 s.
         out: of the checkpoints.
         seed: of noise, split, start and batches.
         start: of the filter in training: the first fix or the true position.
@@ -37,22 +40,23 @@ def train(
         rounds: of a federation on Flower; default: the recipe's.
     """
     from coopoc.errors import InputError
-    from coopoc.fleets import load_fleet
     from coopoc.learned.train import train_all
 
-    fleet = load_fleet(data)
+    from .weights import drives
+
+    clients = drives(data)
     if flower:
         from coopoc.learned import flower as engine
 
         config = {"recipe": recipe, "seed": seed, "start": start, "reading": reading}
         changes = {"rounds": rounds, "aggregate": aggregate}
         changes = {name: value for name, value in changes.items() if value is not None}
-        made = engine.train(engine.job_of(config | changes), fleet, out)
+        made = engine.train(engine.job_of(config | changes), clients, out)
     elif rounds is not None:
         raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
     else:
         made = train_all(
-            fleet, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe], aggregate=aggregate
+            clients, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe], aggregate=aggregate
         )
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")

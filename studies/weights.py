@@ -8,6 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from coopoc.data.registry import load_log
 from coopoc.errors import InputError
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import file_digest, from_file, in_file
@@ -17,11 +18,12 @@ from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, VelocityReading
 from coopoc.world.v2x import V2X
 
-from .scene import Start, fleet, start
+from .scene import Start, fleet, is_real, start
 
 if TYPE_CHECKING:
     from coopoc.evaluate.ledger import Ledger
     from coopoc.learned.checkpoint import Checkpoint
+    from coopoc.learned.training.drives import Drives
     from coopoc.study.results import Results
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
@@ -47,7 +49,7 @@ def seeds(p: Params) -> range:
 
 def trainable(p: Params) -> bool:
     """False for the individual net of a client that is not there."""
-    return p["method"] not in INDIVIDUAL[len(fleet(p["clients"]).ids) :]
+    return p["method"] not in INDIVIDUAL[len(drives(p["clients"]).ids) :]
 
 
 def is_trained(name: str) -> bool:
@@ -58,6 +60,16 @@ def is_trained(name: str) -> bool:
 def key(name: str, p: Params) -> str:
     """Hash of everything that changes the weights of a method, known before any training."""
     return hashlib.sha256("".join(_job(name, p, seed)[1] for seed in seeds(p)).encode()).hexdigest()
+
+
+@lru_cache(maxsize=4)
+def drives(clients: str) -> Drives:
+    """What nets are trained on: a fleet, whose measurements are simulated, or of real data its own measurements."""
+    if not is_real(clients):
+        return fleet(clients)
+    from coopoc.learned.training.drives import drives_of
+
+    return drives_of(load_log(clients))
 
 
 def _recipe(name: str) -> str:
@@ -80,8 +92,8 @@ def _jobs(recipe: str, digest: str, clients: str, setting: Setting) -> list[tupl
     from coopoc.learned.recipes import Setting as Trained
     from coopoc.learned.recipes import jobs_of
 
-    drives = fleet(clients)
-    return [(job.label, job.key(drives)) for job in jobs_of(recipe, Trained(*setting), drives)]
+    data = drives(clients)
+    return [(job.label, job.key(data)) for job in jobs_of(recipe, Trained(*setting), data)]
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
@@ -94,7 +106,7 @@ def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
         from coopoc.learned.train import train_all
 
         train_all(
-            fleet(clients),
+            drives(clients),
             folder,
             seeds=range(count),
             starts=sorted({start(p) for p in asking}),
@@ -131,9 +143,11 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 
 @lru_cache
 def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
-    drives = fleet(clients)
-    acting = Sensors.paper_training(reading)
-    return NoiseModel.fitted(observe(drives, acting, V2X(max_neighbours=0), seed=0), drives)
+    if is_real(clients):
+        log = load_log(clients)
+        return NoiseModel.fitted(log.recording, fleet(clients))
+    acting, moving = Sensors.paper_training(reading), fleet(clients)
+    return NoiseModel.fitted(observe(moving, acting, V2X(max_neighbours=0), seed=0), moving)
 
 
 def trained(results: Results) -> list[str]:
@@ -194,5 +208,5 @@ def _nets(card: Mapping[str, Any], count: int) -> str:
 
 
 def fitted(p: Params) -> NoiseModel:
-    """Noise fitted on the recording that the nets of training seed 0 saw."""
+    """Noise fitted on the recording that the nets of training seed 0 saw, or on the measurements of real data."""
     return _fitted(p["clients"], p["velocity_reading"])

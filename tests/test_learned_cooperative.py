@@ -17,7 +17,8 @@ from coopoc.evaluate.metrics import nees_inside
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.federation.federated import federate
 from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
-from coopoc.learned.nets.noise_net import NoiseFilter, NoiseNet, Variances, filtered, guess, lanes
+from coopoc.learned.nets.noise_guess import guess
+from coopoc.learned.nets.noise_net import NoiseFilter, NoiseNet, Variances, filtered, lanes
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch, clients
 from coopoc.learned.training.schedule import Schedule
@@ -95,6 +96,14 @@ def test_guess_finds_the_noise_that_acts(reading: str, shares: tuple[float, floa
     r, axis, speed = (getattr(found, name)[-1].exp().mean().item() for name in ("gnss", "axis", "speed"))
     assert r == pytest.approx(3.5, rel=0.03)
     assert (axis, speed) == pytest.approx(shares, abs=0.035)  # a share is never negative, so none is found as a few %
+
+
+def test_guess_finds_the_noise_of_fixes_once_a_second() -> None:
+    """Known: 3.5 m, with odometry at 10 Hz. Each fix is compared with the one before, moved by ten steps."""
+    seen = drive(around(600), V2X(max_neighbours=0), 50)
+    rare = np.where((np.arange(600) % 10 == 0)[:, None, None], seen.gnss, np.nan)
+    found = guess(lanes(rare), lanes(seen.velocity), 0.1).gnss[-1]
+    assert float((2.0 * found).exp().mean().sqrt()) == pytest.approx(3.5, rel=0.07)
 
 
 def test_loss_is_the_log_likelihood_of_the_true_error() -> None:
@@ -252,7 +261,7 @@ def test_zero_noise_is_zero_error(crossing: Fleet) -> None:
 def test_bytes_are_those_of_what_arrived(crossing: Fleet) -> None:
     seen = drive(crossing, V2X(4, loss=0.5), observers=[2])
     assert CooperativeGain(net())(seen, [2]).received_bytes[:, 0].tolist() == [
-        56 * (row[seen.links.of(2)] >= 0).sum() for row in seen.arrival
+        68 * (row[seen.links.of(2)] >= 0).sum() for row in seen.arrival
     ]
 
 

@@ -225,7 +225,7 @@ def test_descent_is_that_of_torch() -> None:
     """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the reference; other rows stay, and so does a
     row whose loss is not finite."""
     nets, data = [GainNet(2, 1, seed=s).double() for s in range(4)], batch(3, 3, 12, gaps=0.2)
-    data.truth[:, 1] = torch.nan
+    data.truth[:, 1] = torch.inf
     state, schedule = moving(nets), Schedule(weight_decay=0.3, l2=0.1, proximal=0.2, clip=0.5)
     started, rates = state.theta.clone(), np.array([1e-2, 2e-2, 3e-2])
     leaves = {0: nets[0], 2: nets[3]}

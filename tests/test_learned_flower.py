@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
+from logs import long, seen, write
 from torch import Tensor
 
 from coopoc import Fleet, InputError, load_fleet
@@ -253,6 +255,25 @@ def test_a_node_must_say_which_drive_is_its_own(tmp_path: Path) -> None:
     own["vehicle"] = "c1"
     client, job = configured(Context(1, 1, own, RecordDict(), TINY))
     assert (client.name, job) == ("c1", job_of(TINY))
+
+
+def test_a_node_may_train_on_what_it_measured(tmp_path: Path) -> None:
+    """The node's client has the fixes of its log, to a digit of float32."""
+    from flwr.app import Context, RecordDict
+
+    from coopoc.learned.flower.client import configured
+
+    fleet = drives(2)
+    recording = seen(fleet, 0)
+    write(long(recording), tmp_path / "measurements.csv")
+    there, column = np.nonzero(fleet.present)
+    truth = {"t": fleet.t[there], "vehicle": [fleet.ids[c] for c in column]}
+    truth |= dict(zip("xyz", fleet.position[there, column].T, strict=True))
+    write(pd.DataFrame(truth), tmp_path / "truth.csv")
+    client, job = configured(Context(1, 1, {"log": str(tmp_path), "vehicle": "c1"}, RecordDict(), TINY))
+    steps = job.recipe.piece + 1
+    fixes = recording.gnss[0, :steps, 1]
+    np.testing.assert_allclose(client.training.gnss[0], fixes - fixes[0], atol=1e-4)
 
 
 def test_one_vehicle_alone_has_the_pieces_that_it_has_in_the_fleet() -> None:

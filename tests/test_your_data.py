@@ -47,7 +47,7 @@ def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_every_command_runs(folder: Path) -> None:
     commands = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(commands) == 5
+    assert len(commands) == 7
     for command in commands[1:]:
         done = subprocess.run([*COOPOC, *words(command)[1:]], cwd=folder, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr

@@ -70,7 +70,8 @@ class NoiseModel:
         """Per-axis standard deviations of a training recording against its truth.
 
         process: rms of x_t - x_{t-1} - dt u_t, at least dt times the velocity floor; GNSS: rms of z_t - x_t. Relative
-        measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them.
+        measurements keep the data sheet's figures: the training vehicles drive alone and cannot estimate them; so do
+        fixes on an axis without any error, as the height of a drive in one plane is.
 
         Args:
             recording: of the training vehicles.
@@ -80,6 +81,7 @@ class NoiseModel:
         floor = recording.dt * recording.sensors.velocity_floor
         process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)
         gnss = np.sqrt(np.nanmean((recording.gnss - fleet.position) ** 2, axis=(0, 1, 2)))
+        gnss = np.where(gnss > 0, gnss, recording.sensors.gnss_std)
         return cls("fitted", recording.sensors, _three(process), _three(gnss))
 
     def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:

@@ -70,16 +70,24 @@ def _copy(x: Floats, target: Floats, r: Index) -> None:
 
 @part
 def _score(x: Floats, truth: Floats, r: Index) -> float:
-    """Squared error m^2 of x[:, r], mean over time and lanes, sum over components; x becomes its gradient in x.
+    """Squared error m^2 of x[:, r], mean over the steps with a truth, then over lanes, sum over components; x becomes
+    its gradient in x, 0 where the truth is not known (NaN).
 
     Summed in one order, so that a result does not depend on the other models.
     """
-    share, total = 1.0 / (x.shape[0] * x.shape[2]), 0.0
-    scale = x.dtype.type(2.0 * share)
-    for t in range(x.shape[0]):
-        for b in range(x.shape[2]):
+    total = 0.0
+    for b in range(x.shape[2]):
+        known, squares = 0, 0.0
+        for t in range(x.shape[0]):
+            known += not np.isnan(truth[t, r, b, 0])
+        share = 1.0 / (max(known, 1) * x.shape[2])
+        scale = x.dtype.type(2.0 * share)
+        for t in range(x.shape[0]):
             for i in range(3):
                 error = x[t, r, b, i] - truth[t, r, b, i]
+                if np.isnan(truth[t, r, b, i]):
+                    error = x.dtype.type(0.0)
                 x[t, r, b, i] = scale * error
-                total += error * error
-    return float(total * share)
+                squares += error * error
+        total += share * squares
+    return float(total)

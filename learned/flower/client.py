@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, TypeAlias
 from torch import Tensor
 
 from coopoc.errors import InputError
-from coopoc.fleets import load_fleet
+from coopoc.fleets import load_fleet, read_log
 
 from ..federation.local import local_fit
 from ..recipes import Job, job_clients, untrained
 from ..training.clients import Client
+from ..training.drives import drives_of
 from ..training.fit import Judge
 from ..training.machine import one_core
 from .job import job_of, local
@@ -55,16 +56,18 @@ def client_app(source: Source | None = None) -> ClientApp:
 
 
 def configured(context: Context) -> tuple[Client, Job]:
-    """The vehicle by the node's own configuration, `data` (a name or a path) and `vehicle` (an id, not needed if the
-    data hold one vehicle), and the job by the run's. Drives of other vehicles are not used.
+    """The vehicle by the node's own configuration, `data` (a name or a path of a fleet, whose measurements are
+    simulated) or `log` (a path of measurements with their truth), and `vehicle` (an id, not needed if the data hold one
+    vehicle), and the job by the run's. Drives of other vehicles are not used.
 
     Raises:
-        InputError: no data, or several vehicles and no `vehicle`.
+        InputError: no data, or several vehicles and no `vehicle`; a log without a truth.
     """
     own = context.node_config
-    if "data" not in own:
-        raise InputError("data", "missing", "must name a fleet or a file", "Start the SuperNode with --node-config.")
-    fleet = load_fleet(str(own["data"]))
+    if "data" not in own and "log" not in own:
+        hint = "Start the SuperNode with --node-config."
+        raise InputError("data", "missing", "must name a fleet or a file; or log one's measurements", hint)
+    fleet = drives_of(read_log(str(own["log"])) if "log" in own else load_fleet(str(own["data"])))
     vehicle = own.get("vehicle", fleet.ids[0] if len(fleet.ids) == 1 else None)
     if vehicle is None:
         raise InputError("vehicle", "missing", f"must be one of {len(fleet.ids)} ids", "Add it to --node-config.")

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coopoc.errors import MissingLibraryError
-from coopoc.world.fleet import Fleet
 
 from ..checkpoint import Checkpoint, load, read_card, save
 from ..recipes import Job, job_clients
 from ..training.clients import Client
+from ..training.drives import Drives
 from ..training.machine import watched
 from .ask import Wait
 from .client import Source, client_app
@@ -43,7 +43,7 @@ QUIET = {
 }
 
 
-def train(job: Job, fleet: Fleet, out: Path | str, progress: bool = True) -> dict[str, Checkpoint]:
+def train(job: Job, fleet: Drives, out: Path | str, progress: bool = True) -> dict[str, Checkpoint]:
     """`simulate` and write the checkpoint, or read it from `out` if the same job is there.
 
     Args:
@@ -65,7 +65,7 @@ def train(job: Job, fleet: Fleet, out: Path | str, progress: bool = True) -> dic
     return {job.label: load(path)}
 
 
-def simulate(job: Job, fleet: Fleet, progress: str | None = None, processes: int = 2) -> Checkpoint:
+def simulate(job: Job, fleet: Drives, progress: str | None = None, processes: int = 2) -> Checkpoint:
     """The checkpoint of a federation on Flower's simulation engine, with the weights of `federate`.
 
     Args:
@@ -99,7 +99,7 @@ def simulate(job: Job, fleet: Fleet, progress: str | None = None, processes: int
     return replace(made, model=made.model.calibrate([client.training for client in job_clients(job, fleet)]), card=card)
 
 
-def partition(context: Context, fleet: Fleet, job: Job) -> tuple[Client, Job]:
+def partition(context: Context, fleet: Drives, job: Job) -> tuple[Client, Job]:
     """The vehicle of the fleet that is this virtual node."""
     return job_clients(job, fleet)[int(context.node_config["partition-id"])], job
 

@@ -11,19 +11,24 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.egos import Estimate, follow_egos
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.star import assumptions, measurements
+from coopoc.methods.star import assumptions, measurements, relative_noise
+from coopoc.methods.stream import alone
 from coopoc.methods.track import Track
 from coopoc.world.inbox import Inbox
 from coopoc.world.recording import Recording
+from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import Message
 
 from .noise_net import NoiseNet, estimate_noise
 from .star_gain import follow
+from .sums_stream import SumsMeasurement as SumsMeasurement
+from .sums_stream import SumsStream, model_noise, net_noise
 
 NEWEST = Message("fix, velocity and noise", 14)
 """Fix (3), velocity (3), the variance of each (6), id and time (2)."""
-SUMS = Message("sums since departure", 14, cumulative=True)
-"""Motion (3), its variance (3), 1/r (3) and (fix - motion)/r (3), each summed since departure; id and time (2)."""
+SUMS = Message("sums since departure", 17, cumulative=True)
+"""Motion (3), its variance (3), 1/r (3) and (fix - motion)/r (3), each summed since departure; r of now (3); id and
+time (2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,7 @@ class CooperativeGain:
         name: in tables.
 
     >>> CooperativeGain(NoiseNet()).message.payload
-    56
+    68
     """
 
     noise: NoiseNet | NoiseModel
@@ -99,6 +104,30 @@ class CooperativeGain:
     def message(self) -> Message:
         """The message that each vehicle broadcasts."""
         return SUMS if self.sums else NEWEST
+
+    def start(self, sensors: Sensors | None = None) -> SumsStream:
+        """The filter as a stream: `step(gnss, velocity, dt, neighbours=[...])`, and then `message` to broadcast.
+
+        Args:
+            sensors: whose noise of range and angles is assumed; default `Sensors()`. A NoiseModel has its own.
+
+        Raises:
+            InputError: `sums=False`; sensors beside a NoiseModel.
+
+        >>> ego, other = (CooperativeGain(NoiseNet()).start() for _ in range(2))
+        >>> _ = other.step([10.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+        >>> seen = SumsMeasurement("b", [9.0, 0.0, 1.5707963], other.message)
+        >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
+        >>> float(x[0].round(2)), float(ego.neighbours["b"][0].round(2))  # 10 m apart by the fixes, 9 m as measured
+        (0.46, 9.54)
+        """
+        if not self.sums:
+            raise InputError("sums", False, "must be True for a stream", "JointFilter streams newest fixes.")
+        if isinstance(self.noise, NoiseNet):
+            return SumsStream(net_noise(self.noise), *relative_noise(NoiseModel.nominal(sensors or Sensors())))
+        if sensors is not None:
+            raise InputError("sensors", sensors, "are those of the NoiseModel", "Leave them out.")
+        return SumsStream(model_noise(alone(self.noise)), *relative_noise(alone(self.noise)))
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and their neighbours.

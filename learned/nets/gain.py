@@ -7,7 +7,8 @@ A net of your own is one class in one file. Subclass `Recurrent` and write
     step(memory, gnss, velocity, dt) -> (memory, gain)
 
 and everything else follows: the training loss, a rollout of many nets, the method (Recording -> Track), the stream.
-Where the loss or the method differs, subclass `Gain` and write `losses(theta, batch)` and `method(name, x0)`.
+Where the loss or the method differs, subclass `Gain` and write `losses(theta, batch)` and `method(name, x0)`. The truth
+of a batch is NaN where it is not known; `error`, `known` and `over_time` leave these steps out.
 Arguments of the constructor that are kept as attributes of the same name make the net again from a checkpoint.
 """
 
@@ -139,7 +140,7 @@ class Recurrent(Gain):
             arXiv 2411.05847, equation 7.
         """
         x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return over_time((x - batch.truth).square().sum(-1))
+        return over_time(error(x, batch.truth).square().sum(-1), known(batch.truth))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
@@ -166,6 +167,33 @@ def _arguments(kind: type[Gain]) -> tuple[str, ...]:
     return tuple(inspect.signature(kind).parameters)
 
 
-def over_time(losses: Tensor) -> Tensor:
-    """Mean (S, B) of losses (T, S, B), summed in an order that does not depend on the number of rows."""
-    return losses.movedim(0, -1).contiguous().mean(-1)
+def error(x: Tensor, truth: Tensor) -> Tensor:
+    """x - truth m, and 0, with a gradient of 0, where the truth is not known (NaN).
+
+    >>> error(torch.ones(2), torch.tensor([3.0, torch.nan])).tolist()
+    [-2.0, 0.0]
+    """
+    return torch.where(truth.isfinite(), x - truth, 0.0)
+
+
+def over_axes(terms: Tensor, truth: Tensor) -> Tensor:
+    """Sum (...) of the terms (..., 3) of a loss over the components whose truth (..., 3) is known."""
+    return torch.where(truth.isfinite(), terms, 0.0).sum(-1)
+
+
+def known(truth: Tensor) -> Tensor:
+    """(...) whether a true position (..., 3) is known."""
+    return truth[..., 0].isfinite()
+
+
+def over_time(values: Tensor, counted: Tensor) -> Tensor:
+    """Mean (...) over time of the values (T, ...) that are counted (T, ...), in an order that does not depend on the
+    number of rows; 0 where none is.
+
+    >>> over_time(torch.tensor([1.0, 2.0, 6.0]), torch.tensor([True, False, True])).item()
+    3.5
+    """
+    rows, there = values.movedim(0, -1).contiguous(), counted.movedim(0, -1)
+    if there.all():
+        return rows.mean(-1)
+    return torch.where(there, rows, 0.0).sum(-1) / there.sum(-1).clamp(min=1)

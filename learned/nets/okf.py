@@ -23,7 +23,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core
-from .gain import Gain, over_time
+from .gain import Gain, error, known, over_time
 from .stack import flatten
 
 
@@ -127,7 +127,7 @@ class NoiseParameters(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each segment, mean over time, sum over components, m^2."""
         x, _ = scan(self.stds(theta), batch)
-        return over_time((x - batch.truth).square().sum(-1))
+        return over_time(error(x, batch.truth).square().sum(-1), known(batch.truth))
 
     def method(self, name: str, x0: Floats | None = None) -> OptimisedKF:
         """`OptimisedKF` with these parameters."""
@@ -140,16 +140,26 @@ class NoiseParameters(Gain):
 
         Of each client's segments it needs the mean square per axis only: three numbers per client.
         """
-        squares = torch.zeros(3)
+        squares, pieces = torch.zeros(3), sum(map(len, parts))
         for segments in parts:
             drawn = [torch.Generator().manual_seed(0)]
             seen = scan(self.stds(flatten([self])), segments.batch(torch.arange(len(segments))[None], drawn))[1]
-            squares += seen.square().mean(0).sum((0, 1))
-        return self.with_logs(self.logs + (squares / sum(map(len, parts))).sqrt().log())
+            squares += over_time(seen.square(), seen.isfinite()).sum((0, 1))
+        return self.with_logs(self.logs + log_scale(squares / pieces))
+
+
+def log_scale(squares: Tensor) -> Tensor:
+    """Logarithm of the std whose square is the mean of normalised innovations; 0 on an axis that has none.
+
+    >>> log_scale(torch.tensor([1.0, 0.0])).tolist()
+    [0.0, 0.0]
+    """
+    return 0.5 * torch.where(squares > 0.0, squares, 1.0).log()
 
 
 def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Estimates m and normalised innovations (T, S, B, 3) of filters with a, b, r (S, 3 kinds, 3 axes)."""
+    """Estimates m and normalised innovations (T, S, B, 3) of filters with a, b, r (S, 3 kinds, 3 axes); where a fix is
+    missing the filter predicts, and the innovation is NaN."""
     process, ratio, gnss_std = stds.unsqueeze(2).unbind(1)
     noise, x = gnss_std.square(), batch.x0
     variance = noise if batch.known is None else noise * (~batch.known)[..., None]
@@ -157,9 +167,10 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     motions = process.square() + (ratio * batch.dt * batch.velocity).square()
     for fix, speed, motion in zip(batch.gnss.unbind(), batch.velocity.unbind(), motions.unbind(), strict=True):
         variance = variance + motion
-        gain = variance / (variance + noise)
+        there = fix.isfinite()
+        gain = torch.where(there, variance / (variance + noise), 0.0)
         innovation = fix - x - batch.dt * speed
-        x = x + batch.dt * speed + gain * innovation
+        x = x + batch.dt * speed + gain * torch.where(there, innovation, 0.0)
         normalised.append(innovation / (variance + noise).sqrt())
         variance = (1.0 - gain) * variance
         estimates.append(x)

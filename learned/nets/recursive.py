@@ -21,7 +21,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 from ..method import divergence
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain, over_time, seed_of, size
+from .gain import Gain, error, known, over_axes, over_time, seed_of, size
 from .levels import FEATURES, GNSS_STD, STILL, Levels, after, first, noise
 from .recursive_kernel import HEADS, LIMIT, rollout
 
@@ -73,7 +73,9 @@ class RecursiveGain(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) negative log-likelihood of the true error without its constant, mean over time, sum over axes."""
         x, variance = self.rollout(theta, batch)
-        return over_time(0.5 * ((x - batch.truth).square() / variance + variance.log()).sum(-1))
+        squares = error(x, batch.truth).square()
+        terms = over_axes(0.5 * (squares / variance + variance.log()), batch.truth)
+        return over_time(terms, known(batch.truth))
 
     def rollout(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """Estimates m and variances m^2 (T, S, B, 3) of S nets theta (S, P), differentiable in theta."""

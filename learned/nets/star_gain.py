@@ -97,16 +97,22 @@ def at(values: AnyArray, run: int, t: int, k: int, axis: int) -> float:
 
 @inside
 def enter(account: AnyArray, seen: Measurements, known: Assumptions, run: int, t: int, k: int) -> None:
-    """Add a step to the sums of a vehicle; what is missing adds nothing."""
+    """Add a step to the sums of a vehicle."""
     for c in range(3):
-        step, q = seen.dt * seen.velocity[run, t, k, c], at(known.process, run, t, k, c)
-        fix, r = seen.gnss[run, t, k, c], at(known.fixes, run, t, k, c)
-        if not np.isnan(fix):
-            account[6 + c] += 1.0 / r
-            account[9 + c] += (fix - account[c] - step) / r
-        if not np.isnan(step):
-            account[c] += step
-            account[3 + c] += q
+        motion = seen.dt * seen.velocity[run, t, k, c], at(known.process, run, t, k, c)
+        add_step(account, motion, (seen.gnss[run, t, k, c], at(known.fixes, run, t, k, c)), c)
+
+
+@inside
+def add_step(account: AnyArray, motion: Any, fix: Any, c: int) -> None:
+    """Add to the sums of an axis a motion m and its variance m^2, and a fix m and its; NaN adds nothing."""
+    (step, q), (z, r) = motion, fix
+    if not np.isnan(z):
+        account[6 + c] += 1.0 / r
+        account[9 + c] += (z - account[c] - step) / r
+    if not np.isnan(step):
+        account[c] += step
+        account[3 + c] += q
 
 
 @inner

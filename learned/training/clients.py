@@ -32,8 +32,8 @@ DRAWS = 8
 
 
 class Batch(NamedTuple):
-    """Input of S models, B segments each: gnss, velocity, truth (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is
-    the truth (S, B), None if it never is."""
+    """Input of S models, B segments each: gnss, NaN where a fix is missing, velocity, truth, NaN where it is not known
+    and no loss counts (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is the truth (S, B), None if it never is."""
 
     gnss: Tensor
     velocity: Tensor
@@ -45,7 +45,7 @@ class Batch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Segments:
-    """n sub-trajectories of T steps after a start sample, in float32, each relative to its first true position.
+    """n sub-trajectories of T steps after a start sample, in float32, each relative to an origin near it.
 
     Args:
         gnss: (n, T + 1, 3) m; sample 0 only starts the filter.
@@ -56,8 +56,8 @@ class Segments:
         velocity_std: (n, T + 1, 3) m/s of the noise, for new draws.
         true_start: (n,) whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
         dt: s.
-        noise: "static" was drawn once; "fresh" is drawn anew at every use; "wide" too, and then every use of a
-            piece also draws how large its noise is, log-uniformly between the factors `WIDE`.
+        noise: "static" was drawn once, or measured; "fresh" is drawn anew at every use; "wide" too, and then every use
+            of a piece also draws how large its noise is, log-uniformly between the factors `WIDE`.
     """
 
     gnss: Tensor
@@ -204,8 +204,7 @@ def clients(
     """
     for name, value, allowed in (("noise", noise, get_args(Noise)), ("start", start, get_args(Start))):
         one_of(name, value, allowed)
-    if piece < 2 or not 0 < split < 1:
-        raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
+    check_pieces(piece, split)
     sensors = sensors or Sensors.paper_training()
     if noise != "static" and (sensors.gnss_bias[1] > 0 or sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0):
         given = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std)
@@ -234,6 +233,12 @@ def clients(
         training, validation = pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]) * uses)
         found.append(Client(name, training, validation, long.take([*range(len(long))] * uses)))
     return tuple(found)
+
+
+def check_pieces(piece: int, split: float) -> None:
+    """InputError unless drives can be cut into pieces so long, of which this share trains."""
+    if piece < 2 or not 0 < split < 1:
+        raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
 
 
 def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise: Noise, start: Start) -> Segments:

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from coopoc.world.noise import stream
 
-from ..nets.okf import NoiseParameters, OptimisedKF, scan
+from ..nets.gain import error, known, over_time
+from ..nets.okf import NoiseParameters, OptimisedKF, log_scale, scan
 from .clients import Batch, Segments
 from .machine import one_core, watched
 from .schedule import generator
@@ -79,7 +80,7 @@ def fit_okf_many(
         adam.step()
         fall.step()
     with torch.no_grad():
-        best = best.view(-1, 3, 3) + _calibration(like.stds(best), *data)[:, None].log()
+        best = best.view(-1, 3, 3) + _calibration(like.stds(best), *data)[:, None]
     seconds = (time.perf_counter() - began) / len(tasks)
     return [
         OkfFit(like.with_logs(row), tuple(h), seconds) for row, h in zip(best, zip(*history, strict=True), strict=True)
@@ -103,11 +104,11 @@ def _stacked(parts: Sequence[Segments], kind: str) -> tuple[Batch, Tensor]:
 
 def _loss(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
     """(S,) mean over pieces and time of the squared error, m^2."""
-    error = scan(numbers, batch)[0] - batch.truth
-    return (error.square().sum(-1).mean(0) * weight).sum(1)
+    squares = error(scan(numbers, batch)[0], batch.truth).square().sum(-1)
+    return (over_time(squares, known(batch.truth)) * weight).sum(1)
 
 
 def _calibration(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
-    """(S, 3) factor per axis that gives the normalised innovations unit variance."""
+    """(S, 3) logarithm of the factor per axis that gives the normalised innovations unit variance."""
     normalised = scan(numbers, batch)[1]
-    return (normalised.square().mean(0) * weight[..., None]).sum(1).sqrt()
+    return log_scale((over_time(normalised.square(), normalised.isfinite()) * weight[..., None]).sum(1))
