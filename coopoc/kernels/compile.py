@@ -86,16 +86,19 @@ def _announcing() -> None:
     event.register("numba:compile", Announcer())
 
 
-def _made(function: Function, liberties: set[str], **options: Any) -> Any:
+def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
     import numba
 
+    from .pipeline import Kernel, Part
+
     _announcing()
+    options["pipeline_class"] = Part if part else Kernel
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
 
 
 def _within(function: Function, liberties: set[str], **options: bool) -> Function:
     """Without wrappers for callers from Python, and without counts of references."""
-    made = _made(function, liberties, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
+    made = _made(function, liberties, True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
     return cast(Function, made)
 
 
