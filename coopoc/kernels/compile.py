@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 from collections.abc import Callable
@@ -61,12 +62,13 @@ PATIENCE = 2.0
 
 
 @cache
-def _announcing() -> None:
-    """Report a kernel that compiles for more than PATIENCE seconds, while it compiles."""
+def _watching() -> None:
+    """While a kernel compiles collect no garbage, which a tenth of the time would go to; report it after PATIENCE."""
     from numba.core import event
 
-    class Announcer(event.Listener):
+    class Watcher(event.Listener):
         depth = 0
+        collects = True
         timer: threading.Timer
 
         def on_start(self, event: Any) -> None:
@@ -77,13 +79,17 @@ def _announcing() -> None:
                 self.timer = threading.Timer(PATIENCE, sys.stderr.write, [line])
                 self.timer.daemon = True
                 self.timer.start()
+                self.collects = gc.isenabled()
+                gc.disable()
 
         def on_end(self, event: Any) -> None:
             self.depth -= 1
             if self.depth == 0:
                 self.timer.cancel()
+                if self.collects:
+                    gc.enable()
 
-    event.register("numba:compile", Announcer())
+    event.register("numba:compile", Watcher())
 
 
 def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
@@ -91,7 +97,7 @@ def _made(function: Function, liberties: set[str], part: bool = False, **options
 
     from .pipeline import Kernel, Part
 
-    _announcing()
+    _watching()
     options["pipeline_class"] = Part if part else Kernel
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
 

@@ -10,11 +10,12 @@ from typing import Any
 
 from numba import _dynfunc
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import PassManager, register_pass
-from numba.core.typed_passes import InlineOverloads, NativeLowering, NoPythonBackend
+from numba.core.typed_passes import InlineOverloads, NativeLowering, NopythonRewrites
 from numba.core.untyped_passes import (
     FindLiterallyCalls,
+    InlineClosureLikes,
     LiteralPropagationSubPipelinePass,
     LiteralUnroll,
     MakeFunctionToJitFunction,
@@ -27,35 +28,27 @@ UNUSED = {
     RewriteDynamicRaises,
     MakeFunctionToJitFunction,
     FindLiterallyCalls,
+    InlineClosureLikes,
     LiteralUnroll,
     LiteralPropagationSubPipelinePass,
     InlineOverloads,
+    NopythonRewrites,
 }
 """Passes for `with`, exceptions made at run time, closures, and loops over tuples of several types."""
 
 
-class Passes(PassManager):
-    """Passes that are not checked one by one: to analyse the text anew after each takes longer than most of them."""
+class KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Instructions that are optimised once, when everything that they call stands beside them."""
 
-    _ENFORCING = False
+    def _optimize_functions(self, ll_module: Any) -> None:
+        ll_module.data_layout = self._codegen._data_layout
 
-
-class Kernel(CompilerBase):  # type: ignore[misc]
-    """How a function that Python calls is compiled."""
-
-    lowering: type = NativeLowering
-
-    def define_pipelines(self) -> list[Passes]:
-        """The passes."""
-        passes = Passes("kernel")
-        for each, why in DefaultPassBuilder.define_nopython_pipeline(self.state).passes:
-            if each not in UNUSED:
-                passes.add_pass(self.lowering if each is NativeLowering else each, why)
-        passes.finalize()
-        return [passes]
+    def _optimize_final_module(self) -> None:
+        passes, builder = self._codegen._module_pass_manager()
+        passes.run(self._final_module, builder)
 
 
-class PartLibrary(JITCodeLibrary):  # type: ignore[misc]
+class PartLibrary(KernelLibrary):
     """Instructions that wait for a caller: neither optimised nor made machine code."""
 
     def _optimize_final_module(self) -> None:
@@ -74,7 +67,6 @@ class PartLowering(NativeLowering):  # type: ignore[misc]
 
     def run_pass(self, state: Any) -> bool:
         """Leave the result in `state.cr`."""
-        state.library = PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.flags.no_compile = True
         super().run_pass(state)
         found, name = state.cr, state.func_id.func_name
@@ -84,7 +76,40 @@ class PartLowering(NativeLowering):  # type: ignore[misc]
         return True
 
 
+class KernelFlags(Flags):  # type: ignore[misc]
+    """Options that are compared by what was set of them: numba looks them up for every operation that it types."""
+
+    def __hash__(self) -> int:
+        return hash(tuple(self._values))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, KernelFlags) and self._values == other._values
+
+
+class Kernel(CompilerBase):  # type: ignore[misc]
+    """How a function that Python calls is compiled."""
+
+    library: type = KernelLibrary
+    lowering: type = NativeLowering
+
+    def _compile_core(self) -> Any:
+        self.state.flags = KernelFlags(self.state.flags)
+        return super()._compile_core()
+
+    def define_pipelines(self) -> list[PassManager]:
+        """The passes, each once."""
+        self.state.library = self.library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library.enable_object_caching()
+        passes = PassManager("kernel")
+        for each, why in dict(reversed(DefaultPassBuilder.define_nopython_pipeline(self.state).passes)).items():
+            if each not in UNUSED:
+                passes.passes.insert(0, (self.lowering if each is NativeLowering else each, why))
+        passes.finalize()
+        return [passes]
+
+
 class Part(Kernel):
     """How a function that only compiled ones call is compiled."""
 
+    library = PartLibrary
     lowering = PartLowering
