@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from numba import _dynfunc
+from numba._dynfunc import make_function
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_machinery import PassManager, register_pass
@@ -37,7 +37,7 @@ UNUSED = {
 """Passes for `with`, exceptions made at run time, closures, and loops over tuples of several types."""
 
 
-class KernelLibrary(JITCodeLibrary):  # type: ignore[misc]
+class KernelLibrary(JITCodeLibrary):
     """Instructions that are optimised once, when everything that they call stands beside them."""
 
     def _optimize_functions(self, ll_module: Any) -> None:
@@ -55,12 +55,12 @@ class PartLibrary(KernelLibrary):
         pass
 
     def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()
+        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
         self._finalized = True
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
-class PartLowering(NativeLowering):  # type: ignore[misc]
+class PartLowering(NativeLowering):
     """Translates a part, and makes it known to its callers."""
 
     _name = "part_lowering"
@@ -68,15 +68,15 @@ class PartLowering(NativeLowering):  # type: ignore[misc]
     def run_pass(self, state: Any) -> bool:
         """Leave the result in `state.cr`."""
         state.flags.no_compile = True
-        super().run_pass(state)
+        super().run_pass(state)  # type: ignore[no-untyped-call]
         found, name = state.cr, state.func_id.func_name
-        never = _dynfunc.make_function(found.fndesc.lookup_module(), name, "", 0, found.env, (state.library,))
+        never = make_function(found.fndesc.lookup_module(), name, "", 0, found.env, (state.library,))
         state.targetctx.insert_user_function(never, found.fndesc, [state.library])
         state.cr = found._replace(cfunc=never)
         return True
 
 
-class KernelFlags(Flags):  # type: ignore[misc]
+class KernelFlags(Flags):
     """Options that are compared by what was set of them: numba looks them up for every operation that it types."""
 
     def __hash__(self) -> int:
@@ -86,15 +86,15 @@ class KernelFlags(Flags):  # type: ignore[misc]
         return isinstance(other, KernelFlags) and self._values == other._values
 
 
-class Kernel(CompilerBase):  # type: ignore[misc]
+class Kernel(CompilerBase):
     """How a function that Python calls is compiled."""
 
     library: type = KernelLibrary
     lowering: type = NativeLowering
 
     def _compile_core(self) -> Any:
-        self.state.flags = KernelFlags(self.state.flags)
-        return super()._compile_core()
+        self.state.flags = KernelFlags(self.state.flags)  # type: ignore[no-untyped-call]
+        return super()._compile_core()  # type: ignore[no-untyped-call]
 
     def define_pipelines(self) -> list[PassManager]:
         """The passes, each once."""

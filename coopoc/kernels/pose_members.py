@@ -124,7 +124,8 @@ def advance(
         return
     _, _, (forward, left, up), rate = own_of(seen.own, (run, sent, column))
     odometry, age = (forward, left, up, rate), seen.dt * (t - sent)
-    more = (2.0 * uses - 1.0, (age * noise.acceleration) ** 2)
+    late = age * noise.acceleration
+    more = (2.0 * uses - 1.0, late * late)
     predict(poses, (k * d, d, size), odometry, seen.dt, noise, more)
 
 

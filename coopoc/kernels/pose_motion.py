@@ -97,7 +97,7 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
     cov[block + 1, block + 1] += sin * sin * qf + cos * cos * ql
     cov[block, block + 1] += cos * sin * (qf - ql)
     cov[block + 1, block] += cos * sin * (qf - ql)
-    cov[block + 2, block + 2] += (dt * scale) ** 2 * qu
+    cov[block + 2, block + 2] += (dt * scale) * (dt * scale) * qu
     effect = (-0.5 * dt * north, 0.5 * dt * east, 0.0, dt)
     for i in range(4):
         for j in range(4):
