@@ -31,7 +31,8 @@ def part(function: Function) -> Function:
     """Compiled as `compiled` is, for compiled callers only, and kept in their machine code.
 
     References to arrays are not counted within: the caller holds them. So it allocates nothing and returns no
-    array; counting every array of every NamedTuple would take longer than the sums, and to compile.
+    array; counting every array of every NamedTuple would take longer than the sums, and to compile. It raises nothing:
+    callers look for no exception, but under NUMBA_BOUNDSCHECK=1.
     """
     return _within(function, {"contract"})
 

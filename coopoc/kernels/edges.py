@@ -25,7 +25,7 @@ Python's numba would compile a function once more."""
 
 
 @inner
-def edge(gap: Any, z: Any, assumed: Any, how: int) -> Any:
+def edge(gap: Any, z: Any, assumed: Any, how: Any) -> Any:
     """E = J^T W J and eta = J^T W (z - h) at the vector `gap` m; without standard deviations E is the unit matrix.
 
     Args:

@@ -1,4 +1,4 @@
-"""The inner loop of dense symmetric updates, written as vector instructions: ROWS rows -= (ROWS, ROWS) x ROWS rows.
+"""The inner loop of dense block algebra, written as vector instructions: d rows -= (d, d) x d rows.
 
 A loop over a short row costs more to enter than to run when the compiler must first prove that arrays do not overlap;
 here it is stated. Matrices are flat arrays whose rows are `stride` numbers apart, a multiple of `LANES`.
@@ -16,8 +16,6 @@ from numba.extending import intrinsic
 
 LANES = 4
 """Numbers in one vector: 256 bits."""
-ROWS = 4
-"""Rows of a matrix, and terms of a sum, that one pass of `subtract` takes."""
 _INDEX = types.intp
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 
@@ -70,31 +68,37 @@ class _Code:
         return fused(self.build, a, b, total)
 
 
-def _generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
-    code = _Code(context, build, signature, args, (0, 2, 4))
-    out_at, left_at, right_at, stride, tiles = (args[k] for k in (1, 3, 5, 6, 7))
-    one, each = ir.Constant(stride.type, 1), range(ROWS)
-    factors = [[code.minus(1, code.index(left_at, (stride, c), (one, a))) for c in each] for a in each]
-    with cgutils.for_range(build, tiles) as loop:
-        shift = build.mul(loop.index, ir.Constant(stride.type, LANES))
-        places = [code.index(build.add(right_at, shift), (stride, c)) for c in each]
-        rows = [build.load(code.vector(2, place), align=8) for place in places]
-        for a in each:
-            target = code.vector(0, code.index(build.add(out_at, shift), (stride, a)))
-            total = build.load(target, align=8)
-            for factor, row in zip(factors[a], rows, strict=True):
-                total = code.plus_product(total, factor, row)
-            build.store(total, target, align=8)
-    return context.get_dummy_value()
+def subtracting(d: int) -> Any:
+    """A function for compiled code: `d` rows of a matrix less the transposed (d, d) of `left` times d rows of `right`.
+
+    out[out_at + a stride + j] -= sum_c left[left_at + c stride + a] right[right_at + c stride + j], a, c < d and
+    j < LANES tiles.
+    """
+
+    def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
+        code = _Code(context, build, signature, args, (0, 2, 4))
+        out_at, left_at, right_at, stride, tiles = (args[k] for k in (1, 3, 5, 6, 7))
+        one = ir.Constant(stride.type, 1)
+        factors = [[code.minus(1, code.index(left_at, (stride, c), (one, a))) for c in range(d)] for a in range(d)]
+        with cgutils.for_range(build, tiles) as loop:
+            shift = build.mul(loop.index, ir.Constant(stride.type, LANES))
+            places = [code.index(build.add(right_at, shift), (stride, c)) for c in range(d)]
+            rows = [build.load(code.vector(2, place), align=8) for place in places]
+            for a in range(d):
+                target = code.vector(0, code.index(build.add(out_at, shift), (stride, a)))
+                total = build.load(target, align=8)
+                for factor, row in zip(factors[a], rows, strict=True):
+                    total = code.plus_product(total, factor, row)
+                build.store(total, target, align=8)
+        return context.get_dummy_value()
+
+    def typed(
+        context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
+    ) -> Any:
+        n = _INDEX
+        return types.void(out, n, left, n, right, n, n, n), generate
+
+    return intrinsic(typed)
 
 
-def _subtract(
-    context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
-) -> Any:
-    """out[out_at + a stride + j] -= sum_c left[left_at + c stride + a] right[right_at + c stride + j], a, c < ROWS and
-    j < LANES tiles: ROWS rows less the transposed (ROWS, ROWS) of `left` times ROWS rows of `right`."""
-    n = _INDEX
-    return types.void(out, n, left, n, right, n, n, n), _generate
-
-
-subtract: Any = intrinsic(_subtract)
+subtract: Any = subtracting(3)

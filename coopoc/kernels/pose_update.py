@@ -16,16 +16,19 @@ from numpy import uint64
 from ..arrays import Floats
 from .batched import less, plus, put, take
 from .compile import part
-from .lanes import LANES, ROWS, subtract
+from .lanes import LANES, subtracting
 
 HEADING = 3
 """Place of the heading in a member's state."""
+ROWS = 4
+"""Rows that may be pending, so that one pass over the covariance serves them all."""
+subtract_rows = subtracting(ROWS)
 X, AT, KEPT, TOTAL, COLUMN, SCALED = 0, 1, 2, 3, 4, 4 + ROWS
 """Rows of `Poses.vector`: the state, the state at which rows are linear, the state before the relative measurements;
 the sum of r^2 / s + log s, the number of rows that were used, and of those pending with the 1 / s of each; ROWS columns
 P h of pending rows, which are not yet in the covariance, and the same over s."""
 PENDING = 2
-"""Place in the row TOTAL. ROWS rows may be pending: a pass over the covariance takes little longer than for one."""
+"""Place in the row TOTAL."""
 
 
 class Poses(NamedTuple):
@@ -129,7 +132,7 @@ def settle(poses: Poses, size: int) -> None:
     tiles = (size + LANES - 1) // LANES
     for i in range(0, size, ROWS):
         if any_of(vector, i, size):
-            subtract(poses.cov, i * stride, vector, SCALED * stride + i, vector, COLUMN * stride, stride, tiles)
+            subtract_rows(poses.cov, i * stride, vector, SCALED * stride + i, vector, COLUMN * stride, stride, tiles)
     vector[TOTAL, PENDING] = 0.0
 
 

@@ -180,7 +180,7 @@ def solve(
 
 @inner
 def descend(
-    window: Window, span: Any, assumed: Any, how: int, settings: Settings, memory: Memory, here: Any, found: Found
+    window: Window, span: Any, assumed: Any, how: Any, settings: Settings, memory: Memory, here: Any, found: Found
 ) -> None:
     """Gauss-Newton steps of the active runs until each has settled; a converted problem is linear.
 
