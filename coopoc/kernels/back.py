@@ -49,7 +49,6 @@ class Past(NamedTuple):
     kept_eta: Floats
 
 
-@storage
 def new_past(length: int, most: int) -> Past:
     """Room for windows of `length` steps of at most `most` members."""
     rows = (3 * (length + 1) * most, LANES)

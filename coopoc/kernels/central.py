@@ -56,7 +56,6 @@ class Step(NamedTuple):
     scratch: Scratch
 
 
-@compiled
 def begin(vehicles: int, most: int, runs: int) -> tuple[State, Step]:
     """State before the first step, and memory for so many pairs a step and runs together."""
     size, wide = padded(vehicles) ** 2 + vehicles * padded(1) ** 2, padded(vehicles)

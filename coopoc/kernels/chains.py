@@ -14,7 +14,7 @@ from numpy import uint64
 
 from ..arrays import Floats
 from .batched import take
-from .compile import inner, storage
+from .compile import inner
 from .elimination import eliminate, substitute
 from .lanes import LANES
 from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, place_of
@@ -58,7 +58,6 @@ class Memory(NamedTuple):
     active: Floats
 
 
-@storage
 def new_memory(length: int, most: int) -> Memory:
     """Scratch for the same."""
     places = (length + 1) * most

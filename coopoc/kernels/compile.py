@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
 from collections.abc import Callable
@@ -30,7 +31,8 @@ def part(function: Function) -> Function:
     """Compiled as `compiled` is, for compiled callers only, and kept in their machine code.
 
     References to arrays are not counted within: the caller holds them. So it allocates nothing and returns no
-    array; counting every array of every NamedTuple would take longer than the sums, and to compile.
+    array; counting every array of every NamedTuple would take longer than the sums, and to compile. It raises nothing:
+    callers look for no exception, but under NUMBA_BOUNDSCHECK=1.
     """
     return _within(function, {"contract"})
 
@@ -61,12 +63,13 @@ PATIENCE = 2.0
 
 
 @cache
-def _announcing() -> None:
-    """Report a kernel that compiles for more than PATIENCE seconds, while it compiles."""
+def _watching() -> None:
+    """While a kernel compiles collect no garbage, which a tenth of the time would go to; report it after PATIENCE."""
     from numba.core import event
 
-    class Announcer(event.Listener):
+    class Watcher(event.Listener):
         depth = 0
+        collects = True
         timer: threading.Timer
 
         def on_start(self, event: Any) -> None:
@@ -77,25 +80,32 @@ def _announcing() -> None:
                 self.timer = threading.Timer(PATIENCE, sys.stderr.write, [line])
                 self.timer.daemon = True
                 self.timer.start()
+                self.collects = gc.isenabled()
+                gc.disable()
 
         def on_end(self, event: Any) -> None:
             self.depth -= 1
             if self.depth == 0:
                 self.timer.cancel()
+                if self.collects:
+                    gc.enable()
 
-    event.register("numba:compile", Announcer())
+    event.register("numba:compile", Watcher())
 
 
-def _made(function: Function, liberties: set[str], **options: Any) -> Any:
+def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
     import numba
 
-    _announcing()
+    from .pipeline import Kernel, Part
+
+    _watching()
+    options["pipeline_class"] = Part if part else Kernel
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
 
 
 def _within(function: Function, liberties: set[str], **options: bool) -> Function:
     """Without wrappers for callers from Python, and without counts of references."""
-    made = _made(function, liberties, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
+    made = _made(function, liberties, True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
     return cast(Function, made)
 
 

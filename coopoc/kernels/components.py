@@ -11,7 +11,7 @@ Each component keeps the upper triangle of its covariance in a flat array, with 
 from __future__ import annotations
 
 from ..arrays import AnyArray
-from .compile import part
+from .compile import compiled, part
 
 HOME, ROW, MEMBER, BEGIN, BASE, STRIDE = range(6)
 TILE = 12
@@ -70,7 +70,7 @@ def arrange(label: AnyArray, plan: AnyArray) -> int:
     return components
 
 
-@part
+@compiled
 def padded(members: int) -> int:
     """Stride of a component's matrix."""
     return (3 * members + TILE - 1) // TILE * TILE

@@ -60,7 +60,7 @@ def add_common(star: Star, drift: Drift, n: int, old: int) -> Any:
     star.previous[n] = before - 1
     zero = three(0.0 * load(star.motion, 0, ROW)[0])
     store(star.motion, 4 * n + MOVED, zero)
-    noise = drift.common * (1.0 - drift.keep**2)
+    noise = drift.common * (1.0 - drift.keep * drift.keep)
     store(star.motion, 4 * n + PROCESS, (zero[0] + noise, zero[1] + noise, zero[2] + noise))
     for row in range(8):
         store(star.relative, 8 * n + row, (0.0,))
@@ -87,7 +87,7 @@ def drift_noise(star: Star, joint: Joint, drift: Drift, members: int, n: int, ol
     """Inverse process noise of the drifts of the members that stay; the common error has none."""
     least = NOTHING * NOTHING
     for k in range(n):
-        process = 1.0 / max(drift.own * (1.0 - drift.keep**2), least) if k < members else 1.0 / least
+        process = 1.0 / max(drift.own * (1.0 - drift.keep * drift.keep), least) if k < members else 1.0 / least
         if star.previous[k] >= 0:
             at = block_of(star.previous[k], old)
             position = first3(load(joint.process, at, (0.0,) * 6))

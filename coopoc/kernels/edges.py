@@ -9,6 +9,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from .batched import choose, plus
 from .compile import inner
 from .relative import completed, converted, exact, vector
@@ -16,13 +18,14 @@ from .small import apply, choose_each, from_upper, scale, subtract
 
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05
 """m; of the converted start, as in `coopoc.optimize.initial`."""
-EXACT, AT_MEASUREMENT, AT_GAP = range(3)
+EXACT, AT_MEASUREMENT, AT_GAP = np.arange(3)
 """Linear in range and angles at the present points; converted to a vector, weighted by the geometry of the measurement
-itself or by that of the points, which must not depend on the measurement."""
+itself or by that of the points, which must not depend on the measurement. NumPy's integers: for each constant of
+Python's numba would compile a function once more."""
 
 
 @inner
-def edge(gap: Any, z: Any, assumed: Any, how: int) -> Any:
+def edge(gap: Any, z: Any, assumed: Any, how: Any) -> Any:
     """E = J^T W J and eta = J^T W (z - h) at the vector `gap` m; without standard deviations E is the unit matrix.
 
     Args:

@@ -15,7 +15,7 @@ from numpy import uint64
 from ..arrays import Bools, Floats
 from .batched import choose, put, take
 from .batched import lane as lane_of
-from .compile import inner, storage
+from .compile import inner
 from .lanes import LANES
 from .slots import ROW, Window, count_of, fix_gap, motion, place_of
 from .small import load, scale, store, times
@@ -67,7 +67,6 @@ class Weights(NamedTuple):
     blind: Bools
 
 
-@storage
 def new_weights(vehicles: int) -> Weights:
     """Room for the weights of all vehicles."""
     n = vehicles + 1

@@ -72,7 +72,6 @@ class Horizon(NamedTuple):
     mask: Floats
 
 
-@as_written
 def new_horizon(length: int, most: int) -> Horizon:
     """Room for windows of `length` steps of at most `most` members."""
     joint = new_joint(most, ROW)
@@ -182,8 +181,8 @@ def gather_arrived(
             changed |= sent != seen.newest[run, link] or come != seen.fresh[run, link]
             seen.newest[run, link], seen.fresh[run, link] = sent, come
         if changed:
-            for lane in range(LANES):
-                run = min(runs[0] + lane, runs[1])
+            for lane in range(uint64(LANES)):
+                run = min(runs[0] + int(lane), runs[1])
                 receive(star, seen, known, (run, step, link), (k, place, lane))
                 used_since = max(seen.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1

@@ -23,8 +23,8 @@ from .messages import (
     Star,
     gather,
     largest,
-    new_star,
     position_or_nan,
+    star_within,
 )
 from .relative import converted_cov, vector
 
@@ -44,7 +44,7 @@ def follow(seen: Measurements, known: Assumptions, split: bool, least_det: bool)
     believed = np.zeros((LANES, 16))
     fusion = Fusion(np.empty((most, 22)), np.zeros((most, 3)), np.zeros(9), np.empty(18), np.empty(3))
     for first in range(0, runs, LANES):
-        star, old, last = new_star(most), NONE, min(first + LANES, runs) - 1
+        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)
             for lane in range(last - first + 1):

@@ -71,7 +71,7 @@ class Joint(NamedTuple):
 @inside
 def joint_size(most: int, row: Any) -> int:
     """Rows of memory for `most` members."""
-    return 4 * len(row) * most + 2 * len(row) ** 2 * (most * most + most)
+    return 4 * len(row) * most + 2 * len(row) * len(row) * (most * most + most)
 
 
 @storage
@@ -93,9 +93,19 @@ def joint_in(memory: AnyArray, most: int, row: Any) -> Joint:
 
 
 @storage
+def joint_within(most: int, row: Any) -> Joint:
+    """Room for `most` members, made by compiled code."""
+    return joint_in(np.zeros(joint_size(most, row) * LANES), most, row)
+
+
 def new_joint(most: int, row: Any) -> Joint:
     """Room for `most` members."""
-    return joint_in(np.zeros(joint_size(most, row) * LANES), most, row)
+    d = len(row)
+    information, factor, scratch = (
+        np.zeros((d * d * blocks, LANES)) for blocks in (most * most, most * most, 2 * most)
+    )
+    state, eta, move, process = (np.zeros((d * most, LANES)) for _ in range(4))
+    return Joint(state, information, factor, eta, move, process, scratch, most)
 
 
 @inside

@@ -21,8 +21,8 @@ from .joint import (
     block_of,
     copy,
     exact_information,
+    joint_within,
     move,
-    new_joint,
     predict_state,
     rearrange,
     relative_information,
@@ -41,7 +41,7 @@ from .messages import (
     clear,
     gather,
     largest,
-    new_star,
+    star_within,
 )
 from .small import first3, load, negate, square, store, subtract, with_first3
 
@@ -61,7 +61,7 @@ def follow(
     most = largest(seen.start) + 1
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint = new_star(most), new_joint(most, row)
+        star, joint = star_within(most), joint_within(most, row)
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)
             step(star, joint, known, refine, drift, (n, old), row)

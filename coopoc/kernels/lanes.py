@@ -1,4 +1,4 @@
-"""The inner loops of dense 3x3-block algebra, written as vector instructions: three rows -= (3, 3) x three rows.
+"""The inner loop of dense block algebra, written as vector instructions: d rows -= (d, d) x d rows.
 
 A loop over a short row costs more to enter than to run when the compiler must first prove that arrays do not overlap;
 here it is stated. Matrices are flat arrays whose rows are `stride` numbers apart, a multiple of `LANES`.
@@ -68,51 +68,37 @@ class _Code:
         return fused(self.build, a, b, total)
 
 
-def _three_rows(begins: bool) -> Any:
-    """Code of `subtract`, or of `minus_product`, whose rows begin at zero."""
+def subtracting(d: int) -> Any:
+    """A function for compiled code: `d` rows of a matrix less the transposed (d, d) of `left` times d rows of `right`.
+
+    out[out_at + a stride + j] -= sum_c left[left_at + c stride + a] right[right_at + c stride + j], a, c < d and
+    j < LANES tiles.
+    """
 
     def generate(context: Any, build: Any, signature: Any, args: Any) -> Any:
         code = _Code(context, build, signature, args, (0, 2, 4))
         out_at, left_at, right_at, stride, tiles = (args[k] for k in (1, 3, 5, 6, 7))
-        one, across = ir.Constant(stride.type, 1), ir.Constant(stride.type, 3) if begins else stride
-        factors = [[code.minus(1, code.index(left_at, (across, c), (one, a))) for c in range(3)] for a in range(3)]
+        one = ir.Constant(stride.type, 1)
+        factors = [[code.minus(1, code.index(left_at, (stride, c), (one, a))) for c in range(d)] for a in range(d)]
         with cgutils.for_range(build, tiles) as loop:
             shift = build.mul(loop.index, ir.Constant(stride.type, LANES))
-            rows = [
-                build.load(code.vector(2, code.index(build.add(right_at, shift), (stride, c))), align=8)
-                for c in range(3)
-            ]
-            for a in range(3):
+            places = [code.index(build.add(right_at, shift), (stride, c)) for c in range(d)]
+            rows = [build.load(code.vector(2, place), align=8) for place in places]
+            for a in range(d):
                 target = code.vector(0, code.index(build.add(out_at, shift), (stride, a)))
-                total = ir.Constant(_VECTOR, [0.0] * LANES) if begins else build.load(target, align=8)
+                total = build.load(target, align=8)
                 for factor, row in zip(factors[a], rows, strict=True):
                     total = code.plus_product(total, factor, row)
                 build.store(total, target, align=8)
         return context.get_dummy_value()
 
-    return generate
+    def typed(
+        context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
+    ) -> Any:
+        n = _INDEX
+        return types.void(out, n, left, n, right, n, n, n), generate
+
+    return intrinsic(typed)
 
 
-def _flat(out: Any, left: Any, right: Any) -> Any:
-    n = _INDEX
-    return types.void(out, n, left, n, right, n, n, n)
-
-
-def _subtract(
-    context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
-) -> Any:
-    """out[out_at + a stride + j] -= sum_c left[left_at + c stride + a] right[right_at + c stride + j], a, c < 3 and
-    j < LANES tiles: three rows less the transposed (3, 3) of `left` times three rows of `right`."""
-    return _flat(out, left, right), _three_rows(False)
-
-
-def _minus_product(
-    context: Any, out: Any, out_at: Any, left: Any, left_at: Any, right: Any, right_at: Any, stride: Any, tiles: Any
-) -> Any:
-    """out[out_at + a stride + j] = -sum_c left[left_at + 3 c + a] right[right_at + c stride + j]: three rows are minus
-    the transposed (3, 3) of `left`, its numbers in sequence, times three rows of `right`."""
-    return _flat(out, left, right), _three_rows(True)
-
-
-subtract: Any = intrinsic(_subtract)
-minus_product: Any = intrinsic(_minus_product)
+subtract: Any = subtracting(3)

@@ -29,7 +29,7 @@ from .messages import (
     clear,
     gather,
     largest,
-    new_star,
+    star_within,
 )
 from .relative import vector
 from .small import load, store
@@ -51,7 +51,7 @@ def follow(seen: Measurements, known: Assumptions, ones: bool, reset: bool) -> t
     size = joint_size(most, ONE) * LANES + 16 * LANES
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, memory = new_star(most), np.zeros((LANES, size))
+        star, memory = star_within(most), np.zeros((LANES, size))
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)
             for lane in range(last - first + 1):

@@ -17,7 +17,7 @@ from numpy import uint64
 
 from ..arrays import AnyArray
 from .batched import less, pack, put, take
-from .compile import part, storage
+from .compile import part
 from .components import BASE, BEGIN, MEMBER, STRIDE, TILE
 from .lanes import LANES, subtract
 
@@ -50,7 +50,6 @@ class Scratch(NamedTuple):
     diagonal: AnyArray
 
 
-@storage
 def scratch(vehicles: int, wide: int) -> Scratch:
     """For so many vehicles and a stride."""
     return Scratch(

@@ -123,9 +123,16 @@ def star_in(memory: AnyArray, columns: AnyArray, most: int) -> Star:
 
 
 @storage
+def star_within(most: int) -> Star:
+    """Room for `most` members, made by compiled code."""
+    return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)
+
+
 def new_star(most: int) -> Star:
     """Room for `most` members."""
-    return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)
+    columns = [np.zeros(most, np.int64) for _ in range(3)]
+    status, motion, relative, last = (np.zeros((rows * most, LANES)) for rows in (5, 12, 8, 5))
+    return Star(columns[0], columns[1], status, motion, relative, columns[2], last)
 
 
 @inner

@@ -23,8 +23,8 @@ from .messages import (
     Star,
     gather,
     largest,
-    new_star,
     position_or_nan,
+    star_within,
 )
 from .relative import completed, converted_cov, vector
 from .small import add, add_diagonal, apply, from_upper, inverse, load, scale, square, store, subtract, times, zeros
@@ -46,7 +46,7 @@ def follow(seen: Measurements, known: Assumptions) -> tuple[Floats, Floats, Floa
     )
     most, state = largest(seen.start), np.zeros((12, LANES))
     for first in range(0, runs, LANES):
-        star, old, last = new_star(most), NONE, min(first + LANES, runs) - 1
+        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
             n = gather(star, seen, known, (first, last), t, old)
             fuse(star, known, state, n, old)

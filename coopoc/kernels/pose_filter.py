@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Floats, Ints
-from .compile import compiled, storage
-from .pose_members import COMPASS, RATE, VELOCITY, PoseSeen, arrange, place_at
+from .compile import compiled, part, storage
+from .pose_members import PoseSeen, arrange, own_of, place_at
 from .pose_motion import PoseNoise, velocity_variances
 from .pose_pairs import fuse_pairs
 from .pose_rows import retract, update_fix, update_heading, update_relative, wrapped
@@ -100,7 +100,7 @@ def room(seen: PoseSeen, d: int) -> tuple[Floats, Floats, Floats]:
     return np.empty((runs, members, d)), np.empty((runs, members, d, d)), np.zeros((runs, 2))
 
 
-@storage
+@part
 def keep(poses: Poses, seen: PoseSeen, at: tuple[int, int], d: int, found: tuple[Floats, Floats, Floats]) -> None:
     """Write down states, covariances and the sums so far."""
     (run, t), (x, cov, cost), vector, state_cov = at, found, poses.vector, poses.cov
@@ -113,7 +113,7 @@ def keep(poses: Poses, seen: PoseSeen, at: tuple[int, int], d: int, found: tuple
     cost[run, 0], cost[run, 1] = vector[TOTAL, 0], vector[TOTAL, 1]
 
 
-@storage
+@part
 def add_own(memory: PoseMemory, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int], known: Any, d: int) -> None:
     """The members of a step in their order, moved, with the fix and the compass of each.
 
@@ -137,7 +137,7 @@ def add_own(memory: PoseMemory, seen: PoseSeen, noise: PoseNoise, at: tuple[int,
     settle(poses, count * d)
 
 
-@storage
+@part
 def add_one(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, int], sizes: tuple[int, int]) -> None:
     """A member's fix and compass, once each; those of an older message are brought forward by its odometry."""
     (run, t, k), (d, size) = at, sizes
@@ -146,20 +146,18 @@ def add_one(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, 
     if sent < 0 or not seen.fresh[run, i]:
         return
     late = seen.dt * (t - sent)
-    own = seen.own[run, sent, column]
-    heading, fix, u, rate = own[COMPASS], own[:COMPASS], own[VELOCITY:RATE], own[RATE]
+    (x, y, z), heading, (u, v, w), rate = own_of(seen.own, (run, sent, column))
     if not math.isnan(heading):
         variance = noise.heading + late * late * noise.yaw_rate
         update_heading(poses, size, k * d, wrapped(heading + late * rate), variance, noise.gate)
-    if not math.isnan(fix[0]):
-        motion = (late * u[0], late * u[1], late * u[2])
-        q = velocity_variances((u[0], u[1], u[2]), noise)
-        wide = late * late * max(q[0], q[1], q[2])
-        found = (fix[0], fix[1], fix[2], noise.fix[0] + wide, noise.fix[1] + wide, noise.fix[2] + wide)
-        update_fix(poses, size, k * d, found, motion, noise.gate)
+    if not math.isnan(x):
+        p, q, r = velocity_variances((u, v, w), noise)
+        wide = late * late * max(p, q, r)
+        fix = (x, y, z, noise.fix[0] + wide, noise.fix[1] + wide, noise.fix[2] + wide)
+        update_fix(poses, size, k * d, fix, (late * u, late * v, late * w), noise.gate)
 
 
-@storage
+@part
 def add_relative(
     poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int], options: PoseOptions, left_out: Ints
 ) -> None:

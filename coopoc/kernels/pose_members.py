@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..arrays import Bools, Floats, Ints
-from .compile import part, storage
+from .compile import part
 from .pose_motion import PoseNoise, predict
 from .pose_update import HEADING, KEPT, Poses, X
 
-COMPASS, VELOCITY, RATE = 3, 4, 7
-"""Places in `PoseSeen.own`, behind the fix."""
 UNKNOWN_HEADING = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
 
@@ -44,7 +42,7 @@ class PoseSeen(NamedTuple):
     dt: float
 
 
-@storage
+@part
 def arrange(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int], d: int, uses: Floats) -> None:
     """Take the members of this step in their order from those of the last one, and move them; others join."""
     vector, cov, kept = poses.vector, poses.cov, poses.kept
@@ -102,7 +100,16 @@ def goes_on(member: Ints, newest: Ints, run: int, before: int, one: int) -> bool
     return bool(known and member[before] == member[one])
 
 
-@storage
+@part
+def own_of(own: Floats, at: tuple[int, int, int]) -> Any:
+    """Fix, compass heading, velocity and yaw rate of `PoseSeen.own` at a run, step and vehicle."""
+    run, t, vehicle = at
+    fix = own[run, t, vehicle, 0], own[run, t, vehicle, 1], own[run, t, vehicle, 2]
+    velocity = own[run, t, vehicle, 4], own[run, t, vehicle, 5], own[run, t, vehicle, 6]
+    return fix, own[run, t, vehicle, 3], velocity, own[run, t, vehicle, 7]
+
+
+@part
 def advance(
     poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, int], sizes: tuple[int, int], uses: float
 ) -> None:
@@ -115,20 +122,21 @@ def advance(
             poses.cov[k * d + axis, k * d + axis] += noise.flat
         poses.cov[k * d + HEADING, k * d + HEADING] += UNKNOWN_HEADING
         return
-    own, age = seen.own[run, sent, column], seen.dt * (t - sent)
-    odometry = (own[VELOCITY], own[VELOCITY + 1], own[VELOCITY + 2], own[RATE])
-    more = (2.0 * uses - 1.0, (age * noise.acceleration) ** 2)
+    _, _, (forward, left, up), rate = own_of(seen.own, (run, sent, column))
+    odometry, age = (forward, left, up, rate), seen.dt * (t - sent)
+    late = age * noise.acceleration
+    more = (2.0 * uses - 1.0, late * late)
     predict(poses, (k * d, d, size), odometry, seen.dt, noise, more)
 
 
-@storage
+@part
 def join(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, int], d: int) -> None:
     """Begin a member where its message places it, and know nothing of it yet."""
     vector, cov = poses.vector, poses.cov
     run, t, k = at
     i = seen.start[t] + k
     sent, column, block = seen.newest[run, i], seen.member[i], k * d
-    heading = seen.own[run, sent, column, COMPASS] if sent >= 0 else math.nan
+    heading = seen.own[run, sent, column, HEADING] if sent >= 0 else math.nan
     vector[X, block + HEADING] = 0.0 if math.isnan(heading) else heading
     for axis in range(3):
         fix = seen.own[run, sent, column, axis] if sent >= 0 else math.nan
@@ -139,7 +147,7 @@ def join(poses: Poses, seen: PoseSeen, noise: PoseNoise, at: tuple[int, int, int
         cov[block + j, block + j] = noise.lasting[j - 4]
 
 
-@storage
+@part
 def place_at(poses: Poses, seen: PoseSeen, begin: Floats, spread: Floats, run: int, d: int) -> None:
     """Begin the members of the first step at poses that are given."""
     vector, cov, start = poses.vector, poses.cov, seen.start

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ..arrays import Floats
 from .compile import part
 from .pose_update import HEADING, Poses, X
@@ -84,20 +82,13 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
         vector[X, block + 4] *= noise.keep
         vector[X, block + 5] *= noise.keep
     effects = (east, north, up, scale, dt, noise.keep)
-    moved_rows(cov, (block, d), effects, (np.int64(0), size))
-    for i in range(block, block + d):
-        for j in range(i + 1, block + d):
-            cov[i, j], cov[j, i] = cov[j, i], cov[i, j]
-    moved_rows(cov, (block, d), effects, (block, block + d))
-    for i in range(size):
-        if i < block or i >= block + d:
-            for j in range(block, block + d):
-                cov[i, j] = cov[j, i]
+    moved_rows(cov, (block, d), effects, size)
+    moved_rows(cov.T, (block, d), effects, size)
     cov[block, block] += cos * cos * qf + sin * sin * ql
     cov[block + 1, block + 1] += sin * sin * qf + cos * cos * ql
     cov[block, block + 1] += cos * sin * (qf - ql)
     cov[block + 1, block] += cos * sin * (qf - ql)
-    cov[block + 2, block + 2] += (dt * scale) ** 2 * qu
+    cov[block + 2, block + 2] += (dt * scale) * (dt * scale) * qu
     effect = (-0.5 * dt * north, 0.5 * dt * east, 0.0, dt)
     for i in range(4):
         for j in range(4):
@@ -107,21 +98,21 @@ def predict(poses: Poses, at: Any, odometry: Any, dt: float, noise: PoseNoise, m
 
 
 @part
-def moved_rows(cov: Floats, member: tuple[int, int], effects: Any, columns: Any) -> None:
-    """F P of some columns in the rows of a member; the transposed of it, moved once more, is F P F^T.
+def moved_rows(cov: Floats, member: tuple[int, int], effects: Any, columns: int) -> None:
+    """F P in the rows of a member; the transposed of it, moved once more, is F P F^T.
 
     Args:
         cov: P.
         member: its first number, and how many it has.
         effects: displacement east, north and up m, 1 / (1 + s), dt s, and share of s and b that is left.
-        columns: first, and one past the last.
+        columns: how many.
     """
-    (block, d), (east, north, up, scale, dt, left), (begin, end) = member, effects, columns
-    for j in range(begin, end):
+    (block, d), (east, north, up, scale, dt, left) = member, effects
+    for j in range(columns):
         cov[block, j] -= north * cov[block + HEADING, j]
         cov[block + 1, j] += east * cov[block + HEADING, j]
     if d > 4:
-        for j in range(begin, end):
+        for j in range(columns):
             ds, db = -scale * cov[block + 4, j], -dt * cov[block + 5, j]
             cov[block, j] += east * ds - 0.5 * north * db
             cov[block + 1, j] += north * ds + 0.5 * east * db

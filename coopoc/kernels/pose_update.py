@@ -11,52 +11,51 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy import uint64
 
 from ..arrays import Floats
+from .batched import less, plus, put, take
 from .compile import part
-from .lanes import LANES, subtract
+from .lanes import LANES, subtracting
 
 HEADING = 3
 """Place of the heading in a member's state."""
-X, AT, KEPT, TOTAL, COLUMN, SCALED = 0, 1, 2, 3, 4, 7
+ROWS = 4
+"""Rows that may be pending, so that one pass over the covariance serves them all."""
+subtract_rows = subtracting(ROWS)
+X, AT, KEPT, TOTAL, COLUMN, SCALED = 0, 1, 2, 3, 4, 4 + ROWS
 """Rows of `Poses.vector`: the state, the state at which rows are linear, the state before the relative measurements;
-the sum of r^2 / s + log s, the number of rows that were used, and of those pending with the s of each; three columns
+the sum of r^2 / s + log s, the number of rows that were used, and of those pending with the 1 / s of each; ROWS columns
 P h of pending rows, which are not yet in the covariance, and the same over s."""
 PENDING = 2
-"""Place in the row TOTAL. Three rows may be pending: one pass over the covariance then takes as long as for one."""
+"""Place in the row TOTAL."""
 
 
 class Poses(NamedTuple):
     """State of the members of one unit.
 
     Attributes:
-        vector: (10, stride), see `X`; the stride is a multiple of LANES.
-        cov: (most d + 2, stride).
+        vector: (4 + 2 ROWS, stride), see `X`; the stride is a multiple of LANES.
+        cov: (stride, stride).
         kept: the same, before the relative measurements.
-        vector_memory: the numbers of `vector` one after the other.
-        cov_memory: the numbers of `cov`.
     """
 
     vector: Floats
     cov: Floats
     kept: Floats
-    vector_memory: Floats
-    cov_memory: Floats
 
 
 def new_poses(size: int) -> Poses:
     """Room for `size` numbers."""
     stride = (size + LANES - 1) // LANES * LANES
-    vector, cov = np.zeros(10 * stride + LANES), np.zeros((size + 2) * stride)  # three rows at a time reach beyond
-    whole = cov.reshape((size + 2, stride))
-    return Poses(vector[: 10 * stride].reshape((10, stride)), whole, np.zeros((size + 2, stride)), vector, cov)
+    return Poses(np.zeros((4 + 2 * ROWS, stride)), np.zeros((stride, stride)), np.zeros((stride, stride)))
 
 
 @part
 def update_row(poses: Poses, size: int, ends: Any, row: Any, measured: Any, gate: float) -> bool:
     """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance; nothing where r^2 > gate^2 s.
 
-    The covariance follows with the third row, or with `settle`; a row sees those that are pending.
+    The covariance follows when ROWS rows are pending, or with `settle`; a row sees those that are pending.
 
     Args:
         poses: the state.
@@ -70,33 +69,42 @@ def update_row(poses: Poses, size: int, ends: Any, row: Any, measured: Any, gate
         Whether the measurement is used.
     """
     vector, cov, (k, o), (a, b, c, h), (residual, variance) = poses.vector, poses.cov, ends, row, measured
-    if vector[TOTAL, PENDING] == 3.0:
+    if vector[TOTAL, PENDING] == ROWS:
         settle(poses, size)
     pending = int(vector[TOTAL, PENDING])
     column = COLUMN + pending
-    if o < 0:
-        for i in range(size):
-            vector[column, i] = a * cov[k, i] + b * cov[k + 1, i] + c * cov[k + 2, i] + h * cov[k + 3, i]
-    else:
-        for i in range(size):
-            x, y, z = cov[k, i] - cov[o, i], cov[k + 1, i] - cov[o + 1, i], cov[k + 2, i] - cov[o + 2, i]
-            vector[column, i] = a * x + b * y + c * z + h * cov[k + 3, i]
+    tiles, wide = (size + LANES - 1) // LANES, vector.shape[1] // LANES
+    for i in range(tiles):
+        x, y, z = tile(cov, k, wide, i), tile(cov, k + 1, wide, i), tile(cov, k + 2, wide, i)
+        if o >= 0:
+            x, y, z = x - tile(cov, o, wide, i), y - tile(cov, o + 1, wide, i), z - tile(cov, o + 2, wide, i)
+        put(vector, uint64(column * wide + i), plus(plus(plus(h * tile(cov, k + 3, wide, i), a, x), b, y), c, z))
     for q in range(pending):
-        share = along(vector, COLUMN + q, ends, row) / vector[TOTAL, PENDING + 1 + q]
-        for i in range(size):
-            vector[column, i] -= share * vector[COLUMN + q, i]
+        share = along(vector, COLUMN + q, ends, row) * vector[TOTAL, PENDING + 1 + q]
+        for i in range(tiles):
+            left = less(tile(vector, column, wide, i), share, tile(vector, COLUMN + q, wide, i))
+            put(vector, uint64(column * wide + i), left)
     s = variance + along(vector, column, ends, row)
-    square = residual * residual / s
+    weight = 1.0 / s
+    step = residual * weight
+    square = residual * step
     vector[TOTAL, 0] += min(square, gate * gate) + math.log(s)
     if square > gate * gate:
         return False
     vector[TOTAL, 1] += 1.0
-    step = residual / s
-    for i in range(size):
-        vector[X, i] += step * vector[column, i]
-    vector[TOTAL, PENDING + 1 + pending] = s
+    for i in range(tiles):
+        one = tile(vector, column, wide, i)
+        put(vector, uint64(X * wide + i), plus(tile(vector, X, wide, i), step, one))
+        put(vector, uint64((SCALED + pending) * wide + i), weight * one)
+    vector[TOTAL, PENDING + 1 + pending] = weight
     vector[TOTAL, PENDING] = pending + 1.0
     return True
+
+
+@part
+def tile(rows: Floats, row: int, wide: int, i: int) -> Any:
+    """LANES numbers of a row of `wide` times as many."""
+    return take(rows, uint64(row * wide + i))
 
 
 @part
@@ -113,28 +121,26 @@ def along(vector: Floats, column: int, ends: Any, row: Any) -> float:
 
 @part
 def settle(poses: Poses, size: int) -> None:
-    """Bring the pending rows into the covariance, three rows of it at a time."""
+    """Bring the pending rows into the covariance, ROWS rows of it at a time."""
     vector, stride = poses.vector, poses.vector.shape[1]
     pending = int(vector[TOTAL, PENDING])
     if pending == 0:
         return
-    for q in range(3):
-        weight = 1.0 / vector[TOTAL, PENDING + 1 + q] if q < pending else 0.0
-        for i in range(size):
-            vector[SCALED + q, i] = weight * vector[COLUMN + q, i]
+    for q in range(pending, ROWS):
+        for i in range(stride):
+            vector[SCALED + q, i] = 0.0
     tiles = (size + LANES - 1) // LANES
-    for i in range(0, size, 3):
+    for i in range(0, size, ROWS):
         if any_of(vector, i, size):
-            left, right = SCALED * stride + i, COLUMN * stride
-            memory = poses.vector_memory
-            subtract(poses.cov_memory, i * stride, memory, left, memory, right, stride, tiles)
+            subtract_rows(poses.cov, i * stride, vector, SCALED * stride + i, vector, COLUMN * stride, stride, tiles)
     vector[TOTAL, PENDING] = 0.0
 
 
 @part
 def any_of(vector: Floats, first: int, size: int) -> bool:
-    """Whether a pending row changes one of three rows of the covariance."""
-    for i in range(first, min(first + 3, size)):
-        if vector[SCALED, i] != 0.0 or vector[SCALED + 1, i] != 0.0 or vector[SCALED + 2, i] != 0.0:
-            return True
+    """Whether a pending row changes one of ROWS rows of the covariance."""
+    for i in range(first, min(first + ROWS, size)):
+        for q in range(ROWS):
+            if vector[SCALED + q, i] != 0.0:
+                return True
     return False

@@ -60,7 +60,6 @@ class Window(NamedTuple):
     layout: tuple[int, int]
 
 
-@storage
 def new_window(length: int, most: int) -> Window:
     """Room for windows of `length` steps of at most `most` members."""
     places = (length + 1) * most

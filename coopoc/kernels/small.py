@@ -43,14 +43,13 @@ def _rounded(a: Numbers, b: Numbers) -> Number:
 @unrolled
 def load(memory: Any, at: Any, like: Any) -> Any:
     """Tuple number `at` of those, as long as `like`, that stand in memory one after the other."""
-    return [memory.read(at, len(like), i) for i in range(len(like))]
+    return memory.read(at, len(like))
 
 
 @unrolled
 def store(memory: Any, at: Any, values: Any) -> Any:
     """Write tuple number `at`."""
-    for i, value in enumerate(values):
-        memory.write(at, len(values), i, value)
+    memory.write(at, values)
 
 
 @unrolled

@@ -72,7 +72,7 @@ def start_points(window: Window, past: Past, known: Assumptions, t: int) -> None
 
 
 @inner
-def put_edge(window: Window, past: Past, known: Assumptions, place: int, gap: Any, how: int, mask: Any) -> None:
+def put_edge(window: Window, past: Past, known: Assumptions, place: int, gap: Any, how: Any, mask: Any) -> None:
     """The relative measurement of a place, linear at the vector `gap`, where the mask is positive: E and E v + eta."""
     z = load(window.relative, place, RELATIVE)
     information, eta = edge(gap, z, (known.relative_std, known.min_range), how)

@@ -94,28 +94,28 @@ class _Memory:
     def batched(self) -> bool:
         return bool(self.kind.ndim == 2)
 
-    def place(self, tuple_: Any, length: int, i: int) -> Any:
-        """Pointer to number i of one of the tuples of some length that stand one after the other."""
-        kind, build = tuple_.type, self.build
-        number = build.add(build.mul(tuple_, ir.Constant(kind, length)), ir.Constant(kind, i))
-        width = ir.Constant(kind, LANES if self.batched else 1)
-        start = build.mul(number, width)
-        check_index(self.context, build, self.kind, self.array, build.add(start, width))
-        data = cgutils.create_struct_proxy(self.kind)(self.context, build, self.array).data
-        place = build.gep(data, [start])
-        return build.bitcast(place, VECTOR.as_pointer()) if self.batched else place
+    def places(self, at: Any, length: int) -> list[Any]:
+        """Pointers to the numbers of tuple number `at` of those of some length that stand one after the other."""
+        build, kind, width = self.build, at.type, LANES if self.batched else 1
+        start = build.mul(at, ir.Constant(kind, length * width))
+        check_index(self.context, build, self.kind, self.array, build.add(start, ir.Constant(kind, length * width)))
+        first = build.gep(cgutils.create_struct_proxy(self.kind)(self.context, build, self.array).data, [start])
+        if self.batched:
+            first = build.bitcast(first, VECTOR.as_pointer())
+        return [build.gep(first, [ir.Constant(kind, i)]) for i in range(length)]
 
-    def read(self, tuple_: Any, length: int, i: int) -> Number:
-        """That number."""
+    def read(self, at: Any, length: int) -> list[Number]:
+        """That tuple."""
         if self.build is None:
-            return Number(self.batched)
-        return Number(self.batched, self.build, self.build.load(self.place(tuple_, length, i), align=8))
+            return [Number(self.batched)] * length
+        return [Number(self.batched, self.build, self.build.load(p, align=8)) for p in self.places(at, length)]
 
-    def write(self, tuple_: Any, length: int, i: int, number: Number) -> None:
-        """Write that number."""
+    def write(self, at: Any, numbers: Numbers) -> None:
+        """Write that tuple."""
         if self.build is not None:
-            value = wide(self.build, number.value) if self.batched and not number.batched else number.value
-            self.build.store(value, self.place(tuple_, length, i), align=8)
+            for number, place in zip(numbers, self.places(at, len(numbers)), strict=True):
+                value = wide(self.build, number.value) if self.batched and not number.batched else number.value
+                self.build.store(value, place, align=8)
 
 
 def unrolled(write: Callable[..., Any]) -> Any:

@@ -19,7 +19,7 @@ from .compile import as_written, inner
 from .edges import AT_MEASUREMENT, EXACT
 from .gnc import GNC, Weights, new_weights, residuals, restore, reweigh, trust_all, weigh
 from .lanes import LANES
-from .messages import HELD, NEW, POSITION, USES, VARIANCE, Assumptions, Measurements, Star, largest, new_star
+from .messages import HELD, NEW, POSITION, USES, VARIANCE, Assumptions, Measurements, Star, new_star
 from .slots import ROW, Window, any_positive, count_of, enter, linearise, new_window, place_of
 from .small import load, store, subtract
 
@@ -62,7 +62,6 @@ class Found(NamedTuple):
     ended: Ints
 
 
-@as_written
 def windows(seen: Measurements, known: Assumptions, fresh: Fresh, settings: Settings, gnc: GNC) -> Found:
     """All windows of a drive.
 
@@ -70,15 +69,32 @@ def windows(seen: Measurements, known: Assumptions, fresh: Fresh, settings: Sett
         seen: `fresh` is where any message is held.
         gnc: without rounds for no robust loss.
     """
-    runs, steps, most = seen.gnss.shape[0], seen.gnss.shape[1], largest(seen.start)
+    runs, steps = seen.gnss.shape[:2]
     found = Found(
         np.empty((runs, steps, 3)),
         np.empty((runs, steps, 3, 3)),
         np.empty((runs, len(seen.neighbour), 3)),
         np.full((runs, steps), LOST),
     )
-    window, star = new_window(settings.length, most), new_star(most)
-    tools = new_memory(settings.length, most), new_weights(seen.gnss.shape[2]), gnc
+    window, star = new_windows(seen.start, settings.length)
+    tools = new_memory(settings.length, window.layout[1]), new_weights(seen.gnss.shape[2]), gnc
+    solve_all(window, star, seen, known, fresh, settings, tools, found)
+    return found
+
+
+@as_written
+def solve_all(
+    window: Window,
+    star: Star,
+    seen: Measurements,
+    known: Assumptions,
+    fresh: Fresh,
+    settings: Settings,
+    tools: Any,
+    found: Found,
+) -> None:
+    """Solve window after window."""
+    runs, steps = seen.gnss.shape[:2]
     for first in range(0, runs, LANES):
         here = (first, min(first + LANES, runs) - 1)
         for t in range(steps):
@@ -86,13 +102,12 @@ def windows(seen: Measurements, known: Assumptions, fresh: Fresh, settings: Sett
             enter(window, star, seen, known, here, t)
             use_fixes(window, seen.start, fresh, here, span)
             solve(window, seen, known, here, span, settings, tools, found)
-    return found
 
 
-@as_written
 def new_windows(start: AnyArray, length: int) -> tuple[Window, Star]:
     """Room for the windows of a drive."""
-    return new_window(length, largest(start)), new_star(largest(start))
+    most = 1 + int(np.diff(start).max(initial=0))
+    return new_window(length, most), new_star(most)
 
 
 @as_written
@@ -165,7 +180,7 @@ def solve(
 
 @inner
 def descend(
-    window: Window, span: Any, assumed: Any, how: int, settings: Settings, memory: Memory, here: Any, found: Found
+    window: Window, span: Any, assumed: Any, how: Any, settings: Settings, memory: Memory, here: Any, found: Found
 ) -> None:
     """Gauss-Newton steps of the active runs until each has settled; a converted problem is linear.
 
