@@ -14,7 +14,7 @@ import numpy as np
 from coopoc.arrays import AnyArray, Floats
 from coopoc.kernels.compile import as_written, inner, inside
 from coopoc.kernels.elimination import rescale
-from coopoc.kernels.joint import Joint, new_joint
+from coopoc.kernels.joint import Joint, joint_within
 from coopoc.kernels.joint_filter import step, write
 from coopoc.kernels.lanes import LANES
 from coopoc.kernels.messages import (
@@ -32,7 +32,7 @@ from coopoc.kernels.messages import (
     Star,
     gather,
     largest,
-    new_star,
+    star_within,
 )
 from coopoc.kernels.relative import vector
 from coopoc.kernels.small import add, load, square, store
@@ -59,7 +59,7 @@ def follow(seen: Measurements, known: Assumptions, sums: bool) -> tuple[Floats, 
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
     most = largest(seen.start) + 1
     for first in range(0, runs, LANES):
-        star, joint, old, last = new_star(most), new_joint(most, ROW), NONE, min(first + LANES, runs) - 1
+        star, joint, old, last = star_within(most), joint_within(most, ROW), NONE, min(first + LANES, runs) - 1
         accounts = Accounts(np.zeros((LANES, vehicles, SIZE)), np.zeros((3 * most, LANES)), np.zeros((3 * most, LANES)))
         for lane in range(LANES):
             for k in range(vehicles):
