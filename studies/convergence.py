@@ -171,7 +171,7 @@ STUDY = lineup.study(
         "train_seeds": 5,
     },
     tables={"rounds": _table},
-    figures={"clients": _clients, "rounds": _figure},
+    figures={"rounds": _figure, "clients": _clients},
     findings=_findings,
     limitations=(
         "The centralised net has no rounds: its schedule is cut into equal parts, as many as the federated net has.",

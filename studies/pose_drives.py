@@ -84,23 +84,23 @@ def block(p: Params) -> float:
 
 def length(data: str) -> float:
     """s of the part of a drive in which all vehicles are there."""
-    log = _log(data)
+    log = _part(data)
     t = log.fleet.t if isinstance(log, MrclamLog) else log.recording.t
     return float(t[-1] - t[0])
 
 
 def counts(data: str) -> tuple[int, int]:
     """Numbers of vehicles and of landmarks."""
-    log = _log(data)
+    log = _part(data)
     if isinstance(log, MrclamLog):
         return len(log.fleet.ids), len(surveyed(log))
     marks = len(log.recording.landmarks)
     return len(log.recording.ids) - marks, marks
 
 
-def taught(data: str) -> bool:
+def has_true_poses(data: str) -> bool:
     """Whether true poses are known, from which noise is learned."""
-    log = _log(data)
+    log = _part(data)
     return isinstance(log, MrclamLog) or (log.truth is not None and log.truth.heading is not None)
 
 
@@ -115,7 +115,7 @@ def check(data: str, until: float, gate: float) -> None:
     Raises:
         InputError: as of `drive`.
     """
-    log = _log(data)
+    log = _part(data)
     if isinstance(log, MrclamLog):
         surveyed(log), _calibration(data, until)
     else:
@@ -135,7 +135,7 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
     Raises:
         InputError: a log in the world's frame, or one that cannot be followed.
     """
-    log = _log(data)
+    log = _part(data)
     if isinstance(log, MrclamLog):
         recording = pose_recording(log, v2x, _calibration(data, until))
         return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
@@ -147,17 +147,20 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
 
 def described(data: str) -> str:
     """What was measured, and where its noise comes from, for captions."""
-    log = _log(data)
+    log = _part(data)
     if isinstance(log, MrclamLog):
-        return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:g} s calibrate the noise."
+        return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
+    where = "" if (span := _log(data)[1]) == "throughout" else f" {span},"
     begin = _begin(data, GATE)[1]
-    return f"What {{}} holds ({read}), with the noise that it states{begin}; the first {{:g}} s are not scored."
+    return (
+        f"What {{}} holds ({read}),{where} with the noise that it states{begin}; the first {{:.3g}} s are not scored."
+    )
 
 
 def digests(data: str) -> dict[str, str]:
     """Digest of all that the numbers of a drive are made of."""
-    log = _log(data)
+    log = _part(data)
     if not isinstance(log, MrclamLog):
         truth = "" if log.truth is None else log.truth.digest
         return {"log": digest(log.recording), "truth": truth}
@@ -185,11 +188,17 @@ def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
     return replace(recording, links=fewer, relative=recording.relative[:, ~gone], arrival=recording.arrival[:, ~gone])
 
 
+def _part(data: str) -> MrclamLog | Log:
+    """What is followed: of a log its longest part in which all vehicles are there."""
+    return _log(data)[0]
+
+
 @lru_cache(maxsize=2)
-def _log(data: str) -> MrclamLog | Log:
+def _log(data: str) -> tuple[MrclamLog | Log, str]:
+    """That, and where it is in words."""
     name, kind = split(data)[0], kind_of(data)
     if kind == "mrclam":
-        return read_mrclam(Path(name))
+        return read_mrclam(Path(name)), "throughout"
     if kind not in ("log", "recording"):
         hint = "Check it; a log may hold what vehicles measured (docs/your_data.md), a folder a set of MR.CLAM."
         raise InputError("data", repr(data), "must be the path of measurements, not only of drives", hint)
@@ -197,19 +206,19 @@ def _log(data: str) -> MrclamLog | Log:
     if log.recording.body is None:
         hint = f'Read it so: --data "{name}?frame=body".'
         raise InputError("data", repr(data), "must be a log in body frames, for poses", hint)
-    return together(log)[0]
+    return together(log)
 
 
 @lru_cache(maxsize=2)
 def _calibration(data: str, until: float) -> Calibration:
-    log = _log(data)
+    log = _part(data)
     assert isinstance(log, MrclamLog)
     return calibrate(log, until)
 
 
 @lru_cache(maxsize=2)
 def _begin(data: str, gate: float) -> tuple[Floats | None, str]:
-    log = _log(data)
+    log = _part(data)
     assert isinstance(log, Log)
     moving = [k for k in range(len(log.recording.ids)) if k not in log.recording.landmarks]
     return begin_of(log, moving, gate)

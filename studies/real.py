@@ -71,8 +71,8 @@ def key(p: Params) -> dict[str, str]:
     return {"code": revision(*CODE), **drives.digests(str(p["data"]))}
 
 
-def apart(p: Params) -> bool:
-    """Whether a combination is another one than those beside it, and can be run."""
+def applies(p: Params) -> bool:
+    """Whether the data has so many vehicles and landmarks, and the method needs what there is."""
     k, n, method, data = int(p["max_neighbours"]), int(p["landmarks"]), p["method"], str(p["data"])
     if not Path(split(data)[0]).exists():
         return True  # the key names what is wrong
@@ -80,7 +80,7 @@ def apart(p: Params) -> bool:
     if k == 0 and method not in ("pose-fleet", views.LEARNED):
         return False
     ends = (0, min(max(views.NEIGHBOURS), vehicles - 1))
-    if method == views.LEARNED and not (k in ends and drives.taught(data) and drives.calibrated(p)):
+    if method == views.LEARNED and not (k in ends and drives.has_true_poses(data) and drives.calibrated(p)):
         return False
     return _distinct(k, views.NEIGHBOURS, vehicles - 1) and _distinct(n, views.LANDMARKS, marks)
 
@@ -159,7 +159,7 @@ STUDY = Study(
         "evaluations": 150,
     },
     key=key,
-    where=apart,
+    where=applies,
     shares=("max_neighbours",),
     tables={
         "rt_le": partial(views.table, value="rt_le_m", text="RT-LE [m], K neighbours against landmarks.", decimals=3),

@@ -14,7 +14,7 @@ from coopoc.evaluate.statistics import Interval
 from coopoc.study.marks import series
 from coopoc.study.numbers import Number, difference, interval, mean, present, ran, sentence
 from coopoc.study.pivot import crossed, pivot
-from coopoc.study.style import look
+from coopoc.study.style import look, words
 
 from . import pose_drives
 
@@ -30,10 +30,10 @@ FEW = 4
 """Landmarks whose number a finding compares with, at most."""
 LANDMARKS, NEIGHBOURS = (0, 1, 2, 4, 15), (0, 1, 2, 3, 4)
 FLEET = {"method": "pose-fleet"}
-NOTE = (
-    "Poses are found with all landmarks; then the landmarks are thinned and the rest is scored. Intervals are over "
-    "vehicles, then blocks of {:.3g} s."
-)
+NOTE = "Intervals are over vehicles, then blocks of {:.3g} s."
+THINNED = "Poses are found with all landmarks; then they are thinned and the rest is scored."
+UNFIT = 100.0
+"""Mean NEES of a pose that no drift explains: units, axes or noise are other ones."""
 
 
 def _caption(results: Results, text: str) -> str:
@@ -41,8 +41,10 @@ def _caption(results: Results, text: str) -> str:
     data = str(p["data"])
     what = pose_drives.described(data).format(Path(split(data)[0]).name, pose_drives.calibrated(p))
     marks = pose_drives.counts(data)[1]
-    all_of = f" A number of landmarks above {marks} is all that there are." if marks < max(LANDMARKS) else ""
-    return f"{text} {what} {NOTE.format(pose_drives.block(p))}{all_of}"
+    parts = [text, what, THINNED if marks else "There are no landmarks.", NOTE.format(pose_drives.block(p))]
+    if 0 < marks < max(LANDMARKS):
+        parts.append(f"A number of landmarks above {marks} is all that there are.")
+    return " ".join(parts)
 
 
 def _most(results: Results, axis: str) -> int:
@@ -51,12 +53,14 @@ def _most(results: Results, axis: str) -> int:
 
 
 def table(results: Results, value: str, text: str, **options: Any) -> Table | None:
+    """A metric of one state, by K and landmarks."""
     if present(results, FLEET, value) is None:
         return None
     return pivot(results, "max_neighbours", "landmarks", value, FLEET, _caption(results, text), best=None, **options)
 
 
 def fusions(results: Results, value: str, text: str, **options: Any) -> Table | None:
+    """A metric of the ways of fusion at the largest K, by landmarks."""
     if present(results, {}, value) is None or not _most(results, "max_neighbours"):
         return None
     where = {"max_neighbours": _most(results, "max_neighbours")}
@@ -108,36 +112,46 @@ def bytes(results: Results) -> Table | None:
 
 
 def figure(results: Results) -> Plot | None:
-    """Left: a line per number of neighbours over the landmarks. Right: the ways of fusion at the largest K."""
+    """Over the landmarks, a line per K and, at the largest, per way of fusion; where their number is one, over K."""
     from matplotlib import colormaps
 
     from coopoc.study.plot import Plot, canvas, plain_log
 
     if present(results, FLEET) is None:
         return None
-    at = {n: place for place, n in enumerate(sorted(results.frame["landmarks"].unique().tolist()))}
-    ks = sorted(results.frame["max_neighbours"].unique().tolist())
-    with canvas(1, 2, width=6.6, sharey=True) as (figure, (left, right)):
-        lines = [(f"K = {k}", {**FLEET, "max_neighbours": k}, colormaps["viridis"](k / 4.6)) for k in ks]
-        most = {"max_neighbours": ks[-1]}
-        others = [(look(name).label, {"method": name, **most}, look(name).color) for name in METHODS]
-        for axis, shown in ((left, lines), (right, others)):
+    marks, ks = (sorted(results.frame[axis].unique().tolist()) for axis in ("landmarks", "max_neighbours"))
+    ways = [(look(name).label, {"method": name}, look(name).color) for name in METHODS]
+    lines = [(f"K = {k}", {**FLEET, "max_neighbours": k}, colormaps["viridis"](k / 4.6)) for k in ks]
+    most = [(name, {**where, "max_neighbours": ks[-1]}, color) for name, where, color in ways]
+    if len(marks) > 1:
+        panels = [("One state, K neighbours", lines), *([(f"Ways of fusion, K = {ks[-1]}", most)] if ks[-1] else [])]
+        x, values = "landmarks", marks
+    elif len(ks) > 1:
+        panels, x, values = [("", ways)], "max_neighbours", ks
+    else:
+        return None
+    width = 6.6 if len(panels) > 1 else 4.4
+    with canvas(1, len(panels), width=width, sharey=True, squeeze=False) as (figure, ((*grid,),)):
+        for axis, (title, shown) in zip(grid, panels, strict=True):
             for label, where, color in shown:
-                gid = series(label)
-                each = {n: interval(results, {**where, "landmarks": n}) for n in at}
-                ran = {at[n]: value for n, value in each.items() if value is not None}
-                if ran:
-                    axis.plot(
-                        list(ran), [one.mean for one in ran.values()], color=color, label=label, marker="o", gid=gid
-                    )
-                    ends = [one.low for one in ran.values()], [one.high for one in ran.values()]
-                    axis.fill_between(list(ran), *ends, alpha=0.12, color=color, linewidth=0, gid=gid)
-            axis.set(xticks=list(at.values()), xticklabels=list(at), xlabel="Landmarks", yscale="log")
+                _line(axis, results, {**where}, (x, values), (label, color))
+            places = {"xticks": list(range(len(values))), "xticklabels": values}
+            axis.set(**places, xlabel=words(x), yscale="log", title=title)
             plain_log(axis.yaxis)
             axis.legend()
-        left.set(ylabel="RT-LE [m]", title="One state, K neighbours")
-        right.set(title=f"Ways of fusion, K = {ks[-1]}")
-    return Plot(figure, _caption(results, "RT-LE against the number of landmarks; bands: 95 % intervals."))
+        grid[0].set(ylabel="RT-LE [m]")
+    return Plot(figure, _caption(results, f"RT-LE against {words(x)}; bands: 95 % intervals."))
+
+
+def _line(axis: Any, results: Results, where: dict[str, Any], along: tuple[str, list[int]], style: Any) -> None:
+    """Means of a selection along an axis, with their intervals."""
+    (x, values), (label, color), gid = along, style, series(style[0])
+    each = {place: interval(results, {**where, x: value}) for place, value in enumerate(values)}
+    shown = {place: value for place, value in each.items() if value is not None}
+    if shown:
+        axis.plot(list(shown), [one.mean for one in shown.values()], color=color, label=label, marker="o", gid=gid)
+        ends = [one.low for one in shown.values()], [one.high for one in shown.values()]
+        axis.fill_between(list(shown), *ends, alpha=0.12, color=color, linewidth=0, gid=gid)
 
 
 def findings(results: Results) -> dict[str, str]:
@@ -165,12 +179,18 @@ def findings(results: Results) -> dict[str, str]:
         best = {"alone": of(0, marks[-1]), "together": of(ks[-1], marks[-1])}
         template = f"With {_landmarks(marks[-1])}: alone {{alone:.3f}} m, K = {ks[-1]} {{together:.3f}} m."
         found["all landmarks"] = sentence(template, **best)
+    if len(alone) == len(ks) == 1:
+        found["alone"] = f"One vehicle alone: {next(iter(alone.values())):.3g} m."
     nees = [of(k, n, "nees") for k in ks for n in marks]
     values = [value for value in nees if value is not None]
     if values:
         inside = sum(2 <= value <= 5 for value in values)
-        text = f"Mean NEES of a pose (3 is consistent): {np.mean(values):.1f} over {len(values)} cells"
-        found["nees"] = f"{text}, {inside} of them in 2..5, the largest {max(values):.1f}."
+        text = f"Mean NEES of a pose (3 is consistent): {np.mean(values):.1f}"
+        more = f" over {len(values)} cells, {inside} of them in 2..5, the largest {max(values):.1f}"
+        found["nees"] = text + (more if len(values) > 1 else "") + "."
+        if min(values) > UNFIT:
+            doubt = "Units, axes or stated noise do not fit the drive"
+            found["nees"] += f" {doubt}: coopoc data check shows the residuals of each kind."
     return found
 
 

@@ -243,3 +243,24 @@ def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:
         co.run_study("real", tmp_path, settings={"data": str(folder)}, progress=False)
     with pytest.raises(co.InputError, match="Take coopoc run real"):
         co.run_study("side_by_side", tmp_path, settings={"data": f"{folder}?frame=body"}, progress=False)
+
+
+def test_the_study_says_which_part_it_took_and_what_cannot_fit(tmp_path: Path) -> None:
+    """One car leaves after 20 s; the other's speeds are written in km/h."""
+    log, truth = table(noise=1.0)
+    cars = log["vehicle"].isin(["red", "blue"]) & ~log["partner"].isin(["mast", "green"])
+    left = cars & ~((log["t"] > 20) & (log["vehicle"] == "blue")) & ~((log["t"] > 20) & (log["partner"] == "blue"))
+    wrong = log[left].copy()
+    wrong.loc[(wrong["kind"] == "speed") & (wrong["vehicle"] == "red"), "value"] *= 3.6
+    for name, rows in (("part", log[left]), ("kmh", wrong)):
+        (tmp_path / name).mkdir()
+        rows.to_csv(tmp_path / name / "log.csv", index=False)
+        truth.to_csv(tmp_path / name / "truth.csv", index=False)
+        settings = {"data": f"{tmp_path / name}?frame=body", "method": "pose-fleet"}
+        results = co.run_study("real", tmp_path / name, settings=settings, progress=False)
+        text = (tmp_path / name / "real" / "tables" / "rt_le.md").read_text()
+        assert "where all are there" in text
+        assert "There are no landmarks" in text
+        nees = find_study("real").found(results)["nees"]
+        assert ("do not fit the drive" in nees) == (name == "kmh")
+        assert (tmp_path / name / "real" / "figures" / "rt_le.png").stat().st_size > 5_000

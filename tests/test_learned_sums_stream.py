@@ -7,15 +7,16 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from filterpy.kalman import KalmanFilter
+from test_learned_cooperative import NOISE, net
 
-from coopoc import V2X, Fleet, InputError, Recording, Sensors, observe
+from coopoc import V2X, Fleet, InputError, Recording, RelativeMeasurement, observe
 from coopoc.arrays import Floats
-from coopoc.learned import CooperativeGain, NoiseNet
+from coopoc.learned import CooperativeGain
 from coopoc.learned.nets.cooperative import SUMS, SumsMeasurement
 from coopoc.learned.nets.noise_net import NoiseFilter, estimate_noise
 from coopoc.learned.nets.noise_step import new_memory, noise_step, packed
@@ -24,23 +25,12 @@ from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.inbox import inbox
 from coopoc.world.links import Links
 
-NOISE = Sensors.paper_scenario2()
 CHANNELS = {
     "ideal": V2X(max_neighbours=4, radius=25.0),
     "lossy": V2X(max_neighbours=4, radius=25.0, loss=0.5, burst=3.0),
     "rare": V2X(max_neighbours=4, radius=25.0, rate=2.0),
     "silent": V2X(max_neighbours=4, radius=25.0, loss=1.0),
 }
-
-
-def net(seed: int = 0) -> NoiseNet:
-    """A net that is no longer at its start, where its corrections are zero."""
-    made = NoiseNet(hidden=3, seed=seed)
-    torch.manual_seed(seed)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
-    return made
 
 
 def holed(recording: Recording, share: float = 0.2) -> Recording:
@@ -203,3 +193,10 @@ def test_the_blocks_of_the_page_run() -> None:
     assert done.returncode == 0, done.stderr
     alone, together = map(float, done.stdout.splitlines()[0].split())
     assert together < 0.7 * alone
+
+
+@pytest.mark.parametrize("wrong", [None, [1], ["b"], [RelativeMeasurement("b", [9.0, 0.1, 1.57])]])
+def test_what_is_no_measurement_with_sums_is_refused(wrong: Any) -> None:
+    stream = CooperativeGain(net()).start(NOISE)
+    with pytest.raises(InputError, match="must hold SumsMeasurements"):
+        stream.step([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.1, neighbours=wrong)

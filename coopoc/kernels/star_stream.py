@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Floats, Ints
 from .compile import as_written, inner, inside, storage
-from .joint import joint_in, joint_size
+from .joint import Joint, joint_in, joint_size
 from .joint_filter import step
 from .lanes import LANES
 from .messages import (
@@ -156,13 +156,29 @@ def stream_step(
         interpret(star, noise.known, k, dt if k > 0 else 1.0)
     step(star, joint, noise.known, noise.refine, None, (n, old), ROW)
     finish(memory, slots, n, dt)
+    answered(joint, n, answer)
+    return ESTIMATE
+
+
+@inside
+def answered(joint: Joint, n: int, answer: AnyArray) -> None:
+    """Position m and covariance m^2 of the ego, and positions of its neighbours m."""
     for c in range(3):
         answer[c] = joint.state[c, 0]
         for i in range(3):
             answer[3 + 3 * c + i] = joint.scratch[3 * min(c, i) + max(c, i), 0]
         for k in range(1, n):
             answer[9 + 3 * k + c] = joint.state[3 * k + c, 0]
-    return ESTIMATE
+
+
+@inner
+def see(star: Star, row: AnyArray, std: AnyArray, k: int) -> None:
+    """Range m, azimuth and inclination rad of member k, with which a row begins; NaN is what was not measured."""
+    sa, ca = sine_and_cosine(row[1])
+    si, ci = sine_and_cosine(row[2])
+    seen = or_else(row[0], -1.0), or_else(sa, 0.0), or_else(ca, 0.0), or_else(si, 0.0), or_else(ci, 0.0)
+    for lane in range(LANES):
+        measured(star.relative, seen, std, k, lane)
 
 
 @inside
@@ -221,11 +237,7 @@ def neighbour(star: Star, memory: Memory, noise: Noise, row: AnyArray, slot: int
         for lane in range(LANES):
             for i in range(4):
                 star.motion[at + 3 * i + c, lane] = values[i]
-    sa, ca = sine_and_cosine(row[1])
-    si, ci = sine_and_cosine(row[2])
-    seen = or_else(row[0], -1.0), or_else(sa, 0.0), or_else(ca, 0.0), or_else(si, 0.0), or_else(ci, 0.0)
-    for lane in range(LANES):
-        measured(star.relative, seen, noise.known.relative_std, k, lane)
+    see(star, row, noise.known.relative_std, k)
 
 
 @inside

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +101,26 @@ def three(field: str, value: npt.ArrayLike) -> Floats:
     if array.shape != (3,) or not np.isfinite(array).all():
         raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
     return array
+
+
+def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
+    """Names of the vehicles that a stream is given measurements of, each once.
+
+    Args:
+        field: name of the argument.
+        given: a sequence of measurements.
+        kind: their class.
+
+    Raises:
+        InputError: anything else, or a vehicle twice.
+    """
+    if not isinstance(given, Sequence) or not all(isinstance(one, kind) for one in given):
+        hint = f"Give a list of {kind.__name__}, empty for none."
+        raise InputError(field, repr(given)[:60], f"must hold {kind.__name__}s", hint)
+    names: list[str] = [one.id for one in given]
+    if len(set(names)) < len(names):
+        raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
+    return names
 
 
 def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:

@@ -11,7 +11,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..world.spherical import wrap
 from . import pose_unit
-from .motion_history import seconds
+from .motion_history import names_of, seconds
 from .pose_measurement import BodyMeasurement, OwnMeasurement
 
 if TYPE_CHECKING:
@@ -91,9 +91,7 @@ class PoseStream:
         return PoseEstimate(state, cov[0, len(found.member) - members.shape[1]])
 
     def _check(self, own: OwnMeasurement, seen: Sequence[BodyMeasurement]) -> None:
-        names = [one.id for one in seen]
-        if len(set(names)) < len(names):
-            raise InputError("seen", names, "must be given once each", "Merge the measurements of one vehicle.")
+        names = names_of("seen", seen, BodyMeasurement)
         if not self._star and any(one.place is None for one in seen):
             raise InputError("seen", names, "must be landmarks of a vehicle alone", 'Take PoseFilter("star").')
         if self._step == 0 and np.isnan(np.where(np.isnan(self._first), own.row[:4], self._first)).any():

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..kernels.messages import Assumptions
 from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
 from ..kernels.star_stream import FIX, MESSAGE, MESSAGE_AGE, RELATIVE, VELOCITY, Noise, packed, resized, stream_step
-from .motion_history import MotionHistory, check_step, fix_or_none, numbers, seconds, three
+from .motion_history import MotionHistory, check_step, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import NoiseModel
 from .star import ACCELERATION_STD, FORGOTTEN, relative_noise
 from .stream import motion_noise
@@ -148,13 +148,7 @@ class StarStream:
         Raises:
             InputError: as `Stream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
-        try:
-            names, given = [s.id for s in neighbours], self._given
-        except (TypeError, AttributeError):
-            hint = "Give a list of coopoc.RelativeMeasurement, empty for none."
-            raise InputError("neighbours", repr(neighbours)[:60], "must be relative measurements", hint) from None
-        if len(set(names)) < len(names):
-            raise InputError("neighbours", names, "must be given once each", "Merge the measurements of one vehicle.")
+        names, given = names_of("neighbours", neighbours, RelativeMeasurement), self._given
         if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
             check_step(gnss, velocity, dt, fix_age, self.history)
         try:

@@ -14,9 +14,9 @@ from coopoc.kernels.compile import as_written, inner, storage
 from coopoc.kernels.joint import joint_in
 from coopoc.kernels.joint_filter import step
 from coopoc.kernels.lanes import LANES
-from coopoc.kernels.messages import ROW, Assumptions, Star, measured, star_in
-from coopoc.kernels.relative import or_else, sine_and_cosine
+from coopoc.kernels.messages import ROW, Assumptions, Star, star_in
 from coopoc.kernels.small import load, store
+from coopoc.kernels.star_stream import answered, see
 from coopoc.methods.star import FORGOTTEN
 
 from .star_gain import LAST, SIZE, STEP, SUMS, Accounts, add_step, relocate, revalue, revise, settle
@@ -113,12 +113,7 @@ def sums_step(
     for k in range(n):
         place[star.member[k]] = k
     index[0] = n
-    for c in range(3):
-        answer[c] = joint.state[c, 0]
-        for i in range(3):
-            answer[3 + 3 * c + i] = joint.scratch[3 * min(c, i) + max(c, i), 0]
-        for k in range(1, n):
-            answer[9 + 3 * k + c] = joint.state[3 * k + c, 0]
+    answered(joint, n, answer)
     return True
 
 
@@ -133,15 +128,11 @@ def restart(account: AnyArray, t: int) -> None:
 @inner
 def receive(star: Star, held: Accounts, known: Assumptions, row: AnyArray, slot: int, k: int) -> None:
     """Copy the measurement of member k, and its message if one has come."""
-    sa, ca = sine_and_cosine(row[RELATIVE + 1])
-    si, ci = sine_and_cosine(row[RELATIVE + 2])
-    seen = or_else(row[RELATIVE], -1.0), or_else(sa, 0.0), or_else(ca, 0.0), or_else(si, 0.0), or_else(ci, 0.0)
-    for lane in range(LANES):
-        measured(star.relative, seen, known.relative_std, k, lane)
-        if row[NEWS] > 0.0:
+    see(star, row, known.relative_std, k)
+    if row[NEWS] > 0.0:
+        for lane in range(LANES):
             for i in range(LAST - SUMS):
                 held.vehicle[lane, slot, SUMS + i] = row[MESSAGE + i]
-    if row[NEWS] > 0.0:
         for c in range(3):
             known.fixes[0, 0, slot, c] = row[MESSAGE + LAST + c]
 

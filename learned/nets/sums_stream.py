@@ -16,7 +16,7 @@ from torch import nn
 from coopoc.arrays import Floats, number
 from coopoc.errors import InputError
 from coopoc.kernels.star_stream import resized
-from coopoc.methods.motion_history import fix_or_none, numbers, three
+from coopoc.methods.motion_history import fix_or_none, names_of, numbers, three
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.stream import motion_noise
 
@@ -150,9 +150,7 @@ class SumsStream:
         Raises:
             InputError: numbers that are not finite, or a neighbour that is given twice. The filter is then as it was.
         """
-        names = [one.id for one in neighbours]
-        if len(set(names)) < len(names):
-            raise InputError("neighbours", names, "must be given once each", "Merge the measurements of one vehicle.")
+        names = names_of("neighbours", neighbours, SumsMeasurement)
         self._read(gnss, velocity, dt)
         slots = [self.slots.get(name, -1) for name in names]
         if -1 in slots or len(names) >= len(self._inbox):

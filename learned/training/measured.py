@@ -10,7 +10,7 @@ import torch
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.plugins import unknown
+from coopoc.plugins import one_of
 from coopoc.world.axes import columns
 from coopoc.world.recording import Recording
 
@@ -53,8 +53,7 @@ def measured_clients(
     >>> [(len(c.training), len(c.validation)) for c in measured_clients(MeasuredDrives(observe(line, Sensors()), line))]
     [(2, 1)]
     """
-    if start not in get_args(Start):
-        raise unknown("start", start, get_args(Start))
+    one_of("start", start, get_args(Start))
     check_pieces(piece, split)
     cols = columns("vehicles", drives.ids, drives.recording.ids)
     piece = _steps(drives.recording, cols, piece)
