@@ -38,8 +38,9 @@ def race(
 
     A start from which no step was refused and no promise failed by half, and that leads to a cost which the assumed
     noise explains, ends the search. Others are tried where the first had trouble, and all whose costs are near
-    the least go on (ROUNDS). Where the noise does not explain the end, the growing start is tried, too. A problem that
-    is not large takes the first.
+    the least go on (ROUNDS). Where the noise does not explain the end and no second start led there, the growing start
+    is tried, too: stated noise that is ten times too small costs a few more starts and not that. A problem that is not
+    large takes the first.
 
     Args:
         problem: at any start.
@@ -60,7 +61,8 @@ def race(
         if smooth(end) and tried[name][0] <= limit:
             return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
     assert system is not None
-    least = min(cost for cost, _ in tried.values())
+    reached = {name: cost for name, (cost, _) in tried.items()}
+    least = min(reached.values())
     for within, steps in ROUNDS:
         if all(cost <= (1.0 + SAME) * least for cost, _ in tried.values()):
             break
@@ -70,9 +72,11 @@ def race(
             ends = {name: arrive(system, x, steps, TOLERANCE) for name, x in close.items()}
             tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
             taken += sum(end.iterations for end in ends.values())
-            least = min(cost for cost, _ in tried.values())
+            reached |= {name: cost for name, (cost, _) in tried.items()}
+            least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    if growing is not None and system.cost(x) > limit:
+    alone = sum(cost <= (1.0 + SAME) * least for cost in reached.values()) == 1
+    if growing is not None and alone and system.cost(x) > limit:
         end = arrive(system, x, MORE, TOLERANCE)
         x, taken = end.x, taken + end.iterations
         if system.cost(x) > limit:
