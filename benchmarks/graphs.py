@@ -3,7 +3,7 @@
 Run:  python benchmarks/graphs.py                            (every PyFG file in ../shared/data/pyfg, if it is there)
       python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
       python benchmarks/graphs.py folder --hard              (any folder of PyFG, g2o and JRL files, with hard variants)
-      python benchmarks/graphs.py --unseen 1                 (kinds of graphs that no file holds; a seed, or three)
+      python benchmarks/graphs.py --unseen 1                 (kinds of graphs that no file holds; so many seeds)
 
 GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
 as it comes, from chained odometry. It has no factor for a landmark's position in a pose's frame with our weights, so
@@ -13,9 +13,9 @@ its seconds contain the search for the start, the checks and all marginals, GTSA
 
 from __future__ import annotations
 
+import argparse
 import os
 import resource
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +28,7 @@ from hard_graphs import VARIANTS
 from tabulate import tabulate
 from unseen_graphs import FAMILIES
 
+from coopoc.errors import InputError
 from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
@@ -80,11 +81,14 @@ def plain_gtsam(problem: Problem) -> tuple[np.ndarray, int]:
 
 
 def error(graph: Graph, position: np.ndarray) -> float:
-    """ATE: rms of the poses after alignment, m."""
+    """ATE: rms of the poses after alignment, m; NaN where the file's vertices are no trajectory to align with."""
     truth = graph.position[graph.is_pose]
     if len(truth) <= graph.dimension or not np.isfinite(truth).all():
         return np.nan
-    return float(absolute_error(position[graph.is_pose], truth).rmse)
+    try:
+        return float(absolute_error(position[graph.is_pose], truth).rmse)
+    except InputError:
+        return np.nan
 
 
 def row(name: str, graph: Graph) -> list[object]:
@@ -120,49 +124,55 @@ HEADER = (
 )
 
 
+STATUS, COST, SECONDS, FROM_ODOMETRY, GTSAM_COST, GTSAM_SECONDS = 3, 4, 6, 11, 12, 14
+"""Places in a row."""
+
+
 def rows(files: list[Path], hard: bool) -> Iterator[list[object]]:
-    """A row per file and variant; the first solve of a process also loads libraries, and is done beforehand."""
-    row("warm", load_graph(files[0]))
+    """A row per file and variant; of a file that cannot be read or solved its name and the reason."""
+    cold = True  # the first solve of a process also loads libraries
     for file in files:
-        graph = load_graph(file)
-        for variant, make in VARIANTS.items() if hard else [("", lambda graph: graph)]:
-            yield row(f"{file.stem} {variant}".strip(), make(graph))
+        try:
+            graph = load_graph(file)
+            if cold:
+                row("warm", graph)
+            cold = False
+            for variant, make in VARIANTS.items() if hard else [("", lambda graph: graph)]:
+                yield row(f"{file.stem} {variant}".strip(), make(graph))
+        except InputError as reason:
+            yield [file.name, str(reason)]
 
 
-def main(*arguments: str) -> None:
+def main() -> None:
     """Print the table, and the totals."""
-    given = [a for a in arguments if not a.startswith("--")]
-    if "--unseen" in arguments:
-        found = list(unseen(*map(int, given)))
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER, help="of .pyfg, .g2o and .jrl files")
+    parser.add_argument("names", nargs="*", help="files, without their suffixes; all of them by default")
+    parser.add_argument("--hard", action="store_true", help="worse variants of each file, too")
+    parser.add_argument("--unseen", type=int, metavar="SEEDS", help="graphs that no file holds, of so many seeds")
+    given = parser.parse_args()
+    if given.unseen:
+        found = list(unseen(given.unseen))
+    elif not given.folder.is_dir():
+        parser.error(f"no folder {given.folder}")
     else:
-        folder = Path(given[0]) if given else FOLDER
-        if not folder.is_dir():
-            print(f"no folder {folder}", file=sys.stderr)
-            return
-        files = sorted(f for f in folder.rglob("*") if f.suffix in GRAPHS)
-        files = [f for f in files if not given[1:] or f.stem in given[1:]]
-        found = list(rows(files, "--hard" in arguments))
-    total: list[object] = [
-        "total",
-        "",
-        "",
-        "",
-        "",
-        "",
-        sum(r[6] for r in found),
-        "",
-        "",
-        "",
-        "",
-        sum(r[11] for r in found),
-    ]  # type: ignore[misc]
-    total += ["", "", sum(r[14] for r in found), ""]  # type: ignore[misc]
-    print(tabulate([*found, total], HEADER.split(), tablefmt="github", floatfmt=".6g"))
-    behind = [r[0] for r in found if not (r[3] == "SOLVED" and r[4] <= r[12] * (1 + 1e-9) + 1e-9)]  # type: ignore[operator]
-    slow = [r[0] for r in found if r[6] > 0.5 * r[14]]  # type: ignore[operator]
+        files = sorted(f for f in given.folder.rglob("*") if f.suffix in GRAPHS)
+        found = list(rows([f for f in files if not given.names or f.stem in given.names], given.hard))
+    ended = [r for r in found if len(r) > 2]
+    total: list[object] = ["total", *[""] * 15]
+    for column in (SECONDS, FROM_ODOMETRY, GTSAM_SECONDS):
+        total[column] = sum(r[column] for r in ended)  # type: ignore[misc]
+    print(tabulate([*ended, total], HEADER.split(), tablefmt="github", floatfmt=".6g"))
+    print("".join(f"{name}: {reason}\n" for name, reason in (r for r in found if len(r) == 2)), end="")
+    behind = [
+        r[0]
+        for r in ended
+        if not (r[STATUS] == "SOLVED" and r[COST] <= r[GTSAM_COST] * (1 + 1e-9) + 1e-9)  # type: ignore[operator]
+    ]
+    slow = [r[0] for r in ended if r[SECONDS] > 0.5 * r[GTSAM_SECONDS]]  # type: ignore[operator]
     print(f"not SOLVED, or above GTSAM: {behind}; slower than half of GTSAM: {slow}")
     print(f"largest memory {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

@@ -80,7 +80,7 @@ BAD_G2O = {
     "both": ("FIX", "VERTEX_TRACKXYZ 1 0 0 0\nEDGE_RANGE 0 1 2 4\nFIX", "line 9 = vertex 1", "both a pose and a point"),
     "id": ("VERTEX_TRACKXYZ 2", "VERTEX_TRACKXYZ -2", "line 3 = vertex -2", "g2o: a number"),
     "wrong kind": ("EDGE_SE3:QUAT 0 1", "EDGE_SE3:QUAT 0 2", "line 5 = vertex 2", "must be a pose"),
-    "unknown record": ("FIX", "EDGE2", "line 8 = EDGE2", "PARAMS_SE3OFFSET, FIX"),
+    "unknown record": ("FIX", "EDGE_2", "line 8 = EDGE_2", "PARAMS_SE3OFFSET, FIX"),
     "mixed": ("VERTEX_TRACKXYZ 2 3 4 5", "VERTEX_XY 2 3 4", "line 3 = VERTEX_XY", "3-D as line 1"),
 }
 
