@@ -1,8 +1,7 @@
-"""Cooperative Awareness Messages (ETSI EN 302 637-2): data elements, PER unaligned by pycrate (extra `etsi`), sizes."""
+"""Cooperative Awareness Messages (ETSI EN 302 637-2): data elements, PER unaligned by pycrate (extra `etsi`)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,6 @@ from ..arrays import Floats
 from ..errors import InputError, MissingLibraryError
 from .cam_structure import DIRECTIONS, Elements, structure
 from .data_dictionary import Origin, course_of, exact, heading_of, place_of, position_of, referenced_place, whole
-from .on_air import on_air, share
-from .v2x import FIX_AND_VELOCITY, V2X
 
 NO_SPEED, NO_YAW_RATE, NO_DIRECTION = np.array(16383), np.array(32767), np.array(2)
 """Unavailable."""
@@ -105,24 +102,6 @@ def decode(message: bytes) -> Elements:
     except Exception as error:
         raise InputError("message", f"{len(message)} bytes", f"is no CAM ({error})", "Give PER unaligned.") from None
     return Elements(place, np.array(heading), np.array(speed), np.array(rate), np.array(direction))
-
-
-def mean_size(rate: float, path: int = 10) -> float:
-    """Mean bytes on air of a car's CAMs at a rate, in Hz, with low-frequency containers and certificates when due."""
-    state = to_elements(np.zeros(3), np.array(0.0), np.array(10.0), np.array(0.0), (47.0, 8.0, 400.0))
-    short, long = (len(encode(state, (1.5, 1.5, 1.5), path=points)) for points in (0, path))
-    return on_air(short + share(2.0, rate) * (long - short), rate)
-
-
-def cam_encoded(max_neighbours: int = 6) -> V2X:
-    """`V2X.cam` with the size of an encoded CAM, which holds a fix and a velocity; what a method adds comes on top.
-
-    >>> cam_encoded(6).overhead
-    285
-    """
-    plain = V2X.cam(max_neighbours)
-    assert plain.rate is not None
-    return replace(plain, overhead=round(mean_size(plain.rate)) - FIX_AND_VELOCITY.payload)
 
 
 def _codec() -> Any:

@@ -1,8 +1,7 @@
-"""Collective Perception Messages (ETSI TS 103 324): data elements, PER unaligned by asn1tools (extra `etsi`), sizes."""
+"""Collective Perception Messages (ETSI TS 103 324): data elements, PER unaligned by asn1tools (extra `etsi`)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -24,12 +23,8 @@ from .data_dictionary import (
     referenced_place,
     whole,
 )
-from .on_air import on_air, share
-from .v2x import FIX_AND_VELOCITY, V2X
 
 LEAST, NO_CONFIDENCE = np.array(-131072), np.array(4096)
-VELOCITY = 12
-"""Bytes of a velocity in `FIX_AND_VELOCITY`: a CPM holds none of its sender."""
 
 
 def to_elements(
@@ -161,38 +156,6 @@ def decode(message: bytes) -> Elements:
         )
     except Exception as error:
         raise InputError("message", f"{len(message)} bytes", f"is no CPM ({error})", "Give PER unaligned.") from None
-
-
-def mean_size(rate: float, objects: int, described: bool = False) -> float:
-    """Mean bytes on air of a car's CPMs at a rate, in Hz, with sensors and certificates when due.
-
-    Args:
-        rate: Hz.
-        objects: perceived.
-        described: as in `encode`.
-    """
-    several = np.arange(objects)
-    vectors, std = np.ones((objects, 3)), np.full((objects, 3), 0.5)
-    elements = to_elements(np.zeros(3), np.array(0.0), several, vectors, std, (47.0, 8.0, 400.0))
-    short, long = (len(encode(elements, (1.5, 1.5, 1.5), 0.0, described, sensors)) for sensors in (False, True))
-    return on_air(short + share(1.0, rate) * (long - short), rate)
-
-
-def cpm_encoded(max_neighbours: int = 6, objects: int | None = None) -> V2X:
-    """`V2X.cpm` with the size of an encoded CPM, which holds a fix; what a method adds, a velocity first, is on top.
-
-    Args:
-        max_neighbours: K.
-        objects: perceived, with position and confidence; None for K. A method that sends its relative measurements
-            counts them itself: give 0.
-
-    >>> cpm_encoded(6).overhead
-    284
-    """
-    plain = V2X.cpm(max_neighbours)
-    assert plain.rate is not None
-    size = mean_size(plain.rate, max_neighbours if objects is None else objects)
-    return replace(plain, overhead=round(size) - (FIX_AND_VELOCITY.payload - VELOCITY))
 
 
 @cache

@@ -61,8 +61,9 @@ def heading_of(course: Floats) -> Ints:
 
 
 def course_of(heading: Ints) -> Floats:
-    """Courses in rad from +x, anticlockwise, in (-pi, pi]."""
-    return np.deg2rad(np.mod(270.0 - exact(heading, NO_HEADING) / 10.0, 360.0) - 180.0)
+    """Courses in rad from +x, anticlockwise, in [-pi, pi)."""
+    course: Floats = np.deg2rad(np.mod(270.0 - exact(heading, NO_HEADING) / 10.0, 360.0) - 180.0)
+    return course
 
 
 def confidence(std: tuple[float, float, float]) -> tuple[int, int]:
