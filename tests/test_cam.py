@@ -61,7 +61,7 @@ def one(elements: cam.Elements, k: int) -> cam.Elements:
 
 @pytest.mark.parametrize("path", [0, 10, 23])
 def test_asn1tools_writes_the_same_bytes(path: int) -> None:
-    """From the fields of the standard, by a codec that we did not write and that is not pycrate."""
+    """From the fields of the standard, by asn1tools, which shares no code with the codec that encodes CAMs here."""
     spec: Any = pytest.importorskip("asn1tools").compile_string(CAR, "uper")
     elements = states()
     for k in range(0, 200, 9):

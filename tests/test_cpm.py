@@ -54,7 +54,7 @@ def sent(count: int) -> cpm.Elements:
 
 @pytest.mark.parametrize(("count", "full"), PUBLIC)
 def test_bytes_are_those_of_the_public_modules(count: int, full: bool) -> None:
-    """ETSI's public modules, encoded by pycrate, which shares no code with asn1tools: bytes, and what they hold."""
+    """ETSI's public modules, encoded by pycrate, which shares no code with the codec here: bytes, and what they hold."""
     elements = sent(count)
     message = cpm.encode(elements, (1.5,) * 3, instant=723600000.5, described=full, sensors=full)
     assert message.hex() == PUBLIC[count, full]

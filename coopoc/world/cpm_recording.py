@@ -45,6 +45,7 @@ def cpm_received(recording: Recording, ego: int | str, origin: Origin = (50.0, 8
     links, body = recording.links, recording.body
     sent = np.flatnonzero(~np.isin(links.observer, [own, *recording.landmarks]))
     step, observer, measured = links.step[sent], links.observer[sent], recording.relative[:, sent]
+    # In the world frame vectors are as they were measured, whatever orientation a sender states.
     course = np.zeros(measured.shape[:2]) if body is None else body.heading[:, step, observer]
     level = np.isnan(measured[..., 2])
     measured[level, 2] = np.pi / 2
