@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 import coopoc as co
+from coopoc.errors import MissingLibraryError
 from coopoc.world import cpm
 from coopoc.world.cpm_recording import cpm_received
 from coopoc.world.encoded_channels import CERTIFICATE, DIGEST, HEADERS, cpm_encoded
@@ -54,7 +56,7 @@ def sent(count: int) -> cpm.Elements:
 
 @pytest.mark.parametrize(("count", "full"), PUBLIC)
 def test_bytes_are_those_of_the_public_modules(count: int, full: bool) -> None:
-    """ETSI's public modules, encoded by pycrate, which shares no code with the codec here: bytes, and what they hold."""
+    """ETSI's public modules, encoded by pycrate, which shares no code with the codec here: bytes and content."""
     elements = sent(count)
     message = cpm.encode(elements, (1.5,) * 3, instant=723600000.5, described=full, sensors=full)
     assert message.hex() == PUBLIC[count, full]
@@ -190,6 +192,13 @@ def test_the_channel_has_the_bytes_of_a_message() -> None:
     wanted = HEADERS + DIGEST + six + (CERTIFICATE - DIGEST + sensor) / 5 - 20
     assert cpm_encoded(6) == replace(co.V2X.cpm(6), overhead=round(wanted))
     assert cpm_encoded(0).overhead == cpm_encoded(6, objects=0).overhead < cpm_encoded(6).overhead
+
+
+def test_a_missing_codec_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpm._codec.cache_clear()
+    monkeypatch.setitem(sys.modules, "asn1tools", None)
+    with pytest.raises(MissingLibraryError, match=r"coopoc\[etsi\]"):
+        cpm.encode(sent(1), (1.5,) * 3)
 
 
 MAP = "020e0000000102a1e7af17d28d448c3b80745918b80b8000111894020a804028004001e0030096030bfce00c30006013900c00"
