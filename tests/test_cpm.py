@@ -113,13 +113,15 @@ def test_what_is_decoded_is_what_was_encoded() -> None:
             np.testing.assert_array_equal(given, found)
 
 
-def test_fields_that_this_package_never_sends_are_read_over() -> None:
-    """ETSI's public modules by pycrate: polar velocity and acceleration, yaw rate, a list of sensors, a pitch angle."""
-    message = bytes.fromhex(
-        "020e0000000102a1e7af17d28d448c3b80745918b80b8000111894080321a5fe00306021100402e810001e0030096030bfce00c3000601"
-        "382690234b0e060501410f8402020400"
+def test_fields_that_are_never_sent_here_are_read_over() -> None:
+    """ETSI's public modules by pycrate: a segment and rates, pitch and roll, a road-side unit's container, polar and
+    Cartesian velocities and accelerations, three angles, a yaw rate, one dimension, a list of sensors, two classes."""
+    message = (
+        "020e0000000132a1e7af17d28d448c3b80745918b80b800011189422028984010c697f8050400a0802020089e09013a060007800c02580"
+        "c2ff38030c001804e89a40805043b2d04860501410940af84020204581591625e2c7fffc0000000ffeffffc002765a09d9682d28152815"
+        "281701410028200504160431b800"
     )
-    for given, found in zip(sent(1), cpm.decode(message), strict=True):
+    for given, found in zip(sent(2), cpm.decode(bytes.fromhex(message)), strict=True):
         np.testing.assert_array_equal(given, found)
 
 

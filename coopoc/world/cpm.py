@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from typing import Any
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError, MissingLibraryError
-from .cpm_structure import ABSENT, OBJECTS, RADAR, SENSORS, VEHICLE, Elements, coordinates, left_out, perceived
+from .cpm_structure import ABSENT, CPM, OBJECTS, RADAR, SENSORS, VEHICLE, Elements, coordinates, left_out, perceived
 from .data_dictionary import (
     LINE,
+    NO_HEADING,
     Origin,
     course_of,
     exact,
@@ -97,25 +98,24 @@ def encode(
     >>> len(encode(two, (1.5, 1.5, 1.5))), len(encode(two, (1.5, 1.5, 1.5), described=True))
     (70, 110)
     """
-    codec = _codec()
+    pack = partial(_codec().encode, check_constraints=True)
     try:
         angle = {"value": int(elements.orientation), "confidence": 127}
-        containers = [(VEHICLE, codec.encode("OriginatingVehicleContainer", {"orientationAngle": angle}))]
+        containers = [(VEHICLE, pack("OriginatingVehicleContainer", {"orientationAngle": angle}))]
         if sensors:
-            containers.append((SENSORS, codec.encode("SensorInformationContainer", [RADAR])))
+            containers.append((SENSORS, pack("SensorInformationContainer", [RADAR])))
         if len(elements.identifiers):
-            objects = codec.encode("PerceivedObjectContainer", perceived(elements, described), check_constraints=True)
-            containers.append((OBJECTS, objects))
+            containers.append((OBJECTS, pack("PerceivedObjectContainer", perceived(elements, described))))
         management = {
             "referenceTime": round(1000 * instant),
             "referencePosition": reference_position(elements.place, std),
         }
         wrapped = [{"containerId": one, "containerData": data} for one, data in containers]
         message = {
-            "header": {"protocolVersion": 2, "messageId": 14, "stationId": 1},
+            "header": {"protocolVersion": 2, "messageId": CPM, "stationId": 1},
             "payload": {"managementContainer": management, "cpmContainers": wrapped},
         }
-        return bytes(codec.encode("CollectivePerceptionMessage", message, check_constraints=True))
+        return bytes(pack("CollectivePerceptionMessage", message))
     except Exception as error:
         raise InputError("elements", elements, f"cannot be encoded ({error})", "Take those of to_elements.") from None
 
@@ -138,7 +138,7 @@ def decode(message: bytes) -> Elements:
     codec = _codec()
     try:
         found = codec.decode("CollectivePerceptionMessage", message)
-        if found["header"]["messageId"] != 14:
+        if found["header"]["messageId"] != CPM:
             raise ValueError(f"messageId {found['header']['messageId']}")
         payload = found["payload"]
         data = {one["containerId"]: one["containerData"] for one in payload["cpmContainers"]}
@@ -149,10 +149,12 @@ def decode(message: bytes) -> Elements:
         objects = container.get("perceivedObjects", [])
         return Elements(
             referenced_place(payload["managementContainer"]["referencePosition"]),
-            np.array(vehicle.get("orientationAngle", {"value": 3601})["value"]),
+            np.array(vehicle.get("orientationAngle", {"value": int(NO_HEADING)})["value"]),
             np.array([one["objectId"] for one in objects], dtype=np.int64),
             np.array([coordinates(one["position"], "value", ABSENT) for one in objects]).reshape(-1, 3),
-            np.array([coordinates(one["position"], "confidence", 4096) for one in objects]).reshape(-1, 3),
+            np.array([coordinates(one["position"], "confidence", int(NO_CONFIDENCE)) for one in objects]).reshape(
+                -1, 3
+            ),
         )
     except Exception as error:
         raise InputError("message", f"{len(message)} bytes", f"is no CPM ({error})", "Give PER unaligned.") from None

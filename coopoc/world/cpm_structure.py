@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 from ..arrays import Ints
 
+CPM = 14
+"""Identifier of the message."""
 VEHICLE, SENSORS, OBJECTS = 1, 3, 5
 """Identifiers of the containers: the vehicle that sends, its sensors, what it perceives."""
 ABSENT = 131072
