@@ -139,11 +139,13 @@ def test_a_receiver_has_all_but_half_a_unit() -> None:
     assert 0.99 < more.max() < 1 + 1e-9
 
 
-def test_a_vector_that_is_too_long_is_none() -> None:
-    vectors = np.array([[1310.0, 0.0, 0.0], [1311.0, 0.0, 0.0], [0.0, -2000.0, 0.0]])
-    elements = cpm.to_elements(np.zeros(3), np.array(0.0), np.arange(3), vectors, np.ones((3, 3)), ORIGIN)
-    found = cpm.from_elements(cpm.decode(cpm.encode(elements, (1.5,) * 3)), ORIGIN)[2]
+def test_what_is_out_of_range_is_unavailable() -> None:
+    vectors, std = np.array([[1310.0, 0.0, 0.0], [1311.0, 0.0, 0.0], [0.0, -2000.0, 0.0]]), np.ones((3, 3))
+    std[0, 1] = 20.9  # times 1.96 is more than the 40.94 m that can be stated
+    elements = cpm.to_elements(np.zeros(3), np.array(0.0), np.arange(3), vectors, std, ORIGIN)
+    _, _, found, stated = cpm.from_elements(cpm.decode(cpm.encode(elements, (1.5,) * 3)), ORIGIN)
     assert np.isnan(found).any(axis=1).tolist() == [False, True, True]
+    assert np.isnan(stated).any(axis=1).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])

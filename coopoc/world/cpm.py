@@ -16,7 +16,6 @@ from .data_dictionary import (
     NO_HEADING,
     Origin,
     course_of,
-    exact,
     heading_of,
     place_of,
     position_of,
@@ -60,7 +59,7 @@ def to_elements(
 
 def from_elements(elements: Elements, origin: Origin) -> tuple[Floats, Floats, Floats, Floats]:
     """Position (..., 3) m and course rad of the sender, vectors (..., n, 3) m to the objects and their standard
-    deviations (..., n, 3) m as a receiver reads them; NaN: unavailable.
+    deviations (..., n, 3) m as a receiver reads them; NaN: unavailable or out of range.
 
     >>> std = np.full((1, 3), 0.5)
     >>> sent = to_elements(np.zeros(3), np.array(0.1), np.array([7]), np.array([[3.004, -4, 0]]), std, (47, 8, 400))
@@ -69,7 +68,7 @@ def from_elements(elements: Elements, origin: Origin) -> tuple[Floats, Floats, F
     """
     outside = (elements.vectors <= LEAST) | (elements.vectors >= ABSENT - 1)
     vectors = np.where(outside, np.nan, elements.vectors / 100.0)
-    std = exact(elements.confidence, NO_CONFIDENCE) / (100.0 * LINE)
+    std = np.where(elements.confidence >= NO_CONFIDENCE - 1, np.nan, elements.confidence / (100.0 * LINE))
     return position_of(elements.place, origin), course_of(elements.orientation), vectors, std
 
 
@@ -147,14 +146,16 @@ def decode(message: bytes) -> Elements:
         if left_out([vehicle, container]):
             raise ValueError("it holds fields that are not read here")
         objects = container.get("perceivedObjects", [])
+        vectors, confidence = (
+            np.array([coordinates(one["position"], part, missing) for one in objects], dtype=np.int64).reshape(-1, 3)
+            for part, missing in (("value", ABSENT), ("confidence", int(NO_CONFIDENCE)))
+        )
         return Elements(
             referenced_place(payload["managementContainer"]["referencePosition"]),
             np.array(vehicle.get("orientationAngle", {"value": int(NO_HEADING)})["value"]),
             np.array([one["objectId"] for one in objects], dtype=np.int64),
-            np.array([coordinates(one["position"], "value", ABSENT) for one in objects]).reshape(-1, 3),
-            np.array([coordinates(one["position"], "confidence", int(NO_CONFIDENCE)) for one in objects]).reshape(
-                -1, 3
-            ),
+            vectors,
+            confidence,
         )
     except Exception as error:
         raise InputError("message", f"{len(message)} bytes", f"is no CPM ({error})", "Give PER unaligned.") from None
