@@ -10,6 +10,7 @@ import pytest
 import coopoc as co
 from coopoc.world import cam
 from coopoc.world.cam_recording import cam_received
+from coopoc.world.data_dictionary import confidence
 
 pytest.importorskip("pycrate_asn1dir")
 ORIGIN = (50.1, 8.6, 112.0)
@@ -60,13 +61,13 @@ def one(elements: cam.Elements, k: int) -> cam.Elements:
 
 @pytest.mark.parametrize("path", [0, 10, 23])
 def test_asn1tools_writes_the_same_bytes(path: int) -> None:
-    """From the fields of the standard, by a codec that we did not write and that is not pycrate."""
+    """From the fields of the standard, by asn1tools, which shares no code with the codec that encodes CAMs here."""
     spec: Any = pytest.importorskip("asn1tools").compile_string(CAR, "uper")
     elements = states()
     for k in range(0, 200, 9):
         state = one(elements, k)
         latitude, longitude, altitude = state.place.tolist()
-        ellipse, height = cam.confidence((1.5, 1.5, 1.5))
+        ellipse, height = confidence((1.5, 1.5, 1.5))
         place = {
             "latitude": latitude,
             "longitude": longitude,

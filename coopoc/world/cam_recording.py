@@ -8,7 +8,8 @@ import numpy as np
 
 from ..arrays import Floats, checked, instance
 from .body import Body
-from .cam import Origin, from_elements, received_std, to_elements
+from .cam import from_elements, to_elements
+from .data_dictionary import Origin, received_std
 from .recording import Recording
 
 

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from ..arrays import Ints
+from .data_dictionary import reference_position
 
 POINT = {"pathPosition": {"deltaLatitude": 500, "deltaLongitude": 500, "deltaAltitude": 0}, "pathDeltaTime": 50}
 """Of a path history; a point takes the same bits whatever it holds."""
 
-
-HEIGHTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0)
-"""m, the classes of an altitude's confidence, and their names."""
-CLASSES = tuple("alt-{:03d}-{:02d}".format(*divmod(round(100 * height), 100)) for height in HEIGHTS)
 DIRECTIONS = ("forward", "backward", "unavailable")
 """Of the drive; a speed has no sign."""
 
@@ -35,17 +32,17 @@ class Elements(NamedTuple):
     direction: Ints
 
 
-def structure(elements: Elements, confidence: tuple[int, int], instant: float, path: int) -> dict[str, Any]:
+def structure(elements: Elements, std: tuple[float, float, float], instant: float, path: int) -> dict[str, Any]:
     """The message; what no localization method uses is unavailable.
 
     Args:
         elements: of one state.
-        confidence: semi-axis in cm, and class of the altitude.
+        std: m, of its fix.
         instant: s.
         path: points of a path history, 0 for no low-frequency container.
     """
     parameters: dict[str, Any] = {
-        "basicContainer": {"stationType": 5, "referencePosition": _place(elements, *confidence)},
+        "basicContainer": {"stationType": 5, "referencePosition": reference_position(elements.place, std)},
         "highFrequencyContainer": ("basicVehicleContainerHighFrequency", _fast(elements)),
     }
     if path:
@@ -54,20 +51,6 @@ def structure(elements: Elements, confidence: tuple[int, int], instant: float, p
     return {
         "header": {"protocolVersion": 2, "messageID": 2, "stationID": 1},
         "cam": {"generationDeltaTime": round(1000 * instant) % 65536, "camParameters": parameters},
-    }
-
-
-def _place(elements: Elements, axis: int, height: int) -> dict[str, Any]:
-    latitude, longitude, altitude = elements.place.tolist()
-    return {
-        "latitude": latitude,
-        "longitude": longitude,
-        "positionConfidenceEllipse": {
-            "semiMajorConfidence": axis,
-            "semiMinorConfidence": axis,
-            "semiMajorOrientation": 0,
-        },
-        "altitude": {"altitudeValue": altitude, "altitudeConfidence": [*CLASSES, "outOfRange"][height]},
     }
 
 
