@@ -13,12 +13,13 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..optimize.backend import require_backend
 from ..optimize.batch import solve_batch
-from ..optimize.gnc import EASY, RATE, ROUNDS, SETTLED, solve_gnc, surrogate_of
+from ..optimize.gnc import ROUNDS, solve_gnc
 from ..optimize.initial import converted
 from ..optimize.outliers import Candidates, mark, reweigh
 from ..optimize.problem import Problem
 from ..optimize.solution import Status
 from ..optimize.solve import solve
+from ..optimize.surrogates import EASY, RATE, SETTLED, surrogate_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message

@@ -8,6 +8,7 @@ from .constraint import Constraint
 from .distributed import Distributed, solve_distributed
 from .factor import Factor
 from .gnc import GNCBatch, solve_gnc, solve_gnc_batch
+from .graphs import loop_closures
 from .joint import joint_covariance
 from .local_problem import LocalProblem
 from .losses import Loss
@@ -37,6 +38,7 @@ __all__ = [
     "Status",
     "backends",
     "joint_covariance",
+    "loop_closures",
     "measurement",
     "pose",
     "solve",

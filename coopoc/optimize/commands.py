@@ -12,8 +12,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
+from ..errors import InputError
 from .backend import backends
-from .graphs import Objective, read_graph
+from .gnc import solve_gnc
+from .graphs import Objective, loop_closures, read_graph
 from .problem import Problem
 from .race import expected as expected_cost
 from .search import Search
@@ -35,6 +37,7 @@ def solve_file(
     start: Literal["auto", "odometry", "tree", "linear", "incremental", "apart", "file", "relaxed"] = "auto",
     seconds: Annotated[float, arg(metavar="S")] = np.inf,
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
+    outliers: bool = False,
 ) -> int:
     """Solve the factor graph of a PyFG, g2o or JRL file.
 
@@ -49,6 +52,7 @@ def solve_file(
             file's vertices, or the rounded point of a convex relaxation that needs no start (relaxed).
         seconds: after which a relaxed start is the point that was reached; without it the relaxation is solved.
         output: the solution as JSON; without it a summary goes to stdout.
+        outliers: find wrong loop closures and relative poses between robots, and leave them out (solve_gnc).
     """
     problem = read_graph(file, objective, "apart" if start == "relaxed" else start)
     if start == "relaxed":
@@ -58,9 +62,9 @@ def solve_file(
         problem = replace(problem, x0=staircase(problem, refine=False, seconds=seconds).x)
         problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
     print(f"coopoc: {problem}", file=sys.stderr)
-    solution = solve(problem, backend, throw=False)
+    solution = without_outliers(problem, backend) if outliers else solve(problem, backend, throw=False)
     summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
-    summary |= {"misfit": (size := misfit(problem, solution))}
+    summary |= {"misfit": (size := None if outliers else misfit(problem, solution))}
     if output is not None:
         output.write_text(json.dumps(summary | nodes(solution)) + "\n")
         print(f"coopoc: the solution is in {output}", file=sys.stderr)
@@ -70,6 +74,22 @@ def solve_file(
     if size is not None and not 1 / UNLIKELY < size < UNLIKELY:
         print(f"coopoc: residuals are {size:.2g} times what the file states. {MISTAKEN}", file=sys.stderr)
     return int(solution.status is not Status.SOLVED)
+
+
+def without_outliers(problem: Problem, backend: str) -> Solution:
+    """The solution without relative poses that GNC rejects; extras["rejected"] has their names.
+
+    Raises:
+        InputError: no relative pose but odometry, which is taken as right, or odometry leaves poses free.
+    """
+    candidates = loop_closures(problem)
+    if not candidates:
+        allowed = "must hold relative poses beside each robot's odometry"
+        raise InputError("outliers", repr(problem), allowed, "Leave out --outliers.")
+    solution = solve_gnc(problem, candidates, backend=backend, throw=False, start="known")
+    nodes = np.concatenate([problem.factors[k].nodes[rows] for k, rows in candidates])
+    rejected = [[problem.names[i] for i in pair] for pair in nodes[solution.extras["weights"] < 0.5].tolist()]
+    return replace(solution, extras=solution.extras | {"rejected": rejected})
 
 
 def misfit(problem: Problem, solution: Solution) -> float | None:
@@ -97,7 +117,7 @@ def described(solution: Solution) -> dict[str, Any]:
         "build_seconds": solution.build_seconds,
         "solve_seconds": solution.solve_seconds,
         "unobservable": list(solution.unobservable),
-    }
+    } | {key: solution.extras[key] for key in ("rejected",) if key in solution.extras}
 
 
 def nodes(solution: Solution) -> dict[str, Any]:

@@ -4,63 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, Ints, instance, number
+from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
 from ..plugins import one_of
 from .backend import Backend
 from .batch import Batch, solve_batch
+from .compatible import compatible
 from .outliers import Candidates, Marked, bounds, mark, reweigh, squares
 from .problem import Problem
 from .solution import Solution, SolveError, Status
 from .solve import solve
+from .surrogates import surrogate_of
 
-RATE = 1.4
-"""By which mu changes from round to round."""
+Start = Literal["all", "known"]
 ROUNDS = 300
 """About 20 are needed."""
-SETTLED = 1e-6
-"""Largest change of a weight that is none."""
-EASY = 1e-6
-"""Below this mu is not inverted: all candidates are far within their thresholds."""
-
-
-@dataclass(frozen=True)
-class Surrogate:
-    """A robust loss made convex by mu, as weights of the ratio s = r^2 / c^2.
-
-    Args:
-        first: mu from the largest ratio.
-        weight: w(s, mu) = d rho_mu / d r^2.
-        later: the next mu.
-        done: whether the weights (B, G) have settled, from the new ones, those before and mu (B,).
-    """
-
-    first: Callable[[Floats], Floats]
-    weight: Callable[[Floats, Floats], Floats]
-    later: Callable[[Floats], Floats]
-    done: Callable[[Floats, Floats, Floats], Bools]
-
-
-SURROGATES = {
-    "truncated": Surrogate(
-        lambda worst: 1.0 / np.maximum(2.0 * worst - 1.0, EASY),
-        lambda s, mu: np.clip(np.sqrt(mu * (mu + 1.0) / np.maximum(s, 1e-30)) - mu, 0.0, 1.0),
-        lambda mu: mu * RATE,
-        lambda new, old, mu: np.asarray(((new == old) & ((new == 0.0) | (new == 1.0))).all(axis=1)),
-    ),
-    "geman-mcclure": Surrogate(
-        lambda worst: np.maximum(2.0 * worst, 1.0),
-        lambda s, mu: np.square(mu / (s + mu)),
-        lambda mu: np.maximum(mu / RATE, 1.0),
-        lambda new, old, mu: np.asarray((mu == 1.0) & (np.abs(new - old) <= SETTLED).all(axis=1)),
-    ),
-}
-"""Of Yang et al.: min(r^2, c^2) as mu grows from c^2 / (2 r_max^2 - c^2), r^2 / (1 + r^2/c^2) as it falls to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +48,7 @@ def solve_gnc(
     groups: npt.ArrayLike | None = None,
     backend: str | Backend = "gauss-newton",
     throw: bool = True,
+    start: Start = "all",
     **options: Any,
 ) -> Solution:
     """A minimum of 1/2 sum |r_inlier|^2 + 1/2 sum_g rho(r_g^2), r_g^2 = sum over the group of |W (h(x) - z)|^2.
@@ -99,6 +63,10 @@ def solve_gnc(
     until the weights no longer change, truncated ones at 0 or 1. It needs no good start, but inlier groups that agree
     better than the others: a majority of consistent outliers wins, and so does an error that all share.
 
+    start="known" begins with the known inliers alone, which candidates join where they are predicted (`compatible`),
+    and then alternates with rho itself. Long drives with wrong loop closures need that: the first least squares over
+    all of them is of no use there.
+
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
         candidates: factors by index, or (factor, rows); M measurements in all.
@@ -108,6 +76,7 @@ def solve_gnc(
             each on its own.
         backend: of `solve`, which solves every round.
         throw: as in `solve`.
+        start: "all" with full weights, or "known" inliers, which must hold all nodes.
         options: of the backend.
 
     Returns:
@@ -116,7 +85,8 @@ def solve_gnc(
 
     Raises:
         InputError: candidates that do not exist, appear twice or have a loss, other groups than measurements, a
-            threshold outside (0, 1), an unknown loss, and what `solve` refuses.
+            threshold outside (0, 1), an unknown loss or start, known inliers that leave nodes free where the start is
+            theirs, and what `solve` refuses.
         SolveError: (if `throw`) as `solve`, or weights that did not settle.
 
     References:
@@ -137,7 +107,8 @@ def solve_gnc(
         return each[-1].x[None]
 
     marked = mark(problem, candidates, groups)
-    end = _sharpen(problem, marked, loss, threshold, inner)
+    one_of("start", start, get_args(Start))
+    end = _sharpen(problem, marked, loss, threshold, inner, start)
     weighted = reweigh(problem, marked, end.weight, end.x).pick(0)
     final = solve(weighted, backend, throw=throw and bool(end.settled[0]), **options)
     extras = {"weights": end.weight[0, marked.group], "rounds": int(end.rounds[0]), "mu": float(end.mu[0])}
@@ -206,14 +177,25 @@ class _End:
     settled: Bools
 
 
-def _sharpen(problem: Problem, marked: Marked, loss: str, threshold: float, inner: Callable[[Problem], Floats]) -> _End:
+def _sharpen(
+    problem: Problem,
+    marked: Marked,
+    loss: str,
+    threshold: float,
+    inner: Callable[[Problem], Floats],
+    start: Start = "all",
+) -> _End:
     """The alternation, in which `inner` solves the weighted least squares of the realisations that still change."""
-    surrogate, bound = surrogate_of(loss, threshold), bounds(problem, marked, threshold)
-    x = inner(problem)
-    bound = np.broadcast_to(bound, (len(x), bound.shape[1]))
-    ratio = squares(problem, marked, x) / bound
-    mu, weight = surrogate.first(ratio.max(axis=1)), np.ones_like(ratio)
-    rounds, active = np.zeros(len(x), dtype=np.int64), np.arange(len(x))
+    surrogate, bound, before = surrogate_of(loss, threshold), bounds(problem, marked, threshold), 0
+    if start == "known":
+        x, weight, before = compatible(problem, marked, bound, inner)
+        ratio, mu = squares(problem, marked, x) / bound, np.array([surrogate.last])
+    else:
+        x = inner(problem)
+        bound = np.broadcast_to(bound, (len(x), bound.shape[1]))
+        ratio = squares(problem, marked, x) / bound
+        mu, weight = surrogate.first(ratio.max(axis=1)), np.ones_like(ratio)
+    rounds, active = np.full(len(x), before), np.arange(len(x))
     for _ in range(ROUNDS):
         new = surrogate.weight(ratio, mu[active, None])
         going = ~surrogate.done(new, weight[active], mu[active])
@@ -227,12 +209,3 @@ def _sharpen(problem: Problem, marked: Marked, loss: str, threshold: float, inne
         mu[active] = surrogate.later(mu[active])
         rounds[active] += 1
     return _End(x, weight, mu, rounds, ~np.isin(np.arange(len(x)), active))
-
-
-def surrogate_of(loss: str, threshold: float) -> Surrogate:
-    """The surrogate of a loss; InputError if there is none, or if the threshold is no probability in (0, 1)."""
-    one_of("loss", loss, SURROGATES)
-    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
-        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
-        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
-    return SURROGATES[loss]

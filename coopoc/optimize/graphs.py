@@ -87,6 +87,33 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     return keep(problem, problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began)))
 
 
+def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
+    """Candidates for `solve_gnc`, (factor, rows): relative poses but those from one pose of a robot to its next.
+
+    Args:
+        problem: of a graph; the first letter of a name is the robot.
+
+    >>> from coopoc.optimize import pose
+    >>> problem = Problem(("A0", "A1", "A2"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1, 2), fixed=(0,))
+    >>> pairs = [("A0", "A1"), ("A1", "A2"), ("A2", "A0")]
+    >>> loop_closures(problem.add("relative_pose", pairs, pose(np.zeros((3, 2))), std=[0.1, 0.1, 0.1]))
+    [(0, [2])]
+    """
+    after, last = np.full(len(problem.names), -1), dict[str, int]()
+    for node in problem.poses:
+        robot = problem.names[node][0]
+        if robot in last:
+            after[last[robot]] = node
+        last[robot] = node
+    found = []
+    for k, factor in enumerate(problem.factors):
+        if factor.kind.startswith("relative_pose"):
+            i, j = factor.nodes.T
+            rows = np.flatnonzero((after[i] != j) & (after[j] != i)).tolist()
+            found += [(k, rows)] if rows else []
+    return found
+
+
 def _refuse_exact(graph: Graph, objective: Objective) -> None:
     """InputError for the first measurement without variance; a chordal objective sees means of variances alone."""
     for kind in ENDS:
