@@ -130,8 +130,8 @@ def read_log(
     rows, given = local(rows, origin), log_sensors.stds(rows)
     planar = not (rows.kind == "z").any()
     _check_scale(rows, path.name, any_scale)
-    grid = _grid(rows, dt, path.name)
     ids, make = _ids(rows, body), body_vehicle if body else vehicle
+    grid = _grid(rows, dt, path.name)
     vehicles = {one: make(one, rows.take(rows.vehicle == one), grid, max_gap, planar, tally) for one in ids}
     marks = [k for k, one in enumerate(vehicles.values()) if body and one.station]
     rows = seen_by_vehicles(rows, [ids[k] for k in marks], tally)
@@ -189,6 +189,9 @@ def _ids(rows: Rows, body: bool) -> list[str]:
     """Members that can be placed: by fixes, or in body frames by odometry, too."""
     if body:
         known = set(rows.vehicle[np.isin(rows.kind, ["x", "speed", "yaw_rate"])].tolist())
+        if not known:
+            hint = "Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks."
+            raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
         return [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in known]
     ids = _placed(rows)
     if not ids:

@@ -104,6 +104,7 @@ STUDY = lineup.study(
     findings=_findings,
     limitations=(
         "The bound is for the rms over runs over an ideal channel, whatever the channel of the cells.",
+        "Real data have no bound: it is of sensors that measure at every step.",
         "Methods that know nothing of noise, or learned it, are the same under every knowledge.",
     ),
     minutes=1,

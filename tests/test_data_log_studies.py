@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -55,7 +56,7 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
 
 
 def test_a_study_scores_vehicles_where_they_are(folders: Path, tmp_path: Path) -> None:
-    """The row of a vehicle that was away is the root mean square over its two stretches."""
+    """The row of a vehicle that was away is the root mean square over its two stretches; a log has no bound."""
     settings = {**FEW, "data": str(folders / "with"), "egos": ["car1", "car2"]}
     rows = co.run_study("side_by_side", tmp_path, settings=settings, progress=False).frame
     rec, fleet = co.load_recording(folders / "with"), load_fleet(folders / "with")
@@ -69,7 +70,18 @@ def test_a_study_scores_vehicles_where_they_are(folders: Path, tmp_path: Path) -
     assert got.tolist() == pytest.approx([wanted])
     mean = rows.groupby(["method", "max_neighbours"])["rt_le_m"].mean()
     assert mean["joint", 2] < mean["kalman", 2] < mean["gnss", 2]
-    assert (mean["bound"] < 1.3 * mean["joint"]).all()  # one run of two egos
+    assert mean["bound"].isna().all()
+
+
+def test_vehicles_whose_truth_comes_and_goes_fail_no_cell(folders: Path, tmp_path: Path) -> None:
+    """The default methods, of which the bound refused an ego that was absent at some steps."""
+    shutil.copytree(folders / "with", tmp_path / "gaps")
+    known = truth(drive(4, gap=15.0))
+    write(known[known["t"] >= known.groupby("vehicle")["t"].transform("min") + 3], tmp_path / "gaps" / "truth.csv")
+    settings = {"data": str(tmp_path / "gaps"), "max_neighbours": "2", "egos": "car1,car2"}
+    results = co.run_study("side_by_side", tmp_path, settings=settings, progress=False)
+    assert not results.failed
+    assert results.frame.groupby("method")["rt_le_m"].count().drop("bound").eq(2).all()
 
 
 def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> None:

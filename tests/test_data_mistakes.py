@@ -25,6 +25,9 @@ WIDE = "t,vehicle,x,y,speed,heading\n" + "".join(f"{k / 10},red,{0.8 * k:.1f},0,
 STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.0\n" for k in range(20))
 
 
+RANGES = "t,vehicle,partner,range\n0,tag,anchor,4.2\n1,tag,anchor,4.4\n"
+
+
 def swap(old: str, new: str, text: str = GOOD, count: int = 1) -> str:
     assert old in text
     return text.replace(old, new, count)
@@ -64,6 +67,8 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
         "vehicle red",
     ),
     "no fix at all": ("t,vehicle,vx,vy\n0,red,8,0\n1,red,8,0\n", {}, "fixes"),
+    "ranges alone": (RANGES, {"dt": 0.5}, "fixes"),
+    "ranges alone, in body frames": (RANGES, {"dt": 0.5, "frame": "body"}, "fixes, odometry"),
     "a truth of other vehicles": (GOOD, {"truth": "t,vehicle,x,y\n0,rot,0,0\n1,rot,8,0\n"}, "column vehicle"),
     "a clock of an unknown vehicle": (GOOD, {"clock": {"bleu": 0.1}}, ""),
     "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
