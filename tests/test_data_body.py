@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 import coopoc as co
+from coopoc.data.log_poses import check_poses
 from coopoc.data.recordings import load_log
 from coopoc.evaluate.innovations import innovation_columns, normalised_innovations
 from coopoc.study.run import find_study
@@ -177,6 +178,15 @@ def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path,
     assert ("bearings miss the filter's estimates" in done.stdout) == mirrored
     assert ("nothing looks wrong" in done.stdout) != mirrored
     assert (tmp_path / "log-check.png").stat().st_size > 20_000
+
+
+def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
+    folder = written(tmp_path / "log", noise=1.0)
+    truth = table()[1]
+    truth[truth["vehicle"] == "blue"].assign(x=lambda frame: frame["x"] + 50).to_csv(folder / "truth.csv", index=False)
+    found = check_poses(co.read_log(folder, frame="body"))
+    assert ["error_m" in row for row in found.vehicles] == [row["vehicle"] == "blue" for row in found.vehicles]
+    assert ["blue: fixes lie -5" in doubt for doubt in found.doubts] == [True]
 
 
 def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -174,6 +175,16 @@ def test_the_check_finds_nothing_wrong_where_nothing_is(folders: Path) -> None:
     assert all(0.7 < row["nis"] < 1.3 for row in found.vehicles)
     (ranges,) = [row for row in found.measurements if row["measurement"] == "range"]
     assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
+
+
+def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> None:
+    moved = truth(drive(4, gap=15.0)).assign(x=lambda frame: frame["x"] - 40, y=lambda frame: frame["y"] + 9)
+    write(moved, tmp_path / "vicon.csv")
+    doubts = check(read_log(folders / "without", truth=tmp_path / "vicon.csv")).doubts
+    assert len(doubts) == 4
+    east, north = re.findall(r"lie (\S+) m east and (\S+) m north", doubts[0])[0]
+    assert float(east) == pytest.approx(40, abs=0.7)
+    assert float(north) == pytest.approx(-9, abs=0.7)
 
 
 def _changed(frame: pd.DataFrame, kinds: list[str], change: object) -> pd.DataFrame:
