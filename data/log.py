@@ -88,10 +88,10 @@ def read_log(
             largest of 5 dt, 0.5 s and 1.5 times its own median interval.
         columns: names in the files, as {"t": "timestamp", "vehicle": "car|from"}, where tables differ.
         kinds: names in a column kind, as {"uwb": "range"}.
-        ignore: kinds that are left out.
+        ignore: kinds that are left out; topics of a bag.
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
         origin: latitude deg, longitude deg, height m of the local frame; None: the first fix.
-        truth: file of the truth, if it is not in the folder under that name.
+        truth: file of the truth, if it is not in the folder under that name; topic in a bag.
         sensors: noise that methods may assume; None: the standard deviations in the log, else `Sensors()`.
         any_scale: True accepts positions that do not look like metres and seconds.
         frame: "world", or "body" for pose filters: speed, yaw rate, compass and bearings stay as they were measured, a
@@ -114,8 +114,11 @@ def read_log(
     _check_options(dt, max_gap, clock, frame)
     body = frame == "body"
     if is_bag(path):
-        rows, actual = read_bag(path, tally)
-        true = None if truth is None else Path(truth)
+        if columns or kinds:
+            hint = 'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".'
+            raise InputError("columns, kinds", path.name, "are of tables, and this is a bag", hint)
+        true = Path(truth) if truth is not None and Path(truth).exists() else None
+        rows, actual = read_bag(path, tally, ignore, "" if true or truth is None else str(truth))
     else:
         files, true = files_of(path, None if truth is None else Path(truth))
         check_headers(columns or {}, [*files, *([true] if true else [])], path.name)

@@ -56,6 +56,18 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
         load_fleet(folders / "without")
 
 
+def test_errors_are_averaged_where_the_truth_is_known(folders: Path, tmp_path: Path) -> None:
+    known = truth(drive(4, gap=15.0))
+    write(known[known["t"] > 6], tmp_path / "late.csv")
+    log = read_log(folders / "without", truth=tmp_path / "late.csv")
+    assert log.truth is not None
+    track = co.Kalman()(log.recording, ["car0"])
+    late = log.truth.present[:, 0]
+    assert 0 < late.sum() < len(late)
+    gap = track.x[0, late, 0] - drive(4, gap=15.0).position[late, 0]
+    assert co.rt_le(track, log.truth).item() == pytest.approx(np.sqrt(np.square(gap).sum(axis=1).mean()))
+
+
 def test_a_study_scores_vehicles_where_they_are(folders: Path, tmp_path: Path) -> None:
     """The row of a vehicle that was away is the root mean square over its two stretches; a log has no bound."""
     settings = {**FEW, "data": str(folders / "with"), "egos": ["car1", "car2"]}
