@@ -23,6 +23,8 @@ from .log_truth import frame_doubt
 
 WRONG = 3.0
 """Times the stated standard deviation that residuals of a filter's own estimates are not expected to reach."""
+INCONSISTENT = 75.0
+"""NEES of a pose, 3 if consistent: errors five times as large as stated."""
 GATE = 5.0
 
 
@@ -70,7 +72,11 @@ def check_poses(log: Log) -> PoseCheck:
         assert track.heading_covariance is not None
         row["std_m"] = float(np.sqrt(np.trace(track.covariance[0, :, k, :2, :2], axis1=1, axis2=2)).mean())
         row["heading_std_deg"] = float(np.rad2deg(np.sqrt(track.heading_covariance[0, :, k, 3])).mean())
-        vehicles.append(row | _errors(log, track, k))
+        row |= _errors(log, track, k)
+        vehicles.append(row)
+        if row.get("nees", 0.0) > INCONSISTENT:
+            larger = np.sqrt(row["nees"] / 3)
+            doubts.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
         doubts += frame_doubt(rec, log.truth, column)
     measurements = []
     for name, unit, residual, std in _residuals(rec, track):

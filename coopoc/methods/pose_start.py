@@ -152,6 +152,9 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known:
         given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         allowed = "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found"
         raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
+    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (known[seen] == known[seen[0]]).all():
+        given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
+        raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
     turns = _turns(recording, run, column)
     middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
     way = recording.dt * turned(recording.velocity[run, :, column], middle)
