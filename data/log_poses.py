@@ -74,10 +74,11 @@ def check_poses(log: Log) -> PoseCheck:
         row["heading_std_deg"] = float(np.rad2deg(np.sqrt(track.heading_covariance[0, :, k, 3])).mean())
         row |= _errors(log, track, k)
         vehicles.append(row)
-        if row.get("nees", 0.0) > INCONSISTENT:
+        apart = frame_doubt(rec, log.truth, column)
+        doubts += apart
+        if not apart and row.get("nees", 0.0) > INCONSISTENT:
             larger = np.sqrt(row["nees"] / 3)
             doubts.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
-        doubts += frame_doubt(rec, log.truth, column)
     measurements = []
     for name, unit, residual, std in _residuals(rec, track):
         spread = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
