@@ -80,7 +80,11 @@ def _of_mrclam(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
     log = read_mrclam(path, dt=dt, max_gap=max_gap)
     seen = recording(log, V2X(max_neighbours=max(len(log.fleet.ids) - 1, 0), radius=float("inf")))
     grid = f"{len(seen.t)} steps of {seen.dt:g} s, {seen.t[-1]:.1f} s"
-    counts = {"landmarks": len(log.sightings), "robots without files": log.absent, "barcodes in no list": log.unknown}
+    counts = {
+        "landmarks (coopoc run real takes them)": len(log.sightings),
+        "robots without odometry, measurements or truth": log.absent,
+        "barcodes in no list": log.unknown,
+    }
     refused = {f"measurements of {what}": (number, "") for what, number in counts.items() if number}
     vehicles = dict.fromkeys(log.fleet.ids, "wheel odometry, range and bearing, Vicon")
     read = {"measurements between robots": len(log.range)}

@@ -14,8 +14,10 @@ import pandas as pd
 import pytest
 from filterpy.kalman import KalmanFilter
 from logs import drive, long, seen, write
+from matplotlib.figure import Figure
 
 import coopoc as co
+from coopoc.data import log_picture
 from coopoc.data.log import read_log
 from coopoc.data.log_check import check
 from coopoc.data.registry import kind_of, load_fleet, load_log
@@ -187,6 +189,15 @@ def test_the_check_finds_nothing_wrong_where_nothing_is(folders: Path) -> None:
     assert all(0.7 < row["nis"] < 1.3 for row in found.vehicles)
     (ranges,) = [row for row in found.measurements if row["measurement"] == "range"]
     assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
+
+
+def test_a_picture_without_innovations_says_so(tmp_path: Path) -> None:
+    frame = long(seen(drive(2, steps=60)), messages=False)
+    first = frame["t"] == frame["t"].min()
+    log = read_log(write(frame[first | ~frame["kind"].isin(["x", "y", "z"])], tmp_path / "log.csv"))
+    axes = Figure().add_subplot()
+    log_picture._fixes(axes, log.recording, check(log))
+    assert [text.get_text() for text in axes.texts] == ["no vehicle has a fix after its first"]
 
 
 def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> None:
