@@ -139,7 +139,7 @@ def read_log(
     marks = [k for k, one in enumerate(vehicles.values()) if body and one.station]
     rows = seen_by_vehicles(rows, [ids[k] for k in marks], tally)
     found = linked(rows, vehicles, grid, planar, tally)
-    noise = log_sensors.assumed(given, sensors, rows, planar, body, tally)
+    noise = log_sensors.assumed(given, sensors, rows, planar, body, tally, float(grid[1] - grid[0]))
     to_landmark = np.isin(found.links.neighbour, marks)
     pairs = (found.links.step * len(ids) + found.links.observer)[~to_landmark]
     recording = Recording(
