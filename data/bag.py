@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from coopoc.errors import InputError, MissingLibraryError
+from coopoc.plugins import unknown
 
 from .log_rows import Rows, rows_of
 from .log_summary import Tally
@@ -19,8 +21,10 @@ READ = {
     "sensor_msgs/msg/Imu": "imu",
     "geometry_msgs/msg/PoseStamped": "pose",
 }
+POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 TRUTH = ("truth", "ground_truth", "groundtruth")
 Row = tuple[float, str, str, float, float]
+"""Time s, vehicle, kind, value and standard deviation of a number."""
 
 
 def is_bag(path: Path) -> bool:
@@ -32,21 +36,24 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
 
 
-def read_bag(path: Path, tally: Tally) -> tuple[Rows, Rows | None]:
+def read_bag(path: Path, tally: Tally, ignore: Sequence[str] = (), truth: str = "") -> tuple[Rows, Rows | None]:
     """Rows of the measurements in a bag, and those of the truth, if a topic is named after it.
 
     The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part. NavSatFix
     gives latitude, longitude, height; Odometry the speed and yaw rate of its twist (its pose has a frame of its own and
     is not used); Imu the yaw of its orientation as heading and the yaw rate, which goes before that of Odometry;
-    PoseStamped x, y, z in the frame of the map, and the truth where a part of the topic is truth or ground_truth. Times
-    are those of the headers, deviations those of the covariances.
+    PoseStamped x, y, z in the frame of the map. The truth is the poses of PoseStamped or Odometry where the topic is
+    `truth`, or a part of it is truth or ground_truth. Times are those of the headers, deviations those of the
+    covariances.
 
     Args:
         path: of the bag.
         tally: counts what is not read.
+        ignore: topics and kinds that are left out.
+        truth: topic of the truth.
 
     Raises:
-        InputError: no bag, or none of these messages.
+        InputError: no bag, none of these messages, or no such topic.
         MissingLibraryError: rosbags is not installed.
     """
     try:
@@ -59,17 +66,24 @@ def read_bag(path: Path, tally: Tally) -> tuple[Rows, Rows | None]:
     folder = path.parent if path.suffix == ".db3" else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            wanted = [c for c in reader.connections if c.msgtype in READ]
+            topics = sorted({c.topic for c in reader.connections})
+            for topic in filter(None, [truth, *(one for one in ignore if one.startswith("/"))]):
+                if topic not in topics:
+                    raise unknown(f"{path.name}: topic", topic, topics)
+            wanted = [c for c in reader.connections if c.msgtype in READ and c.topic not in ignore]
             for connection in reader.connections:
-                if connection.msgtype not in READ:
+                if connection not in wanted:
                     tally.unused(f"{path.name}: topic {connection.topic} ({connection.msgtype})", connection.msgcount)
             for connection, _, raw in reader.messages(connections=wanted) if wanted else ():
                 parts = connection.topic.strip("/").split("/")
                 name = parts[0] if len(parts) > 1 else path.stem
                 message: Any = reader.deserialize(raw, connection.msgtype)
-                actual = any(part.lower() in TRUTH for part in parts)
-                found = _rows(READ[connection.msgtype], name, message, tally, f"{path.name}: {connection.topic}")
-                (true if actual else rows).extend(found)
+                actual = connection.topic == truth or any(part.lower() in TRUTH for part in parts)
+                kind = "actual" if actual and connection.msgtype in POSES else READ[connection.msgtype]
+                found = _rows(kind, name, message, tally, f"{path.name}: {connection.topic}")
+                (true if actual else rows).extend(row for row in found if row[2].partition(" of ")[0] not in ignore)
+    except InputError:
+        raise
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
         found_text = next(iter(str(error).splitlines()), type(error).__name__)[:200]
         raise InputError(path.name, found_text, "must be a ROS bag", "Record it again, or reindex it.") from None
@@ -104,8 +118,10 @@ def _rows(kind: str, name: str, m: Any, tally: Tally, place: str) -> list[Row]:
         if m.orientation_covariance[0] >= 0 and _yaw(m.orientation) is not None:
             out.append((t, name, "heading", float(_yaw(m.orientation) or 0.0), std[2]))
         return out
-    p = m.pose.position
-    return [(t, name, axis, float(value), np.nan) for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)]
+    pose = getattr(m.pose, "pose", m.pose)
+    p, yaw = pose.position, _yaw(pose.orientation) if kind == "actual" else None
+    facing = [] if yaw is None else [(t, name, "heading", yaw, np.nan)]
+    return [(t, name, axis, float(value), np.nan) for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)] + facing
 
 
 def _one_yaw_rate(rows: list[Row]) -> list[Row]:

@@ -179,13 +179,13 @@ def convert_(
     columns: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=HEADER ...")] = (),
     format: str | None = None,
 ) -> None:
-    """Convert a drive to CSV, Parquet or a folder of TUM files.
+    """Convert a drive to CSV, Parquet or a folder of TUM files, and a log in body frames to a factor graph.
 
-    Example: coopoc data convert fcd.xml drive.csv --dt 0.1
+    Example: coopoc data convert fcd.xml drive.csv --dt 0.1; coopoc data convert "mylog?frame=body" drive.pyfg
 
     Args:
         source: name or path.
-        out: .csv, .parquet or a folder.
+        out: .csv, .parquet or a folder; of a log .pyfg or .g2o.
         dt: s, resample.
         max_gap: s, longest gap of a vehicle that dt bridges.
         columns: names in the file, where they differ from id, t, x, y, z, vx, vy, vz.
@@ -193,6 +193,12 @@ def convert_(
     """
     given = {"max_gap": max_gap, "columns": _pairs("--columns", columns)}
     options = {name: value for name, value in given.items() if value}
+    if out.suffix in (".pyfg", ".g2o"):
+        from .recording_graph import write_log_graph
+
+        log = load_log(source, **options, **({} if dt is None else {"dt": dt}))
+        print(f"{write_log_graph(log, out)!r} written to {out}", file=sys.stderr)
+        return
     print(f"{convert(source, out, dt, format=format, **options)!r} written to {out}", file=sys.stderr)
 
 

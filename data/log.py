@@ -88,10 +88,10 @@ def read_log(
             largest of 5 dt, 0.5 s and 1.5 times its own median interval.
         columns: names in the files, as {"t": "timestamp", "vehicle": "car|from"}, where tables differ.
         kinds: names in a column kind, as {"uwb": "range"}.
-        ignore: kinds that are left out.
+        ignore: kinds that are left out; topics of a bag.
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
         origin: latitude deg, longitude deg, height m of the local frame; None: the first fix.
-        truth: file of the truth, if it is not in the folder under that name.
+        truth: file of the truth, if it is not in the folder under that name; topic in a bag.
         sensors: noise that methods may assume; None: the standard deviations in the log, else `Sensors()`.
         any_scale: True accepts positions that do not look like metres and seconds.
         frame: "world", or "body" for pose filters: speed, yaw rate, compass and bearings stay as they were measured, a
@@ -114,8 +114,11 @@ def read_log(
     _check_options(dt, max_gap, clock, frame)
     body = frame == "body"
     if is_bag(path):
-        rows, actual = read_bag(path, tally)
-        true = None if truth is None else Path(truth)
+        if columns or kinds:
+            hint = 'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".'
+            raise InputError("columns, kinds", path.name, "are of tables, and this is a bag", hint)
+        true = Path(truth) if truth is not None and Path(truth).exists() else None
+        rows, actual = read_bag(path, tally, ignore, "" if true or truth is None else str(truth))
     else:
         files, true = files_of(path, None if truth is None else Path(truth))
         check_headers(columns or {}, [*files, *([true] if true else [])], path.name)
@@ -130,13 +133,13 @@ def read_log(
     rows, given = local(rows, origin), log_sensors.stds(rows)
     planar = not (rows.kind == "z").any()
     _check_scale(rows, path.name, any_scale)
-    grid = _grid(rows, dt, path.name)
     ids, make = _ids(rows, body), body_vehicle if body else vehicle
+    grid = _grid(rows, dt, path.name)
     vehicles = {one: make(one, rows.take(rows.vehicle == one), grid, max_gap, planar, tally) for one in ids}
     marks = [k for k, one in enumerate(vehicles.values()) if body and one.station]
     rows = seen_by_vehicles(rows, [ids[k] for k in marks], tally)
     found = linked(rows, vehicles, grid, planar, tally)
-    noise = log_sensors.assumed(given, sensors, rows, planar, body, tally)
+    noise = log_sensors.assumed(given, sensors, rows, planar, body, tally, float(grid[1] - grid[0]))
     to_landmark = np.isin(found.links.neighbour, marks)
     pairs = (found.links.step * len(ids) + found.links.observer)[~to_landmark]
     recording = Recording(
@@ -189,6 +192,9 @@ def _ids(rows: Rows, body: bool) -> list[str]:
     """Members that can be placed: by fixes, or in body frames by odometry, too."""
     if body:
         known = set(rows.vehicle[np.isin(rows.kind, ["x", "speed", "yaw_rate"])].tolist())
+        if not known:
+            hint = "Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks."
+            raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
         return [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in known]
     ids = _placed(rows)
     if not ids:

@@ -14,6 +14,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.world.recording import Recording
 
 from .log import Log
+from .log_truth import frame_doubt
 from .mrclam import robust_std
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
@@ -105,6 +106,7 @@ def _vehicles(log: Log, fix: Floats, normalised: Floats) -> tuple[list[dict[str,
             row["fix_error_m"] = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else None
         rows.append(row)
         doubts += _of_vehicle(name, row, distance, turn, int(seen.sum()))
+        doubts += frame_doubt(rec, log.truth, column)
     return rows, doubts
 
 

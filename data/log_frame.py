@@ -65,7 +65,8 @@ def origin_of(rows: Rows, given: tuple[float, float, float] | None) -> tuple[flo
         return given
     flat = np.flatnonzero(np.isin(rows.kind, ["x", "y"]))
     if len(flat):
-        hint = "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two."
+        hint = "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "
+        hint += "ignore= leaves out kinds, and topics of a bag."
         raise InputError(f"{rows.place(int(flat[0]))}, x", "metres", "stand beside fixes in degrees", hint)
     heights = bool((degrees.kind == "height").any())
     order = np.argsort(degrees.t, kind="stable")

@@ -13,8 +13,10 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.links import Links
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import schedule
+from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
+from .log_moved import Measured, brought, brought_in_body
 from .log_rows import Rows
 from .log_summary import Tally
 from .log_vehicle import COURSE, Vehicle
@@ -43,10 +45,10 @@ def linked(rows: Rows, vehicles: Mapping[str, Vehicle], grid: Floats, planar: bo
     """Links of all relative measurements and messages, at the nearest step to their time.
 
     A bearing becomes an azimuth by the heading of its observer at its own time; in body frames an azimuth becomes a
-    bearing by the heading that was measured. Of several measurements of a kind
-    of one pair at a step the nearest in time is kept. Where heights are all 0, an inclination that was not measured is
-    pi/2 beside a range and a direction. A message at a step without a measurement is a link without one. Where no
-    message was logged at all, every vehicle sends at every step and all arrives at once.
+    bearing by the heading that was measured. Then all are brought to the step (`log_moved`). Of several measurements of
+    a kind of one pair at a step the nearest in time is kept. Where heights are all 0, an inclination that was not
+    measured is pi/2 beside a range and a direction. A message at a step without a measurement is a link without one.
+    Where no message was logged at all, every vehicle sends at every step and all arrives at once.
     """
     ids = list(vehicles)
     there = np.stack([np.isfinite(one.velocity[:, 0]) for one in vehicles.values()], axis=1)
@@ -149,12 +151,16 @@ def _measured(
             tally.refuse(reason, int(wrong.sum()), rows.place(int(np.flatnonzero(wrong)[0])))
     good = np.flatnonzero(both & np.isfinite(value))
     good = good[np.argsort(np.abs(lag[good]), kind="stable")]
+    which = Measured(*(part[good] for part in (value, component, step, lag, observer, partner)))
+    every = list(vehicles.values())
+    moved = brought_in_body(which, every) if body else brought(which, every, float(grid[1] - grid[0]))
+    moved = np.where(which.component == 1, wrap(moved), moved)
     found: dict[tuple[int, int, int], list[float]] = {}
     again: list[int] = []
-    for k in good.tolist():
+    for k, brought_value in zip(good.tolist(), moved.tolist(), strict=True):
         entry = found.setdefault((int(step[k]), int(observer[k]), int(partner[k])), [np.nan] * 3)
         if np.isnan(entry[component[k]]):
-            entry[component[k]] = float(value[k])
+            entry[component[k]] = brought_value
         else:
             again.append(k)
     if again:

@@ -138,6 +138,9 @@ def _fixes(axes: Axes, rec: Recording, found: Check) -> None:
             heights, _ = np.histogram(np.minimum(each, top - 1e-9), bins, density=True)
             label = f"{picture(name)}: mean {each.mean():.3g}"
             axes.stairs(heights, bins, color=_color(column), lw=1.4, label=label)
+    if not axes.get_legend_handles_labels()[1]:
+        text = "no vehicle has a fix after its first"
+        axes.text(0.5, 0.5, text, ha="center", va="center", color="#5B6470", transform=axes.transAxes)
     line = np.linspace(0, top, 200)
     axes.plot(line, chi2(size).pdf(line), color=INK, lw=1.8, ls=(0, (4, 2)), label=f"$\\chi^2_{size}$: mean {size}")
     axes.set_xlim(0, top)

@@ -19,9 +19,12 @@ from coopoc.world.recording import Recording
 from coopoc.world.spherical import wrap
 
 from .log import Log
+from .log_truth import frame_doubt
 
 WRONG = 3.0
 """Times the stated standard deviation that residuals of a filter's own estimates are not expected to reach."""
+INCONSISTENT = 75.0
+"""NEES of a pose, 3 if consistent: errors five times as large as stated."""
 GATE = 5.0
 
 
@@ -69,7 +72,13 @@ def check_poses(log: Log) -> PoseCheck:
         assert track.heading_covariance is not None
         row["std_m"] = float(np.sqrt(np.trace(track.covariance[0, :, k, :2, :2], axis1=1, axis2=2)).mean())
         row["heading_std_deg"] = float(np.rad2deg(np.sqrt(track.heading_covariance[0, :, k, 3])).mean())
-        vehicles.append(row | _errors(log, track, k))
+        row |= _errors(log, track, k)
+        vehicles.append(row)
+        apart = frame_doubt(rec, log.truth, column)
+        doubts += apart
+        if not apart and row.get("nees", 0.0) > INCONSISTENT:
+            larger = np.sqrt(row["nees"] / 3)
+            doubts.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
     measurements = []
     for name, unit, residual, std in _residuals(rec, track):
         spread = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
@@ -133,10 +142,10 @@ def begin_of(log: Log, who: Sequence[int], gate: float) -> tuple[Floats | None, 
 
 def _errors(log: Log, track: Track, k: int) -> dict[str, float]:
     """Errors of an ego of the track, as far as the truth is known."""
-    if log.truth is None:
+    if log.truth is None or not log.truth.present[:, track.egos[k]].any():
         return {}
     found = {"error_m": float(np.nanmean(errors(track, log.truth)[0, :, k]))}
-    if log.truth.heading is not None:
+    if log.truth.heading is not None and np.isfinite(log.truth.heading[:, track.egos[k]]).any():
         off = np.rad2deg(np.abs(heading_error(track, log.truth)[0, :, k]))
         found |= {"heading_error_deg": float(np.nanmean(off))}
         found |= {"nees": float(np.nanmean(pose_nees(track, log.truth)[0, :, k]))}

@@ -35,7 +35,13 @@ def stds(rows: Rows) -> Mapping[str, Floats]:
 
 
 def assumed(
-    given: Mapping[str, Floats], sensors: Sensors | None, rows: Rows, planar: bool, body: bool, tally: Tally
+    given: Mapping[str, Floats],
+    sensors: Sensors | None,
+    rows: Rows,
+    planar: bool,
+    body: bool,
+    tally: Tally,
+    dt: float,
 ) -> Sensors:
     """Sensors of a log: those that are given, else the root mean square of the logged standard deviations of each kind.
 
@@ -82,4 +88,22 @@ def assumed(
             heading_std=of("heading", default=HEADING_STD, unit="rad"),
             compass="heading" in used,
         )
-    return found if speed is None else replace(found, velocity_std_ratio=0.0, velocity_floor=speed)
+    if speed is None:
+        return found
+    if not body and {"speed", "heading"} <= set(given):
+        speed = _across(speed, of("heading", default=0.0, unit="rad"), rows, dt)
+        tally.assume(f"{speed:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds")
+    return replace(found, velocity_std_ratio=0.0, velocity_floor=speed)
+
+
+def _across(speed: float, heading: float, rows: Rows, dt: float) -> float:
+    """Standard deviation m/s of each axis of a velocity that is a speed v turned by a measured heading: the mean of the
+    variances along, s_v^2, and across, v^2 s_h^2 n, where a heading's error lasts for the n steps to the next one; at
+    least s_v."""
+    v = rows.value[rows.kind == "speed"]
+    turned = rows.kind == "heading"
+    vehicles = set(rows.vehicle[turned].tolist())
+    gaps = [np.diff(np.unique(rows.t[turned & (rows.vehicle == one)])) for one in vehicles]
+    interval = float(np.median(np.concatenate([*gaps, [dt]])))
+    across = float(np.mean(v**2)) * heading**2 * max(interval / dt, 1.0)
+    return max(speed, float(np.sqrt((speed**2 + across) / 2)))

@@ -109,9 +109,13 @@ def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
     kind = np.array([kinds.get(one, one) for one in found.tolist()], dtype=object)
     for k, one in enumerate(kind.tolist()):
         if one not in KINDS:
-            hint = suggestion(one, KINDS, f'Map it with kinds={{"{one}": "range"}}, or leave it out: ignore=["{one}"].')
+            more = ", ".join(dict.fromkeys(f"{other!r}" for other in kind.tolist() if other not in {one, *KINDS}))
+            hint = (
+                f'{suggestion(one, KINDS, "")} Map it with kinds={{"{one}": ...}} (--kinds), or leave it out: '
+                f'ignore=["{one}"] (--ignore).{f" Unknown too: {more}." if more else ""}'
+            )
             raise InputError(
-                f"{file}: row {row[k]}, column kind", repr(one), f"must be one of {', '.join(KINDS)}", hint
+                f"{file}: row {row[k]}, column kind", repr(one), f"must be one of {', '.join(KINDS)}", hint.lstrip()
             )
     message = kind == "message"
     value = np.full(len(frame), np.nan)
@@ -280,7 +284,8 @@ def _no_column(file: str, column: str, frame: pd.DataFrame) -> InputError:
         places = "; one of places alone has vehicle, x, y, each vehicle once" if column == "t" else ""
         allowed = f"is needed{places}; the file has {', '.join(headers)}"
     near = [h for h in headers if h.lower() in USUAL.get(column, ())]
-    wanted = f'columns={{"{column}": "{near[0] if near else "..."}"}}'
+    header = near[0] if near else "..."
+    wanted = f'columns={{"{column}": "{header}"}} (--columns {column}={header})'
     hint = (
         f"Did you mean {near[0]}? Pass {wanted}." if near else suggestion(column, headers, f"Add it, or pass {wanted}.")
     )

@@ -16,6 +16,29 @@ from .log_summary import Tally
 from .log_vehicle import samples
 from .rows import backward_difference, interpolate
 
+FEW = 5
+"""Fixes with a truth, from which a difference of frames shows."""
+APART = 3.0
+"""Standard deviations of a fix by which fixes and truth in one frame do not differ on average."""
+
+
+def frame_doubt(recording: Recording, truth: Fleet | None, column: int) -> list[str]:
+    """A sentence where the fixes of a vehicle lie beside its truth by more than their noise explains, as they do where
+    the truth has another origin."""
+    if truth is None:
+        return []
+    gap = (recording.gnss[0, :, column] - truth.position[:, column])[:, :2]
+    gap = gap[np.isfinite(gap).all(axis=1)]
+    if len(gap) < FEW:
+        return []
+    east, north = np.median(gap, axis=0)
+    if np.hypot(east, north) < APART * np.hypot(*recording.sensors.fix_std[:2]):
+        return []
+    return [
+        f"{recording.ids[column]}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. "
+        "Fixes in degrees are local at the first one: give origin= of the frame of the truth, or the truth in degrees."
+    ]
+
 
 def truth_of(rows: Rows, recording: Recording, max_gap: float | None, name: str, file: Path | None) -> Fleet:
     """Truth of the members that have one, on the steps of the recording."""

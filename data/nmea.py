@@ -56,6 +56,8 @@ def read_nmea(path: Path, tally: Tally) -> Rows:
             continue
         try:
             sentence: Any = NMEAReader.parse(line[start:].strip() + b"\r\n")
+            if sentence is None:
+                raise ValueError("incomplete")
             kind = sentence.msgID
             if kind in ("GGA", "RMC", "VTG", "GST"):
                 getattr(found, kind.lower())(sentence, clock, number, path.name, tally)

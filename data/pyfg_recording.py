@@ -6,6 +6,7 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
+from coopoc.formats.edges import PointEdges
 from coopoc.formats.graph import Graph
 from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
@@ -26,7 +27,8 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
     """Recording of the robots of a graph in the plane, in one run, and the truth that its vertices hold.
 
     Odometry is chained and differenced over steps; a range belongs to the nearest step, and to the robot that is named
-    first. Standard deviations are those of the file, for one step. Points are landmarks; messages arrive at once.
+    first, and so does a measured point or pose of another robot, as range and bearing. Standard deviations are those of
+    the file, for one step. Points are landmarks; messages arrive at once.
 
     Args:
         graph: of `read_pyfg`, with stamps.
@@ -58,9 +60,9 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
     velocity = np.concatenate([turned(flat, -midway(path[..., 2])), 0 * place], axis=1)[None]
     rate = np.concatenate([moved[..., 2], 0 * place[..., 0]], axis=1)[None]
     gnss = np.concatenate([np.full((len(t), robots, 3), np.nan), place], axis=1)[None]
-    table = _ranges(graph, (marks, robots), begin, t)
+    table = _relative(graph, (marks, robots), begin, t)
     links = Links(*table[:, :3].astype(np.int64).T)
-    relative = np.column_stack([table[:, 3], np.full(len(table), np.nan), np.full(len(table), np.pi / 2)])[None]
+    relative = np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None]
     position = np.concatenate([np.append(truth[..., :2], 0 * truth[..., :1], axis=2), place], axis=1)
     fleet = Fleet(
         ids,
@@ -82,7 +84,10 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
         sensors=_sensors(graph, dt),
         v2x=V2X(max_neighbours=max(robots - 1, 0), radius=float("inf")),
         observers=tuple(range(len(ids))),
-        notes=("odometry and ranges are real; no fix, no compass", "inclinations are pi/2: all is in one plane"),
+        notes=(
+            "odometry and relative measurements are real; no fix, no compass",
+            "inclinations are pi/2: all is in one plane",
+        ),
         body=Body(rate, np.full(rate.shape, np.nan)),
         landmarks=tuple(range(robots, len(ids))),
     )
@@ -109,19 +114,39 @@ def _at(t: Floats, stamps: Floats, values: Floats) -> Floats:
     return np.column_stack([np.interp(t, stamps, column) for column in values.T])
 
 
-def _ranges(graph: Graph, who: tuple[Ints, int], begin: float, t: Floats) -> Floats:
-    """(L, 4) step, observer, neighbour, range m; of several of a pair at a step the nearest in time."""
+def _relative(graph: Graph, who: tuple[Ints, int], begin: float, t: Floats) -> Floats:
+    """(L, 5) step, observer, neighbour, range m, bearing rad or NaN; of several of a pair at a step the nearest in
+    time."""
     marks, robots = who
     column = np.full(len(graph.names), -1)
     for k, places in enumerate(graph.robots.values()):
         column[places] = k
     column[marks] = robots + np.arange(len(marks))
-    ends = column[graph.ranges.nodes]
+    points, ranges = _vectors(graph), graph.ranges
+    ends = column[np.concatenate([points.nodes, ranges.nodes])]
     ends = np.where((ends[:, :1] >= robots) & (ends[:, :1] > ends[:, 1:]), ends[:, ::-1], ends)  # a robot observes
-    step, late = steps_of(graph.ranges.stamps - begin, t[1] - t[0], len(t))
+    value = np.column_stack(
+        [
+            np.concatenate([np.hypot(*points.position.T), ranges.distance]),
+            np.append(np.arctan2(*points.position.T[::-1]), np.full(len(ranges), np.nan)),
+        ]
+    )
+    step, late = steps_of(np.append(points.stamps, ranges.stamps) - begin, t[1] - t[0], len(t))
     order = nearest(late, step, np.where(ends[:, 0] < robots, ends[:, 0], -1), ends[:, 1])
-    table = np.column_stack([step, ends, graph.ranges.distance])[order]
+    table = np.column_stack([step, ends, value])[order]
     return np.asarray(table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))])
+
+
+def _vectors(graph: Graph) -> PointEdges:
+    """Points that were measured, and poses of other robots as points."""
+    points, poses = graph.relative_point, graph.relative_pose
+    other = np.array([graph.names[a][0] != graph.names[b][0] for a, b in poses.nodes.tolist()], dtype=bool)
+    return PointEdges(
+        np.concatenate([points.nodes, poses.nodes[other]]),
+        np.concatenate([points.position, poses.position[other]]),
+        np.concatenate([points.covariance, poses.covariance[other, :2, :2]]),
+        np.append(points.stamps, poses.stamps[other]),
+    )
 
 
 def _sensors(graph: Graph, dt: float) -> Sensors:
@@ -131,12 +156,19 @@ def _sensors(graph: Graph, dt: float) -> Sensors:
     one = (lasts > 0) & np.array([graph.names[a][0] == graph.names[b][0] for a, b in edges.nodes.tolist()])
     share = dt / lasts[one]
     move, turn = (np.mean(share * edges.covariance[one, k, k]) for k in (0, 2))
+    points = _vectors(graph)
+    square = np.square(points.position).sum(axis=1)
+    ahead = points.position / np.sqrt(np.maximum(square, FLAT**2))[:, None]
+    along, whole = np.einsum("mi,mij,mj->m", ahead, points.covariance, ahead), np.trace(points.covariance.T)
+    bearing = (whole - along) / np.maximum(square, whole)
+    along = np.append(along, graph.ranges.variance)
     return Sensors(
         gnss_std=(1.0, 1.0, FLAT),
         velocity_std_ratio=0.0,
         velocity_floor=max(float(np.sqrt(move)) / dt, FLAT),
         yaw_rate_std=float(np.sqrt(turn)) / dt,
-        range_std=float(np.sqrt(np.mean(graph.ranges.variance))) if len(graph.ranges) else 1.0,
+        range_std=float(np.sqrt(np.mean(along))) if len(along) else 1.0,
+        azimuth_std=float(np.sqrt(np.mean(bearing))) if len(bearing) else Sensors().azimuth_std,
         inclination_std=FLAT,
         compass=False,
         min_range=0.0,

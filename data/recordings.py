@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from coopoc.errors import InputError
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.plugins import suggestion, unknown
@@ -78,7 +80,11 @@ def _of_mrclam(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
     log = read_mrclam(path, dt=dt, max_gap=max_gap)
     seen = recording(log, V2X(max_neighbours=max(len(log.fleet.ids) - 1, 0), radius=float("inf")))
     grid = f"{len(seen.t)} steps of {seen.dt:g} s, {seen.t[-1]:.1f} s"
-    counts = {"landmarks": len(log.sightings), "robots without files": log.absent, "barcodes in no list": log.unknown}
+    counts = {
+        "landmarks (coopoc run real takes them)": len(log.sightings),
+        "robots without odometry, measurements or truth": log.absent,
+        "barcodes in no list": log.unknown,
+    }
     refused = {f"measurements of {what}": (number, "") for what, number in counts.items() if number}
     vehicles = dict.fromkeys(log.fleet.ids, "wheel odometry, range and bearing, Vicon")
     read = {"measurements between robots": len(log.range)}
@@ -86,10 +92,21 @@ def _of_mrclam(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
 
 
 def _of_pyfg(path: Path, *, dt: float = 0.1) -> Log:
-    seen, truth = graph_recording(read_pyfg(path), dt=dt)
-    grid = f"{len(seen.t)} steps of {seen.dt:g} s, {seen.t[-1]:.1f} s"
-    vehicles = {name: "landmark" if k in seen.landmarks else "odometry, ranges" for k, name in enumerate(seen.ids)}
-    return Log(seen, truth, Summary(path.name, grid, vehicles, {"ranges": len(seen.links)}, {}, {}, seen.notes), True)
+    graph = read_pyfg(path)
+    seen, truth = graph_recording(graph, dt=dt)
+    grid = f"{len(seen.t)} steps of {seen.dt:g} s, {seen.t[-1] - seen.t[0]:.1f} s"
+    vehicles = {name: "landmark" if k in seen.landmarks else "odometry" for k, name in enumerate(seen.ids)}
+    number = {"ranges": len(seen.links), "bearings": int(np.isfinite(seen.relative[0, :, 1]).sum())}
+    chained = sum(len(places) - 1 for places in graph.robots.values())
+    edges = (graph.ranges, graph.relative_point, graph.relative_pose)
+    left = {
+        "edges outside the steps that all robots share, beside another of the same pair and step, between points, or "
+        "between poses of one robot": sum(map(len, edges)) - chained - len(seen.links),
+        "priors": len(graph.pose_prior) + len(graph.point_prior),
+    }
+    read = {what: count for what, count in number.items() if count}
+    refused = {what: (count, "") for what, count in left.items() if count}
+    return Log(seen, truth, Summary(path.name, grid, vehicles, read, refused, {}, seen.notes), True)
 
 
 def _of_file(path: Path) -> Log:

@@ -169,11 +169,12 @@ def rows(
 def bound_rows(p: Params) -> list[Row]:
     """The bound of each ego over an ideal channel, which needs no draws, with the bytes that the ego would receive.
 
-    The noise model of PAST makes it the bound with the past of newcomers.
+    The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the bound is of sensors
+    that measure at every step.
     """
     bound = past_bound if (p["method"], p.get("noise_model")) == PAST else posterior_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
-    if not drive.present.any():  # a bound is of a geometry that is known
+    if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
     acting, rate = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt)
     found: list[Row] = []

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 import coopoc as co
+from coopoc.data.log_poses import check_poses
 from coopoc.data.recordings import load_log
 from coopoc.evaluate.innovations import innovation_columns, normalised_innovations
 from coopoc.study.run import find_study
@@ -118,6 +119,30 @@ def test_pose_filters_run_on_a_log_and_cooperation_helps(tmp_path: Path) -> None
     assert 1.5 < np.nanmean(co.pose_nees(tracks[2], log.truth)) < 5
 
 
+def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Path) -> None:
+    """One car has fixes; the others measure it and each other, and nobody has a compass."""
+    folder = written(tmp_path / "log", noise=1.0, compass=False)
+    frame = pd.read_csv(folder / "log.csv")
+    frame[(frame["vehicle"].isin(["red", "mast"])) | ~frame["kind"].isin(["x", "y"])].to_csv(
+        folder / "log.csv", index=False
+    )
+    log = co.read_log(folder, frame="body")
+    begin, cars = co.pose_start(log.recording)[0], drives()
+    for name, (place, heading, _, _) in cars.items():
+        found = begin[log.recording.ids.index(name)]
+        assert np.hypot(*(found[:2] - place[0])) < 2.5
+        assert abs(wrapped(found[3] - heading[0])) < np.deg2rad(20)
+    track = co.PoseFilter("fleet", begin=begin[None])(log.recording, list(CARS))
+    assert log.truth is not None
+    assert np.nanmean(co.pose_nees(track, log.truth)[:, 100:]) < 6
+    without = frame[~frame["kind"].isin(["bearing", "range"]) | (frame["partner"] != "red")]
+    without[(without["vehicle"].isin(["red", "mast"])) | ~without["kind"].isin(["x", "y"])].to_csv(
+        folder / "log.csv", index=False
+    )
+    with pytest.raises(co.InputError, match="has no fix and sees no landmark"):
+        co.pose_start(co.read_log(folder, frame="body").recording)
+
+
 def test_an_azimuth_becomes_a_bearing_by_the_compass(tmp_path: Path) -> None:
     frame, _ = table()
     heading = {name: dict(zip(T, way, strict=True)) for name, (_, way, _, _) in drives().items()}
@@ -177,6 +202,15 @@ def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path,
     assert ("bearings miss the filter's estimates" in done.stdout) == mirrored
     assert ("nothing looks wrong" in done.stdout) != mirrored
     assert (tmp_path / "log-check.png").stat().st_size > 20_000
+
+
+def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
+    folder = written(tmp_path / "log", noise=1.0)
+    truth = table()[1]
+    truth[truth["vehicle"] == "blue"].assign(x=lambda frame: frame["x"] + 50).to_csv(folder / "truth.csv", index=False)
+    found = check_poses(co.read_log(folder, frame="body"))
+    assert ["error_m" in row for row in found.vehicles] == [row["vehicle"] == "blue" for row in found.vehicles]
+    assert ["blue: fixes lie -5" in doubt for doubt in found.doubts] == [True]
 
 
 def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:

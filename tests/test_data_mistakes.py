@@ -25,6 +25,9 @@ WIDE = "t,vehicle,x,y,speed,heading\n" + "".join(f"{k / 10},red,{0.8 * k:.1f},0,
 STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.0\n" for k in range(20))
 
 
+RANGES = "t,vehicle,partner,range\n0,tag,anchor,4.2\n1,tag,anchor,4.4\n"
+
+
 def swap(old: str, new: str, text: str = GOOD, count: int = 1) -> str:
     assert old in text
     return text.replace(old, new, count)
@@ -64,6 +67,8 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
         "vehicle red",
     ),
     "no fix at all": ("t,vehicle,vx,vy\n0,red,8,0\n1,red,8,0\n", {}, "fixes"),
+    "ranges alone": (RANGES, {"dt": 0.5}, "fixes"),
+    "ranges alone, in body frames": (RANGES, {"dt": 0.5, "frame": "body"}, "fixes, odometry"),
     "a truth of other vehicles": (GOOD, {"truth": "t,vehicle,x,y\n0,rot,0,0\n1,rot,8,0\n"}, "column vehicle"),
     "a clock of an unknown vehicle": (GOOD, {"clock": {"bleu": 0.1}}, ""),
     "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
@@ -87,6 +92,16 @@ def test_a_mistake_is_named_as_the_page_says(tmp_path: Path, mistake: str) -> No
         at = message.index(part, at)
     assert place in message
     assert error.value.hint
+
+
+def test_all_unknown_kinds_are_named_at_once(tmp_path: Path) -> None:
+    text = "t,car,kind,value\n0,red,gyro,0.1\n0,red,v2x,1\n0,red,gyro,0.1\n"
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(co.InputError, match=r"'gyro'.*\{\"gyro\": \.\.\.\}.*--kinds.*Unknown too: 'v2x'\."):
+        co.read_log(tmp_path / "log.csv", columns={"vehicle": "car"})
+    (tmp_path / "log.csv").write_text(text.replace("t,", "stamp,", 1))
+    with pytest.raises(co.InputError, match=r"\(--columns t=stamp\)"):
+        co.read_log(tmp_path / "log.csv")
 
 
 def test_every_mistake_of_the_page_is_tested() -> None:

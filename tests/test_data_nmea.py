@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import builtins
+from collections.abc import Mapping
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -148,11 +150,39 @@ def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     assert load_and_check(path) == 80 * 2
 
 
+def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
+    """A pose of another program beside fixes in degrees; a simulator's truth by Odometry, whose heading counts."""
+    pytest.importorskip("rosbags")
+    pymap3d = pytest.importorskip("pymap3d")
+    fleet, path = drive(2, steps=80, start=1.7e9), tmp_path / "drive"
+    write_bag(path, fleet, pymap3d, 2, names={"truth": "pose"})
+    with pytest.raises(co.InputError, match="topics of a bag"):
+        read_log(path, dt=0.1)
+    without = read_log(path, dt=0.1, ignore=["/car0/pose"])
+    assert without.truth is None
+    assert any("/car0/pose" in what for what in without.summary.unused)
+    assert read_log(path, dt=0.1, ignore=["x", "y", "z", "heading"]).recording.gnss.shape[2] == 2
+    actual = read_log(path, dt=0.1, truth="/car0/pose", origin=(48.14, 11.58, 560.0), frame="body").truth
+    assert actual is not None
+    np.testing.assert_allclose(actual.position[:, 0], fleet.position[:, 0], atol=1e-6)
+    assert actual.heading is not None
+    course = np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0])
+    np.testing.assert_allclose(actual.heading[:, 0], course, atol=1e-6)
+    stands = read_log(path, dt=0.1, ignore=["/car0/pose"], truth="/car1/odom", origin=(48.14, 11.58, 560.0)).truth
+    assert stands is not None
+    assert not stands.position[:, 1].any()  # that of its poses, which the test left at zero
+    for wrong, match in (({"truth": "/car0/poses"}, "Did you mean /car0/pose"), ({"kinds": {"a": "x"}}, "of tables")):
+        with pytest.raises(co.InputError, match=match):
+            read_log(path, dt=0.1, **wrong)
+
+
 def load_and_check(path: Path) -> int:
     return int(np.isfinite(co.load_recording(path, dt=0.1).gnss[0, :, :, 0]).sum())
 
 
-def write_bag(path: Path, fleet: co.Fleet, pymap3d: Any, ros: int) -> None:
+def write_bag(
+    path: Path, fleet: co.Fleet, pymap3d: Any, ros: int, names: Mapping[str, str] = MappingProxyType({})
+) -> None:
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
     from rosbags.typesys import Stores, get_typestore
@@ -171,16 +201,19 @@ def write_bag(path: Path, fleet: co.Fleet, pymap3d: Any, ros: int) -> None:
 
     point, turned = kind["geometry_msgs/msg/Point"], kind["geometry_msgs/msg/Quaternion"]
     writer: Any = Writer1(path) if ros == 1 else Writer2(path, version=9)
-    names = {
-        "fix": "sensor_msgs/msg/NavSatFix",
-        "odom": "nav_msgs/msg/Odometry",
-        "imu": "sensor_msgs/msg/Imu",
-        "truth": "geometry_msgs/msg/PoseStamped",
-        "note": "std_msgs/msg/String",
-    }
+    topic, names = (
+        names,
+        {
+            "fix": "sensor_msgs/msg/NavSatFix",
+            "odom": "nav_msgs/msg/Odometry",
+            "imu": "sensor_msgs/msg/Imu",
+            "truth": "geometry_msgs/msg/PoseStamped",
+            "note": "std_msgs/msg/String",
+        },
+    )
     with writer:
         topics = {
-            (column, what): writer.add_connection(f"/{one}/{what}", name, typestore=store)
+            (column, what): writer.add_connection(f"/{one}/{topic.get(what, what)}", name, typestore=store)
             for column, one in enumerate(fleet.ids)
             for what, name in names.items()
             if what in ("fix", "odom", "imu") or column == 0

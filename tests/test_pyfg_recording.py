@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
+import pandas as pd
 import pytest
 
 import coopoc as co
 from coopoc.data.commands import check as data_check
 from coopoc.data.pyfg_recording import graph_recording
+from coopoc.data.recording_graph import recording_graph, write_log_graph
+from coopoc.data.recordings import load_log
+from coopoc.formats import write_graph
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.frames import body_motion
 
@@ -78,3 +83,101 @@ def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
         graph_recording(read_pyfg(file))
     with pytest.raises(co.InputError, match="share two steps"):
         graph_recording(read_pyfg(file), dt=5.0)
+
+
+def circles(folder: Path) -> Path:
+    """A log without noise of two cars on circles, which measure each other and two masts."""
+    rows: list[tuple[object, ...]] = []
+    masts = {"mast": np.array([30.0, 5.0]), "tower": np.array([-20.0, 40.0])}
+    for t in np.round(np.arange(0, 5, 0.1), 1):
+        cars = {
+            name: (r * np.array([np.cos(w * t), np.sin(w * t)]), w * t + np.pi / 2, r * w, w)
+            for name, r, w in (("red", 10.0, 0.5), ("blue", 16.0, 0.3))
+        }
+        for name, (place, heading, speed, rate) in cars.items():
+            rows += [(t, name, "speed", "", speed, 0.1), (t, name, "yaw_rate", "", rate, 0.02)]
+            others = {**masts, **{other: cars[other][0] for other in cars if other != name}}
+            for other, there in others.items():
+                gap = there - place
+                rows.append((t, name, "range", other, float(np.hypot(*gap)), 0.2))
+                if (name, other) != ("red", "tower"):
+                    bearing = np.arctan2(gap[1], gap[0]) - heading
+                    rows.append((t, name, "bearing", other, np.arctan2(np.sin(bearing), np.cos(bearing)), 0.02))
+            if t in (0.0, 2.0):
+                rows += [(t, name, axis, "", value, 0.5) for axis, value in zip("xy", place, strict=True)]
+    rows += [(0.0, name, axis, "", v, 0.1) for name, at in masts.items() for axis, v in zip("xy", at, strict=True)]
+    columns = ["t", "vehicle", "kind", "partner", "value", "std"]
+    pd.DataFrame(rows, columns=columns).to_csv(folder / "circles.csv", index=False)
+    return folder / "circles.csv"
+
+
+def test_a_recording_is_written_and_read_again(tmp_path: Path) -> None:
+    log = co.read_log(circles(tmp_path), frame="body")
+    write_log_graph(log, tmp_path / "circles.pyfg")
+    again, rec = load_log(tmp_path / "circles.pyfg"), log.recording
+    moving = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
+    back = again.recording
+    assert rec.body is not None
+    assert back.body is not None
+    np.testing.assert_allclose(back.velocity[0, 1:, :2], rec.velocity[0, 1:, moving].transpose(1, 0, 2), atol=1e-6)
+    np.testing.assert_allclose(back.body.yaw_rate[0, 1:, :2], rec.body.yaw_rate[0, 1:][:, moving], atol=1e-6)
+    assert len(back.links) == len(rec.links)
+    for one, other in ((rec, back), (back, rec)):
+        key = [
+            (int(step), one.relative[0, k, 0].round(6), np.nan_to_num(one.relative[0, k, 1], nan=9.0).round(6))
+            for k, step in enumerate(one.links.step)
+        ]
+        assert len(set(key)) == len(key)
+        assert set(key) == {
+            (int(step), other.relative[0, k, 0].round(6), np.nan_to_num(other.relative[0, k, 1], nan=9.0).round(6))
+            for k, step in enumerate(other.links.step)
+        }
+    assert back.sensors.range_std == pytest.approx(0.2, rel=1e-3)
+    assert back.sensors.azimuth_std == pytest.approx(0.02, rel=0.05)
+    assert back.sensors.yaw_rate_std == pytest.approx(0.02, rel=1e-3)
+    assert again.summary.refused == {"priors": (4, "")}
+
+
+def test_gtsam_reads_the_same_motions(tmp_path: Path) -> None:
+    """The file's edges of odometry at the file's own poses: what GTSAM's factors leave of closed circles."""
+    log = co.read_log(circles(tmp_path), frame="body")
+    rec, t = log.recording, np.arange(50) * 0.1
+    poses = np.full((50, len(rec.ids), 3), np.nan)
+    for name, r, w in (("red", 10.0, 0.5), ("blue", 16.0, 0.3)):
+        at = np.column_stack([r * np.cos(w * t), r * np.sin(w * t), w * t + np.pi / 2])
+        poses[:, rec.ids.index(name)] = at
+    graph = recording_graph(rec, poses)
+    write_graph(graph.stamped(np.nan), tmp_path / "circles.g2o")
+    factors, values = gtsam.readG2o(str(tmp_path / "circles.g2o"), False)
+    assert values.size() >= 100
+    assert factors.size() >= 98 + 100
+    assert factors.error(values) < 1.0  # a step is its chord: 1e-3 m of 0.5 m
+    backwards = recording_graph(rec, poses[::-1].copy())
+    write_graph(backwards.stamped(np.nan), tmp_path / "backwards.g2o")
+    factors, values = gtsam.readG2o(str(tmp_path / "backwards.g2o"), False)
+    assert factors.error(values) > 1e3
+
+
+def test_what_a_graph_cannot_hold_is_named(tmp_path: Path) -> None:
+    frame = pd.read_csv(circles(tmp_path))
+    frame[(frame["kind"] != "range") | (frame["partner"] != "tower")].to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(co.InputError, match=r"50 bearings without a range.*ignore"):
+        write_log_graph(co.read_log(tmp_path / "log.csv", frame="body"), tmp_path / "log.pyfg")
+    with pytest.raises(co.InputError, match="world frame"):
+        write_log_graph(co.read_log(tmp_path / "circles.csv"), tmp_path / "log.pyfg")
+
+
+def test_one_landmark_alone_gives_no_heading(tmp_path: Path) -> None:
+    """The drive may be turned about it; before, some heading was taken."""
+    frame = pd.read_csv(circles(tmp_path))
+    alone = (frame["vehicle"].isin(["red", "mast"])) & ~((frame["vehicle"] == "red") & frame["kind"].isin(["x", "y"]))
+    frame[alone & ~frame["partner"].isin(["tower", "blue"])].to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(co.InputError, match="red sees one landmark alone"):
+        co.pose_start(co.read_log(tmp_path / "log.csv", frame="body").recording)
+
+
+def test_points_and_poses_of_others_are_ranges_and_bearings(shared: Path) -> None:
+    """13,121 points and 3,537 ranges of mrclam6.pyfg, of which the points were left out without a word."""
+    log = load_log(shared / "pyfg" / "mrclam6.pyfg")
+    assert log.summary.read == {"ranges": 16381, "bearings": 12905}
+    assert sum(number for number, _ in log.summary.refused.values()) == 13121 + 3537 - 16381

@@ -46,12 +46,20 @@ def distance(x: Floats, truth: Floats) -> Floats:
 def rt_le(track: Track, fleet: Fleet) -> Floats:
     """Root mean square localization error over time, sqrt(mean_t |x_t - truth_t|^2), (R, E) m (paper, section IV.A).
 
+    The mean is over the steps at which the truth of an ego is known; NaN where it never is.
+
     >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
     >>> rt_le(GNSS()(observe(fleet, Sensors(), runs=5)), fleet).shape
     (5, 1)
     """
-    return np.asarray(np.sqrt(np.mean(errors(track, fleet) ** 2, axis=1)))
+    known = fleet.present[:, list(track.egos)]
+    squares = errors(track, fleet) ** 2
+    if known.all():
+        return np.asarray(np.sqrt(np.mean(squares, axis=1)))
+    total = np.sum(squares, axis=1, where=known)
+    mean = np.divide(total, known.sum(axis=0), out=np.full(total.shape, np.nan), where=known.any(axis=0))
+    return np.asarray(np.sqrt(mean))
 
 
 def max_error(track: Track, fleet: Fleet) -> Floats:

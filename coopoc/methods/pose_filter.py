@@ -91,8 +91,7 @@ class PoseFilter:
             hint = 'Take PoseFilter("solo", exact=False, invariant=True).'
             raise InputError("invariant", True, "is for a solo vehicle and one linearisation", hint)
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
-        spread = checked("spread", self.spread, "(4,)", (4,))
-        if not (spread > 0).all():
+        if not (checked("spread", self.spread, "(4,)", (4,)) > 0).all():
             raise InputError("spread", self.spread, "must be > 0", "Give m, m, m and rad.")
         if not self.name:
             word = self.unit if self.fusion == "joint" else self.fusion
@@ -176,13 +175,19 @@ class PoseFilter:
         return PoseStream(self.unit == "star", noise, self.options(), first, dt, max_age)
 
     def follow(
-        self, recording: Recording, members: Members, links: Ints, begin: Floats, kept: Bools | None = None
+        self,
+        recording: Recording,
+        members: Members,
+        links: Ints,
+        begin: Floats,
+        kept: Bools | None = None,
+        place: Floats | None = None,
     ) -> tuple[Floats, Floats, Floats]:
-        """States, covariances, and cost and number of measurements of a unit, as of `kernels.pose_filter`."""
+        """States, covariances, and cost and number of measurements of a unit; `kept` and `place` as of `seen`."""
         from ..kernels.pose_filter import follow, follow_apart
 
         noise = pose_unit.pose_noise(self.assumed or recording.sensors, recording.dt, self.gate)
-        measured, options = pose_unit.seen(recording, members, links, kept), self.options()
+        measured, options = pose_unit.seen(recording, members, links, kept, place), self.options()
         memory = pose_unit.memory(int(np.diff(members.start).max()), options.d)
         run = follow if self.fusion == "joint" else follow_apart
         return run(measured, noise, begin, np.array(self.spread, dtype=float), options, memory)

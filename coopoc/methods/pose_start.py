@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from ..arrays import Floats, Ints, number
@@ -28,7 +30,8 @@ def pose_start(
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
     odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle;
     the one whose innovations, and bearings of other vehicles from fix to fix, have the largest likelihood over the
-    first seconds is kept. A compass leaves one.
+    first seconds is kept. A compass leaves one. Vehicles without a fix that see fewer than two landmarks come last:
+    for them those that were found before are places, too.
 
     Args:
         recording: in body frames.
@@ -38,7 +41,7 @@ def pose_start(
         assumed: noise, default that of the recording.
 
     Raises:
-        InputError: a vehicle that has neither a fix nor sees a landmark in that time.
+        InputError: a vehicle that has no fix and sees neither a landmark nor a vehicle with a pose in that time.
 
     References:
         Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.5 (multi-hypothesis tracking).
@@ -56,21 +59,63 @@ def pose_start(
     headings = number("headings", headings, 4, 360, kind=int, allowed="4..360", hint="24 are 15 degrees apart.")
     steps = min(int(number("seconds", seconds, hint="30 is the default.") / recording.dt) + 1, len(recording.t))
     part = recording.between(0, max(steps, 2))
-    angles = 2 * np.pi * np.arange(headings) / headings
+    noise = assumed or recording.sensors
+    spread = (*_spread(noise), np.pi / headings)
+    filter_ = PoseFilter("solo", gate=gate, spread=spread, assumed=noise)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
-    spread = (*_spread(assumed or recording.sensors), np.pi / headings)
-    for column in np.unique(pose_unit.fleet(part).column):
-        links = part.links.of(column)
-        links = links[np.isin(part.links.neighbour[links], part.landmarks)]
-        for run in range(recording.runs):
-            tried = begin[run].repeat(headings).reshape(-1, 4, headings).transpose(2, 0, 1).copy()
-            tried[:, column] = _hypotheses(part, run, int(column), links, angles)
-            filter_ = PoseFilter("solo", gate=gate, spread=spread, assumed=assumed)
-            copies = part.of_runs(np.full(headings, run))
-            _, _, cost = filter_.follow(copies, pose_unit.alone(copies, int(column)), links, tried)
-            seen_from = _cost_of_bearings(part, run, int(column), angles, assumed or recording.sensors)
-            begin[run, column] = tried[np.argmin(cost[:, 0] + seen_from), column]
+    for run in range(recording.runs):
+        known = np.full((len(part.t), len(part.ids), 3), np.nan)
+        known[:, list(part.landmarks)] = part.gnss[run][:, list(part.landmarks)]
+        waiting = np.unique(pose_unit.fleet(part).column).tolist()
+        while waiting:
+            column, links = _next(part, run, waiting, known)
+            begin[run, column], known[:, column] = _most_likely(part, run, column, links, known, filter_, headings)
+            waiting.remove(column)
     return begin
+
+
+def _next(recording: Recording, run: int, waiting: list[int], known: Floats) -> tuple[int, Ints]:
+    """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix or sees
+    two of them; else, of the one with most, those to all whose places `known` (T, N, 3) m are finite."""
+    every: list[Ints] = []
+    for column in waiting:
+        links = recording.links.of(column)
+        marks = links[np.isin(recording.links.neighbour[links], recording.landmarks)]
+        whole = marks[np.isfinite(recording.relative[run, marks, :2]).all(axis=1)]
+        fix = np.isfinite(recording.gnss[run, :, column, 0]).any()
+        if fix or len(np.unique(recording.links.neighbour[whole])) > 1:
+            return column, marks
+        every.append(links[np.isfinite(known[recording.links.step[links], recording.links.neighbour[links], 0])])
+    most = int(np.argmax([np.isfinite(recording.relative[run, links, :2]).all(axis=1).sum() for links in every]))
+    return waiting[most], every[most]
+
+
+def _most_likely(
+    recording: Recording, run: int, column: int, links: Ints, known: Floats, filter_: PoseFilter, headings: int
+) -> tuple[Floats, Floats]:
+    """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood."""
+    angles = 2 * np.pi * np.arange(headings) / headings
+    place = known[recording.links.step[links], recording.links.neighbour[links]]
+    tried = np.full((headings, len(recording.ids), 4), np.nan)
+    tried[:, column] = _hypotheses(recording, run, column, links, place, angles)
+    copies = recording.of_runs(np.full(headings, run))
+    noise = filter_.assumed or recording.sensors
+    if not np.isin(recording.links.neighbour[links], recording.landmarks).all():
+        filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
+    x, _, cost = filter_.follow(copies, pose_unit.alone(copies, column), links, tried, place=place)
+    best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, angles, noise))
+    return tried[best, column], x[best, :, :3]
+
+
+def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
+    """Noise of measurements of vehicles whose places are as uncertain as a fix, at these ranges (L,) m."""
+    fix = max(noise.fix_std[:2])
+    apart = max(float(np.nanmedian(ranges)), fix)
+    return replace(
+        noise,
+        range_std=float(np.hypot(noise.range_std, fix)),
+        azimuth_std=float(np.hypot(noise.azimuth_std, fix / apart)),
+    )
 
 
 def _spread(sensors: Sensors) -> tuple[float, float, float]:
@@ -97,14 +142,19 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     return found
 
 
-def _hypotheses(recording: Recording, run: int, column: int, links: Ints, angles: Floats) -> Floats:
-    """(headings, 4) poses at the first step that the first fix, or the first landmark seen, leaves for each heading."""
+def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known: Floats, angles: Floats) -> Floats:
+    """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading; `known`
+    (L, 3) m are the places of what the links measure."""
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
     seen = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
     if not len(fixes) and not len(seen):
         given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
-        raise InputError("seconds", given, "must hold one of the two", "Take more seconds, or give its pose.")
+        allowed = "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found"
+        raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
+    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (known[seen] == known[seen[0]]).all():
+        given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
+        raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
     turns = _turns(recording, run, column)
     middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
     way = recording.dt * turned(recording.velocity[run, :, column], middle)
@@ -118,7 +168,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, angles
         step = int(recording.links.step[link])
         flat = np.array([*relative[seen[0], :2], np.pi / 2])
         flat[2] = relative[seen[0], 2] if np.isfinite(relative[seen[0], 2]) else flat[2]
-        place = recording.gnss[run, step, recording.links.neighbour[link]]
+        place = known[seen[0]]
         offset = way[step] + turned(to_vector(flat), np.asarray(turns[step]))
     compass = body.heading[run, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Ints
+from ..arrays import AnyArray, Bools, Floats, Ints
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.sensors import Sensors
@@ -73,7 +73,9 @@ def fleet(recording: Recording) -> Members:
     return _by_step(recording, step, column, newest, np.ones(newest.shape, dtype=bool))
 
 
-def seen(recording: Recording, members: Members, links: Ints, kept: Bools | None = None) -> PoseSeen:
+def seen(
+    recording: Recording, members: Members, links: Ints, kept: Bools | None = None, place: Floats | None = None
+) -> PoseSeen:
     """Arguments of the kernel.
 
     Args:
@@ -81,6 +83,7 @@ def seen(recording: Recording, members: Members, links: Ints, kept: Bools | None
         members: of the unit.
         links: indices of the relative measurements of its members.
         kept: (R, links) whether a measurement counts in a run; None for all.
+        place: (links, 3) m, of what is measured and no member; None: landmarks stand at their fix.
     """
     from ..kernels.pose_members import PoseSeen
 
@@ -100,7 +103,7 @@ def seen(recording: Recording, members: Members, links: Ints, kept: Bools | None
         _packed(members.fresh),
         _packed(np.stack([observer, other], axis=1)),
         np.searchsorted(step, np.arange(len(recording.t) + 1)),
-        np.ascontiguousarray(recording.gnss[0, 0, recording.links.neighbour[links]]),
+        np.ascontiguousarray(recording.gnss[0, 0, recording.links.neighbour[links]] if place is None else place),
         np.ascontiguousarray(relative),
         recording.dt,
     )
