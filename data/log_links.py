@@ -151,7 +151,7 @@ def _measured(
             tally.refuse(reason, int(wrong.sum()), rows.place(int(np.flatnonzero(wrong)[0])))
     good = np.flatnonzero(both & np.isfinite(value))
     good = good[np.argsort(np.abs(lag[good]), kind="stable")]
-    which = Measured(*(part[good] for part in (value, component, step, lag, observer, partner)))
+    which = Measured(value[good], component[good], step[good], lag[good], observer[good], partner[good])
     every = list(vehicles.values())
     moved = brought_in_body(which, every) if body else brought(which, every, float(grid[1] - grid[0]))
     moved = np.where(which.component == 1, wrap(moved), moved)
