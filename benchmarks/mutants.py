@@ -47,7 +47,7 @@ UNFINISHED = "unfinished"
 def tests_of(file: str) -> list[str]:
     """Files of tests that mention most what a file defines, what files define that import it, and those that import
     these, each less than the one before; a shared word in the names of the files counts as ten mentions. For a kernel
-    those that compare with an oracle, and the first of the others."""
+    the first two of those that compare with an oracle come first."""
     weights, level, scores = {ROOT / file: 9}, {ROOT / file}, Counter[str]()
     for weight in (3, 1):
         level = {user for used in level for user in _importers(used)} - weights.keys()
@@ -61,8 +61,8 @@ def tests_of(file: str) -> list[str]:
             scores[test] += weight * (len(words.findall(text)) + 10 * len(shared))
     tests = [test for test, score in scores.most_common() if score]
     if file.startswith("coopoc/kernels/"):
-        oracles = [test for test in tests if "test_kernels" in test or ORACLE.search(texts[test])][:MOST_TESTS]
-        return [*oracles, *[test for test in tests if test not in oracles][:1], file]
+        oracles = [test for test in tests if "test_kernels" in test or ORACLE.search(texts[test])][:2]
+        tests = [*oracles, *(test for test in tests if test not in oracles)]
     return [*tests[:MOST_TESTS], file]
 
 
@@ -77,10 +77,21 @@ def _defined(file: Path) -> tuple[str, ...]:
 @cache
 def _importers(file: Path) -> tuple[Path, ...]:
     """Files that import from a file."""
-    line = re.compile(rf"^\s*from \S*\b{file.stem} import|^\s*from \.+\S* import .*\b{file.stem}\b", re.MULTILINE)
     folders = (ROOT / "coopoc", ROOT / "learned")
     every = [other for folder in folders for other in folder.rglob("*.py") if other.name != "__init__.py"]
-    return tuple(other for other in every if other != file and line.search(other.read_text()))
+    return tuple(other for other in every if file in _imported(other))
+
+
+@cache
+def _imported(file: Path) -> frozenset[Path]:
+    """Files that a file imports from, among others that there are not."""
+    found = set[Path]()
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.ImportFrom):
+            above = file.parents[node.level - 1] if node.level else ROOT
+            module = above.joinpath(*(node.module or "").split("."))
+            found |= {module.with_suffix(".py"), *(module / f"{name.name}.py" for name in node.names)}
+    return frozenset(found)
 
 
 def affected(file: Path) -> set[Path]:
