@@ -17,6 +17,7 @@ import csv
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -25,6 +26,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterable
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 from mutations import ROOT, Mutant, mutants
@@ -36,18 +38,15 @@ LONG = re.compile("test_(study|studies|cli|install|extend|site|examples|reliabil
 """Files of tests that run whole studies or look at conventions: they take minutes and see little of a formula."""
 ORACLE = re.compile(r"^from (oracles|coopoc\.kernels)|callable_part", re.MULTILINE)
 """In tests that compare kernels with an oracle."""
-PYTEST = (
-    "import sys, pytest; from coopoc.kernels import compile; compile._stamp = lambda folders: ();"
-    "sys.exit(pytest.main(sys.argv[1:]))"
-)
-"""Runs tests with whatever machine code there is: this program removes what a change makes stale."""
+LOADED = ("numba", "pandas", "pytest", "scipy.optimize", "scipy.sparse.linalg", "torch")
+"""What every run of tests has loaded when it begins."""
 UNFINISHED = "unfinished"
 
 
 def tests_of(file: str) -> list[str]:
     """Files of tests that mention most what a file defines, what files define that import it, and those that import
     these, each less than the one before; a shared word in the names of the files counts as ten mentions. For a kernel
-    the first two of those that compare with an oracle come first."""
+    two, first those that compare with an oracle and mention at least a quarter as much as the best."""
     weights, level, scores = {ROOT / file: 9}, {ROOT / file}, Counter[str]()
     for weight in (3, 1):
         level = {user for used in level for user in _importers(used)} - weights.keys()
@@ -61,8 +60,9 @@ def tests_of(file: str) -> list[str]:
             scores[test] += weight * (len(words.findall(text)) + 10 * len(shared))
     tests = [test for test, score in scores.most_common() if score]
     if file.startswith("coopoc/kernels/"):
-        oracles = [test for test in tests if "test_kernels" in test or ORACLE.search(texts[test])][:2]
-        tests = [*oracles, *(test for test in tests if test not in oracles)]
+        much = scores.most_common(1)[0][1] / 4
+        oracles = [t for t in tests if scores[t] >= much and ("test_kernels" in t or ORACLE.search(texts[t]))]
+        return [*dict.fromkeys([*oracles, *tests])][:2]
     return [*tests[:MOST_TESTS], file]
 
 
@@ -102,12 +102,30 @@ def affected(file: Path) -> set[Path]:
     return found
 
 
-def run(tests: Iterable[str], limit: int, machine_code: Path) -> subprocess.CompletedProcess[str]:
-    """Run tests until the first fails, `limit` s of CPU at most."""
-    options = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE"]
-    command = ["prlimit", f"--cpu={limit}", sys.executable, "-c", PYTEST, *options, *tests]
-    place = os.environ | {"NUMBA_CACHE_DIR": str(machine_code)}
-    return subprocess.run(command, cwd=ROOT, env=place, capture_output=True, text=True, check=False)
+def run(tests: Iterable[str], limit: int, machine_code: Path) -> tuple[int, str]:
+    """Run tests until the first fails, `limit` s of CPU at most, in a fork: minus the signal that ended it or the exit
+    status, and the output."""
+    with tempfile.TemporaryFile("w+") as out:
+        if not (child := os.fork()):
+            os.dup2(out.fileno(), 1)
+            os.dup2(out.fileno(), 2)
+            os._exit(_tested(list(tests), limit, machine_code))
+        _, status = os.waitpid(child, 0)
+        out.seek(0)
+        return os.waitstatus_to_exitcode(status), out.read()
+
+
+def _tested(tests: list[str], limit: int, machine_code: Path) -> int:
+    import numba
+    import pytest
+
+    resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+    os.chdir(ROOT)
+    os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = str(machine_code)
+    from coopoc.kernels import compile
+
+    compile._stamp = lambda folders: ()  # whatever machine code there is holds: what a change makes stale was removed
+    return pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *tests])
 
 
 def found_by(mutant: Mutant, limit: int, tests: Iterable[str], machine_code: Path) -> str:
@@ -122,14 +140,14 @@ def found_by(mutant: Mutant, limit: int, tests: Iterable[str], machine_code: Pat
                 stale.unlink()
         try:
             file.write_text(mutant.text)
-            done = run(tests, limit, Path(own))
+            status, output = run(tests, limit, Path(own))
         finally:
             file.write_bytes(original)
             os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
-    if -done.returncode in (signal.SIGXCPU, signal.SIGKILL):
+    if -status in (signal.SIGXCPU, signal.SIGKILL):
         return UNFINISHED
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-    return "" if done.returncode == 0 else failed[1] if failed else f"exit {done.returncode}"
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", output, re.MULTILINE)
+    return "" if status == 0 else failed[1] if failed else f"exit {status}"
 
 
 def main() -> None:
@@ -148,14 +166,17 @@ def main() -> None:
         parser.error("the tree has changes: commit them first, for files are changed and put back")
     named = [ROOT / name for name in given.folders]
     files = sorted(file for name in named for file in ([name] if name.is_file() else name.rglob("*.py")))
+    for library in LOADED:
+        import_module(library)
     sample = _sample(files, random.Random(given.seed), given.count)
     tests = {mutant: dict.fromkeys([*tests_of(mutant.file), *given.tests]) for mutant in sample}
     found = tried = 0
     with tempfile.TemporaryDirectory() as kept, given.out.open("w", newline="") as out:
         machine_code = Path(kept) / "as_committed"
         every = sorted({test for chosen in tests.values() for test in chosen})
-        if (done := run(every, 3600, machine_code)).returncode:
-            parser.error(f"tests fail without a mutant:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+        status, output = run(every, 3600, machine_code)
+        if status:
+            parser.error(f"tests fail without a mutant:\n{output[-3000:]}")
         table = csv.writer(out)
         table.writerow(["file", "line", "change", "found by"])
         for mutant in (bar := tqdm(sample, unit="mutant")):
