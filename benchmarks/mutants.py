@@ -51,19 +51,27 @@ def tests_of(file: str) -> list[str]:
     for weight in (3, 1):
         level = {user for used in level for user in _importers(used)} - weights.keys()
         weights |= dict.fromkeys(level, weight)
-    texts = {str(test.relative_to(ROOT)): test.read_text() for test in (ROOT / "tests").glob("test_*.py")}
-    texts = {test: text for test, text in texts.items() if not LONG.search(test)}
     for used, weight in weights.items():
-        words = re.compile("|".join(rf"\b{re.escape(word)}\b" for word in _defined(used)))
-        for test, text in texts.items():
+        for test, words in _words().items():
             shared = set(used.stem.split("_")) & set(Path(test).stem.split("_")[1:])
-            scores[test] += weight * (len(words.findall(text)) + 10 * len(shared))
+            scores[test] += weight * (sum(words[name] for name in _defined(used)) + 10 * len(shared))
     tests = [test for test, score in scores.most_common() if score]
     if file.startswith("coopoc/kernels/"):
         much = scores.most_common(1)[0][1] / 4
-        oracles = [t for t in tests if scores[t] >= much and ("test_kernels" in t or ORACLE.search(texts[t]))]
+        oracles = [
+            t for t in tests if scores[t] >= much and ("test_kernels" in t or ORACLE.search((ROOT / t).read_text()))
+        ]
         return [*dict.fromkeys([*oracles, *tests])][:2]
     return [*tests[:MOST_TESTS], file]
+
+
+@cache
+def _words() -> dict[str, Counter[str]]:
+    """How often each word stands in each file of tests that is not LONG."""
+    tests = {str(test.relative_to(ROOT)): test for test in (ROOT / "tests").glob("test_*.py")}
+    return {
+        name: Counter(re.findall(r"\w+", test.read_text())) for name, test in tests.items() if not LONG.search(name)
+    }
 
 
 @cache
@@ -155,6 +163,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", help="folders or files, relative to the project")
     parser.add_argument("--count", type=int, default=300, help="mutants (default 300)")
+    parser.add_argument("--skip", type=int, default=0, help="mutants of the sample that were tried before (default 0)")
     parser.add_argument("--seed", type=int, default=0, help="of the sample (default 0)")
     parser.add_argument("--tests", nargs="*", default=[], help="files of tests that run for every mutant, too")
     parser.add_argument("--limit", type=int, default=300, help="s of CPU for one mutant (default 300)")
@@ -168,7 +177,7 @@ def main() -> None:
     files = sorted(file for name in named for file in ([name] if name.is_file() else name.rglob("*.py")))
     for library in LOADED:
         import_module(library)
-    sample = _sample(files, random.Random(given.seed), given.count)
+    sample = _sample(files, random.Random(given.seed), given.count)[given.skip :]
     tests = {mutant: dict.fromkeys([*tests_of(mutant.file), *given.tests]) for mutant in sample}
     found = tried = 0
     with tempfile.TemporaryDirectory() as kept, given.out.open("w", newline="") as out:
@@ -187,7 +196,7 @@ def main() -> None:
             out.flush()
             if not by:
                 tqdm.write(f"survives: {mutant.file}:{mutant.line}: {mutant.change}", file=sys.stdout)
-    print(f"{found} of {tried} mutants were found, {given.count - tried} took too long.")
+    print(f"{found} of {tried} mutants were found, {len(sample) - tried} took too long.")
 
 
 def _sample(files: list[Path], drawn: random.Random, count: int) -> list[Mutant]:
