@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import crossing_fleet
 from filterpy.kalman import KalmanFilter
 
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
-from coopoc.arrays import Floats
+from coopoc.arrays import Bools, Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.adaptive import AdaptiveKalman
 from coopoc.methods.motion_history import MotionHistory
@@ -114,9 +115,8 @@ def relative_measurements(recording: Recording, box: Inbox, run: int, t: int) ->
     return seen
 
 
-def blinking(recording: Recording) -> Recording:
-    """The recording with a fifth of its relative measurements left out."""
-    kept = np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2
+def only(kept: Bools, recording: Recording) -> Recording:
+    """The recording with these of its relative measurements."""
     links = Links(*(part[kept] for part in (recording.links.step, recording.links.observer, recording.links.neighbour)))
     return replace(recording, links=links, relative=recording.relative[:, kept], arrival=recording.arrival[:, kept])
 
@@ -134,7 +134,8 @@ CHANNELS = {
 def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: Fleet) -> None:
     """Neighbours come and go, a fifth of the measurements fails, and some are seen without a message; the track comes
     from the recording's inbox."""
-    recording = blinking(observe(crossing, S2, CHANNELS[channel], runs=2))
+    recording = observe(crossing, S2, CHANNELS[channel], runs=2)
+    recording = only(np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2, recording)
     assert len(set(recording.neighbours(0).tolist())) > 2
     method = JointFilter("nominal", exact=exact)
     track, box = method(recording, [0]), inbox(recording, 0, method.message)
@@ -147,6 +148,22 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
         assert list(stream.neighbours) == [s.id for s in seen]
         for k, s in enumerate(seen, start=int(box.start[t])):
             np.testing.assert_allclose(stream.neighbours[s.id], track.neighbours[1, k], atol=1e-9)
+
+
+def test_an_ego_alone_meets_more_neighbours_than_there_was_room_for() -> None:
+    """Eleven at once after two seconds, where a stream begins with room for seven: what it knew alone is kept, as in
+    the track of the whole drive, whose memory never grows."""
+    recording = observe(crossing_fleet(12, 30), S2, V2X(max_neighbours=11, radius=200.0))
+    recording = only(recording.links.step >= 20, recording)
+    method = JointFilter("nominal")
+    track, box = method(recording, [0]), inbox(recording, 0, method.message)
+    stream = JointFilter(NoiseModel.nominal(recording.sensors)).start(max_age=recording.v2x.max_age)
+    for t in range(len(recording.t)):
+        seen = relative_measurements(recording, box, 0, t)
+        assert len(seen) == (11 if t >= 20 else 0)
+        x, cov = stream.step(recording.gnss[0, t, 0], recording.velocity[0, t, 0], recording.dt, neighbours=seen)
+        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-12)
+        np.testing.assert_allclose(cov, track.covariance[0, t, 0], atol=1e-12)
 
 
 def peer(x: Floats, known: NoiseModel) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import resource
+import shutil
 import sys
 import time
 import traceback
@@ -68,9 +69,13 @@ def verdict(reader: Reader, text: bytes, folder: Path) -> str:
 
 
 def _tried(reader: Reader, text: bytes, folder: Path) -> str:
-    for file in sorted(folder.rglob("*"), reverse=True):
-        file.rmdir() if file.is_dir() else file.unlink()
-    for name, content in unpacked(text, reader.files).items():
+    files = unpacked(text, reader.files)
+    for other in folder.iterdir():
+        if other.is_dir():
+            shutil.rmtree(other)
+        elif other.name not in files:
+            other.unlink()
+    for name, content in files.items():
         (folder / name).write_bytes(content)
     before, began = _peak(), time.process_time()
     with warnings.catch_warnings(), _guard().on(folder) as seen:

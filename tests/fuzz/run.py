@@ -26,10 +26,11 @@ CORPUS = Path(__file__).parent / "corpus"
 
 
 def main() -> None:
-    """Fuzz until the time is over."""
+    """Fuzz until the time or the number of executions is over."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("reader", choices=READERS)
     parser.add_argument("--minutes", type=float, default=10.0, help="of fuzzing (default 10)")
+    parser.add_argument("--executions", type=int, default=-1, help="after which it ends, too (default any number)")
     parser.add_argument("--out", type=Path, default=Path("build/fuzz"), help="for inputs and finds")
     parser.add_argument("--longest", type=int, default=8192, help="bytes of an input (default 8192)")
     given = parser.parse_args()
@@ -53,15 +54,17 @@ def main() -> None:
                     (finds / hashlib.sha1(text).hexdigest()[:12]).write_bytes(text)
                     print(f"FIND {given.reader}: {wrong}", flush=True)
 
-        times = [f"-max_total_time={60 * given.minutes:.0f}", "-timeout=60", "-rss_limit_mb=6000"]
+        ends = [f"-max_total_time={60 * given.minutes:.0f}", f"-runs={given.executions}"]
         options = [
+            "-timeout=60",
+            "-rss_limit_mb=6000",
             f"-dict={own / 'tokens'}",
             f"-max_len={given.longest}",
             f"-artifact_prefix={finds}/",
             "-len_control=0",
         ]
         seeds = [str(inputs), *([str(found)] if (found := CORPUS / own.name).is_dir() else [])]
-        atheris.Setup([sys.argv[0], *times, *options, "-print_final_stats=1", *seeds], once)
+        atheris.Setup([sys.argv[0], *ends, *options, "-print_final_stats=1", *seeds], once)
         atheris.Fuzz()
 
 
