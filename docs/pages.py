@@ -10,8 +10,8 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from mkdocs.config.defaults import MkDocsConfig
 from matplotlib.ticker import LogLocator, NullFormatter
+from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from scipy import stats
 
@@ -158,7 +158,7 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
                     f"![Error of {look.label} over time]({name}.png)",
                     "",
                     f"Root mean square error of one ego over {RUNS} noise draws, `town10`, scenario 2, "
-                    f"{NEIGHBOURS} neighbours, ideal channel, nominal noise model. The shaded band contains 95 % of such "
+                    f"{NEIGHBOURS} neighbours, ideal channel, nominal noise model. The band contains 95 % of such "
                     "errors of an estimator at the bound.",
                     "",
                     *(["Notes on its Track:", "", *notes, ""] if notes else []),
