@@ -194,7 +194,7 @@ def _finding(results: Results, loss: float) -> str:
 
 STUDY = lineup.study(
     "cooperative_gain",
-    "Can vehicles that send their estimated noise do without known noise, and when messages are lost?",
+    "Can transmitted noise estimates replace known noise parameters, also when messages are lost?",
     cell=cell,
     key=key,
     prepare=prepare,
@@ -232,9 +232,9 @@ STUDY = lineup.study(
     figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
-        "The noise of range and angles is the data sheet's: vehicles that train alone show nothing of it.",
-        "Messages arrive at the step in which they are sent, or never.",
-        "Numbers count as float32; sums of long drives would be restarted before they need more.",
+        "The noise of range and angles is the nominal one, since solo training drives contain no such measurement.",
+        "Messages arrive within the step in which they are sent, or never.",
+        "Numbers count as float32; on long drives the sums would have to be restarted.",
     ),
     minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},

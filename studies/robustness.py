@@ -109,8 +109,8 @@ STUDY = lineup.study(
     figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
-        "Velocities and relative measurements stay true: a spoofer that also forges its motion is found by neither.",
-        "Spoofed vehicles do not coordinate: each has an offset of its own.",
+        "Velocities and relative measurements stay true; a spoofer that also forges its motion is not detected.",
+        "Spoofed vehicles do not coordinate; each has its own offset.",
     ),
     minutes=20,
     metrics={"rt_le_m": "lower", "nees": 3.0},
