@@ -164,12 +164,9 @@ def _figure(results: Results) -> Plot | None:
                 number = mean if pair in BOUNDS else interval
                 at = {k: loss if k and pair not in BOUNDS else 0.0 for k in NEIGHBOURS}
                 points = {k: number(results, of(*pair, **ALIKE, max_neighbours=k, loss=lost)) for k, lost in at.items()}
-                lines.append(Line(of(*pair), points, {"linestyle": ":"} if pair == BOUNDS[1] else {}))
+                lines.append(Line(of(*pair), points))
             shown.append(Panel(lines, f"{100 * loss:g} % of messages lost", "Neighbours K", NEIGHBOURS))
-    text = (
-        "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs; dotted black: the bound "
-        "with its past. LKF-SA lies far above."
-    )
+    text = "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs. LKF-SA lies far above."
     return panels(shown, scene.caption(results, text, INPUTS, BOUND), 2.1 + 2.0 * len(shown), 3.2)
 
 

@@ -15,7 +15,6 @@ GRAPH = ROOT.parent / "shared" / "data" / "pyfg" / "mrclam5a.pyfg"
 PAGES = [
     "optimize",
     pytest.param("distributed", marks=pytest.mark.skipif(not GRAPH.is_file(), reason=f"{GRAPH.name} is not there")),
-    pytest.param("federation", marks=pytest.mark.slow),
 ]
 
 
