@@ -201,7 +201,9 @@ def list_names() -> None:
     """
     for group in plugins.GROUPS:
         if group != "coopoc.commands":
-            print(f"{group.removeprefix('coopoc.')}: {', '.join(plugins.names(group)) or '(none but the built-in ones)'}")
+            print(
+                f"{group.removeprefix('coopoc.')}: {', '.join(plugins.names(group)) or '(none but the built-in ones)'}"
+            )
 
 
 OWN: Mapping[str, Command] = {
