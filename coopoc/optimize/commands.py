@@ -126,13 +126,13 @@ def check() -> int:
     Example: coopoc check
     """
     failed = 0
-    print(f"{'backend':<14} {'constraints':<12} {'status':<10} {'cost':>12} {'differs [m]':>11} {'ms':>8}")
+    print(f"{'backend':<14} {'constraints':<12} {'status':<10} {'cost':>12} {'differs [m]':>11} {'ms':>8}  measures")
     for name, known in backends().items():
         fixed = known.capabilities.constraints
         if not known.installed:
             print(f"{name:<14} {fixed:<12} not installed: pip install {known.library}")
             continue
-        problem = _ranges() if known.capabilities.lacking(tiny()) else tiny()
+        problem, measures = (_ranges(), "range") if known.capabilities.lacking(tiny()) else (tiny(), "spherical")
         expected = solve(problem)
         began = time.perf_counter()
         found = solve(problem, name, throw=False)
@@ -140,7 +140,7 @@ def check() -> int:
         off = float(np.abs(found.x - expected.x).max())
         good = found.status is Status.SOLVED and off < 1e-6
         failed += not good
-        print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}")
+        print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}  {measures}")
     print(f"coopoc: {len(backends())} backends, {failed} disagree with gauss-newton", file=sys.stderr)
     return int(failed > 0)
 
