@@ -49,20 +49,20 @@ def run(
     retry_failed: bool = False,
     dry_run: bool = False,
 ) -> int:
-    """Run a study, or resume it: finished cells are kept, failed cells are computed again with --retry-failed.
+    """Run a study, or resume it: finished cells are kept; --retry-failed repeats failed ones.
 
     Example: coopoc run neighbours --jobs 2 --set runs=100 max_neighbours=0,4
 
     Args:
-        name: of the study, as in coopoc list, or FILE.py:NAME for a file of your own.
-        data: a data set instead of the study's own.
-        out: of all studies; this one goes to FOLDER/NAME.
-        jobs: worker processes. Results do not depend on it.
-        set: settings or axes of the study. Lists are split at commas.
-        shard: compute only the I-th of N parts; a run without it completes and publishes them.
-        cluster: a Dask scheduler, whose workers compute instead of processes here.
-        retry_failed: compute failed cells once more.
-        dry_run: print which cells would be kept, repeated and computed, and stop.
+        name: name of the study (see coopoc list), or FILE.py:NAME.
+        data: data set to use instead of the study's own.
+        out: folder of all studies; this one is written to FOLDER/NAME.
+        jobs: number of worker processes; results do not depend on it.
+        set: settings or axes of the study; commas separate the values of a list.
+        shard: compute only part I of N; a run without --shard completes and publishes them.
+        cluster: address of a Dask scheduler whose workers compute the cells.
+        retry_failed: repeat failed cells.
+        dry_run: print which cells would be kept, repeated and computed, then stop.
     """
     from .study.parse import assignments
     from .study.publish import tables
@@ -93,13 +93,13 @@ def merge(
     /,
     out: Annotated[Path, arg(metavar="FOLDER")],
 ) -> int:
-    """Merge folders of one study, such as those that several machines filled shard by shard.
+    """Merge folders of one study that several machines have computed.
 
     Example: coopoc merge a/neighbours b/neighbours --out runs
 
     Args:
-        folders: of the study, run with the same settings.
-        out: of all studies; this one goes to FOLDER/NAME.
+        folders: folders of one study, run with the same settings.
+        out: folder of all studies; this one is written to FOLDER/NAME.
     """
     from .study.merge import merge as merge_folders
 
@@ -124,12 +124,12 @@ def compare(
     Example: coopoc compare before/neighbours after/neighbours --where method=okf,kalman
 
     Args:
-        run_a: folder of the study.
+        run_a: folder of a study.
         run_b: folder of the same study, run with other code or settings.
-        value: the metric.
-        by: columns beside the parameters that identify a row, such as round.
-        where: rows of the results to compare.
-        format: of the tables.
+        value: metric to compare.
+        by: columns that identify a row in addition to the parameters, such as round.
+        where: compare only the rows with these values.
+        format: format of the tables.
     """
     from .study.compare import compare as compare_runs
 
@@ -146,18 +146,18 @@ def table(
     value: Annotated[str, arg(metavar="METRIC")] = "rt_le_m",
     where: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
 ) -> None:
-    """Print the tables of a study, or (with --rows) another table of its results.
+    """Print the tables of a study, or with --rows any other table of its results.
 
     Example: coopoc table runs/neighbours --format latex
 
     Args:
-        folder: of the study.
-        format: of the table.
-        name: only this one of the study's tables.
-        rows: parameter down the rows of another table.
-        columns: parameter across its columns.
-        value: metric that it shows.
-        where: rows of the results that it is made from.
+        folder: folder of the study.
+        format: format of the table.
+        name: print only this table of the study.
+        rows: parameter in the rows of a new table.
+        columns: parameter in the columns of a new table.
+        value: metric in the cells of a new table.
+        where: use only the results with these values.
     """
     from .study.pivot import pivot
     from .study.publish import tables
@@ -176,17 +176,16 @@ def report(
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     title: Annotated[str, arg(metavar="TEXT")] = "",
 ) -> None:
-    """Write a self-contained HTML page on one or several studies, or print it to a PDF.
+    """Write a self-contained HTML page, or a PDF, on one or several studies.
 
     Example: coopoc report runs/neighbours runs/error_cdf --out report.html
 
     Example: coopoc report runs/neighbours --out report.pdf
 
     Args:
-        folders: of the studies, in the order of the page.
-        out: the file; default report.html in the folder of the first study. A name in .pdf gives a PDF, which needs
-            Chromium (apt-get install chromium).
-        title: of the page.
+        folders: folders of the studies, in the order of the page.
+        out: file to write; .pdf needs Chromium. Default: report.html in the first folder.
+        title: title of the page.
     """
     from .study.report import report as write_report
 
@@ -196,13 +195,15 @@ def report(
 
 
 def list_names() -> None:
-    """List what is installed: methods, studies, data sets, backends and other open sets.
+    """List what is installed: data sets, methods, studies, backends, recipes, channels and more.
 
     Example: coopoc list
     """
     for group in plugins.GROUPS:
         if group != "coopoc.commands":
-            print(f"{group.removeprefix('coopoc.')}: {', '.join(plugins.names(group)) or '(none)'}")
+            print(
+                f"{group.removeprefix('coopoc.')}: {', '.join(plugins.names(group)) or '(none but the built-in ones)'}"
+            )
 
 
 OWN: Mapping[str, Command] = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,13 +27,18 @@ def axes(ax: Axes | None) -> Axes:
         InputError: no axes of matplotlib.
     """
     from matplotlib.axes import Axes as Known
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    class Picture(Figure):
+        """A figure that notebooks show without pyplot."""
+
+        def _repr_png_(self) -> bytes:
+            out = io.BytesIO()
+            self.savefig(out, format="png")
+            return out.getvalue()
+
     if ax is None:
-        figure = Figure(figsize=(6.4, 5.2), dpi=150, layout="constrained")
-        FigureCanvasAgg(figure)
-        ax = figure.add_subplot()
+        ax = Picture(figsize=(6.4, 5.2), dpi=150, layout="constrained").add_subplot()
     if not isinstance(ax, Known):
         raise InputError("ax", repr(ax)[:60], "must be axes of matplotlib", "Take them from plt.subplots().")
     ax.set_aspect("equal", adjustable="datalim")

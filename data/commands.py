@@ -30,12 +30,12 @@ def list_() -> None:
 
 
 def show(name: tyro.conf.Positional[str]) -> None:
-    """Show the card of a bundled fleet, or what a file of drives holds: speeds, neighbours, heights.
+    """Show the card of a bundled fleet, or statistics of a file of drives: speeds, neighbours, heights.
 
     Example: coopoc data show town10
 
     Args:
-        name: of the fleet, or a path as in --data.
+        name: a bundled fleet, or a path as in --data.
     """
     if name in DATASETS:
         print(DATASETS[name].card().render())
@@ -155,11 +155,11 @@ def make(
         recipe: name of a bundled fleet, or FILE.py:NAME of a Recipe of your own.
         maps: folder with the .xodr files of CARLA.
         out: folder for the fleet and its card.
-        seed: instead of the recipe's.
-        tries: seeds to try, one after the other, until all vehicles drive and none jumps.
+        seed: seed instead of the recipe's.
+        tries: number of seeds to try until all vehicles drive and none jumps.
         map: file in the folder of maps, instead of the recipe's.
-        vehicles: their number, instead of the recipe's.
-        cutoff: Hz, of the smoother, instead of the recipe's.
+        vehicles: number of vehicles, instead of the recipe's.
+        cutoff: cutoff of the smoother in Hz, instead of the recipe's.
     """
     from .generate import make as generate
 
@@ -184,12 +184,12 @@ def convert_(
     Example: coopoc data convert fcd.xml drive.csv --dt 0.1; coopoc data convert "mylog?frame=body" drive.pyfg
 
     Args:
-        source: name or path.
-        out: .csv, .parquet or a folder; of a log .pyfg or .g2o.
-        dt: s, resample.
-        max_gap: s, longest gap of a vehicle that dt bridges.
-        columns: names in the file, where they differ from id, t, x, y, z, vx, vy, vz.
-        format: of the source, if it is not detected.
+        source: name or path of the drive.
+        out: file in .csv or .parquet, or a folder for TUM files; of a log a .pyfg or .g2o file.
+        dt: step in s to resample to.
+        max_gap: longest gap of a vehicle in s that resampling bridges.
+        columns: headers in the file that differ from id, t, x, y, z, vx, vy, vz.
+        format: format of the source, if it is not detected.
     """
     given = {"max_gap": max_gap, "columns": _pairs("--columns", columns)}
     options = {name: value for name, value in given.items() if value}

@@ -1,4 +1,4 @@
-"""coopoc score: trajectories of other people's programs against a truth."""
+"""coopoc score: trajectories of any program against a truth."""
 
 from __future__ import annotations
 
@@ -100,21 +100,21 @@ def score(
     unit: Unit = "steps",
     output: Annotated[File | None, arg(metavar="FILE")] = None,
 ) -> int:
-    """Score trajectories of any program against a truth: RT-LE, APE, RPE and NEES, with intervals over blocks of time.
+    """Score trajectories of any program against a truth: RT-LE, APE, RPE and NEES, with intervals.
 
     Example: coopoc score orb.txt --truth truth.txt --align each
 
     Example: coopoc score team.csv --truth truth.csv --align team --output scores.json
 
     Args:
-        estimates: TUM, KITTI, CSV, Parquet; of several vehicles by several files or a column id.
-        truth: the same kinds of files; vehicles are matched by file name or id.
-        align: none compares in the frame given, each aligns every vehicle, team moves all by one motion.
-        max_diff: s, how far stamps that belong together may be apart.
-        offset: s, added to the estimates' stamps.
-        delta: between the poses of the relative error; a whole number of steps, or a length.
-        unit: of delta, steps or m.
-        output: the scores as JSON.
+        estimates: TUM, KITTI, CSV or Parquet files; several vehicles are several files or a column id.
+        truth: files of the same kinds; vehicles are matched by file name or id.
+        align: none compares as given, each aligns every vehicle, team aligns all by one motion.
+        max_diff: largest difference of matched time stamps in s.
+        offset: time in s that is added to the estimates' stamps.
+        delta: distance between the poses of the relative error, in --unit.
+        unit: unit of delta, steps or metres.
+        output: file for the scores as JSON.
     """
     from coopoc.evaluate.score import scores
 

@@ -10,8 +10,10 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.ticker import LogLocator, NullFormatter
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from scipy import stats
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
@@ -34,13 +36,13 @@ SECTIONS = {
 FOUND = {
     "aggregation": (
         "federation.md#aggregation-study",
-        "**Rules differ where a client is poisoned.** One poisoned update takes the mean from 0.91 to 1.48 m;"
+        "**Rules differ once a client is poisoned.** One poisoned update raises the mean's error from 0.91 to 1.48 m;"
         " the median, the trimmed mean, multi-Krum and the geometric median stay at 0.92 to 0.93 m.",
     ),
     "backends": (
         "optimize.md#what-each-backend-is-for",
-        "**All backends find the same positions**, within 5 µm of SciPy's trust-region least squares; they "
-        "differ in time.",
+        "**All backends find the same positions**, within 5 µm of SciPy's trust-region least squares; only their "
+        "times differ.",
     ),
     "convergence": (
         "learned.md#the-papers-net",
@@ -54,8 +56,8 @@ FOUND = {
     ),
     "generalisation": (
         "learned.md#other-traffic-another-town-other-noise",
-        "**A gain that was trained once holds elsewhere**: the recursive one within 1 % of the oracle "
-        "filter's rms in three fleets under its training noise, FedKalmanNet within 7 to 31 %.",
+        "**A trained gain generalises to other traffic**: under its training noise the recursive gain is within 1 % of "
+        "the oracle filter's rms in three fleets, FedKalmanNet within 7 to 31 %.",
     ),
     "learned_gains": (
         "learned.md#one-set-of-weights-four-noises",
@@ -64,27 +66,28 @@ FOUND = {
     ),
     "neighbours": (
         "index.md",
-        "**With identity covariances the federated net alone beats cooperative filters, with fitted ones it "
-        "does not**: 0.95 m against 2.19 and 0.54 m of LKF-SA with ten neighbours.",
+        "**With identity covariances the federated net alone beats cooperative filters; with fitted covariances it "
+        "does not**: 0.95 m, against 2.19 and 0.54 m for LKF-SA with ten neighbours.",
     ),
     "open_choices": (
         "learned.md#choices-that-the-paper-leaves-open",
-        "**What the paper leaves open moves results more than the method does**: the first fix or the true "
-        "start, and how “10 % of the velocity” is read.",
+        "**What the paper leaves open changes results more than the method does**: a start at the first fix or at "
+        "the true position, and the reading of “10 % of the velocity”.",
     ),
     "privacy": (
         "privacy.md",
-        "**With four clients a net of 19,938 weights cannot be trained at any epsilon that was run; nine "
-        "numbers survive**: the federated OKF loses 9 % at epsilon 10 with four clients, 3 % at epsilon 1 with "
+        "**With four clients a net of 19,938 weights cannot be trained at any epsilon tried; nine parameters "
+        "can**: the federated OKF loses 9 % at epsilon 10 with four clients, 3 % at epsilon 1 with "
         "sixty.",
     ),
     "scaling": (
         "performance.md#as-fleets-grow",
-        "**A vehicle costs about as much in a fleet of 1,980 as in one of 60**: 1.2 to 1.4 times the time a step.",
+        "**The time per vehicle and step hardly grows with the fleet**: 1.2 to 1.4 times as long among 1,980 vehicles "
+        "as among 60.",
     ),
     "side_by_side": (
         "your_data.md",
-        "**Any methods and conditions beside each other and beside the bound**, on a bundled drive or on your own log.",
+        "**Any methods under any conditions, with the bound**, on a bundled drive or on your own log.",
     ),
 }
 """Studies without a page of their own: where they are described, and what they found."""
@@ -136,10 +139,10 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
         what, sends, covariance = table.get(name, ("", "", ""))
         size = method.message.payload if method.cooperative else 0
         facts = [
-            f"| does | {what} |",
-            f"| sends | {sends or 'nothing'}{f' ({size} B payload)' if size else ''} |",
-            f"| covariance | {covariance} |",
-            f"| RT-LE in the picture | {_rms(track, fleet):.2f} m; Kalman filter {np.sqrt((solo**2).mean()):.2f} m |",
+            f"- **Does:** {what}",
+            f"- **Sends per step:** {sends or 'nothing'}{f' ({size} B payload)' if size and ' B' not in sends else ''}",
+            f"- **Covariance:** {covariance}",
+            f"- **RT-LE in the picture:** {_rms(track, fleet):.2f} m; solo Kalman filter {_root_mean(solo):.2f} m",
         ]
         notes = [f"- {note}" for note in track.notes]
         yield (
@@ -150,14 +153,13 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
                     "",
                     f"`{name}`, `coopoc.{kind.__name__}`" if hasattr(co, kind.__name__) else f"`{name}`",
                     "",
-                    "| | |",
-                    "|---|---|",
                     *facts,
                     "",
                     f"![Error of {look.label} over time]({name}.png)",
                     "",
                     f"Root mean square error of one ego over {RUNS} noise draws, `town10`, scenario 2, "
-                    f"{NEIGHBOURS} neighbours, ideal channel, nominal noise model.",
+                    f"{NEIGHBOURS} neighbours, ideal channel, nominal noise model. The band contains 95 % of such "
+                    "errors of an estimator at the bound.",
                     "",
                     *(["Notes on its Track:", "", *notes, ""] if notes else []),
                     f"::: {kind.__module__}.{kind.__name__}",
@@ -201,7 +203,11 @@ def _error(track: Any, fleet: Any) -> Any:
 
 
 def _rms(track: Any, fleet: Any) -> float:
-    return float(np.sqrt((_error(track, fleet) ** 2).mean()))
+    return _root_mean(_error(track, fleet))
+
+
+def _root_mean(error: Any) -> float:
+    return float(np.sqrt((error**2).mean()))
 
 
 def _picture(t: Any, curves: tuple[Any, Any, Any], look: Any, information: str) -> bytes:
@@ -213,9 +219,12 @@ def _picture(t: Any, curves: tuple[Any, Any, Any], look: Any, information: str) 
     ax.plot(t, solo, color="#E69F00", lw=1.0, label="Kalman filter, alone")
     ax.plot(t, error, color=look.color, lw=1.6, label=look.label)
     ax.plot(t, bound, color="black", ls="--", lw=1.0, label=f"bound, {information}")
+    low, high = np.sqrt(stats.chi2.ppf([0.025, 0.975], 3 * RUNS) / (3 * RUNS))
+    ax.fill_between(t, low * bound, high * bound, color="black", alpha=0.12, lw=0, label=f"95 % of {RUNS} draws at it")
     ax.set(xlabel="Time [s]", ylabel="RMS error [m]", yscale="log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(NullFormatter())
     ax.grid(True, color="#E3E7EC")
     ax.legend(fontsize=8, frameon=False)
     out = io.BytesIO()
@@ -225,14 +234,14 @@ def _picture(t: Any, curves: tuple[Any, Any, Any], look: Any, information: str) 
 
 def _gallery() -> str:
     """Every study with its question, its figure, its finding and its page."""
-    lines = ["# Studies", "", "`coopoc run NAME` repeats each; [how](studies.md).", ""]
+    lines = ["# Studies", "", "`coopoc run NAME` reproduces a study ([Running studies](studies.md)).", ""]
     for name in names("coopoc.studies"):
         study = find("coopoc.studies", name)
         page, finding = FOUND.get(name, (f"{name}.md", ""))
         finding = finding or _first_finding(DOCS / page)
         lines += [f"## [{name}]({page})", "", f"*{study.question}*", "", finding, ""]
         if (DOCS / f"{name}.png").is_file():
-            lines += [f"![{name}]({name}.png)" + "{ .gallery }", ""]
+            lines += [f"[![Figure of {name}]({name}.png)]({name}.png)" + "{ .gallery }", ""]
     return "\n".join(lines)
 
 
@@ -245,7 +254,7 @@ def _first_finding(page: Path) -> str:
 def _api() -> Iterator[tuple[str, str]]:
     """A page for each room, with the public names that live there."""
     homes = re.findall(r"from \.([\w.]+) import (\w+)", (DOCS.parent / "coopoc" / "__init__.pyi").read_text())
-    lines = ["# API reference", "", "Public names of `import coopoc as co`; each is one page's entry.", ""]
+    lines = ["# API reference", "", "The public names of `import coopoc as co`.", ""]
     for room, (title, words) in SECTIONS.items():
         mine = [(module, name) for module, name in homes if module.split(".")[0] == room]
         yield f"api/{room}.md", "\n".join([f"# {title}", "", *(f"::: coopoc.{m}.{n}\n" for m, n in mine)])

@@ -175,8 +175,8 @@ STUDY = lineup.study(
     figures={"choices": _figure},
     findings=_findings,
     limitations=(
-        "One K, one scenario: a window pays where messages are late, which study latency_loss shows.",
-        "The fitted noise model comes from vehicles that drive alone; for neighbours it takes the data sheet.",
+        "One K and one scenario; the study latency_loss shows that a window pays off when messages are late.",
+        "The fitted noise model comes from solo drives; the noise of relative measurements is the nominal one.",
     ),
     minutes=8,
     metrics={"rt_le_m": "lower", "nees": 3.0},

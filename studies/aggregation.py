@@ -172,7 +172,7 @@ STUDY = Study(
     },
     findings=_findings,
     limitations=(
-        "The kept round is chosen by what all clients that took part report, the bad one included.",
+        "The selected round depends on the reports of all participating clients, the poisoned one included.",
         "Rules have their default parameters, of which some were chosen under iid on town10-validation; krum and "
         "multi_krum expect one bad client.",
         "Intervals of the differences are not corrected for the number of rules that are compared.",

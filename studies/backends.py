@@ -190,7 +190,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "backends",
-    "Do all backends find the same positions, and what does a solve cost with each?",
+    "Do all backends find the same positions, and how long does each take?",
     cell=cell,
     key=scene.facts,
     recipe=None,
@@ -207,7 +207,7 @@ STUDY = lineup.study(
     tables={"agreement": _agreement, "cost": _cost},
     findings=_findings,
     limitations=(
-        "The referee is local, too: of problems with several minima it shows which was found, not which is the lowest.",
+        "The reference solver is local, too: where there are several minima it does not show which is the lowest.",
         "Times are of one call at a time and of this machine.",
     ),
     minutes=2,

@@ -23,7 +23,7 @@ def benchmark(
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK")] = (),
     table: bool = False,
 ) -> int:
-    """Run CL-Bench: fixed tasks, seeds, egos and scores; one small JSON card per method, and the table of all cards.
+    """Run CL-Bench on methods: fixed tasks, seeds, egos and scores; one JSON card per method, and their table.
 
     Example: coopoc benchmark joint lkf-sa mine.py:Own
 
@@ -32,13 +32,12 @@ def benchmark(
     Example: coopoc benchmark --table --out benchmarks/cards
 
     Args:
-        methods: names of `coopoc list`, shipped learned gains, or mine.py:NAME; with --data also pose-solo, pose-fleet,
-            pose-intersection, pose-naive, and backends.
+        methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ... and backends.
         out: folder of the cards.
-        data: with MR.CLAM's set 6 and PyFG files somewhere below it, for the tasks of real measurements.
-        validation: the tasks on which parameters may be chosen, whose cards are no submission.
-        tasks: some of the tasks; all without it.
-        table: print the table of the folder's cards, worst last.
+        data: folder with MR.CLAM set 6 and PyFG files, for the tasks of real measurements (docs/benchmark.md).
+        validation: run the validation tasks, for choosing parameters; their cards cannot be submitted.
+        tasks: run only these tasks.
+        table: print the table of all cards in the folder, best first.
     """
     from .bench_cards import card, method, page, simulated
     from .bench_tasks import TASKS, VALIDATION

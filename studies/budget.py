@@ -163,7 +163,7 @@ def _scheduled(results: Results, method: str, known: str) -> str:
 
 STUDY = lineup.study(
     "budget",
-    "What does accuracy cost in bytes, in a training once or in every second of a drive?",
+    "What does accuracy cost in bytes: once for training, or in every second of a drive?",
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 3},
     shares=AXES,
@@ -177,8 +177,8 @@ STUDY = lineup.study(
     figures={"pareto": _pareto},
     findings=_findings,
     limitations=(
-        "A vehicle receives what its K neighbours send; what the others send fills the channel, too.",
-        "Under a cap messages of the nearest neighbours pass first where no other schedule is named.",
+        "Only messages of the K neighbours are counted; those of other vehicles also occupy the channel.",
+        "Under a cap the nearest neighbours' messages pass first unless another schedule is named.",
         "Numbers count as float32; CAMs quantise positions and velocities instead.",
     ),
     minutes=13,

@@ -96,7 +96,9 @@ STUDY = lineup.study(
     tables={"nees": _table},
     figures={"nees": _figure},
     findings=_findings,
-    limitations=("White noise over an ideal channel: late messages, biases and spoofing are other studies.",),
+    limitations=(
+        "White noise and an ideal channel; other studies cover late messages, correlated errors and spoofing.",
+    ),
     minutes=10,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

@@ -173,9 +173,7 @@ STUDY = lineup.study(
     tables={"rounds": _table},
     figures={"rounds": _figure, "clients": _clients},
     findings=_findings,
-    limitations=(
-        "The centralised net has no rounds: its schedule is cut into equal parts, as many as the federated net has.",
-    ),
+    limitations=("The centralised net has no rounds: its schedule is divided into as many equal parts.",),
     minutes=2,
     metrics={"rt_le_m": "lower"},
 )

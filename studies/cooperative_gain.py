@@ -164,12 +164,9 @@ def _figure(results: Results) -> Plot | None:
                 number = mean if pair in BOUNDS else interval
                 at = {k: loss if k and pair not in BOUNDS else 0.0 for k in NEIGHBOURS}
                 points = {k: number(results, of(*pair, **ALIKE, max_neighbours=k, loss=lost)) for k, lost in at.items()}
-                lines.append(Line(of(*pair), points, {"linestyle": ":"} if pair == BOUNDS[1] else {}))
+                lines.append(Line(of(*pair), points))
             shown.append(Panel(lines, f"{100 * loss:g} % of messages lost", "Neighbours K", NEIGHBOURS))
-    text = (
-        "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs; dotted black: the bound "
-        "with its past. LKF-SA lies far above."
-    )
+    text = "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs. LKF-SA lies far above."
     return panels(shown, scene.caption(results, text, INPUTS, BOUND), 2.1 + 2.0 * len(shown), 3.2)
 
 
@@ -194,7 +191,7 @@ def _finding(results: Results, loss: float) -> str:
 
 STUDY = lineup.study(
     "cooperative_gain",
-    "Can vehicles that send their estimated noise do without known noise, and when messages are lost?",
+    "Can transmitted noise estimates replace known noise parameters, also when messages are lost?",
     cell=cell,
     key=key,
     prepare=prepare,
@@ -232,9 +229,9 @@ STUDY = lineup.study(
     figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
-        "The noise of range and angles is the data sheet's: vehicles that train alone show nothing of it.",
-        "Messages arrive at the step in which they are sent, or never.",
-        "Numbers count as float32; sums of long drives would be restarted before they need more.",
+        "The noise of range and angles is the nominal one, since solo training drives contain no such measurement.",
+        "Messages arrive within the step in which they are sent, or never.",
+        "Numbers count as float32; on long drives the sums would have to be restarted.",
     ),
     minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},

@@ -115,9 +115,9 @@ STUDY = lineup.study(
     limitations=(
         "A Gauss-Markov error with one correlation time stands for multipath and atmosphere; real ones depend on the "
         "place and on the satellites in view.",
-        "What lasts for all alike is shared by the whole map: over some hundred metres that is nearly so.",
-        "A neighbour that comes back is new to the drift filter and to the bound, although its error was met before: "
-        "the filter is somewhat over-confident, the bound lower than it need be.",
+        "The common error is the same over the whole map, which is nearly true over some hundred metres.",
+        "The drift filter and the bound treat a returning neighbour as new, although its error was partly known: "
+        "the filter is somewhat over-confident, and the bound is not tight.",
         "Learned gains were trained with white noise.",
     ),
     minutes=12,

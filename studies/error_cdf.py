@@ -116,9 +116,7 @@ STUDY = lineup.study(
     tables={f"scenario{s}_{100 * r:g}": partial(_table, at=case(s, r)) for s, r in CASES},
     figures={f"cdf_scenario{s}_{100 * r:g}": partial(_cdf, at=case(s, r)) for s, r in CASES},
     findings=_findings,
-    limitations=(
-        "The nets and the fitted noise come from vehicles with 1.5 m and 10 %; the noise of the test is another one.",
-    ),
+    limitations=("The nets and the fitted noise model come from drives with 1.5 m and 10 %; the test noise differs.",),
     minutes=3,
     metrics={"rt_le_m": "lower"},
 )

@@ -140,7 +140,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = lineup.study(
     "generalisation",
-    "Does what was learned on four drives hold in other traffic, another town and other noise?",
+    "Does a gain trained on four drives generalise to other traffic, another town and other noise?",
     cell=cell,
     key=key,
     grid=_grid(),

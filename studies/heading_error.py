@@ -152,7 +152,7 @@ def _grid() -> list[dict[str, Any]]:
 
 STUDY = Study(
     "heading_error",
-    "What does a heading cost that is measured with an error, or only estimated, and when does a fleet find its own?",
+    "What does an erroneous or unknown heading cost, and how soon does a fleet estimate its headings?",
     cell,
     _grid(),
     settings={"runs": 20, "seed": 0, "radius_m": 60.0, "gnss_std_m": 1.5, "yaw_rate_std": 0.01, "score_s": 0.1},
@@ -167,9 +167,9 @@ STUDY = Study(
     figures={"heading": views.figure},
     findings=views.findings,
     limitations=(
-        "One convoy: the geometry decides what a bearing is worth.",
-        "One state needs a centre; the bound is that of all measurements of all vehicles.",
-        "Of a drive its last instant is scored: first headings without a compass are sought in all of it.",
+        "One convoy: the value of a bearing depends on its geometry.",
+        "A joint state of all vehicles needs a centre; its bound uses all measurements of all vehicles.",
+        "Only the last step of a drive is scored; without a compass the initial headings are estimated from all of it.",
     ),
     reference=reference("heading_error"),
     minutes=5,

@@ -105,7 +105,7 @@ def _best(results: Results, way: dict[str, Any]) -> str:
 
 STUDY = lineup.study(
     "latency_loss",
-    "How much of cooperation is left when messages come late or not at all?",
+    "How much of the benefit of cooperation remains when messages are late or lost?",
     grid=_grid(),
     settings={**scene.TOWN, "runs": 20, "train_seeds": 0},
     shares=tuple(PERFECT),

@@ -132,9 +132,9 @@ STUDY = lineup.study(
     figures={"multiples": _figure},
     findings=_findings,
     limitations=(
-        "The Kalman filters with nominal and oracle noise model know the acting noise, the others do not. The "
-        "adaptive filters learn the noise of fixes and assume the velocity noise of the training.",
-        "What was trained at 5 to 20 % and 1 to 6 m saw the noise of the tests among others; the paper's nets saw one.",
+        "The Kalman filters with the nominal and the oracle noise model know the acting noise; the others do not. The "
+        "adaptive filters estimate the noise of fixes and assume the velocity noise of the training drives.",
+        "Gains trained at 5 to 20 % and 1 to 6 m have seen the test noise among others; the paper's nets have not.",
     ),
     minutes=6,
     metrics={"rt_le_m": "lower", "nees": 3.0},

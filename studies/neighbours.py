@@ -88,7 +88,7 @@ def _sweep(results: Results, known: str) -> Plot | None:
     where = present(results, _of(known))
     if where is None:
         return None
-    text = f"RT-LE against the number of neighbours, {known} knowledge; bands: 95 % intervals over egos, then runs."
+    text = f"RT-LE against the number of neighbours, {known} noise model; bands: 95 % intervals over egos, then runs."
     return figures.sweep(results, x="max_neighbours", where=where, log=True, caption=_caption(results, text, where))
 
 
@@ -142,14 +142,14 @@ def _innovations(results: Results) -> Plot | None:
 NEES: dict[str, Any] = {"wanted": _of("nominal", method=FILTERS), "best": None}
 STUDY = lineup.study(
     "neighbours",
-    "What does another neighbour gain online, at what cost, and does collaborative training replace it?",
+    "What does another neighbour bring online, at what cost, and can collaborative training replace it?",
     grid=_grid(),
     where=_meaningful,
     settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 5, "backend": "gauss-newton"},
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
         **{
-            f"rt_le_{known}": partial(_table, wanted=_of(known), text=f"RT-LE [m] against K, {known} knowledge.")
+            f"rt_le_{known}": partial(_table, wanted=_of(known), text=f"RT-LE [m] against K, {known} noise model.")
             for known in ("identity", "fitted", "nominal")
         },
         "budget": partial(
@@ -182,10 +182,9 @@ STUDY = lineup.study(
     },
     findings=findings,
     limitations=(
-        "Azimuth and inclination are in the world frame: the heading that turns a bearing into an azimuth is known.",
-        "MSMV-R is a reconstruction; no reading of MSMV that we tried is flat in K as the paper's curve is.",
-        "The nets and the fitted noise come from vehicles that drive alone with 1.5 m and 10 %; the noise of the test "
-        "is another one.",
+        "Azimuth and inclination are in the world frame, which assumes known headings.",
+        "MSMV-R is a reconstruction; no variant of MSMV that we tried is flat in K like the paper's curve.",
+        "The nets and the fitted noise model come from solo drives with 1.5 m and 10 %; the test noise differs.",
     ),
     minutes=5,
     metrics={"rt_le_m": "lower", "nees": 3.0},

@@ -71,7 +71,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
 
 STUDY = lineup.study(
     "open_choices",
-    "How much do the start and the reading of the velocity noise move the comparison of learned gains?",
+    "How much do the start and the reading of the velocity noise change the comparison of learned gains?",
     cell=lineup.rows,
     recipe=None,
     reference=None,
@@ -81,6 +81,6 @@ STUDY = lineup.study(
     shares=("scenario", "velocity_ratio", "velocity_reading"),
     tables={name: partial(_table, choice=choice) for name, choice in CHOICES.items()},
     findings=_findings,
-    limitations=("The true start is what KalmanNet's published loop assumes; no vehicle has it.",),
+    limitations=("KalmanNet's published loop starts at the true position, which no vehicle knows.",),
     minutes=30,
 )

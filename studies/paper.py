@@ -16,12 +16,14 @@ def paper(
     jobs: Annotated[int, tyro.conf.arg(metavar="N")] = 2,
     data: Annotated[str, tyro.conf.arg(metavar="NAME_OR_PATH")] = "town10",
 ) -> int:
-    """Reproduce the paper's comparison: train, run its three studies, write one report. Repeat it to resume.
+    """Reproduce the paper's comparison: train, run its three studies, write one report. Repeat to resume.
 
     Example: coopoc paper --out runs/paper --jobs 2
 
     Args:
-        out: of weights, studies and report. jobs: worker processes. data: test fleet, a name or a path.
+        out: folder of weights, studies and report.
+        jobs: number of worker processes.
+        data: fleet to test on, a name or a path.
     """
     from coopoc.data.registry import DATASETS
     from coopoc.study.report import report

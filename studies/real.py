@@ -178,10 +178,10 @@ STUDY = Study(
     figures={"rt_le": views.figure},
     findings=views.findings,
     limitations=(
-        "A truth is used on the first part alone: of MR.CLAM noise, scales and lag of the odometry are calibrated "
+        "The truth is used on the first part alone: noise, scales and lag of MR.CLAM's odometry are calibrated "
         "against Vicon, and noise is learned there.",
-        "One drive: an interval over blocks of time does not hold for other vehicles or places.",
-        "With one state a centre receives all that is measured, at its step; late messages are lost.",
+        "One drive: intervals over blocks of time do not extend to other vehicles or places.",
+        "With one joint state a centre receives every measurement at its step; late messages are lost.",
     ),
     minutes=3,
 )

@@ -66,11 +66,13 @@ def _figure(results: Results) -> Plot | None:
 
     shown = []
     for k in _ks(results):
+        wide = {"lkf-sa": {"linewidth": 3.5, "markersize": 9.0, "zorder": 1.5}}  # beside the joint filter
         lines = [
-            Line(of(m, "fitted"), {100 * share: mean(results, at(m, k, share)) for share in SHARES}) for m in METHODS
+            Line(of(m, "fitted"), {100 * share: mean(results, at(m, k, share)) for share in SHARES}, wide.get(m, {}))
+            for m in METHODS
         ]
         lines.append(Line(of(*BOUND), mean(results, {"method": "bound", "max_neighbours": k})))
-        shown.append(Panel(lines, f"K = {k}", "Attacked vehicles [%]", [100 * share for share in SHARES]))
+        shown.append(Panel(lines, f"K = {k}", "Spoofed vehicles [%]", [100 * share for share in SHARES]))
     text = "RT-LE against the share of spoofed vehicles; dashed: the bound without an attack."
     return panels(shown, scene.caption(results, text, NOTE), 2.4 + 2.3 * len(shown), 3.2, log=True)
 
@@ -109,8 +111,8 @@ STUDY = lineup.study(
     figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
-        "Velocities and relative measurements stay true: a spoofer that also forges its motion is found by neither.",
-        "Spoofed vehicles do not coordinate: each has an offset of its own.",
+        "Velocities and relative measurements stay true; a spoofer that also forges its motion is not detected.",
+        "Spoofed vehicles do not coordinate; each has its own offset.",
     ),
     minutes=20,
     metrics={"rt_le_m": "lower", "nees": 3.0},

@@ -140,7 +140,7 @@ def _findings(results: Results) -> dict[str, str]:
 
 STUDY = Study(
     "scaling",
-    "What does a vehicle cost as the fleet grows?",
+    "How does the time per vehicle grow with the fleet?",
     cell=cell,
     key=key,
     grid={"copies": COPIES, "method": ("observe", *METHODS)},
@@ -151,7 +151,7 @@ STUDY = Study(
     findings=_findings,
     limitations=(
         "Copies of one town: every vehicle has the same neighbours at every size.",
-        "CPU time of this machine, beside whatever else it did.",
+        "CPU times are of this machine under its other load.",
     ),
     minutes=5,
 )

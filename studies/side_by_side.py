@@ -77,13 +77,13 @@ def _findings(results: Results) -> dict[str, str]:
         if ranked:
             value, (method, known) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
-            found[f"K = {k}"] = f"K = {k}: the lowest rms is {look(method).label}'s ({known}), {value:.3g} m{gap}."
+            found[f"K = {k}"] = f"K = {k}: {look(method).label} ({known}) has the lowest rms, {value:.3g} m{gap}."
     return found
 
 
 STUDY = lineup.study(
     "side_by_side",
-    "How do these methods do beside each other and beside the bound?",
+    "How do these methods compare with each other and with the bound?",
     grid={"max_neighbours": (0, 2, 6), "method": METHODS, "noise_model": ("nominal",)},
     settings={**scene.TOWN, **scene.WEIGHTS, **CONDITIONS, "backend": "gauss-newton", "runs": 10, "train_seeds": 1},
     reference=None,
@@ -110,9 +110,9 @@ STUDY = lineup.study(
     figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
-        "The bound is for the rms over runs over an ideal channel, whatever the channel of the cells.",
-        "Real data have no bound: it is of sensors that measure at every step.",
-        "Methods that know nothing of noise, or learned it, are the same under every knowledge.",
+        "The bound applies to the rms over runs and assumes an ideal channel, whatever the channel of the cells.",
+        "Real data have no bound: it assumes sensors that measure at every step.",
+        "Methods without a noise model, learned ones among them, give the same result under every noise model.",
     ),
     minutes=1,
 )

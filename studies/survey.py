@@ -30,13 +30,15 @@ def survey(
     data: Annotated[str, tyro.conf.arg(metavar="NAME_OR_PATH")] = "town10",
     runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None,
 ) -> int:
-    """Run the studies of bytes, correlated errors, latency, headings, spoofing and consistency, and write one report.
+    """Run the studies of bytes, correlated errors, latency, headings, spoofing and consistency; write one report.
 
     Example: coopoc survey --out runs/survey --jobs 2
 
     Args:
-        out: of weights, studies and report. jobs: worker processes. data: test fleet, a name or a path.
-        runs: noise draws of every study instead of its own number.
+        out: folder of weights, studies and report.
+        jobs: number of worker processes.
+        data: fleet to test on, a name or a path.
+        runs: number of noise draws of every study, instead of its own.
     """
     from coopoc.study.report import report
 

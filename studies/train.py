@@ -28,16 +28,15 @@ def train(
     Example: coopoc train okf --data "mylog?until=300" --out runs/mylog
 
     Args:
-        recipe: a name such as fedkalmannet (see coopoc list), or mine.py:NAME, a recipe or a net of yours.
-        data: fleet of the clients, a name or a path; of a log with its truth the measured fixes and odometry train,
-            "mylog?until=300" is its first 300 s.
-        out: of the checkpoints.
-        seed: of noise, split, start and batches.
-        start: of the filter in training: the first fix or the true position.
-        reading: of "10 % of the velocity": per axis or of the speed on every axis.
-        aggregate: aggregation rule of a federation, a name or mine.py:NAME; default: the recipe's.
-        flower: train a federation on Flower's simulation engine, every client in a process of its own.
-        rounds: of a federation on Flower; default: the recipe's.
+        recipe: a name such as fedkalmannet (see coopoc list), or FILE.py:NAME of a recipe or a net.
+        data: fleet of the clients or a log with its truth, a name or a path; "mylog?until=300" takes 300 s.
+        out: folder of the checkpoints.
+        seed: seed of noise, split, start and batches.
+        start: start of the filter in training, the first fix or the true position.
+        reading: reading of "10 % of the velocity", per axis or of the speed on every axis.
+        aggregate: aggregation rule, a name or FILE.py:NAME, instead of the recipe's.
+        flower: train on Flower's simulation engine, every client in its own process.
+        rounds: number of rounds on Flower, instead of the recipe's.
     """
     from coopoc.errors import InputError
     from coopoc.learned.train import train_all

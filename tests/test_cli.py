@@ -45,6 +45,15 @@ def test_help_loads_nothing_heavy_and_lists_what_others_add(tmp_path: Path) -> N
     assert re.search(r"run +Run a study", own.stdout)
 
 
+def test_a_list_of_names_imports_no_library(tmp_path: Path) -> None:
+    code = (
+        "import sys, coopoc.cli as c\ntry: c.main(['list'])\nexcept SystemExit as e: "
+        "print(e.code, sorted({'numpy', 'torch', 'gtsam'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "0 []"
+
+
 @pytest.mark.parametrize("name", ["run", "merge", "compare", "table", "report", "list", "reference", "survey", "greet"])
 def test_each_command_explains_itself_with_an_example(tmp_path: Path, name: str) -> None:
     done = coopoc(name, "--help", cwd=tmp_path)

@@ -43,6 +43,14 @@ def test_a_recording_shows_its_fixes_and_links(seen: tuple[co.Fleet, co.Recordin
     assert recording.plot(again) is again
 
 
+def test_a_notebook_shows_a_picture_without_pyplot(seen: tuple[co.Fleet, co.Recording]) -> None:
+    """IPython's own formatter makes a PNG of the figure; a plain Figure gives text alone."""
+    formatters = pytest.importorskip("IPython.core.formatters")
+
+    shown, _ = formatters.DisplayFormatter().format(seen[1].plot(step=1).figure)
+    assert shown["image/png"].startswith(b"\x89PNG")
+
+
 def test_a_track_shows_paths_and_truth(seen: tuple[co.Fleet, co.Recording]) -> None:
     fleet, recording = seen
     track = co.JointFilter("nominal")(recording, [24, 3])

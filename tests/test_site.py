@@ -33,6 +33,14 @@ def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
     assert len(studies) >= 20
 
 
+def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:
+    from coopoc.methods.catalogue import METHODS
+
+    page = (ROOT / "docs" / "methods.md").read_text()
+    rows = [re.findall(r"`([\w-]+)`", line.split("|")[1]) for line in page.splitlines() if line.startswith("| `")]
+    assert set(METHODS) <= {name for names in rows for name in names}
+
+
 @pytest.mark.parametrize(
     "tutorial",
     [pytest.param(path, marks=pytest.mark.slow) if path.stem in ("learned", "compare") else path for path in TUTORIALS],

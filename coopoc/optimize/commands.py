@@ -44,14 +44,12 @@ def solve_file(
     Example: coopoc solve drive.pyfg --backend gtsam --output solution.json
 
     Args:
-        file: .pyfg, .g2o or .jrl.
-        backend: coopoc check shows them.
-        objective: chordal (quadratic, can be certified) or geodesic with the full covariances.
-        start: odometry chained from each robot's first vertex, a spanning tree over loops too, rotations relaxed
-            (linear), growing along the odometry (incremental), the lowest of these (auto), from a ring (apart), the
-            file's vertices, or the rounded point of a convex relaxation that needs no start (relaxed).
-        seconds: after which a relaxed start is the point that was reached; without it the relaxation is solved.
-        output: the solution as JSON; without it a summary goes to stdout.
+        file: graph in .pyfg, .g2o or .jrl.
+        backend: solver (see coopoc check).
+        objective: chordal (quadratic, can be certified), or geodesic with the full covariances.
+        start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of several.
+        seconds: time limit of the relaxation for --start relaxed.
+        output: file for the solution with all nodes, as JSON; a summary goes to stdout.
         outliers: find wrong loop closures and relative poses between robots, and leave them out (solve_gnc).
     """
     problem = read_graph(file, objective, "apart" if start == "relaxed" else start)
@@ -148,13 +146,13 @@ def check() -> int:
     Example: coopoc check
     """
     failed = 0
-    print(f"{'backend':<14} {'holds constraints':<18} {'status':<10} {'cost':>12} {'off by [m]':>11} {'ms':>8}")
+    print(f"{'backend':<14} {'constraints':<12} {'status':<10} {'cost':>12} {'differs [m]':>11} {'ms':>8}  measures")
     for name, known in backends().items():
         fixed = known.capabilities.constraints
         if not known.installed:
-            print(f"{name:<14} {fixed:<18} not installed: pip install {known.library}")
+            print(f"{name:<14} {fixed:<12} not installed: pip install {known.library}")
             continue
-        problem = _ranges() if known.capabilities.lacking(tiny()) else tiny()
+        problem, measures = (_ranges(), "range") if known.capabilities.lacking(tiny()) else (tiny(), "spherical")
         expected = solve(problem)
         began = time.perf_counter()
         found = solve(problem, name, throw=False)
@@ -162,7 +160,7 @@ def check() -> int:
         off = float(np.abs(found.x - expected.x).max())
         good = found.status is Status.SOLVED and off < 1e-6
         failed += not good
-        print(f"{name:<14} {fixed:<18} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}")
+        print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}  {measures}")
     print(f"coopoc: {len(backends())} backends, {failed} disagree with gauss-newton", file=sys.stderr)
     return int(failed > 0)
 

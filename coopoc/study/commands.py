@@ -27,11 +27,11 @@ def reference(
     Example: coopoc reference runs/mine --study mine.py:STUDY
 
     Args:
-        folder: of the study.
-        study: the study that was run, if it is one of your own files: FILE.py:NAME.
-        file: with the reference values, instead of the study's own.
-        write: write them from these results instead.
-        all: show the values that hold, too.
+        folder: folder of the study.
+        study: the study, FILE.py:NAME, if it is not an installed one.
+        file: file of the reference values, instead of the study's own.
+        write: write the reference values from these results.
+        all: show every value, not only those that moved.
     """
     from . import reference as known
     from .results import Results

@@ -107,10 +107,11 @@ def canvas(rows: int = 1, columns: int = 1, width: float = 6.4, height: float = 
 
 
 def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
-    """Line options of a method (colour, marker) and of a noise model (line style), and the line's name; the bound is
-    dashed."""
+    """Line options of a method (colour, marker) and of a noise model (line style), and the line's name; a bound is
+    dashed, with the past of newcomers dotted."""
     shown = look(_line(names))
-    dashes = "--" if _line(names) == "bound" else line(names.get("noise_model"))
+    bound = ":" if names.get("noise_model") == "with its past" else "--"
+    dashes = bound if _line(names) == "bound" else line(names.get("noise_model"))
     width = {"linewidth": 0.8} if thin else {}
     name = series(_line(names), str(names.get("noise_model", "")))
     drawn = {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
@@ -120,7 +121,7 @@ def strokes(names: Mapping[str, Any], thin: bool = False) -> dict[str, Any]:
 def legend(
     axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None, inside: bool = False
 ) -> None:
-    """Draw the legend: one entry per method, and one per line style where noise models differ.
+    """Draw the legend: one entry per method and per bound, and one per line style where noise models differ.
 
     Args:
         axes: panel.
@@ -129,9 +130,12 @@ def legend(
         inside: in the panel; else at its right.
     """
     handles = []
-    for method, names in {_line(names): names for names in lines}.items():
-        options = strokes({"method": method} if "method" in names else names)
+    bounds = dict.fromkeys(str(names.get("noise_model")) for names in lines if _line(names) == "bound")
+    entries = {(_line(names), names.get("noise_model") if _line(names) == "bound" else ""): names for names in lines}
+    for (method, information), names in entries.items():
+        options = strokes({"method": method, "noise_model": information} if "method" in names else names)
         text = look(method).label + (words or {}).get(method, "")
+        text += f", {information}" if information and len(bounds) > 1 else ""
         handles.append(Line2D([], [], **options, label=picture(text)))
     styles: dict[Any, list[str]] = {}
     modelled = [n for n in lines if "noise_model" in n and "method" in n and n["method"] != "bound"]

@@ -131,6 +131,7 @@
       const centre = Math.min(Math.max(found.at[0] * box.width, 100), box.width - 100);
       spot.style.left = `${100 * found.at[0]}%`;
       tip.style.left = `${centre}px`;
+      tip.classList.toggle("below", found.at[1] * box.height < 48);
       spot.style.top = tip.style.top = `${100 * found.at[1]}%`;
     });
     drawing.addEventListener("pointerleave", () => (spot.hidden = tip.hidden = true));

@@ -40,7 +40,7 @@ METHODS = {
     "joint": Look("Joint filter", GREEN, "o"),
     "drift": Look("Drift filter", "#7A1FA2", "s"),
     "cooperative-map": Look("Cooperative MAP", "#00543C", "P"),
-    "cooperative-map-5": Look("Cooperative MAP, 5 steps", "#00A37A", "P"),
+    "cooperative-map-5": Look("Cooperative MAP, 5 steps", "#6A51A3", "P"),
     "cooperative-map-gnc": Look("Cooperative MAP, GNC", "#6B8E23", "P"),
     "ci": Look("Covariance intersection", "#A65628", "<"),
     "split-ci": Look("Split CI", "#C77C11", ">"),

@@ -9,9 +9,9 @@
 # %% [markdown]
 # # Compare methods on a drive
 #
-# Sixty vehicles drive through a town. One of them, the ego, is followed by filters that know nothing of the others, by
-# filters that exchange messages with their neighbours, and by a net that was trained on four other vehicles. All meet
-# the same noise, and the posterior Cramér-Rao bound says how good any of them could be.
+# Sixty vehicles drive through a town. The position of one of them, the ego, is estimated by solo filters, by filters
+# that use messages of its neighbours, and by a net that was trained on four other vehicles. All use the same noise
+# draws, and the posterior Cramér-Rao bound is the least error that any filter with the same measurements can have.
 
 # %%
 import coopoc as co
@@ -23,8 +23,8 @@ seen = co.observe(fleet, sensors, v2x, runs=20, seed=0, observers=[ego])
 seen
 
 # %% [markdown]
-# A `Recording` holds what vehicles may see, in 20 noise draws, and no truth. Dots are fixes; lines are what the ego
-# measures at one step.
+# A `Recording` contains the measurements of all vehicles in 20 noise draws, and no truth. Dots are fixes; lines connect
+# the ego with the neighbours that it measures at one step.
 
 # %%
 seen.between(0, 300).plot(step=150).figure
@@ -32,8 +32,8 @@ seen.between(0, 300).plot(step=150).figure
 # %% [markdown]
 # ## Six methods
 #
-# RT-LE is the root of the time-averaged squared error. The noise model is what a method assumes: `identity` is what
-# the paper's baselines do, `nominal` knows the acting standard deviations.
+# RT-LE is the root of the time-averaged squared error. The noise model is the noise that a method assumes: `identity`
+# has unit covariances, as the paper's baselines do; `nominal` has the acting standard deviations.
 
 # %%
 methods = {
@@ -54,16 +54,17 @@ print(f"{'bound of the star':25s}{bound:6.2f} m")
 # %% [markdown]
 # ## Is the difference real?
 #
-# Draws are paired: method A and method B meet the same noise, so that the interval of their difference is narrow.
+# Draws are paired: both methods have the same noise, so that the interval of their difference is narrow.
 
 # %%
-solo, joint = (co.rt_le(tracks[name], fleet) for name in ("Kalman filter, nominal", "joint filter, nominal"))
+solo = co.rt_le(tracks["Kalman filter, nominal"], fleet)
+joint = co.rt_le(tracks["joint filter, nominal"], fleet)
 print(co.paired_difference(joint, solo))
 
 # %% [markdown]
-# ## Does it know how wrong it is?
+# ## Is its covariance consistent?
 #
-# NEES, the squared error in units of the claimed covariance, should be 3 for a position in space.
+# NEES, the squared error in units of the claimed covariance, is 3 on average for a consistent position in space.
 
 # %%
 for name in ("Kalman filter, identity", "Kalman filter, nominal", "joint filter, nominal"):

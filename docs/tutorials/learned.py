@@ -9,8 +9,8 @@
 # %% [markdown]
 # # Train, federate and stream a learned gain
 #
-# KalmanNet replaces the Kalman gain by a small recurrent net. Here vehicles train one together without sending their
-# drives: each trains on its own, and a server averages the weights. Then the net runs on a new drive, step by step.
+# KalmanNet replaces the Kalman gain by a small recurrent net. Here vehicles train one net without sending their drives:
+# each trains on its own drive, and a server averages the weights. Then the net runs on a new drive, step by step.
 # The sizes are small, so that this page is built in a minute; `coopoc paper` does it in full.
 
 # %%
@@ -51,8 +51,8 @@ for name, method in {
 # %% [markdown]
 # ## Step by step
 #
-# On a vehicle there is no drive to look back on. `start` gives a stream that takes a fix and a velocity at a time; its
-# numbers are those of the Track.
+# On a vehicle, measurements arrive one at a time. `start` returns a stream that takes one fix and one velocity per step
+# and gives the numbers of the Track.
 
 # %%
 method = load_method("recursive")

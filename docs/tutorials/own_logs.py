@@ -9,9 +9,9 @@
 # %% [markdown]
 # # Your own logs
 #
-# Two cars and a road-side unit: fixes once a second, wheel speed and compass ten times a second, UWB ranges five times
-# a second, and a column layout of their own. The first cell writes such a file, with a gap, as a logger would. From
-# there on everything is what you do with yours; [Your data](../your_data.md) describes all kinds and columns.
+# Two cars and a road-side unit: fixes once a second, wheel speed and compass ten times a second, UWB ranges five
+# times a second, and their own column layout. The first cell writes such a file, with a gap, as a logger would. The
+# other cells work the same on your file; [Your data](../your_data.md) describes all kinds and columns.
 
 # %%
 import tempfile
@@ -62,8 +62,8 @@ log.recording.plot(step=300).figure
 # %% [markdown]
 # ## Methods on it
 #
-# There is no truth, so that innovations take the place of scores: how far the next fix is from where a method
-# expected it, before it uses it. A normalised one (NIS) near 1 says that the assumed noise is the acting one.
+# Without a truth, innovations take the place of scores: the distance of the next fix from its prediction. A normalised
+# innovation (NIS) near 1 means that the assumed noise agrees with the acting noise.
 
 # %%
 from coopoc.evaluate.innovations import innovation_columns
@@ -82,7 +82,7 @@ track.plot(every=60).figure
 # `coopoc data check log.csv --columns t=zeit vehicle=auto` prints the summary, tests the units against the geometry and
 # draws a picture; `coopoc run side_by_side --data "log.csv?columns=t:zeit,vehicle:auto"` compares methods.
 #
-# A truth, where you have one, is a file `truth.csv` beside the log; then studies give errors and intervals.
+# If you have a truth, put it into a file `truth.csv` beside the log; then studies give errors and intervals.
 
 # %% [markdown]
 # ## A typical mistake

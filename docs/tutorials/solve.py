@@ -9,9 +9,9 @@
 # %% [markdown]
 # # Solve a cooperative localization problem
 #
-# Three vehicles and a road-side unit in the plane. Each vehicle knows its fixes, two of them measure ranges and
-# bearings, one range is wrong by twenty metres, and a wall keeps one vehicle on its side of the road. You will build
-# the factor graph, solve it, find the outlier, add the wall, and check one solver against another.
+# Three vehicles and a road-side unit in the plane. Each vehicle has a fix, all measure ranges and bearings, one range
+# is wrong by twenty metres, and a wall bounds the position of one vehicle. You will build the factor graph, solve it,
+# find the outlier, add the wall, and check one solver against another.
 
 # %%
 import numpy as np
@@ -60,8 +60,8 @@ solution = co.solve(honest)
 print(solution)
 
 # %% [markdown]
-# The cost is half the sum of squared, whitened residuals. With 26 numbers and 12 unknowns it should be near 7: the
-# outlier makes it hundreds, and moves everyone.
+# The cost is half the sum of squared, whitened residuals. With 21 numbers and 12 unknowns it should be near 4.5.
+# The outlier raises it to hundreds and shifts all vehicles.
 
 # %%
 error = np.linalg.norm(solution.position - [at[:2] for at in truth.values()], axis=1)
@@ -70,8 +70,9 @@ dict(zip(names, error.round(2).tolist(), strict=True))
 # %% [markdown]
 # ## An outlier
 #
-# A robust loss discounts what does not fit. Graduated non-convexity (Yang et al., RA-L 2020) starts from least squares
-# and tightens; what ends with weight zero is an outlier.
+# A robust loss discounts large residuals. Graduated non-convexity (Yang et al., RA-L 2020) starts from least squares
+# and tightens the loss; a measurement that ends with weight zero is an outlier. It still adds its truncated loss,
+# 3²/2 = 4.5, to the cost.
 
 # %%
 robust = problem.add("range", pairs, ranges, std=0.3, loss=co.optimize.Loss("truncated", 3.0)).add(
@@ -88,8 +89,8 @@ solution.plot(problem=robust).figure
 # %% [markdown]
 # ## A wall
 #
-# Bounds are constraints on measurements. Without the bad range blue comes out at y = 2.1 m; it is known to be south of
-# a wall at 1.5 m. osqp solves linear constraints, casadi any; a solver that cannot refuses and names those that can.
+# Bounds are constraints on measurements. Without the bad range the estimate of blue is y = 2.1 m, but a wall at 1.5 m
+# lies north of it. osqp takes linear constraints, casadi any; another solver raises an error that names these two.
 
 # %%
 good = [k for k in range(len(pairs)) if k != 4]
@@ -109,7 +110,7 @@ except co.InputError as error:
 # %% [markdown]
 # ## Another opinion
 #
-# Every backend gets the same problem and is judged by the same checks, made without it.
+# Every backend solves the same problem, and the same checks, independent of the solver, verify its solution.
 
 # %%
 for backend in ("gauss-newton", "gtsam", "osqp"):
