@@ -53,8 +53,8 @@ def rt_le(track: Track, fleet: Fleet) -> Floats:
     >>> rt_le(GNSS()(observe(fleet, Sensors(), runs=5)), fleet).shape
     (5, 1)
     """
-    known = fleet.present[:, list(track.egos)]
     squares = errors(track, fleet) ** 2
+    known = fleet.present[:, list(track.egos)]
     if known.all():
         return np.asarray(np.sqrt(np.mean(squares, axis=1)))
     total = np.sum(squares, axis=1, where=known)
