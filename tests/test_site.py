@@ -52,15 +52,6 @@ def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
     assert done.stdout
 
 
-def test_the_ten_lines_of_the_start_run(tmp_path: Path) -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "index.md").read_text(), flags=re.DOTALL)
-    (tmp_path / "start.py").write_text(block)
-    command = [sys.executable, "-W", "error", tmp_path / "start.py"]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    errors = [float(found) for found in re.findall(r" ([\d.]+) m", out)]
-    assert errors[0] > 5 > errors[2] > 2 > errors[1] > errors[3] > 0.9 * errors[4]
-
-
 def test_doctests_of_pages_are_fenced() -> None:
     """The extension of the API pages, which the package does not contain."""
     pytest.importorskip("griffe")
