@@ -41,8 +41,8 @@ FOUND = {
     ),
     "backends": (
         "optimize.md#what-each-backend-is-for",
-        "**All backends find the same positions**, within 5 µm of SciPy's trust-region least squares; only their "
-        "times differ.",
+        "**All backends find the same positions**, within 0.6 µm of SciPy's trust-region least squares; only their "
+        "times differ (medians of 60 solves, beside other load).",
     ),
     "convergence": (
         "learned.md#the-papers-net",
@@ -71,9 +71,9 @@ FOUND = {
     ),
     "open_choices": (
         "learned.md#choices-that-the-paper-leaves-open",
-        "**What the paper leaves open moves results more than the method does**: FedKalmanNet has 0.96 m in scenario 2, "
-        "0.81 m from the true position, 1.23 m with noise of the speed; a fitted Kalman filter differs from it by 0.04 m "
-        "at most (20 runs, two training seeds).",
+        "**What the paper leaves open moves results more than the method does**: FedKalmanNet has 0.96 m in scenario "
+        "2, 0.81 m from the true position, 1.23 m with noise of the speed; a fitted Kalman filter differs from it by "
+        "0.04 m at most (20 runs, two training seeds).",
     ),
     "privacy": (
         "privacy.md",
