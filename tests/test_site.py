@@ -57,7 +57,7 @@ def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
 
 def says_what_it_prints(printed: str) -> None:
     """The findings of the tutorial on the paper, from its table and its differences."""
-    rows = {line[:26].strip(): [float(cell) for cell in line[26:].split()] for line in printed.splitlines()[6:21]}
+    rows = {line[:25].strip(): [float(cell) for cell in line[25:].split()] for line in printed.splitlines()[6:21]}
     net, tuned = rows["FedKalmanNet"][0], rows["Kalman filter, fitted"][0]
     for name in ("MSMV", "LKF-SA"):
         assert min(rows[f"{name}, identity"][:6]) > 1.5 * net

@@ -20,7 +20,7 @@
 
 # %%
 import numpy as np
-from matplotlib.figure import Figure
+from matplotlib import pyplot as plt
 
 import coopoc as co
 from coopoc.learned import GainNet, LearnedGain, clients, federate, fit, ledger
@@ -93,21 +93,22 @@ for k in neighbours:
         size[name, k] = track.received_bytes.mean() / len(track.t)  # per step
     error["bound", k] = np.array([co.bound_rt_le(co.posterior_bound(fleet, sensors, ego, v2x)) for ego in egos])
 
-print("RT-LE [m]".ljust(26) + "".join(f"  K = {k:<3d}" for k in neighbours) + "bytes per step, K = 10")
+print("RT-LE [m], K =".ljust(25) + "".join(f"{k:6d}" for k in neighbours) + "  B/step")
 for name in [*solo, *online, "bound"]:
-    cells = [f"{error[name, k].mean():7.2f} " if (name, k) in error else 8 * " " for k in neighbours]
-    print(name.ljust(26) + "".join(cells) + f"{size.get((name, 10), 0):10.0f}" * (name != "bound"))
+    cells = [f"{error[name, k].mean():6.2f}" if (name, k) in error else 6 * " " for k in neighbours]
+    print(name.ljust(25) + "".join(cells) + f"{size.get((name, 10), 0):8.0f}" * (name != "bound"))
 
 # %% [markdown]
-# `nominal` has the test's own standard deviations, which no vehicle knows exactly; it shows how much the fitted
-# filters lose because they were tuned elsewhere. MSMV is a reconstruction, since its equations are not public.
+# The last column is what an ego receives per step with ten neighbours. `nominal` has the test's own standard
+# deviations, which no vehicle knows exactly; it shows how much the fitted filters lose because they were tuned
+# elsewhere. MSMV is a reconstruction, since its equations are not public.
 
 # %%
 looks = {"LKF-SA": "o-", "MSMV": "s--", "joint filter": "D:"}
 looks |= {"FedKalmanNet": "^-", "Kalman filter": "v--", "bound": "-"}
 colors = dict(zip(looks, ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "black"), strict=True))
-figure = Figure(figsize=(9.0, 3.8), dpi=110, layout="constrained")
-for ax, noise in zip(figure.subplots(1, 2, sharey=True), ("identity", "fitted"), strict=True):
+figure, axes = plt.subplots(1, 2, sharey=True, figsize=(9.0, 3.8), layout="constrained")
+for ax, noise in zip(axes, ("identity", "fitted"), strict=True):
     for name, look in looks.items():
         column = name if name in ("FedKalmanNet", "bound") else f"{name}, {noise}"
         heights = [error.get((column, k), error.get((column, 0))) for k in neighbours]  # alone: the same at every K
@@ -117,9 +118,9 @@ for ax, noise in zip(figure.subplots(1, 2, sharey=True), ("identity", "fitted"),
     ax.yaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()
     ax.grid(color="#E3E7EC")
-figure.axes[0].set_ylabel("RT-LE [m]")
-figure.axes[1].legend(fontsize=9, bbox_to_anchor=(1.02, 1), loc="upper left", frameon=False)
-figure
+axes[0].set_ylabel("RT-LE [m]")
+axes[1].legend(fontsize=9, bbox_to_anchor=(1.02, 1), loc="upper left", frameon=False)
+plt.show()
 
 # %% [markdown]
 # ## Is it noise?
