@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +152,19 @@ def test_the_cheap_ones_run(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
         assert line in shown
         assert _status(words(line)) == 0, line
     assert Path("report.html").stat().st_size > 1e5
+
+
+def test_scripts_and_targets_of_the_pages_exist() -> None:
+    pages = [path.read_text() for path in PAGES]
+    scripts = {
+        name for text in pages for name in re.findall(r"python (?:-m )?((?:examples|benchmarks|tests)/\w+\.py)", text)
+    }
+    modules = {name for text in pages for name in re.findall(r"python -m (coopoc[\w.]*\w)", text)}
+    targets = {name for text in pages for name in re.findall(r"(?:^|`)make ([a-z][a-z-]+)", text, flags=re.MULTILINE)}
+    assert len(scripts) > 8
+    assert {name for name in scripts if not (ROOT / name).is_file()} == set()
+    assert {name for name in modules if find_spec(name) is None} == set()
+    assert targets - set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)) == set()
 
 
 def test_a_wrong_command_is_found() -> None:
