@@ -107,19 +107,21 @@ for name in [*solo, *online, "bound"]:
 looks = {"LKF-SA": "o-", "MSMV": "s--", "joint filter": "D:"}
 looks |= {"FedKalmanNet": "^-", "Kalman filter": "v--", "bound": "-"}
 colors = dict(zip(looks, ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "black"), strict=True))
-figure, axes = plt.subplots(1, 2, sharey=True, figsize=(9.0, 3.8), layout="constrained")
+widths = {"LKF-SA": 4}  # where the joint filter is as good it stays visible
+figure, axes = plt.subplots(1, 2, sharey=True, figsize=(7.5, 4.0), layout="constrained")
 for ax, noise in zip(axes, ("identity", "fitted"), strict=True):
     for name, look in looks.items():
         column = name if name in ("FedKalmanNet", "bound") else f"{name}, {noise}"
         heights = [error.get((column, k), error.get((column, 0))) for k in neighbours]  # alone: the same at every K
         if heights[0] is not None:
-            ax.plot(neighbours, [each.mean() for each in heights], look, color=colors[name], ms=4, label=name)
+            style = {"color": colors[name], "lw": widths.get(name), "ms": 4, "label": name}
+            ax.plot(neighbours, [each.mean() for each in heights], look, **style)
     ax.set(xlabel="Neighbours K", title=f"{noise.capitalize()} covariances", yscale="log", yticks=[0.5, 1, 2, 4])
     ax.yaxis.set_major_formatter("{x:g}")
     ax.minorticks_off()
     ax.grid(color="#E3E7EC")
 axes[0].set_ylabel("RT-LE [m]")
-axes[1].legend(fontsize=9, bbox_to_anchor=(1.02, 1), loc="upper left", frameon=False)
+figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
 plt.show()
 
 # %% [markdown]
