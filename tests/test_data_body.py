@@ -120,7 +120,7 @@ def test_pose_filters_run_on_a_log_and_cooperation_helps(tmp_path: Path) -> None
 
 
 def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Path) -> None:
-    """One car has fixes; the others measure it and each other, and nobody has a compass."""
+    """One car has fixes; the others measure it and each other, and none has a compass."""
     folder = written(tmp_path / "log", noise=1.0, compass=False)
     frame = pd.read_csv(folder / "log.csv")
     frame[(frame["vehicle"].isin(["red", "mast"])) | ~frame["kind"].isin(["x", "y"])].to_csv(
