@@ -48,7 +48,7 @@ COUNTS: tuple[tuple[Kind, Way], ...] = (
     ("on air", "broadcast"),
 )
 CROWD = 300
-"""Vehicles within the range of each other, as in a jam: at 10 Hz their messages of 350 B ask for 8.4 Mb/s of a channel of 6 Mb/s."""
+"""Vehicles within the range of each other, as in a jam: 350 B each at 10 Hz are 8.4 Mb/s, and the channel has 6."""
 
 
 def way(channel: str, k: int, **limits: Any) -> dict[str, Any]:

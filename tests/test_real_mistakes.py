@@ -123,9 +123,7 @@ def test_a_mistake_in_mrclam_is_named(clam: Path, tmp_path: Path, mistake: str) 
     assert any(re.search(message, warning) for warning in found), found
 
 
-def test_mrclam_as_it_is_raises_no_warning_and_a_mark_of_its_encoding_changes_nothing(
-    clam: Path, tmp_path: Path
-) -> None:
+def test_mrclam_as_it_is_raises_no_warning_and_a_byte_order_mark_changes_nothing(clam: Path, tmp_path: Path) -> None:
     for file in clam.glob("*.dat"):
         (tmp_path / file.name).write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
     marked, plain = load_log(tmp_path), load_log(clam)

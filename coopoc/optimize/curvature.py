@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from .arrowhead import structure
 from .factor import Factor, unchecked
 from .linear import Linear, linearise, opposite
-from .normal import Pattern, assemble, normal_equations, squares
+from .normal import Pattern, assemble, normal_equations
 from .problem import Problem
 from .sparse import Sparse, sparse
 
@@ -108,16 +108,14 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
 def true_blocks(problem: Problem, linear: Linear) -> Floats:
     """(P, dof, dof) blocks of the exact Hessian of a single problem, in the pattern's order."""
     x = linear.x[0]
-    parts = [part for k in range(len(problem.factors)) for part in _hessian(problem, k, x, linear)]
-    blocks: Floats = assemble(structure(problem)[0], parts)[0]
-    return blocks
+    return assemble(structure(problem)[0], [_hessian(problem, k, x, linear) for k in range(len(problem.factors))])
 
 
 def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats]:
-    """Second derivatives of what each measurement of a factor costs, as `squares` orders them: (1, M, dof, dof)."""
+    """Second derivatives (M, dof, dof) of what each measurement of a factor costs, as `assemble` takes them."""
     factor, jacobians = problem.factors[k], linear.jacobian[k]
     if factor.measurement.linear and factor.loss is None:
-        return squares(Linear(linear.x, (linear.residual[k],), (jacobians,), linear.cost), [factor.nodes])
+        return _squares([np.broadcast_to(s[0], (len(factor.nodes), *s.shape[2:])) for s in jacobians], factor.nodes)
     pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.movable)
     count, dof = len(factor.nodes), problem.space.dof
     local, bare = x[factor.nodes], unchecked(factor, loss=None)
@@ -138,10 +136,22 @@ def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats
             problem, factor, whole, x, _gradients(problem, bare, local, np.zeros((1, count, arity, dof)))[0]
         )
     if not pair or opposed:
-        return [whole[None]]
+        return [whole]
     first, second, between = whole[:, :dof, :dof], whole[:, dof:, dof:], whole[:, :dof, dof:]
-    swapped = (factor.nodes[:, 0] > factor.nodes[:, 1])[:, None, None]
-    return [first[None], second[None], np.where(swapped, np.swapaxes(between, 1, 2), between)[None]]
+    return [first, second, _ordered(between, factor.nodes)]
+
+
+def _squares(jacobians: list[Floats], nodes: Ints) -> list[Floats]:
+    """S_i^T S_i of the derivatives (M, size, dof) by one node, or also S_j^T S_j and S_i^T S_j (i the smaller)."""
+    products: list[Floats] = [np.swapaxes(s, 1, 2) @ s for s in jacobians]
+    if len(jacobians) == 2:
+        products.append(_ordered(np.swapaxes(jacobians[0], 1, 2) @ jacobians[1], nodes))
+    return products
+
+
+def _ordered(between: Floats, nodes: Ints) -> Floats:
+    """Blocks (M, dof, dof) of two nodes, rows of the smaller one."""
+    return np.where((nodes[:, 0] > nodes[:, 1])[:, None, None], np.swapaxes(between, 1, 2), between)
 
 
 def _with_loss(problem: Problem, factor: Factor, whole: Floats, x: Floats, gradient: Floats) -> Floats:
