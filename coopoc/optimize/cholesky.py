@@ -59,6 +59,25 @@ class Cholesky:
         return found[places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
+def cholesky_of(matrix: Any) -> Cholesky | None:
+    """Factors of a sparse symmetric matrix (SciPy's, any format), or None: it is not positive definite.
+
+    >>> from scipy.sparse import csc_array
+    >>> cholesky_of(csc_array([[2.0, 1.0], [1.0, 2.0]])).solve(np.array([3.0, 3.0])).round(6)
+    array([1., 1.])
+    >>> cholesky_of(csc_array([[1.0, 2.0], [2.0, 1.0]])) is None
+    True
+    """
+    from scipy.sparse import triu
+
+    upper = triu(matrix, format="csc")
+    upper.sort_indices()
+    if not (np.isfinite(upper.data).all() and (upper.diagonal() > 0).all()):
+        return None
+    cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64))
+    return cholesky if cholesky.factor(upper.data) else None
+
+
 def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     """Fronts of a pattern, its groups of unknowns in the order of approximate minimum degree.
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .arrowhead import structure
+from .cholesky import cholesky_of
 from .factor import Factor, unchecked
 from .linear import Linear, linearise, opposite
 from .normal import Pattern, assemble, normal_equations
@@ -77,8 +78,8 @@ def _by_tapes(system: Sparse, x: Floats) -> float | None:
 def _solved(scheme: Pattern, blocks: Floats, rhs: Floats) -> Floats | None:
     """H^-1 rhs of symmetric blocks (P, dof, dof); None unless H is positive definite."""
     if scheme.nodes > SMALL:
-        factored = pivots(matrix(scheme, blocks))
-        return None if factored is None else np.asarray(factored.solve(rhs))
+        factored = cholesky_of(matrix(scheme, blocks))
+        return None if factored is None else factored.solve(rhs)
     whole = dense(scheme, blocks)
     try:
         np.linalg.cholesky(whole)
@@ -99,7 +100,7 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
     at = np.arange(problem.space.dof)
     blocks[own[:, None], at, at] += damping[0, scheme.pairs[own, 0]]
-    factored = pivots(matrix(scheme, blocks))
+    factored = cholesky_of(matrix(scheme, blocks))
     if factored is None:
         raise np.linalg.LinAlgError("the cost curves downwards here")
     return np.asarray(-factored.solve(gradient.ravel()).reshape(gradient.shape))
@@ -185,22 +186,6 @@ def _gradients(problem: Problem, factor: Factor, local: Floats, step: Floats) ->
         jacobians = jacobians[1:]
     parts = [(np.swapaxes(s, -1, -2) @ residual[..., None])[..., 0] for s in jacobians]
     return np.concatenate(parts, axis=-1)
-
-
-def pivots(matrix: Any) -> Any:
-    """Factors of a sparse symmetric matrix if all pivots of its L D L^T are positive, else None."""
-    from scipy.sparse.linalg import splu
-
-    if not np.isfinite(matrix.data).all():
-        return None
-    try:
-        factored = splu(
-            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-    except RuntimeError:  # a pivot of exactly zero
-        return None
-    symmetric = np.array_equal(factored.perm_r, factored.perm_c)
-    return factored if symmetric and (factored.U.diagonal() > 0).all() else None
 
 
 def dense(scheme: Pattern, blocks: Floats) -> Floats:
