@@ -11,7 +11,7 @@ import numpy as np
 from ..arrays import Bools, Floats
 from .active import Active, active_at
 from .arrowhead import marginals, structure
-from .cholesky import cholesky_of
+from .cholesky import cholesky_of, with_still
 from .curvature import matrix as sparse_matrix
 from .dense import diagonal_blocks, is_small, normal_matrix
 from .linear import Linear
@@ -169,11 +169,7 @@ def _restricted(J: Any, gradient: Floats, still: Bools | None, active: Active) -
     With Z the directions that remain: cov = Z (Z^T J^T J Z)^-1 Z^T, and the step solves the same system after the least
     step onto what holds.
     """
-    hessian = J.T @ J
-    if still is not None:
-        from scipy.sparse import diags_array
-
-        hessian = hessian + diags_array(still.ravel().astype(np.float64))
+    hessian = with_still(J.T @ J, still)
     solve, _ = _within(hessian, active.along)
     dx = active.onto - solve(gradient.ravel() + hessian @ active.onto)
     solve, own = _within(hessian, active.exact)
@@ -189,18 +185,16 @@ def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats
     if not ways.shape[1]:
         return np.zeros_like, np.zeros(ways.shape[0])
     reduced = ways.T @ hessian @ ways
-    factored = factorise(reduced, None)
+    factored = factorise(reduced)
     return lambda rhs: ways @ factored.solve(ways.T @ rhs), (ways @ reduced @ ways.T).diagonal()
 
 
-def factorise(matrix: Any, still: Bools | None) -> Any:
-    """Sparse LU of a symmetric matrix, 1 added to the diagonal of what is `still`; LinAlgError if it is singular."""
-    from scipy.sparse import diags_array
+def factorise(matrix: Any) -> Any:
+    """Sparse LU of a symmetric matrix; LinAlgError if it is singular."""
     from scipy.sparse.linalg import splu
 
-    whole = matrix if still is None else matrix + diags_array(still.ravel().astype(np.float64))
     try:
-        return splu(whole.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     except RuntimeError as singular:
         raise np.linalg.LinAlgError(str(singular)) from singular
 
@@ -246,7 +240,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
     if len(length) <= SMALL:
         values, ways = np.linalg.eigh(square.toarray())
         return np.asarray(ways[:, values <= 1e-10 * values.max(initial=1.0)].T)
-    factored = factorise(square + diags_array(np.full(len(length), 1e-12)), None)
+    factored = factorise(square + diags_array(np.full(len(length), 1e-12)))
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
         ways = np.linalg.qr(factored.solve(ways))[0]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 
 
 class Cholesky:
@@ -76,6 +76,13 @@ def cholesky_of(matrix: Any) -> Cholesky | None:
         return None
     cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64))
     return cholesky if cholesky.factor(upper.data) else None
+
+
+def with_still(matrix: Any, added: Floats | Bools | None) -> Any:
+    """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
+    from scipy.sparse import diags_array
+
+    return matrix if added is None else matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
 
 
 def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
