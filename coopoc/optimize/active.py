@@ -77,15 +77,6 @@ def bounded(constraint: Constraint) -> Bools:
     return np.asarray(np.isfinite(constraint.lower) | np.isfinite(constraint.upper))
 
 
-def steerable(problem: Problem, constraint: Constraint) -> Bools:
-    """(M, size) True where a side is finite and a node can move: the rows that a solver gets."""
-    free = problem.movable
-    if free is None:
-        return bounded(constraint)
-    moves = np.asarray(free[constraint.nodes].any(axis=(1, 2)))
-    return np.asarray(bounded(constraint) & moves[:, None])
-
-
 def constraint_rows(problem: Problem, x: Floats) -> Rows:
     """The constraints of a single problem at x (n, ambient)."""
     from scipy.sparse import vstack
