@@ -91,6 +91,11 @@ def values(
     return known.differentiate(vector, rotation, nothing, constraint.constants)
 
 
+def bounded(constraint: Constraint) -> Bools:
+    """(M, size) True where a side is finite."""
+    return np.asarray(np.isfinite(constraint.lower) | np.isfinite(constraint.upper))
+
+
 def steerable(constraint: Constraint, movable: Bools | None) -> Bools:
     """(M, size) True where a side is finite and a node can move, `movable` (n, dof): the rows that a solver gets."""
     if movable is None:
