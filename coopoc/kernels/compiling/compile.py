@@ -1,0 +1,135 @@
+"""How kernels are compiled: machine code at the first call, kept on disk, no interpreter's lock."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function) -> Function:
+    """Compiled at the first call. A product and a sum may become one instruction; nothing is reordered.
+
+    The machine code is kept beside the source, or in the user's cache where that is read-only. It is made anew after a
+    change of any file of the kernels or of the function's own folder, since it holds what it calls.
+    """
+    return _kept(_made(function, {"contract"}), function)
+
+
+def as_written(function: Function) -> Function:
+    """Compiled, each product and sum rounded as it stands, so that numbers and vectors of them get the same digits."""
+    return _kept(_made(function, set()), function)
+
+
+def part(function: Function) -> Function:
+    """Compiled as `compiled` is, for compiled callers only, and kept in their machine code.
+
+    References to arrays are not counted within: the caller holds them. So it allocates nothing and returns no
+    array; counting every array of every NamedTuple would take longer than the sums, and to compile. It raises nothing:
+    callers look for no exception, but under NUMBA_BOUNDSCHECK=1.
+    """
+    return _within(function, {"contract"})
+
+
+def summing(function: Function) -> Function:
+    """A part that adds many terms: it may do so in several sums, in one way for all arguments."""
+    return _within(function, {"contract", "reassoc"})
+
+
+def inner(function: Function) -> Function:
+    """A part, rounded as `as_written` is."""
+    return _within(function, set())
+
+
+def inside(function: Function) -> Function:
+    """As `inner`, and copied into the caller: a call would hand over every number that describes an array, which
+    takes longer than to read three of its elements."""
+    return _within(function, set(), forceinline=True)
+
+
+def storage(function: Function) -> Function:
+    """A function that allocates arrays or returns views of them, typed as if its lines stood in its caller."""
+    return cast(Function, _made(function, set(), inline="always"))
+
+
+KERNELS = Path(__file__).resolve().parents[1]
+PATIENCE = 2.0
+"""s of compiling after which a line on stderr reports it."""
+
+
+@cache
+def _watching() -> None:
+    """While a kernel compiles collect no garbage, which a tenth of the time would go to; report it after PATIENCE."""
+    from numba.core import event
+
+    class Watcher(event.Listener):
+        depth = 0
+        collects = True
+        timer: threading.Timer
+
+        def on_start(self, event: Any) -> None:
+            self.depth += 1
+            if self.depth == 1:
+                name = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
+                line = f"compiling the {name} kernel, once per machine\n"
+                self.timer = threading.Timer(PATIENCE, sys.stderr.write, [line])
+                self.timer.daemon = True
+                self.timer.start()
+                self.collects = gc.isenabled()
+                gc.disable()
+
+        def on_end(self, event: Any) -> None:
+            self.depth -= 1
+            if self.depth == 0:
+                self.timer.cancel()
+                if self.collects:
+                    gc.enable()
+
+    event.register("numba:compile", Watcher())
+
+
+def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
+    import numba
+
+    from .pipeline import Kernel, Part
+
+    _watching()
+    options["pipeline_class"] = Part if part else Kernel
+    return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
+
+
+def _within(function: Function, liberties: set[str], **options: bool) -> Function:
+    """Without wrappers for callers from Python, and without counts of references."""
+    made = _made(function, liberties, True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
+    return cast(Function, made)
+
+
+def _kept(made: Any, function: Function) -> Function:
+    try:
+        made.enable_caching()
+        file = made._cache._cache_file
+        file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+        file._load_index = partial(_index_or_none, file._load_index)
+    except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
+        pass
+    return cast(Function, made)
+
+
+def _index_or_none(load: Callable[[], Any]) -> Any:
+    """What is on disk; nothing if it names types that have been renamed since."""
+    try:
+        return load()
+    except (ImportError, AttributeError):
+        return {}
+
+
+@cache
+def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
+    files = sorted({*KERNELS.rglob("*.py"), *folder.glob("*.py")})
+    return tuple((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
