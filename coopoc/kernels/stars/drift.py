@@ -1,4 +1,4 @@
-"""Fixes with time-correlated errors, in the blocks of `coopoc.kernels.stars.joint`: z = x + drift + common + white noise.
+"""Fixes with time-correlated errors, in the blocks of the joint filter: z = x + drift + common + white noise.
 
 A state is (position, drift), six numbers. The error that all fixes have in common is the position of one more block
 behind the members'; its drift is zero. Both errors are Gauss-Markov: e_t = keep e_{t-1} + w, in steady state.

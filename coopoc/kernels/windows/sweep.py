@@ -1,6 +1,6 @@
 """One Gauss-Newton step of a window of stars: on through its steps, solve the newest, and back.
 
-A step's information matrix goes on to the next one block by block (`coopoc.kernels.stars.elimination.predict`): with motion
+A step's information matrix goes on to the next one block by block (`stars.elimination.predict`): with motion
 of information D the block k leaves A - U (A_kk + D)^-1 U^T, U its columns, which are kept. Going back, the point was
 (A_kk + D)^-1 (eta_k + D d - U z), d being the move of the next one and z those of all others.
 """
