@@ -115,7 +115,7 @@ def add_drifting_fixes(star: Star, joint: Joint, drift: Drift, members: int, n: 
     """Add every member's position as broadcast: information about its position, its drift and the common error."""
     row, common = (0.0,) * 6, n - 2
     for k in range(members):
-        if k > 0:
+        if k > 0 and star.previous[k] >= 0:
             place(star, joint, k, row)
         new = load(star.status, 5 * k + NEW, (0.0,))[0]
         p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)

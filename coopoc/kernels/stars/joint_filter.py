@@ -118,7 +118,7 @@ def step(star: Star, joint: Joint, known: Assumptions, refine: bool, drift: Drif
 def add_fixes(star: Star, joint: Joint, n: int, row: Any) -> None:
     """Add every member's position as broadcast."""
     for k in range(n):
-        if k > 0:
+        if k > 0 and star.previous[k] >= 0:
             place(star, joint, k, row)
         new = load(star.status, 5 * k + NEW, (0.0,))[0]
         p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)

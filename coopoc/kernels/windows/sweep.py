@@ -68,7 +68,7 @@ def start_points(window: Window, past: Past, known: Assumptions, t: int) -> None
         store(window.point, place, at)
         store(past.at, place, at)
         if k > 0:
-            gap = subtract(fix, load(window.point, ego, ROW))
+            gap = subtract(at, load(window.point, ego, ROW))
             put_edge(window, past, known, place, gap, AT_GAP, 0.0 * gap[0] + 1.0)
     if t == 0:
         n = count_of(window.sizes, t)
