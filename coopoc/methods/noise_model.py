@@ -131,6 +131,11 @@ class NoiseModel:
 FINEST = 1e-5
 """Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
 beside 1 leaves the fixes six of double precision's sixteen digits."""
+FAR = 30.0
+"""m, distance at which an angle is coarse."""
+UNEVEN = 3e-7
+"""Least variance that is assumed of a relative measurement, over the product of the largest std of a fix and of its own
+components: information that is large in one direction and small in another loses the small one's digits, too."""
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
@@ -158,9 +163,13 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
 
 
 def _resolvable(known: NoiseModel) -> NoiseModel:
-    """With relative noise of at least FINEST of a fix's, angles at a distance of 1 m; a note names the floor."""
-    least = FINEST * max(known.gnss_std)
-    if known.sensors is None or min(known.sensors.relative_std) >= least:
+    """With relative noise that is not finer than FINEST and UNEVEN say, angles at a distance of 1 m; a note names the
+    floor."""
+    if known.sensors is None:
+        return known
+    fix, coarse = max(known.gnss_std), max(known.sensors.relative_std * np.array([1.0, FAR, FAR]))
+    least = max(FINEST * fix, float(np.sqrt(UNEVEN * fix * min(fix, coarse))))
+    if min(known.sensors.relative_std) >= least:
         return known
     names = ("range_std", "azimuth_std", "inclination_std")
     raised = {name: max(getattr(known.sensors, name), min(least, np.pi)) for name in names}
