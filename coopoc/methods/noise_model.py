@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, instance
 from ..errors import InputError
 from ..plugins import suggestion
 from ..world.fleet import Fleet
@@ -56,14 +56,14 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> NoiseModel:
         """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        sensors = sensors.check_assumed().without_bias()
+        sensors = instance("sensors", sensors, Sensors).check_assumed().without_bias()
         sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
         return cls("nominal", sensors, gnss_std=sensors.fix_std)
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:
         """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is compared with."""
-        return replace(cls.nominal(sensors), name="oracle", velocity=fleet.velocity)
+        return replace(cls.nominal(sensors), name="oracle", velocity=instance("fleet", fleet, Fleet).velocity)
 
     @classmethod
     def fitted(cls, recording: Recording, fleet: Fleet) -> NoiseModel:
@@ -77,6 +77,10 @@ class NoiseModel:
             recording: of the training vehicles.
             fleet: their true motion.
         """
+        true, rates = instance("fleet", fleet, Fleet).position, instance("recording", recording, Recording).velocity
+        if true.shape != rates.shape[1:]:
+            allowed = f"must hold the {rates.shape[1]} steps and {rates.shape[2]} vehicles of the recording"
+            raise InputError("fleet", repr(fleet), allowed, "Give the fleet that was observed.")
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
         floor = recording.dt * recording.sensors.velocity_floor
         process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)

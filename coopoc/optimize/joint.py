@@ -46,7 +46,7 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
     if problem.constraints or problem.batch is not None:
         what = "constraints" if problem.constraints else f"{problem.batch} realisations"
         raise InputError("problem", what, "must be a single one without constraints", "Pick one: problem.pick(0).")
-    listed = nodes if isinstance(nodes, Iterable) else [nodes]
+    listed = [nodes] if isinstance(nodes, str) or not isinstance(nodes, Iterable) else nodes
     places = [problem.index(node) for node in listed]
     dof = problem.space.dof
     number, solve_one = _solver(problem.replace_unchecked(separator=()), x)
