@@ -16,7 +16,7 @@ EXPLAINS, REST = 0.7, 2.0
 """An offset is named if it shrinks the residuals to this share, and to this many of their expected deviations."""
 
 
-def clock_doubts(recording: Recording, x: Floats, residual: Floats, expected: Floats) -> list[str]:
+def clock_warnings(recording: Recording, x: Floats, residual: Floats, expected: Floats) -> list[str]:
     """A sentence for each vehicle whose clock explains what relative measurements and positions disagree about.
 
     Vehicle k writes stamps that are delta_k too late. What i measures of j then misses their logged positions by
@@ -74,7 +74,7 @@ def _offsets(A: Floats, b: Floats, vehicles: int) -> tuple[Floats, Floats, float
     return found[:vehicles], np.sqrt(np.maximum(np.diagonal(cov)[:vehicles], 0.0)), scale / 1.4826
 
 
-def apart_doubts(recording: Recording) -> list[str]:
+def apart_warnings(recording: Recording) -> list[str]:
     """A sentence for each vehicle that drives while no other is there, as after stamps of another time zone."""
     there: Bools = np.isfinite(recording.velocity[0, :, :, 0])
     moving = [k for k in range(there.shape[1]) if k not in recording.landmarks and there[:, k].any()]
@@ -90,7 +90,7 @@ def apart_doubts(recording: Recording) -> list[str]:
     return found[-1:] if len(moving) == 2 else found
 
 
-def truth_doubt(recording: Recording, truth: Fleet | None, column: int) -> list[str]:
+def truth_warning(recording: Recording, truth: Fleet | None, column: int) -> list[str]:
     """A sentence where the fixes of a vehicle lie behind its truth along its way, by the same time at any speed."""
     if truth is None:
         return []

@@ -41,7 +41,7 @@ def doubts(folder: Path, log: pd.DataFrame, truth: pd.DataFrame | None = None) -
     log.to_csv(folder / "measurements.csv", index=False)
     if truth is not None:
         truth.to_csv(folder / "truth.csv", index=False)
-    return check(read_log(folder)).doubts
+    return check(read_log(folder)).warnings
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -61,7 +61,7 @@ def test_the_clock_of_one_vehicle_is_found(tmp_path: Path, late: float, vehicles
     assert named is not None
     assert named[1] == named[3] == "barge"
     assert float(named[2]) == pytest.approx(late, rel=0.2)
-    assert check(read_log(tmp_path, clock={"barge": late})).doubts == ()
+    assert check(read_log(tmp_path, clock={"barge": late})).warnings == ()
 
 
 def test_stamps_of_another_time_zone_are_named(tmp_path: Path) -> None:
