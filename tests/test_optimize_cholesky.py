@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu
 
-from coopoc.kernels.graph_fronts import RELAXED, supernodes
-from coopoc.optimize.cholesky import Cholesky
+from coopoc.kernels.graphs.graph_fronts import RELAXED, supernodes
+from coopoc.optimize.algebra.cholesky import Cholesky
 
 
 def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:

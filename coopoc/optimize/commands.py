@@ -14,11 +14,11 @@ from tyro.conf import Positional, arg
 
 from ..errors import InputError
 from .backend import backends
-from .gnc import solve_gnc
 from .graphs import Objective, loop_closures, read_graph
-from .problem import Problem
-from .race import expected as expected_cost
-from .search import Search
+from .initialisation.race import expected as expected_cost
+from .model.problem import Problem
+from .model.search import Search
+from .robust.gnc import solve_gnc
 from .solution import Solution, Status
 from .solve import solve
 

@@ -1,0 +1,98 @@
+"""A start that grows: the first poses of all robots are solved, then more with them, so that odometry drifts little."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ...formats.graph import Graph
+from ..algebra.sparse import sparse
+from ..descent.trust_region import arrive
+from ..model.part import restricted
+from ..model.problem import Problem
+from .trilateration import located
+
+STAGE = 25
+"""Poses of the longest robot that are added at a time, at least."""
+STAGES = 60
+"""At most."""
+STEPS = 10
+"""Of each stage."""
+TOLERANCE = 1e-2
+"""m or rad, a step at which a stage has arrived for the purpose."""
+HOLDING = 2
+"""Ranges per dimension from which a point is placed by them."""
+
+
+class Growth(NamedTuple):
+    """Where a start is: nodes (n, ambient), which of them are solved (n,), and iterations so far."""
+
+    x: Floats
+    solved: Bools
+    iterations: int
+
+
+def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
+    """Nodes (n, ambient) and iterations: each stage solves the measurements among the poses so far.
+
+    A stage begins at the answer of the one before, which it continues by the relative poses of the problem's x0. Points
+    join when they are seen or have a prior, as x0 has them, or where enough ranges place them.
+
+    References:
+        Kaess et al., iSAM, T-RO 2008: an estimate that follows the measurements in time.
+    """
+    assert problem.x0 is not None
+    longest = max(len(places) for places in graph.robots.values())
+    count = int(np.clip(longest // STAGE, 1, STAGES))
+    now = Growth(problem.x0.copy(), np.zeros(len(graph.names), dtype=bool), 0)
+    for stage in range(count):
+        now = _extended(graph, problem, now, (stage + 1) / count)
+    return now.x, now.iterations
+
+
+def _extended(graph: Graph, problem: Problem, now: Growth, share: float) -> Growth:
+    """The start after a stage that takes the first `share` of each robot's poses."""
+    assert problem.x0 is not None
+    space, x, used = problem.space, now.x, np.zeros(len(graph.names), dtype=bool)
+    for places in graph.robots.values():
+        new = places[: int(np.ceil(share * len(places)))]
+        used[new] = True
+        old = new[now.solved[new]]
+        if len(old) and len(old) < len(places):
+            x[places[len(old) :]] = _carried(problem, x, old[-1], places[len(old) :])
+    used |= _joining(graph, x, used, space.dimension)
+    part = restricted(problem, used, x)
+    system = sparse(part, least=0)
+    if system is None:
+        return Growth(x, used, now.iterations)
+    end = arrive(system, np.array(part.x0), STEPS, TOLERANCE)
+    x[used] = end.x
+    return Growth(x, used, now.iterations + end.iterations)
+
+
+def _carried(problem: Problem, x: Floats, last: int, later: Ints) -> Floats:
+    """Later poses (K, ambient) as x0 has them, moved as the last one was."""
+    space, x0 = problem.space, problem.x0
+    assert x0 is not None
+    turn = space.rotation(x[last]) @ space.rotation(x0[last]).T
+    gap = space.position(x0[later]) - space.position(x0[last])
+    return space.join(space.position(x[last]) + gap @ turn.T, turn @ space.rotation(x0[later]))
+
+
+def _joining(graph: Graph, x: Floats, used: Bools, d: int) -> Bools:
+    """(n,) which points the poses so far hold; those with ranges alone are placed anew by them, in x."""
+    joins, nodes = np.zeros(len(used), dtype=bool), graph.ranges.nodes
+    for edges in (graph.relative_point, graph.point_prior):
+        if len(edges):
+            joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
+    held = joins.copy()
+    for point in np.setdiff1d(np.flatnonzero(~graph.is_pose), np.flatnonzero(held)).tolist():
+        rows = np.flatnonzero((nodes == point).any(axis=1))
+        other = nodes[rows].sum(axis=1) - point
+        seen = used[other]
+        if seen.sum() >= HOLDING * d + 1:
+            x[point, :d] = located(x[other[seen], :d], graph.ranges.distance[rows[seen]])
+            joins[point] = True
+    return joins
