@@ -14,6 +14,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.world.recording import Recording
 
 from .log import Log
+from .log_clocks import apart_warnings, clock_warnings, truth_warning
 from .log_truth import frame_warning
 from .mrclam import robust_std
 
@@ -81,7 +82,8 @@ def check(log: Log) -> Check:
     relative, expected = _relative(rec, x, variance)
     vehicles, warnings = _vehicles(log, fix, normalised)
     measurements, more = _measurements(rec, relative, expected)
-    return Check(x, variance, fix, normalised, relative, vehicles, measurements, (*warnings, *more))
+    clocks = [*apart_warnings(rec), *clock_warnings(rec, x, relative, expected)]
+    return Check(x, variance, fix, normalised, relative, vehicles, measurements, (*warnings, *clocks, *more))
 
 
 def _vehicles(log: Log, fix: Floats, normalised: Floats) -> tuple[list[dict[str, Any]], list[str]]:
@@ -106,7 +108,7 @@ def _vehicles(log: Log, fix: Floats, normalised: Floats) -> tuple[list[dict[str,
             row["fix_error_m"] = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else None
         rows.append(row)
         warnings += _of_vehicle(name, row, distance, turn, int(seen.sum()))
-        warnings += frame_warning(rec, log.truth, column)
+        warnings += frame_warning(rec, log.truth, column) or truth_warning(rec, log.truth, column)
     return rows, warnings
 
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
+from coopoc.world.storage import DAMAGES, unpacked
 
 from .rows import backward_difference
 
@@ -63,14 +62,14 @@ def load(path: Path, name: str = "") -> Fleet:
         InputError: a file that is damaged, or that `save` did not write.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            ids, steps = tuple(map(str, stored["ids"])), stored["steps"].astype(np.int64)
-            second = stored["second"].transpose(2, 0, 1).astype(np.int64)
-            start, dt = stored["start"].astype(np.int64), float(stored["dt"])
+        stored = unpacked(path)
+        ids, steps = tuple(map(str, stored["ids"])), stored["steps"].astype(np.int64)
+        second = stored["second"].transpose(2, 0, 1).astype(np.int64)
+        start, dt = stored["start"].astype(np.int64), float(stored["dt"])
         fits = second.shape[1:] == start.shape[1:] == (len(ids), 3) and len(start) == 2 and steps.shape == (len(ids),)
         if not (fits and np.isfinite(dt) and dt > 0):
             raise ValueError("arrays that do not fit each other")
-    except (OSError, EOFError, KeyError, ValueError, TypeError, BadZipFile, zlib.error, NotImplementedError) as error:
+    except DAMAGES as error:
         found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
         raise InputError(path.name, found, "must be a fleet of coopoc data make", "Make it again.") from None
     speed = np.concatenate([np.diff(start, axis=0), second]).cumsum(axis=0)

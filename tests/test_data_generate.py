@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -183,6 +185,29 @@ def test_seeds_are_tried_until_one_drives(tmp_path: Path, monkeypatch: pytest.Mo
     assert seeds == [1, 2, 3]
     with pytest.raises(InputError, match="--tries 20"):
         make(TINY, MAPS, tmp_path, tries=2)
+
+
+@pytest.mark.parametrize("name", ["ids", "second", "steps"])
+@pytest.mark.parametrize("claimed", [10**11, 2**61])
+def test_an_array_that_claims_all_memory_is_refused(tmp_path: Path, name: str, claimed: int) -> None:
+    with np.load(DATASETS["town10-clients"].path) as stored, ZipFile(tmp_path / "a.npz", "w") as packed:
+        for part in stored.files:
+            file = io.BytesIO()
+            shape = (claimed,) if part == name else stored[part].shape
+            head = {"descr": stored[part].dtype.str, "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(file, head)
+            packed.writestr(f"{part}.npy", file.getvalue() + stored[part].tobytes())
+    with pytest.raises(InputError, match=r"a\.npz = .*must be a fleet of coopoc data make"):
+        load_fleet(tmp_path / "a.npz")
+
+
+def test_a_fleet_of_an_unknown_version_of_zip_is_named(tmp_path: Path) -> None:
+    """The byte in the directory of the file that says what is needed to unpack."""
+    whole = bytearray(DATASETS["town10-clients"].path.read_bytes())
+    whole[whole.index(b"PK\x01\x02") + 6] = 157
+    (tmp_path / "a.npz").write_bytes(bytes(whole))
+    with pytest.raises(InputError, match=r"a\.npz = .*15\.7"):
+        load_fleet(tmp_path / "a.npz")
 
 
 def test_a_damaged_fleet_is_named(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ BAD_PYFG = {
     "infinite vertex": ("A1 1 0 0.5", "A1 inf 0 0.5", "line 2", "VERTEX_SE2 stamp i x y theta"),
     "stamp": ("VERTEX_SE2 1 A1", "VERTEX_SE2 one A1", "line 2", "stamp"),
     "negative variance": ("5 0.1", "5 -0.1", "line 6 = variance -0.1", ">= 0"),
+    "variance without an inverse": ("5 0.1", "5 4e-322", "line 6 = variance", "its inverse overflows"),
     "negative range": ("5 0.1", "-5 0.1", "line 6 = distance -5", ">= 0"),
     "indefinite": ("0.5 1 0 0 1 0 1", "0.5 1 2 0 1 0 1", "line 4 = covariance", "positive semi-definite"),
     "indefinite point": ("4 1 0 1", "4 1 0 -1", "line 5 = covariance", "positive semi-definite"),

@@ -94,6 +94,21 @@ def test_vehicles_that_appear_and_vanish_and_fixes_that_are_missing(crossing: Fl
     assert_is_the_oracle(replace(recording, gnss=gnss), method, 0, range(3))
 
 
+def test_a_neighbour_that_is_first_seen_due_north() -> None:
+    """It joins where the x of its point and of the ego's are one number."""
+    t = 0.1 * np.arange(8)
+    position = np.zeros((8, 2, 3)) + np.array([[100.0, 0.0, 0.0], [100.0, 12.0, 0.0]])
+    position[:, :, 1] += 5 * t[:, None]
+    fleet = Fleet(("ego", "north"), t, position, np.tile([0.0, 5.0, 0.0], (8, 2, 1)))
+    seen = observe(fleet, S2, V2X(max_neighbours=1), runs=2)
+    assert len(seen.links.of(0))
+    gnss, relative = seen.gnss.copy(), seen.relative.copy()
+    gnss[:, 0] = position[0]
+    relative[:, seen.links.step == 0] = [12.0, np.pi / 2, np.pi / 2]
+    relative[:, (seen.links.step == 0) & (seen.links.observer == 1), 1] *= -1
+    assert_is_the_oracle(replace(seen, gnss=gnss, relative=relative), MovingHorizon(horizon=3), 0, range(2))
+
+
 @pytest.mark.parametrize("make", [MovingHorizon, FixedLagSmoother])
 def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet, make: type) -> None:
     """What stands still is known to 1e-8 m a step; the linear filter, which filterpy confirms, says the same."""

@@ -178,6 +178,32 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 
 
+RAGGED: tuple[Any, ...] = ([[1], [2, 3]], np.datetime64("2024-01-01"), np.array([1, 2], object), 1 + 2j, [10**400] * 4)
+"""Values that NumPy cannot turn into numbers, or whose comparisons are no truth values."""
+
+
+def test_noise_bodies_and_starts_refuse_what_is_no_array_of_theirs() -> None:
+    wrong, body = (*WRONG, *RAGGED, RECORDING, TRACK), co.observe(FLEET, co.Sensors(), CHANNEL, frame="body")
+    swept(co.NoiseModel.nominal, {"sensors": SENSORS}, wrong)
+    swept(co.NoiseModel.oracle, {"sensors": SENSORS, "fleet": FLEET}, wrong)
+    swept(co.NoiseModel.fitted, {"recording": RECORDING, "fleet": FLEET}, (*wrong, FLEET.between(0, 3)))
+    swept(co.Body, {"yaw_rate": np.zeros((1, 2, 1)), "heading": np.zeros((1, 2, 1))}, wrong)
+    swept(lambda begin: co.PoseFilter(begin=begin)(body, [0]), {"begin": None}, wrong)
+    swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0}, RAGGED)
+    whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
+    with pytest.raises(co.InputError, match="nodes = 10000 nodes: must name each of 2 nodes once"):
+        optimize.joint_covariance(whole, co.solve(whole), "a" * 10_000)
+
+
+def test_training_refuses_arguments_of_the_wrong_kind() -> None:
+    learned = pytest.importorskip("coopoc.learned")
+    wrong = (*WRONG, *RAGGED, RECORDING)
+    swept(learned.Privacy, {"clip": 1.0, "noise_multiplier": 1.0, "delta": 1e-5, "clients": None}, wrong)
+    drive = co.load_fleet("town10").between(0, 24).select([0])
+    given = {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}
+    swept(lambda fleet, **options: learned.clients(fleet, **options), given, wrong)
+
+
 def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) -> None:
     for read in (
         co.read_graph,

@@ -61,6 +61,12 @@ def situations() -> Iterator[tuple[str, co.Fleet, co.Sensors]]:
     poor = co.Sensors(gnss_std=(10.0, 10.0, 10.0), range_std=5.0)
     yield "collinear", in_line(8, 10.0), poor
     yield "collinear, closer than the range's noise", in_line(8, 3.0), poor
+    spread = in_line(5, 0.0)
+    place = np.random.default_rng(4).normal(0.0, 15.0, (5, 3)) * [1.0, 1.0, 0.3]
+    spread = replace(spread, position=spread.position + place)
+    for fix, std in (((264.0, 333.0, 390.0), (1.1e-4, 0.012, 0.092)), ((645.0, 113.0, 15.0), (20.0, 3e-5, 0.01))):
+        noise = dict(zip(("range_std", "azimuth_std", "inclination_std"), std, strict=True))
+        yield f"{std}, uneven, beside {fix}", spread, co.Sensors(gnss_std=fix, velocity_std_ratio=1e-3, **noise)  # type: ignore[arg-type]
     yield "10^6 m away", in_line(4, 10.0, 1e6), co.Sensors()
     yield "in one place", in_line(4, 0.0), co.Sensors()
     yield "10^-6 m apart", in_line(4, 1e-6), co.Sensors()
@@ -84,13 +90,39 @@ def test_estimates_stay_sane_where_digits_are_few(fleet: co.Fleet, sensors: co.S
 
 
 def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_the_track_says_so() -> None:
-    """1e-5 of a fix is the least std that is assumed beside it: finer ones made the joint covariance negative."""
+    """Least std (3e-7 x 800 m x 1 m)^(1/2), with the range's 1 m: finer ones made the joint covariance negative."""
     fleet, sensors = in_line(4, 10.0), co.Sensors(gnss_std=(800.0, 2.0, 0.02), azimuth_std=1.5e-6, inclination_std=6e-6)
     track = co.JointFilter("nominal")(observed(fleet, sensors), [0])
-    assert any("at least 0.008 m and rad" in note for note in track.notes)
+    assert any("at least 0.015 m and rad" in note for note in track.notes)
     assert (np.linalg.eigvalsh(track.covariance) > 0.0).all()
     usual = co.JointFilter("nominal")(observed(fleet, co.Sensors()), [0])
     assert not usual.notes
+
+
+def test_a_window_beyond_double_precision_is_the_egos_own_fix() -> None:
+    """Micrometres apart, fixes of kilometres, ranges of tens of kilometres: no covariance is NaN, and it is noted."""
+    wide = co.Sensors((34.0, 2e4, 127.0), range_std=6e4, azimuth_std=0.3, inclination_std=1.0, velocity_floor=1e-6)
+    rng, t = np.random.default_rng(0), np.arange(12) / 10
+    place = rng.normal(0.0, 1e-6, (1, 5, 3))
+    velocity = np.tile(rng.normal(0.0, 5.0, (1, 5, 3)) * [1, 1, 0], (12, 1, 1))
+    fleet = co.Fleet(tuple("abcde"), t, place + t[:, None, None] * velocity, velocity)
+    seen = co.observe(fleet, replace(wide, velocity_std_ratio=1e-8), co.V2X(4, radius=1e9), runs=4, seed=0)
+    track = co.CooperativeMAP(window=5)(seen, [0])
+    assert np.isfinite(track.covariance).all()
+    assert any("windows beyond double precision are the ego's own fix" in note for note in track.notes)
+
+
+@pytest.mark.parametrize(
+    "damage", [np.diag([1.0, -1e-6, 1.0]), np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1)), np.triu(np.ones((3, 3)))]
+)
+def test_a_track_notes_covariances_that_are_none(damage: np.ndarray) -> None:
+    track = co.Kalman()(observed(in_line(2, 9.0), co.Sensors()), [0])
+    assert not track.notes
+    covariance = track.covariance.copy()
+    covariance[1, 3:5, 0] = damage
+    noted = replace(track, covariance=covariance)
+    assert noted.notes[0].startswith(f"2 of {2 * STEPS} covariances are not positive semidefinite")
+    assert replace(noted, seconds=1.0).notes == noted.notes
 
 
 def test_the_smoother_descends_where_whole_steps_lead_away() -> None:

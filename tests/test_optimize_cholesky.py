@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu
 
+from coopoc.kernels.graphs.graph_fronts import RELAXED, supernodes
 from coopoc.optimize.algebra.cholesky import Cholesky
 
 
@@ -63,3 +64,12 @@ def test_parts_that_nothing_joins_are_factored_apart() -> None:
     cholesky = Cholesky(pattern.indptr, pattern.indices)
     assert cholesky.factor(pattern.data)
     assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(A[np.ix_(order, order)], rhs), rel=1e-8)
+
+
+def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros() -> None:
+    """w columns of a chain hold 2 w numbers in a block of w (w + 3) / 2: at w = 5 half of it is zeros."""
+    n = 20
+    parent, begin, rows = np.arange(1, n + 1), np.r_[np.arange(n), n - 1], np.arange(1, n)
+    parent[-1] = -1
+    found = supernodes(parent, begin, rows, np.ones(n, np.int64), np.array(RELAXED))
+    assert found.tolist() == [0, 5, 10, 15, 20]

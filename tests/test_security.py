@@ -353,6 +353,24 @@ def test_a_stored_table_of_another_form_is_named(folder: Path, change: dict[str,
         Table.from_data([])
 
 
+@pytest.mark.parametrize("marks", [-1, True, "ab", {"a": 1}, [3], [{"series": "a", "text": "b", "at": [0]}]])
+def test_a_figure_with_damaged_marks_is_named(folder: Path, marks: object) -> None:
+    edited(folder / "views.json", lambda v: {**v, "figures": [{"name": "f", "caption": "", "marks": marks}]})
+    with pytest.raises(InputError, match="a mark without its series"):
+        report([folder], folder / "report.html")
+
+
+@pytest.mark.parametrize("escape", ["\\ud800", "\\uDFff"])
+def test_half_a_surrogate_pair_is_no_text_and_a_whole_one_is(folder: Path, escape: str) -> None:
+    path = folder / "views.json"
+    known = path.read_text()
+    path.write_text(known.replace("Caption", f"Caption {escape}"))
+    with pytest.raises(InputError, match=r"holds a damaged views\.json"):
+        report([folder], folder / "report.html")
+    path.write_text(known.replace("Caption", "Caption \\ud83d\\ude97"))
+    assert "\U0001f697" in report([folder], folder / "report.html").read_text()
+
+
 def test_a_stored_table_is_the_table(folder: Path) -> None:
     made = table(Results.load(folder))
     assert Table.from_data(views(folder)["tables"][0]["table"]) == made

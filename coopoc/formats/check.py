@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 
@@ -11,6 +12,7 @@ import numpy.typing as npt
 from ..arrays import AnyArray, Bools, Floats, Ints
 from ..errors import InputError
 from .edges import ENDS, Edges, PointEdges, PoseEdges, RangeEdges
+from .noise import LEAST
 from .rotations import UNIT
 from .vertices import Vertices
 
@@ -137,6 +139,12 @@ def _values(edges: Edges, field: str, place: Place) -> None:
         row = _first(values[:, 0] < 0) if name in ("distance", "variance") else None
         if row is not None:
             raise InputError(place(field, row), f"{name} {values[row, 0]:g}", "must be >= 0", "Mend the number.")
+        if name in ("variance", "covariance"):
+            size = values[:, :: math.isqrt(values.shape[1]) + 1]  # the diagonal
+            row = _first((((size > 0) & (size < LEAST)) | (size > 1 / LEAST)).any(axis=1))
+            if row is not None:
+                allowed = f"must be 0, or of a size in {LEAST:g}..{1 / LEAST:g}: its inverse overflows"
+                raise InputError(place(field, row), f"{name} {values[row].tolist()}", allowed, "Mend the number.")
     if isinstance(edges, PoseEdges):
         _unit(edges.orientation, field, place)
     if isinstance(edges, PoseEdges | PointEdges):

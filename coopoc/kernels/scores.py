@@ -10,6 +10,9 @@ import numpy as np
 from ..arrays import AnyArray, Floats
 from .compiling.compile import compiled, part
 
+LIMIT = 1.0 + 1e-9
+"""A squared covariance over the product of its variances, at most, with what rounding adds."""
+
 
 @part
 def less(a: AnyArray, b: AnyArray) -> Any:
@@ -48,6 +51,21 @@ def normalised(x: AnyArray, truth: AnyArray, cov: AnyArray) -> tuple[Floats, boo
                     value = np.nan
                 found[run, t, e] = value
     return found, sound
+
+
+@compiled
+def unsound(cov: AnyArray) -> int:
+    """Number of covariances (n, 3, 3) that are not finite, symmetric and positive semidefinite to a share of 1e-9."""
+    found = 0
+    for p in cov:
+        a, b, c, d, e, f = p[0, 0], p[1, 1], p[2, 2], p[1, 0], p[2, 0], p[2, 1]
+        skew = max(abs(p[0, 1] - d), abs(p[0, 2] - e), abs(p[1, 2] - f))
+        det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+        sides = d * d <= LIMIT * a * b and e * e <= LIMIT * a * c and f * f <= LIMIT * b * c
+        sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - LIMIT) * a * b * c
+        if not (sound and skew <= (LIMIT - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
+            found += 1
+    return found
 
 
 @compiled

@@ -36,6 +36,7 @@ LEAST_GROUND = 0.25
 """m, two vehicles whose centres are closer on the ground than this stand in one place."""
 CONVERTED = "problems where vehicles met were solved converted"
 REJECTED = "problems whose GNC weights rejected every fix were solved with all of them"
+SINGULAR = "windows beyond double precision are the ego's own fix"
 DAMPED = "problems that did not settle were solved one by one, damped"
 
 
@@ -97,6 +98,7 @@ class CooperativeMAP:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         positions, counts = dead_reckoned(recording, known), Counter[str]()
+        variance = np.broadcast_to(positions.variance, positions.x.shape)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
             windows = Windows(recording, ego, box, known, positions, self.window)
@@ -104,6 +106,9 @@ class CooperativeMAP:
             counts.update(windows.count(found.ended))
             for run, step, problem, vehicle in windows.problems(found.ended):
                 x, cov = self._solve(problem, vehicle, counts)
+                if not np.isfinite(cov).all():
+                    x[0], cov = positions.x[run, step, ego], np.diag(variance[run, step, ego])
+                    counts[SINGULAR] += 1
                 windows.put(found, run, step, x, cov)
             yield Estimate(slice(None), found.x, found.covariance, box.link, found.neighbours)
 
@@ -142,7 +147,7 @@ class CooperativeMAP:
             linear = solve_batch(converted(problem))
             x, cov = linear.x, linear.covariance
             counts[CONVERTED] += 1
-        return x[0, ego:], cov[0, ego]
+        return x[0, ego:], 0.5 * (cov[0, ego] + cov[0, ego].T)
 
     def _weighted(self, problem: Problem, vehicle: Ints, counts: Counter[str]) -> Problem:
         """The problem with the GNC weights of its candidates: the fixes of each vehicle, and the ego's odometry."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, instance
 from ..errors import InputError
 from ..plugins import suggestion
 from ..world.fleet import Fleet
@@ -56,14 +56,14 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> NoiseModel:
         """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        sensors = sensors.check_assumed().without_bias()
+        sensors = instance("sensors", sensors, Sensors).check_assumed().without_bias()
         sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
         return cls("nominal", sensors, gnss_std=sensors.fix_std)
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:
         """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is compared with."""
-        return replace(cls.nominal(sensors), name="oracle", velocity=fleet.velocity)
+        return replace(cls.nominal(sensors), name="oracle", velocity=instance("fleet", fleet, Fleet).velocity)
 
     @classmethod
     def fitted(cls, recording: Recording, fleet: Fleet) -> NoiseModel:
@@ -77,6 +77,10 @@ class NoiseModel:
             recording: of the training vehicles.
             fleet: their true motion.
         """
+        true, rates = instance("fleet", fleet, Fleet).position, instance("recording", recording, Recording).velocity
+        if true.shape != rates.shape[1:]:
+            allowed = f"must hold the {rates.shape[1]} steps and {rates.shape[2]} vehicles of the recording"
+            raise InputError("fleet", repr(fleet), allowed, "Give the fleet that was observed.")
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
         floor = recording.dt * recording.sensors.velocity_floor
         process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)
@@ -131,6 +135,11 @@ class NoiseModel:
 FINEST = 1e-5
 """Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
 beside 1 leaves the fixes six of double precision's sixteen digits."""
+FAR = 30.0
+"""m, distance at which an angle is coarse."""
+UNEVEN = 3e-7
+"""Least variance that is assumed of a relative measurement, over the product of the largest std of a fix and of its own
+components: information that is large in one direction and small in another loses the small one's digits, too."""
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
@@ -158,9 +167,13 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
 
 
 def _resolvable(known: NoiseModel) -> NoiseModel:
-    """With relative noise of at least FINEST of a fix's, angles at a distance of 1 m; a note names the floor."""
-    least = FINEST * max(known.gnss_std)
-    if known.sensors is None or min(known.sensors.relative_std) >= least:
+    """With relative noise that is not finer than FINEST and UNEVEN say, angles at a distance of 1 m; a note names the
+    floor."""
+    if known.sensors is None:
+        return known
+    fix, coarse = max(known.gnss_std), max(known.sensors.relative_std * np.array([1.0, FAR, FAR]))
+    least = max(FINEST * fix, float(np.sqrt(UNEVEN * fix * min(fix, coarse))))
+    if min(known.sensors.relative_std) >= least:
         return known
     names = ("range_std", "azimuth_std", "inclination_std")
     raised = {name: max(getattr(known.sensors, name), min(least, np.pi)) for name in names}

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, checked
 from ..errors import InputError
 from ..world.body import Body
 from ..world.recording import Recording
@@ -50,7 +50,7 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
         InputError: another shape, or an unknown pose.
     """
     shape = (recording.runs, len(recording.ids), 4)
-    given = np.full(shape[1:], np.nan) if begin is None else np.asarray(begin, dtype=float)
+    given = np.full(shape[1:], np.nan) if begin is None else checked("begin", begin)
     if given.shape not in (shape, shape[1:]):
         raise InputError("begin", f"shape {given.shape}", f"must have shape {shape[1:]} or {shape}", "One pose each.")
     found = np.ascontiguousarray(np.broadcast_to(given, shape))

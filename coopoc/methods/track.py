@@ -18,6 +18,12 @@ from ..world.v2x import Message
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+UNSOUND = (
+    "covariances are not positive semidefinite: the assumed standard deviations lie too far apart for double "
+    "precision; raise the smallest"
+)
+"""What a note says of covariances that are no covariances."""
+
 
 @dataclass(frozen=True, eq=False)
 class Track:
@@ -84,6 +90,15 @@ class Track:
                 "an estimate must be finite",
                 "The method diverged: lower its gain, or check the assumed standard deviations.",
             )
+        if self.covariance is not None:
+            self._note_unsound(self.covariance.reshape(-1, 3, 3))
+
+    def _note_unsound(self, covariance: Floats) -> None:
+        from ..kernels.scores import unsound
+
+        if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
+            note = f"{found} of {len(covariance)} {UNSOUND}"
+            object.__setattr__(self, "notes", (*self.notes, note))
 
     def plot(
         self, ax: Axes | None = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None

@@ -46,8 +46,10 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
     if problem.constraints or problem.batch is not None:
         what = "constraints" if problem.constraints else f"{problem.batch} realisations"
         raise InputError("problem", what, "must be a single one without constraints", "Pick one: problem.pick(0).")
-    listed = nodes if isinstance(nodes, Iterable) else [nodes]
-    places = [problem.index(node) for node in listed]
+    places = [problem.index(node) for node in (nodes if isinstance(nodes, Iterable) else [nodes])]
+    if len(places) > len(problem.names):
+        allowed = f"must name each of {len(problem.names)} nodes once"
+        raise InputError("nodes", f"{len(places)} nodes", allowed, "Leave out those that stand twice.")
     dof = problem.space.dof
     number, solve_one = _solver(problem.replace_unchecked(separator=()), x)
     wanted = number[places].ravel()

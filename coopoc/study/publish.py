@@ -79,7 +79,8 @@ def views(folder: str | Path) -> Mapping[str, Any]:
     for view in (*found["tables"], *found["figures"]):
         if not isinstance(view, dict) or not isinstance(view.get("caption"), str):
             raise store.damaged(path, "a view without a caption")
-        if not all(map(_is_mark, view.get("marks", ()))):
+        marks = view.get("marks", [])
+        if not isinstance(marks, list) or not all(map(_is_mark, marks)):
             raise store.damaged(path, "a mark without its series, place or text")
         file_name("view", view.get("name"), f"Run the study again: {path} was not written by coopoc run.")
     return found

@@ -73,7 +73,10 @@ def content(path: Path, fields: Mapping[str, Any], absent: str, hint: str) -> di
     if not path.is_file():
         raise InputError("folder", str(path.parent), absent, hint)
     try:
-        found: Any = json.loads(path.read_text())
+        text = path.read_text()
+        found: Any = json.loads(text)
+        if "\\ud" in text.lower():
+            json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
     except (ValueError, RecursionError) as error:
         raise damaged(path, str(error)) from None
     if not isinstance(found, dict):

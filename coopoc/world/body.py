@@ -28,9 +28,10 @@ class Body:
     heading: Floats
 
     def __post_init__(self) -> None:
-        shape = np.shape(self.yaw_rate)
+        shape: tuple[int, ...] = (-1, -1, -1)
         for name in ("yaw_rate", "heading"):
-            values = checked(name, getattr(self, name), "(R, T, N)", shape if len(shape) == 3 else (-1, -1, -1))
+            values = checked(name, getattr(self, name), "(R, T, N)", shape)
+            shape = values.shape
             refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
             object.__setattr__(self, name, values)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import math
 import zipfile
 import zlib
 from dataclasses import asdict
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import AnyArray
 from ..errors import InputError
 from .body import Body
 from .fleet import Fleet
@@ -74,8 +77,34 @@ def is_recording(path: str | Path) -> bool:
     try:
         with zipfile.ZipFile(path) as packed:
             return "coopoc_recording.npy" in packed.namelist()
-    except (OSError, zipfile.BadZipFile):
+    except (OSError, zipfile.BadZipFile, NotImplementedError):
         return False
+
+
+def unpacked(path: Path) -> dict[str, AnyArray]:
+    """Arrays of an .npz file by name; what is damaged raises one of `DAMAGES`.
+
+    Raises:
+        InputError: more than `LARGEST` bytes.
+    """
+    with zipfile.ZipFile(path) as packed:
+        if sum(part.file_size for part in packed.infolist()) > LARGEST:
+            raise InputError(path.name, "more than 4 GB unpacked", "must be smaller", "Save fewer runs.")
+        return {name.removesuffix(".npy"): _array(packed.read(name)) for name in packed.namelist()}
+
+
+def _array(stored: bytes) -> AnyArray:
+    """NumPy's own reader asks for as much memory as the header claims, whatever follows it."""
+    file = io.BytesIO(stored)
+    version = np.lib.format.read_magic(file)
+    if version not in ((1, 0), (2, 0)):
+        raise ValueError(f"an array in version {version} of NumPy's format")
+    reads = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, by_columns, dtype = reads(file)
+    if dtype.hasobject:
+        raise ValueError("an array of Python objects")
+    found = np.frombuffer(stored, dtype, math.prod(shape), file.tell())
+    return found.reshape(shape, order="F" if by_columns else "C")
 
 
 def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
@@ -86,13 +115,8 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     """
     path = Path(path)
     try:
-        with zipfile.ZipFile(path) as packed:
-            if sum(part.file_size for part in packed.infolist()) > LARGEST:
-                raise InputError(path.name, "more than 4 GB unpacked", "must be smaller", "Save fewer runs.")
-        with np.load(path, allow_pickle=False) as stored:
-            words = json.loads(str(stored["coopoc_recording"]))
-            arrays = {name: stored[name] for name in stored.files if name != "coopoc_recording"}
-        return _recording(words, arrays)
+        arrays = unpacked(path)
+        return _recording(json.loads(str(arrays.pop("coopoc_recording"))), arrays)
     except DAMAGES as error:
         if isinstance(error, InputError) and error.field == path.name:
             raise

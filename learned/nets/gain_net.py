@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, instance
 
 from ..engine import rollout as engine
 from ..engine.places import CELLS, LOG_FLOOR, SHORTEST, SIZE
@@ -65,7 +65,8 @@ class GainNet(Recurrent):
         magnitudes: bool = False,
     ) -> None:
         super().__init__()
-        self.in_mult, self.out_mult, self.magnitudes = size("in_mult", in_mult), size("out_mult", out_mult), magnitudes
+        self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
+        self.magnitudes = instance("magnitudes", magnitudes, bool, "Give True or False.")
         wide, both, seen = SIZE * in_mult, 2 * CELLS, SIZE + magnitudes
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_of(seed))

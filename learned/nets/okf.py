@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, instance
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
@@ -109,7 +109,7 @@ class NoiseParameters(Gain):
 
     def __init__(self, velocity_part: bool = True, seed: int = 0) -> None:
         super().__init__()
-        self.velocity_part = velocity_part
+        self.velocity_part = instance("velocity_part", velocity_part, bool, "Give True or False.")
         self.logs = nn.Parameter(torch.tensor([0.1, 0.1, 1.0]).log()[:, None].repeat(1, 3))
 
     def stds(self, theta: Tensor) -> Tensor:

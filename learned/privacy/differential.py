@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc.arrays import number
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.world.noise import stream
 
@@ -59,12 +60,14 @@ class Privacy:
     keyed: bool = True
 
     def __post_init__(self) -> None:
-        within("clip", self.clip, 0 < self.clip < math.inf, "> 0 and finite", "Try the median norm of an update.")
-        finite = 0 <= self.noise_multiplier < math.inf
+        clip = number("clip", self.clip)
+        within("clip", self.clip, 0 < clip < math.inf, "> 0 and finite", "Try the median norm of an update.")
+        finite = 0 <= number("noise_multiplier", self.noise_multiplier) < math.inf
         within("noise_multiplier", self.noise_multiplier, finite, ">= 0 and finite", "0 clips only.")
-        within("delta", self.delta, 0 < self.delta < 1, "in (0, 1)", "1e-5 is far below one over the clients.")
-        some = self.clients is None or self.clients >= 1
-        within("clients", self.clients, some, ">= 1", "Give those whose noise adds up, or None.")
+        within("delta", self.delta, 0 < number("delta", self.delta) < 1, "in (0, 1)", "1e-5 is far below 1 / clients.")
+        if self.clients is not None:
+            hint = "Give those whose noise adds up, or None."
+            number("clients", self.clients, 1, 2**31, kind=int, allowed=">= 1", hint=hint)
 
     def protect(self, updates: Tensor, names: Sequence[str], seed: int, number: int) -> Tensor:
         """Updates (C, P) of the named clients in round `number` as they leave: clipped, plus noise of each client."""

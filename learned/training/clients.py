@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import AnyArray, Floats
+from coopoc.arrays import AnyArray, Floats, instance, number
 from coopoc.errors import InputError
 from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
@@ -205,7 +205,8 @@ def clients(
     for name, value, allowed in (("noise", noise, get_args(Noise)), ("start", start, get_args(Start))):
         one_of(name, value, allowed)
     check_pieces(piece, split)
-    sensors = sensors or Sensors.paper_training()
+    fleet = instance("fleet", fleet, Fleet)
+    sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)
     if noise != "static" and (sensors.gnss_bias[1] > 0 or sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0):
         given = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std)
         raise InputError(
@@ -237,8 +238,9 @@ def clients(
 
 def check_pieces(piece: int, split: float) -> None:
     """InputError unless drives can be cut into pieces so long, of which this share trains."""
-    if piece < 2 or not 0 < split < 1:
-        raise InputError("piece, split", (piece, split), "must be >= 2 and in (0, 1)", "The paper has 100 and 0.8.")
+    number("piece", piece, 2, 2**31, kind=int, allowed=">= 2 steps", hint="The paper has 100.")
+    if not 0 < number("split", split) < 1:
+        raise InputError("split", split, "must be in (0, 1)", "The paper has 0.8.")
 
 
 def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise: Noise, start: Start) -> Segments:

@@ -214,8 +214,8 @@ class Problem:
         index = indices(self.index, kind, nodes)
         size = lookup(kind).size(self.dimension)
         low, high = (
-            np.broadcast_to(numbers(name, v), (len(index), size)) if np.ndim(v) == 0 else numbers(name, v)
-            for name, v in (("lower", lower), ("upper", upper))
+            np.broadcast_to(given, (len(index), size)) if given.ndim == 0 else given
+            for given in (numbers("lower", lower), numbers("upper", upper))
         )
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
