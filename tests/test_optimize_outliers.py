@@ -15,7 +15,7 @@ from coopoc.formats import write_graph
 from coopoc.formats.edges import PoseEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, Status, pose, solve_gnc
-from coopoc.optimize.compatible import predicted
+from coopoc.optimize.predictions import predicted
 from coopoc.optimize.graphs import from_graph, loop_closures
 from coopoc.optimize.outliers import mark
 from coopoc.optimize.space import exp

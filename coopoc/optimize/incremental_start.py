@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats
 from ..formats.graph import Graph
 from .part import restricted
 from .problem import Problem
+from .space import carried
 from .sparse import sparse
 from .trilateration import located
 from .trust_region import arrive
@@ -61,7 +62,7 @@ def _extended(graph: Graph, problem: Problem, now: Growth, share: float) -> Grow
         used[new] = True
         old = new[now.solved[new]]
         if len(old) and len(old) < len(places):
-            x[places[len(old) :]] = _carried(problem, x, old[-1], places[len(old) :])
+            x[places[len(old) :]] = carried(space, problem.x0[places[len(old) :]], problem.x0[old[-1]], x[old[-1]])
     used |= _joining(graph, x, used, space.dimension)
     part = restricted(problem, used, x)
     system = sparse(part, least=0)
@@ -70,15 +71,6 @@ def _extended(graph: Graph, problem: Problem, now: Growth, share: float) -> Grow
     end = arrive(system, np.array(part.x0), STEPS, TOLERANCE)
     x[used] = end.x
     return Growth(x, used, now.iterations + end.iterations)
-
-
-def _carried(problem: Problem, x: Floats, last: int, later: Ints) -> Floats:
-    """Later poses (K, ambient) as x0 has them, moved as the last one was."""
-    space, x0 = problem.space, problem.x0
-    assert x0 is not None
-    turn = space.rotation(x[last]) @ space.rotation(x0[last]).T
-    gap = space.position(x0[later]) - space.position(x0[last])
-    return space.join(space.position(x[last]) + gap @ turn.T, turn @ space.rotation(x0[later]))
 
 
 def _joining(graph: Graph, x: Floats, used: Bools, d: int) -> Bools:
