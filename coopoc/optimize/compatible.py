@@ -17,6 +17,7 @@ from .outliers import Marked, reweigh, squares
 from .predictions import HINT, predicted
 from .problem import Problem
 from .sparse import sparse
+from .trust_region import arrive
 from .walk import along_poses
 
 ROUNDS = 100
@@ -27,6 +28,10 @@ CURVED = 10.0
 """Times its bound up to which a d^2 is checked by a solve: predictions along a drive are linear, and its arc is not."""
 TRIED = 10
 """Of these, the least certain predictions first."""
+STEPS = 20
+"""Of such a solve; a loop that fits needs fewer."""
+TOLERANCE = 1e-3
+"""m or rad, a step that ends it."""
 Inner = Callable[[Problem], Floats]
 """Solves a weighted problem: x (1, n, ambient)."""
 
@@ -54,8 +59,8 @@ def compatible(problem: Problem, marked: Marked, bound: Floats, inner: Inner) ->
     A candidate fits where d^2 = r^T (J P J^T + cov)^-1 r is within its bound, P the covariance of its nodes given all
     that has joined. Of those that fit the half that is predicted best, by log det(J P J^T + cov), joins in each round,
     so that a loop is judged by what little the odometry of its own length has drifted. One whose residual leaves the
-    bound leaves, and when it leaves again stays rejected. Of a group the d^2 are added, as if independent. Where no more
-    fits, those whose prediction is least certain are solved for: the cost must grow by no more than half the bound.
+    bound leaves, and when it leaves again stays rejected. Of a group the d^2 are added, as if independent. Where none
+    fits, the least certain are solved for: the cost must grow by no more than half the bound.
 
     A body that known inliers leave free, such as a robot that only others see, is solved in a frame of its own. Each of
     some candidates between two bodies then places one of them; the placement that predicts most of the other candidates
@@ -102,35 +107,31 @@ def _rounds(problem: Problem, marked: Marked, bound: Floats, inner: Inner, state
         leaving = judged & (weight[0] > 0) & (squares(problem, marked, x)[0] > bound[0])
         left[leaving], weight[0, leaving] = left[leaving] + 1, 0.0
         distance, spread = predicted(problem, marked, weight, x)
-        others = judged & (weight[0] == 0) & (left < CHANCES)
-        fits = others & (left < chances) & (distance <= bound[0])
-        if not fits.any() and chances < CHANCES:
-            chances = CHANCES
-            fits = others & (distance <= bound[0])
+        others = judged & (weight[0] == 0) & (left < chances)
+        fits = others & (distance <= bound[0])
         if fits.any():
             weight[0, fits & (spread <= np.median(spread[fits]))] = 1.0
-            continue
-        some = np.flatnonzero(others & (distance <= CURVED * bound[0]))
-        some = some[np.argsort(-spread[some], kind="stable")][:TRIED]
-        if not any(_explained(problem, marked, bound, inner, x, weight, group) for group in some.tolist()):
-            break
+        elif chances < CHANCES:
+            chances = CHANCES
+        else:
+            some = np.flatnonzero(others & (distance <= CURVED * bound[0]))
+            some = some[np.argsort(-spread[some], kind="stable")][:TRIED]
+            if not any(_explained(problem, marked, bound, x, weight, group) for group in some.tolist()):
+                break
     return x, rounds
 
 
-def _explained(
-    problem: Problem, marked: Marked, bound: Floats, inner: Inner, x: Floats, weight: Floats, group: int
-) -> bool:
+def _explained(problem: Problem, marked: Marked, bound: Floats, x: Floats, weight: Floats, group: int) -> bool:
     """Whether twice the cost grows by no more than the bound where a group joins, which it then does.
 
-    Where the model is linear that growth is d^2. Far along a drive whose heading has become uncertain it is not.
+    Where the model is linear that growth is d^2. Far along a drive whose heading has become uncertain it is less.
     """
     costs = []
     for joins in (0.0, 1.0):
         weight[0, group] = joins
-        weighted = reweigh(problem, marked, weight, x)
-        system = sparse(weighted.pick(0), least=0)
+        system = sparse(reweigh(problem, marked, weight, x).pick(0), least=0)
         assert system is not None
-        costs.append(system.cost(inner(weighted)[0] if joins else x[0]))
+        costs.append(system.cost(arrive(system, x[0], STEPS, TOLERANCE).x if joins else x[0]))
     good = 2.0 * (costs[1] - costs[0]) <= bound[0, group]
     weight[0, group] = float(good)
     return bool(good)

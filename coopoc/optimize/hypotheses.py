@@ -126,7 +126,7 @@ class Pair:
         guess = Joint(self._bodies, group, move, np.zeros(len(self._bound), dtype=bool), 0.0, len(self._groups))
         weight[0, group] = 1.0
         at = guess.placed(self._problem, self._state)[:, self._used]
-        distance, _ = predicted(self._part, self._inside, weight, at)
+        distance, _ = predicted(self._part, self._inside, weight, at, whole=True)
         fits = guess.fits.copy()
         fits[self._groups] = distance[self._groups] <= self._bound[self._groups]
         fits[group] = True
