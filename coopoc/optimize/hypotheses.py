@@ -44,7 +44,7 @@ class Joint:
         fits: (G,) candidates between them that agree, itself included.
         misfit: sum of their d^2.
         count: candidates between them.
-        rival: how many agree with the best of the hypotheses that do not fit this one.
+        rival: most that agree with a hypothesis that does not fit, and not with this one.
     """
 
     bodies: tuple[int, int]
@@ -106,7 +106,8 @@ class Pair:
         others = np.setdiff1d(self._groups, [*np.flatnonzero(best.fits), *(joint.group for joint in tried)])
         tried += self._spread(others)
         best = max(tried, key=lambda joint: (joint.agree, -joint.misfit))
-        return replace(best, rival=max((joint.agree for joint in tried if not best.fits[joint.group]), default=0))
+        rivals = [joint.fits & ~best.fits for joint in tried if not best.fits[joint.group]]
+        return replace(best, rival=max((int(fits.sum()) for fits in rivals), default=0))
 
     def _spread(self, groups: Ints) -> list[Joint]:
         """Hypotheses that are spread over some groups."""
@@ -126,7 +127,7 @@ class Pair:
         guess = Joint(self._bodies, group, move, np.zeros(len(self._bound), dtype=bool), 0.0, len(self._groups))
         weight[0, group] = 1.0
         at = guess.placed(self._problem, self._state)[:, self._used]
-        distance, _ = predicted(self._part, self._inside, weight, at, whole=True)
+        distance, _ = predicted(self._part, self._inside, weight, at)
         fits = guess.fits.copy()
         fits[self._groups] = distance[self._groups] <= self._bound[self._groups]
         fits[group] = True

@@ -43,7 +43,7 @@ def chain(
     d = space.dimension
     back = np.swapaxes(space.rotation(x)[:, nodes[:, 0]], -1, -2)
     moved = jacobian[..., :d] @ back
-    turning = jacobian[..., :d] @ swing(vector)
+    turning = jacobian[..., :d] @ _swing(vector)
     if rotation is None:
         return np.concatenate([-moved, turning], axis=-1), _wide(space, moved)
     own = jacobian[..., d:]
@@ -51,7 +51,7 @@ def chain(
     return np.concatenate([-moved, turning], axis=-1), np.concatenate([moved, own], axis=-1)
 
 
-def swing(vector: Floats) -> Floats:
+def _swing(vector: Floats) -> Floats:
     """d(Exp(-w) v)/dw = [v]x at w = 0: (..., 3, 3), or (..., 2, 1) in the plane."""
     if vector.shape[-1] == 3:
         return cross(vector)

@@ -118,25 +118,6 @@ def log(rotation: Floats) -> Floats:
     return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
 
 
-def log_pose(space: Space, position: Floats, rotation: Floats) -> Floats:
-    """(..., dof) (V^-1 p, Log R) of poses: the velocity that reaches them in a unit of time, turning steadily.
-
-    V = I + (1 - cos|w|)/|w|^2 [w]x + (|w| - sin|w|)/|w|^3 [w]x^2, w = Log R.
-
-    >>> log_pose(Space(2, True), np.array([2.0, 2.0]), exp(np.array([np.pi / 2]))).round(3)
-    array([3.142, 0.   , 1.571])
-    """
-    w = log(rotation)
-    whole = w if space.dimension == 3 else np.concatenate([np.zeros((*w.shape[:-1], 2)), w], axis=-1)
-    angle = np.linalg.norm(whole, axis=-1)[..., None, None]
-    safe = np.where(angle > 1e-4, angle, 1.0)
-    first = np.where(angle > 1e-4, (1.0 - np.cos(safe)) / safe**2, 0.5)
-    second = np.where(angle > 1e-4, (safe - np.sin(safe)) / safe**3, 1.0 / 6.0)
-    turn, d = cross(whole), space.dimension
-    V = (np.eye(3) + first * turn + second * (turn @ turn))[..., :d, :d]
-    return np.concatenate([np.linalg.solve(V, position[..., None])[..., 0], w], axis=-1)
-
-
 def cross(w: Floats) -> Floats:
     """(..., 3, 3) matrices [w]x with [w]x v = w x v."""
     x, y, z = np.moveaxis(w, -1, 0)
