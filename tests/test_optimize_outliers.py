@@ -15,9 +15,9 @@ from coopoc.formats import write_graph
 from coopoc.formats.edges import PoseEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, Status, pose, solve_gnc
-from coopoc.optimize.predictions import predicted
 from coopoc.optimize.graphs import from_graph, loop_closures
 from coopoc.optimize.outliers import mark
+from coopoc.optimize.predictions import predicted
 from coopoc.optimize.space import exp
 
 STD = np.array([0.02, 0.02, 0.01])
@@ -94,11 +94,13 @@ def test_predictions_are_those_of_dense_algebra() -> None:
         assert spread[k] == pytest.approx(np.log(np.linalg.det(S)), rel=1e-6)
 
 
-def test_known_inliers_that_leave_nodes_free_are_refused() -> None:
-    problem = Problem(("A0", "B0"), x0=pose(np.zeros((2, 2))), dimension=2, poses=(0, 1), fixed=(0,))
-    problem = problem.add("relative_pose", ("A0", "B0"), pose([1.0, 0.0]), std=STD)
+def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused() -> None:
+    problem = Problem(("A0", "A1", "L0"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1), fixed=(0,))
+    problem = problem.add("relative_position", ("A1", "L0"), [1.0, 0.0], std=0.1)
+    problem = problem.add("range", ("A0", "A1"), 1.0, std=0.1)
+    problem = problem.add("relative_pose", ("A0", "A1"), pose([1.0, 0.0]), std=STD)
     with pytest.raises(co.InputError, match=r"candidates.*known inliers that hold all nodes.*all"):
-        solve_gnc(problem, [0], start="known")
+        solve_gnc(problem.replace_unchecked(x0=pose(np.array([[0.0, 0], [1, 0], [2, 0]]))), [2], start="known")
 
 
 def test_points_join_as_poses_do() -> None:

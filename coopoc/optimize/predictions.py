@@ -28,17 +28,23 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
     for k in np.unique(marked.factor):
         here = marked.factor == k
         factor = taken(problem.factors[k], marked.row[here])
-        linear = linearise(problem.space, [factor], None, x)
+        with np.errstate(all="ignore"):
+            linear = linearise(problem.space, [factor], None, x)
         shape = (len(factor.nodes), factor.size, problem.space.dof)
         J = np.concatenate([np.broadcast_to(own[0], shape) for own in linear.by_node([factor])[0]], axis=2)
+        r = linear.residual[0][0]
+        # an angle between nodes that coincide has no derivative
+        lost = ~np.isfinite(r).all(axis=1) | ~np.isfinite(J).all(axis=(1, 2))
+        r, J = np.where(lost[:, None], 0.0, r), np.where(lost[:, None, None], 0.0, J)
         number = system.entries.number[factor.nodes].reshape(len(J), -1)
         row, column = np.broadcast_arrays(number[:, :, None], number[:, None])
         free = (row >= 0) & (column >= 0)
         P = np.zeros(row.shape)
         P[free] = system.cholesky.inverse(row[free], column[free])
         S = J @ P @ np.swapaxes(J, 1, 2) + np.eye(factor.size)
-        r = linear.residual[0][0]
-        distance[here] = np.einsum("mk,mk->m", r, np.linalg.solve(S, r[..., None])[..., 0])
+        distance[here] = np.einsum("mk,mk->m", r, np.linalg.solve(S, r[..., None])[..., 0]) + np.where(
+            lost, np.inf, 0.0
+        )
         spread[here] = np.linalg.slogdet(S)[1]
-    groups = weight.shape[1]
-    return np.bincount(marked.group, distance, groups), np.bincount(marked.group, spread, groups)
+    distance, spread = (np.asarray(np.bincount(marked.group, v, weight.shape[1]), float) for v in (distance, spread))
+    return distance, spread
