@@ -125,3 +125,29 @@ def test_the_command_names_what_it_rejects(tmp_path: Path, capsys: pytest.Captur
     write_graph(chain, tmp_path / "chain.g2o")
     with pytest.raises(co.InputError, match="outliers"):
         solve_file(tmp_path / "chain.g2o", outliers=True)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "torus"])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_wrong_loops_of_a_drive_in_space_are_found(shape: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Oracle: the labels, and the solution of the graph that never had the wrong ones."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    from unseen_graphs import joined, surface
+
+    drive_, loops = surface(seed, 15, 30, shape)
+    edges = drive_.relative(loops, 0.1, 0.02, wrong=0.2)
+    gap = drive_.position[loops[:, 1]] - drive_.position[loops[:, 0]]
+    error = np.einsum("mji,mj->mi", drive_.rotation[loops[:, 0]], gap) - edges.position
+    bad = np.linalg.norm(error, axis=1) > 1.0  # ten standard deviations
+    odometry = drive_.relative(drive_.chain(), 0.1, 0.02)
+    solution = solve_gnc(
+        problem := from_graph(drive_.graph(relative_pose=joined(odometry, edges)), start="odometry"),
+        loop_closures(problem),
+        start="known",
+    )
+    rejected = solution.extras["weights"] < 0.5
+    assert solution.status is Status.SOLVED
+    assert not (bad & ~rejected).any()
+    assert (~bad & rejected).sum() <= 0.02 * len(loops)
+    clean = co.solve(from_graph(drive_.graph(relative_pose=joined(odometry, edges.rows(np.flatnonzero(~bad))))))
+    assert np.abs(solution.position - clean.position).max() < 0.3

@@ -18,6 +18,7 @@ from ..formats.graph import Graph
 from .backend import backends
 from .gnc import solve_gnc
 from .graphs import Objective, Start, from_graph, loop_closures, read_graph
+from .hypotheses import AGREEING
 from .problem import Problem
 from .race import expected as expected_cost
 from .search import Search
@@ -74,6 +75,12 @@ def solve_file(
     print(json.dumps(summary, indent=1))
     if solution.status is not Status.SOLVED:
         print(f"coopoc: {solution.status.value}", file=sys.stderr)
+    for joint in solution.extras.get("joined", ()):
+        if joint["rival"] >= AGREEING:
+            print(
+                "coopoc: {body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint),
+                file=sys.stderr,
+            )
     if size is not None and not 1 / UNLIKELY < size < UNLIKELY:
         print(f"coopoc: residuals are {size:.2g} times what the file states. {MISTAKEN}", file=sys.stderr)
     return int(solution.status is not Status.SOLVED)
