@@ -67,7 +67,7 @@ def _by_tapes(system: Sparse, x: Floats) -> float | None:
     if not np.isfinite(values).all():
         return None
     if not system.cholesky.factor(values):
-        own, values = system.entries.diagonal, values.copy()
+        own = system.entries.diagonal
         values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
         if not system.cholesky.factor(values):
             return None

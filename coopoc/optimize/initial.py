@@ -44,7 +44,7 @@ def initial_guess(problem: Problem) -> Floats:
     x: Floats = np.zeros((batch, len(problem.names), problem.dimension))
     if linear.factors and (system := sparse(linear)) is not None:
         _, gradient, values = system.quadratic(x[0], "gauss-newton")
-        own, values = system.entries.diagonal, values.copy()
+        own = system.entries.diagonal
         every = bool((values[own] > 0.0).all())
         values[own] += RIDGE
         system.cholesky.factor(values)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -19,9 +18,6 @@ from .problem import Problem
 from .space import Space
 from .tape import Model, numbers_of
 
-Quadratic: TypeAlias = tuple[float, Floats, Floats]
-"""Cost, gradient and values of a Hessian."""
-
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
@@ -31,13 +27,11 @@ class Sparse:
         space: where the nodes live.
         layout: of its structure.
         numbers: per factor, the inputs of its tape that are no nodes.
-        known: of a small problem, what was found last at a point: solver and assessment ask at the same.
     """
 
     space: Space
     layout: Layout
     numbers: tuple[Floats, ...]
-    known: dict[tuple[bytes, Model], Quadratic] = field(default_factory=dict)
 
     @cached_property
     def entries(self) -> Entries:
@@ -58,20 +52,10 @@ class Sparse:
         """1/2 sum of rho at x (n, ambient)."""
         return float(self.layout.total("cost")(x, self.numbers)[0])
 
-    def quadratic(self, x: Floats, model: Model) -> Quadratic:
-        """Cost, gradient (m,) and values of the Hessian's upper triangle at x, J^T J or the exact one; read-only."""
-        if not self.layout.small:
-            return self._quadratic(x, model)
-        key = x.tobytes(), model
-        if (found := self.known.get(key)) is None:
-            if len(self.known) >= KNOWN:
-                self.known.clear()
-            found = self.known[key] = self._quadratic(x, model)
-        return found
-
-    def _quadratic(self, x: Floats, model: Model) -> Quadratic:
-        m, total = self.size, self.layout.total(model)(x, self.numbers)
-        total.flags.writeable = False
+    def quadratic(self, x: Floats, model: Model) -> tuple[float, Floats, Floats]:
+        """Cost, gradient (m,) and the values of the Hessian's upper triangle at x: J^T J, or the exact one."""
+        m = self.size
+        total = self.layout.total(model)(x, self.numbers)
         return float(total[0]), total[1 : m + 1], total[m + 1 : -1]
 
     def retract(self, x: Floats, step: Floats) -> Floats:
@@ -82,8 +66,6 @@ class Sparse:
         return self.space.retract(x, np.append(step, 0.0)[number])
 
 
-KNOWN = 4
-"""Points, times models."""
 LARGE = 60
 """Nodes beyond which a problem without a separator is sparse."""
 _KEPT: WeakKeyDictionary[Problem, Sparse | None] = WeakKeyDictionary()
