@@ -37,7 +37,7 @@ def load_recording(path: str | Path, **options: Any) -> Recording:
         options: of `read_log`, such as dt in seconds and columns.
 
     Raises:
-        InputError: names file, row, column, value, what is allowed and how to mend it.
+        InputError: names file, row, column, value, what is allowed and how to correct it.
     """
     recording: Recording = read_log(path, **options).recording
     return recording

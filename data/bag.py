@@ -120,8 +120,10 @@ def _rows(kind: str, name: str, m: Any, tally: Tally, place: str) -> list[Row]:
         return out
     pose = getattr(m.pose, "pose", m.pose)
     p, yaw = pose.position, _yaw(pose.orientation) if kind == "actual" else None
-    facing = [] if yaw is None else [(t, name, "heading", yaw, np.nan)]
-    return [(t, name, axis, float(value), np.nan) for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)] + facing
+    headings = [] if yaw is None else [(t, name, "heading", yaw, np.nan)]
+    return [
+        (t, name, axis, float(value), np.nan) for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)
+    ] + headings
 
 
 def _one_yaw_rate(rows: list[Row]) -> list[Row]:

@@ -129,8 +129,8 @@ def check(
             print(f"\n{title}: {against}")
             print(tabulate(rows, headers="keys", tablefmt="github", floatfmt=".3g"))
     print()
-    for doubt in found.doubts or ("nothing looks wrong",):
-        print(f"check: {doubt}")
+    for warning in found.warnings or ("nothing looks wrong",):
+        print(f"check: {warning}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
     drawn = draw_poses(found, out) if isinstance(found, PoseCheck) else draw(log, found, out)
     print(f"picture: {drawn}", file=sys.stderr)

@@ -24,7 +24,7 @@ from .recipes import RECIPES, Recipe
 from .smooth import smooth
 
 DROVE, JUMPED = "recipe", "acceleration"
-"""Fields of the errors that another seed may mend."""
+"""Fields of the errors that another seed may avoid."""
 
 
 def make(

@@ -101,7 +101,7 @@ def read_log(
         Log: recording, truth, summary.
 
     Raises:
-        InputError: names file, row, column, value, what is allowed and how to mend it.
+        InputError: names file, row, column, value, what is allowed and how to correct it.
         MissingLibraryError: pynmeagps or rosbags is not installed, and there is NMEA or a bag.
 
     >>> import tempfile

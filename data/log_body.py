@@ -13,7 +13,7 @@ from coopoc.errors import InputError
 from . import motion
 from .log_rows import Rows
 from .log_summary import Tally
-from .log_vehicle import Vehicle, begun, described, facing, fixes_of, on_steps, samples, standing, stands
+from .log_vehicle import Vehicle, begun, described, fixes_of, heading_from, on_steps, samples, standing, stands
 from .motion import Signal
 from .nearest import nearest, steps_of
 
@@ -65,7 +65,7 @@ def _moved(rows: Rows, fixes: Signal, turn: Signal, grid: Floats, speed: Floats,
     it brings a fix to its step."""
     dt = float(grid[1] - grid[0])
     derived = motion.velocity_of_fixes(fixes, motion.bridged(fixes, dt, max_gap)) if len(fixes.t) > 1 else None
-    heading = facing(rows, turn, ((derived, "fixes"),), dt, max_gap, Tally())[0]
+    heading = heading_from(rows, turn, ((derived, "fixes"),), dt, max_gap, Tally())[0]
     if heading is None:
         return np.zeros((len(grid), 3))
     ahead = heading(grid)

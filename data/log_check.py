@@ -14,7 +14,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.world.recording import Recording
 
 from .log import Log
-from .log_truth import frame_doubt
+from .log_truth import frame_warning
 from .mrclam import robust_std
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
@@ -47,7 +47,7 @@ class Check:
         relative: (L, 3) m, rad, rad: measured less computed from the two filters, which use no relative measurement.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
-        doubts: sentences.
+        warnings: sentences.
     """
 
     x: Floats
@@ -57,7 +57,7 @@ class Check:
     relative: Floats
     vehicles: Sequence[Mapping[str, Any]]
     measurements: Sequence[Mapping[str, Any]]
-    doubts: tuple[str, ...]
+    warnings: tuple[str, ...]
 
 
 def check(log: Log) -> Check:
@@ -79,13 +79,13 @@ def check(log: Log) -> Check:
             if each is not None:
                 normalised[here, column] = each[0, :, 0]
     relative, expected = _relative(rec, x, variance)
-    vehicles, doubts = _vehicles(log, fix, normalised)
+    vehicles, warnings = _vehicles(log, fix, normalised)
     measurements, more = _measurements(rec, relative, expected)
-    return Check(x, variance, fix, normalised, relative, vehicles, measurements, (*doubts, *more))
+    return Check(x, variance, fix, normalised, relative, vehicles, measurements, (*warnings, *more))
 
 
 def _vehicles(log: Log, fix: Floats, normalised: Floats) -> tuple[list[dict[str, Any]], list[str]]:
-    rec, rows, doubts = log.recording, [], []
+    rec, rows, warnings = log.recording, [], []
     for column, name in enumerate(rec.ids):
         seen = np.isfinite(normalised[:, column])
         speed = np.linalg.norm(rec.velocity[0, :, column], axis=-1)
@@ -105,9 +105,9 @@ def _vehicles(log: Log, fix: Floats, normalised: Floats) -> tuple[list[dict[str,
             error = np.linalg.norm(rec.gnss[0, :, column] - log.truth.position[:, column], axis=-1)
             row["fix_error_m"] = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else None
         rows.append(row)
-        doubts += _of_vehicle(name, row, distance, turn, int(seen.sum()))
-        doubts += frame_doubt(rec, log.truth, column)
-    return rows, doubts
+        warnings += _of_vehicle(name, row, distance, turn, int(seen.sum()))
+        warnings += frame_warning(rec, log.truth, column)
+    return rows, warnings
 
 
 def _of_vehicle(name: str, row: Mapping[str, Any], distance: float | None, turn: float | None, count: int) -> list[str]:
@@ -172,7 +172,7 @@ def _relative(rec: Recording, x: Floats, variance: Floats) -> tuple[Floats, Floa
 
 
 def _measurements(rec: Recording, residual: Floats, expected: Floats) -> tuple[list[dict[str, Any]], list[str]]:
-    rows, doubts = [], []
+    rows, warnings = [], []
     for k, (name, unit) in enumerate(UNITS.items()):
         seen = np.isfinite(residual[:, k])
         if not seen.any() or np.ptp(rec.relative[0, seen, k]) == 0:
@@ -203,20 +203,20 @@ def _measurements(rec: Recording, residual: Floats, expected: Floats) -> tuple[l
                 hint = next(
                     (hint for low, high, hint in MISTAKEN[4:] if low < ratio < high), "Check the units of both."
                 )
-                doubts.append(f"ranges are {ratio:.2f} times the distances of the positions. {hint}")
+                warnings.append(f"ranges are {ratio:.2f} times the distances of the positions. {hint}")
         if k == 1 and std > COARSE > 3 * place:
-            doubts.append(
+            warnings.append(
                 f"azimuths scatter by {np.degrees(std):.0f} deg about the positions: check their sense (anticlockwise) "
                 "and whose heading they count from, and that no axis is mirrored."
             )
         if (k == 1 and abs(np.exp(1j * r).mean()) < 0.5) or (abs(median) > max(0.35, 3 * should) and k == 1):
-            doubts.append(
+            warnings.append(
                 f"azimuths miss the positions by {np.degrees(median):.0f} deg in the median: check their zero "
                 "(+x, or the heading for a bearing), their sense (anticlockwise) and their unit (rad)."
             )
         elif std > WIDE * should or abs(median) > 3 * should:
             wrong = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
-            doubts.append(f"{name}s miss the positions by {wrong}.")
+            warnings.append(f"{name}s miss the positions by {wrong}.")
         elif std < NARROW * should and stated > 2 * std:
-            doubts.append(f"{name}s are better than stated: {std:.3g} {unit}, {stated:.3g} {unit} stated.")
-    return rows, doubts
+            warnings.append(f"{name}s are better than stated: {std:.3g} {unit}, {stated:.3g} {unit} stated.")
+    return rows, warnings

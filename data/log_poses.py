@@ -19,7 +19,7 @@ from coopoc.world.recording import Recording
 from coopoc.world.spherical import wrap
 
 from .log import Log
-from .log_truth import frame_doubt
+from .log_truth import frame_warning
 
 WRONG = 3.0
 """Times the stated standard deviation that residuals of a filter's own estimates are not expected to reach."""
@@ -38,7 +38,7 @@ class PoseCheck:
         track: of all vehicles.
         vehicles: a row each.
         measurements: a row for each component of the relative measurements.
-        doubts: sentences on what looks wrong.
+        warnings: sentences on what looks wrong.
     """
 
     log: Log
@@ -46,7 +46,7 @@ class PoseCheck:
     track: Track
     vehicles: list[dict[str, Any]]
     measurements: list[dict[str, Any]]
-    doubts: list[str]
+    warnings: list[str]
 
 
 def check_poses(log: Log) -> PoseCheck:
@@ -63,7 +63,7 @@ def check_poses(log: Log) -> PoseCheck:
     who = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
     begin, start = begin_of(log, who, GATE)
     track = PoseFilter("fleet", gate=GATE, begin=begin)(rec, who)
-    vehicles, doubts = [], []
+    vehicles, warnings = [], []
     for k, column in enumerate(who):
         fix = np.linalg.norm(rec.gnss[0, :, column, :2] - track.x[0, :, k, :2], axis=1)
         row: dict[str, Any] = {"vehicle": rec.ids[column], "fixes": int(np.isfinite(fix).sum())}
@@ -74,22 +74,22 @@ def check_poses(log: Log) -> PoseCheck:
         row["heading_std_deg"] = float(np.rad2deg(np.sqrt(track.heading_covariance[0, :, k, 3])).mean())
         row |= _errors(log, track, k)
         vehicles.append(row)
-        apart = frame_doubt(rec, log.truth, column)
-        doubts += apart
+        apart = frame_warning(rec, log.truth, column)
+        warnings += apart
         if not apart and row.get("nees", 0.0) > INCONSISTENT:
             larger = np.sqrt(row["nees"] / 3)
-            doubts.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
+            warnings.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
     measurements = []
     for name, unit, residual, std in _residuals(rec, track):
         spread = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
         row = {"measurement": name, "unit": unit, "number": len(residual), "median": float(np.median(residual))}
         measurements.append(row | {"robust_std": spread, "stated_std": std})
         if max(spread, abs(row["median"])) > WRONG * std:
-            doubts.append(
+            warnings.append(
                 f"{name}s miss the filter's estimates by {row['median']:.3g} +- {spread:.3g} {unit}, {std:.3g} stated: "
                 "turned, mirrored, in other units, of another partner, or less certain than stated."
             )
-    return PoseCheck(log, f"{span}{start}", track, vehicles, measurements, doubts)
+    return PoseCheck(log, f"{span}{start}", track, vehicles, measurements, warnings)
 
 
 def together(log: Log) -> tuple[Log, str]:

@@ -45,7 +45,7 @@ def assumed(
 ) -> Sensors:
     """Sensors of a log: those that are given, else the root mean square of the logged standard deviations of each kind.
 
-    A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and said.
+    A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
     """
     flat = PLANE_STD if planar else None
     if sensors is not None:

@@ -145,7 +145,11 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
         used.append("message")
     if not used:
         raise _no_column(file, "kind", frame)
-    known = {*LONG, *used, *(f"{kind}_std" for kind in used)}
+    frame = _own_std(frame, used, tally, file)
+    groups = {KINDS[kind].group for kind in used}
+    known = {"t", "vehicle", *used, *(f"{kind}_std" for kind in used)}
+    known |= {"partner"} if groups & {"relative", "message"} else set()
+    known |= {"arrival"} if "message" in used else set()
     for column in frame.columns:
         if column not in known:
             tally.unused(f"{file}: column {column}", len(frame))
@@ -169,6 +173,19 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
             )
         )
     return stacked(parts)
+
+
+def _own_std(frame: pd.DataFrame, used: Sequence[str], tally: Tally, file: str) -> pd.DataFrame:
+    """The table with a column `std`, which names no kind, as that of every kind where all of them are in metres."""
+    if "std" not in frame.columns:
+        return frame
+    alone = len(used) == 1 or all(KINDS[kind].group == "fix" for kind in used)
+    bare = [kind for kind in used if f"{kind}_std" not in frame.columns]
+    if not alone or not bare:
+        tally.unused(f"{file}: column std, which belongs to no kind (name it {used[0]}_std)", len(frame))
+        return frame.drop(columns="std")
+    tally.assume(f"column std of {file} is the standard deviation of each of {', '.join(bare)}")
+    return frame.assign(**{f"{kind}_std": frame["std"] for kind in bare}).drop(columns="std")
 
 
 def _checked(rows: Rows) -> Rows:

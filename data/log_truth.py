@@ -22,7 +22,7 @@ APART = 3.0
 """Standard deviations of a fix by which fixes and truth in one frame do not differ on average."""
 
 
-def frame_doubt(recording: Recording, truth: Fleet | None, column: int) -> list[str]:
+def frame_warning(recording: Recording, truth: Fleet | None, column: int) -> list[str]:
     """A sentence where the fixes of a vehicle lie beside its truth by more than their noise explains, as they do where
     the truth has another origin."""
     if truth is None:
@@ -58,11 +58,11 @@ def truth_of(rows: Rows, recording: Recording, max_gap: float | None, name: str,
             position[:, column] = interpolate(true.t - start, value, recording.t - start, gap)
         elif len(true.t) == 1:
             position[:, column] = np.nan_to_num(true.value[0])
-        facing, _ = samples(rows.take(rows.vehicle == one), ("heading",), Tally(), 1)
-        if len(facing.t) > 1:
-            value = np.unwrap(facing.value, axis=0)
-            gap = max_gap or max(5 * recording.dt, 0.5, 1.5 * facing.interval)
-            heading[:, column] = wrap(interpolate(facing.t - start, value, recording.t - start, gap)[:, 0])
+        headings, _ = samples(rows.take(rows.vehicle == one), ("heading",), Tally(), 1)
+        if len(headings.t) > 1:
+            value = np.unwrap(headings.value, axis=0)
+            gap = max_gap or max(5 * recording.dt, 0.5, 1.5 * headings.interval)
+            heading[:, column] = wrap(interpolate(headings.t - start, value, recording.t - start, gap)[:, 0])
     there = np.isfinite(position[..., 0])
     alone = there.copy()
     alone[1:] &= ~there[:-1]

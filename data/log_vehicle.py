@@ -141,7 +141,7 @@ def _motion(
     rate = turn if len(turn.t) > 1 else None
     derived = motion.velocity_of_fixes(fixes, motion.bridged(fixes, dt, max_gap)) if len(fixes.t) > 1 else None
     moves = ((world, "odometry"), (derived, "fixes"))
-    heading, source, course = facing(rows, rate, moves, dt, max_gap, tally)
+    heading, source, course = heading_from(rows, rate, moves, dt, max_gap, tally)
     if len(world.t):
         if len(speed.t):
             tally.refuse("speeds where a world velocity is given", len(speed.t), rows.place(first[0]))
@@ -172,7 +172,7 @@ def _motion(
     return derived, heading, ", ".join(filter(None, ["velocity derived from them", source])), course
 
 
-def facing(
+def heading_from(
     rows: Rows,
     rate: Signal | None,
     moves: Sequence[tuple[Signal | None, str]],

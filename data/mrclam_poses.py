@@ -6,17 +6,14 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.world.body import Body
-from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links
 from coopoc.world.recording import Recording
-from coopoc.world.sensing import schedule
 from coopoc.world.v2x import V2X
 
 from .mrclam import MrclamLog
 from .mrclam_calibration import Calibration, delayed
 from .mrclam_recording import kept
 from .nearest import nearest, steps_of
+from .planar import planar_recording
 
 
 def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
@@ -36,39 +33,19 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
     """
     robots, marks = log.fleet.ids, surveyed(log)
     ids = (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0]))
-    steps, n = len(log.fleet.t), len(robots)
-    place = np.column_stack([marks[:, 1:], np.zeros(len(marks))])
-    gnss = np.full((1, steps, len(ids), 3), np.nan)
-    gnss[:, :, n:] = place
-    velocity, rate = np.zeros(gnss.shape), np.zeros(gnss.shape[:3])
-    velocity[0, :, :n, 0] = known.speed * delayed(log, log.speed, known.lag)
-    rate[0, :, :n] = known.turn * delayed(log, log.turn_rate, known.lag)
-    table = np.vstack([_robots(log, v2x), _landmarks(log, n)])
-    table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
-    links = Links(*table[:, :3].astype(np.int64).T)
-    relative = np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None]
-    still = np.zeros((steps, len(ids), 3))
-    broadcasts, arrival = schedule(Fleet(ids, log.fleet.t, still, still), links, v2x, 1, 0)
-    arrival[:, links.neighbour >= n] = -1
-    broadcasts[:, n:] = False
-    return Recording(
-        ids=ids,
-        t=log.fleet.t,
-        gnss=gnss,
-        velocity=velocity,
-        links=links,
-        relative=relative,
-        broadcasts=broadcasts,
-        arrival=arrival,
-        sensors=known.sensors,
-        v2x=v2x,
-        observers=tuple(range(len(ids))),
-        notes=(
-            "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
-            "inclination was not measured: pi/2 by the constraint z = 0",
-        ),
-        body=Body(rate, np.full(rate.shape, np.nan)),
-        landmarks=tuple(range(n, len(ids))),
+    turn, forward = (
+        known.turn * delayed(log, log.turn_rate, known.lag),
+        known.speed * delayed(log, log.speed, known.lag),
+    )
+    return planar_recording(
+        ids,
+        log.fleet.t,
+        (np.stack([forward, np.zeros_like(forward)], axis=-1), turn),
+        marks[:, 1:],
+        np.vstack([_robots(log, v2x), _landmarks(log, len(robots))]),
+        known.sensors,
+        v2x,
+        ("odometry, ranges and bearings are real; no fix, no compass, nothing simulated",),
     )
 
 

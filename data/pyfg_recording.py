@@ -8,15 +8,14 @@ from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats.edges import PointEdges
 from coopoc.formats.graph import Graph
-from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
 from coopoc.world.frames import midway, turned
-from coopoc.world.links import Links
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from .nearest import nearest, steps_of
+from .planar import planar_recording
 from .rows import backward_difference
 
 FLAT = 0.01
@@ -46,52 +45,34 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
     if not end - begin >= 2 * dt:
         raise InputError("graph", repr(graph), "must hold robots that share two steps", "Give a smaller dt.")
     t = dt * np.arange(int((end - begin) / dt) + 1)
-    paths = [_chained(graph, name) for name in stamps]
     poses = [np.column_stack([graph.position[p], np.unwrap(graph.orientation[p, 0])]) for p in graph.robots.values()]
     path, truth = (
         np.stack([_at(t + begin, s, each) for s, each in zip(stamps.values(), found, strict=True)], axis=1)
-        for found in (paths, poses)
+        for found in ([_chained(graph, name) for name in stamps], poses)
     )
     marks = np.flatnonzero(~graph.is_pose & np.isfinite(graph.position).all(axis=1))
-    ids, robots = (*stamps, *(graph.names[k] for k in marks)), len(stamps)
-    place = np.broadcast_to(np.column_stack([graph.position[marks], 0 * marks]), (len(t), len(marks), 3))
+    ids = (*stamps, *(graph.names[k] for k in marks))
     moved = np.diff(path, axis=0, prepend=path[:1]) / dt
     flat = np.concatenate([moved[..., :2], 0 * moved[..., :1]], axis=2)
-    velocity = np.concatenate([turned(flat, -midway(path[..., 2])), 0 * place], axis=1)[None]
-    rate = np.concatenate([moved[..., 2], 0 * place[..., 0]], axis=1)[None]
-    gnss = np.concatenate([np.full((len(t), robots, 3), np.nan), place], axis=1)[None]
-    table = _relative(graph, (marks, robots), begin, t)
-    links = Links(*table[:, :3].astype(np.int64).T)
-    relative = np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None]
-    position = np.concatenate([np.append(truth[..., :2], 0 * truth[..., :1], axis=2), place], axis=1)
-    fleet = Fleet(
+    recording = planar_recording(
         ids,
         t,
-        position,
-        backward_difference(t, position, ids),
-        name="pyfg",
-        heading=np.concatenate([truth[..., 2], 0 * place[..., 0]], axis=1),
+        (turned(flat, -midway(path[..., 2]))[..., :2], moved[..., 2]),
+        graph.position[marks],
+        _relative(graph, (marks, len(stamps)), begin, t),
+        _sensors(graph, dt),
+        V2X(max_neighbours=len(stamps) - 1, radius=float("inf")),
+        ("odometry and relative measurements are real; no fix, no compass",),
     )
-    recording = Recording(
-        ids=ids,
-        t=t,
-        gnss=gnss,
-        velocity=velocity,
-        links=links,
-        relative=relative,
-        broadcasts=np.broadcast_to(np.arange(len(ids)) < robots, (len(t), len(ids))),
-        arrival=np.where(links.neighbour < robots, links.step, -1)[None],
-        sensors=_sensors(graph, dt),
-        v2x=V2X(max_neighbours=max(robots - 1, 0), radius=float("inf")),
-        observers=tuple(range(len(ids))),
-        notes=(
-            "odometry and relative measurements are real; no fix, no compass",
-            "inclinations are pi/2: all is in one plane",
-        ),
-        body=Body(rate, np.full(rate.shape, np.nan)),
-        landmarks=tuple(range(robots, len(ids))),
-    )
-    return recording, fleet
+    return recording, _truth(ids, t, truth, graph.position[marks])
+
+
+def _truth(ids: tuple[str, ...], t: Floats, poses: Floats, marks: Floats) -> Fleet:
+    """Of the robots' poses (T, n, 3) m, m, rad, and of landmarks (m, 2) m, which stand."""
+    place = np.broadcast_to(np.column_stack([marks, 0 * marks[:, :1]]), (len(t), len(marks), 3))
+    position = np.concatenate([np.append(poses[..., :2], 0 * poses[..., :1], axis=2), place], axis=1)
+    heading = np.concatenate([poses[..., 2], 0 * place[..., 0]], axis=1)
+    return Fleet(ids, t, position, backward_difference(t, position, ids), name="pyfg", heading=heading)
 
 
 def _chained(graph: Graph, robot: str) -> Floats:
@@ -133,8 +114,7 @@ def _relative(graph: Graph, who: tuple[Ints, int], begin: float, t: Floats) -> F
     )
     step, late = steps_of(np.append(points.stamps, ranges.stamps) - begin, t[1] - t[0], len(t))
     order = nearest(late, step, np.where(ends[:, 0] < robots, ends[:, 0], -1), ends[:, 1])
-    table = np.column_stack([step, ends, value])[order]
-    return np.asarray(table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))])
+    return np.asarray(np.column_stack([step, ends, value])[order])
 
 
 def _vectors(graph: Graph) -> PointEdges:

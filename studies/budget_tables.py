@@ -48,7 +48,7 @@ COUNTS: tuple[tuple[Kind, Way], ...] = (
     ("on air", "broadcast"),
 )
 CROWD = 300
-"""Vehicles within the range of each other, as in a jam (methods.md section 9.4)."""
+"""Vehicles within the range of each other, as in a jam: 350 B each at 10 Hz are 8.4 Mb/s, and the channel has 6."""
 
 
 def way(channel: str, k: int, **limits: Any) -> dict[str, Any]:

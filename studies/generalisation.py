@@ -88,7 +88,7 @@ def _caption(results: Results) -> str:
     return (
         "rms RT-LE as a multiple of the oracle Kalman filter's in the same place and noise. Trained on "
         f"{kept['clients']}; training noise 1.5 m and 10 %, scenario 1: 1.8 m with a bias, 15 %; scenario 2: 3.5 m, 15 "
-        f"% unless said. {kept['runs']} runs, five egos, {kept['train_seeds']} training seeds, no neighbours."
+        f"% unless stated. {kept['runs']} runs, five egos, {kept['train_seeds']} training seeds, no neighbours."
     )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from .survey import ended, stages
+from .survey import ended, reported, stages
 
 
 def paper(
@@ -28,15 +28,24 @@ def paper(
     from coopoc.data.registry import DATASETS
     from coopoc.study.report import report
 
-    began, names = time.perf_counter(), ("convergence", "error_cdf", "neighbours")
-    found = stages(names, out, jobs, {"data": data})
+    began = time.perf_counter()
+    found = stages(tuple(ANSWERS), out, jobs, {"data": data})
     cards = {
         name: DATASETS[name].card().fields() for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS
     }
-    page = report([out / name for name in names], out / "report.html", title=TITLE, lead=lead(data), cards=cards)
+    answers = {found[name].question: reported(name, found[name], keys) for name, keys in ANSWERS.items()}
+    given = {question: answer for question, answer in answers.items() if answer}
+    folders = [out / name for name in ANSWERS]
+    page = report(folders, out / "report.html", title=TITLE, lead=lead(data), answers=given, cards=cards)
     return ended(began, found, page)
 
 
+ANSWERS = {
+    "convergence": ("centralised",),
+    "error_cdf": ("scenario 1", "scenario 2"),
+    "neighbours": ("identity", "fitted"),
+}
+"""Studies, and the keys of the findings that answer their questions: baselines with identity and with fitted noise."""
 TITLE = "Collaborative training against collaborative decision"
 
 

@@ -88,16 +88,21 @@ QUESTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 
 def answers(found: Mapping[str, Results]) -> dict[str, str]:
     """Question -> answer, from the results of the studies that were run."""
-    from coopoc.plugins import find
-
     given = {}
     for limit, words in LIMITS.items() if "budget" in found else ():
         given[f"Which method with {words}?"] = _under(found["budget"], limit)
     for name, (question, keys) in QUESTIONS.items():
         if name in found:
-            texts = find("coopoc.studies", name).found(found[name])
-            given[question] = " ".join(_sentence(texts[key]) for key in keys if key in texts)
+            given[question] = reported(name, found[name], keys)
     return {question: answer for question, answer in given.items() if answer}
+
+
+def reported(name: str, results: Results, keys: Sequence[str]) -> str:
+    """The findings of a study under these keys, one after the other."""
+    from coopoc.plugins import find
+
+    texts = find("coopoc.studies", name).found(results)
+    return " ".join(_sentence(texts[key]) for key in keys if key in texts)
 
 
 def _sentence(text: str) -> str:

@@ -120,7 +120,7 @@ def test_pose_filters_run_on_a_log_and_cooperation_helps(tmp_path: Path) -> None
 
 
 def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Path) -> None:
-    """One car has fixes; the others measure it and each other, and nobody has a compass."""
+    """One car has fixes; the others measure it and each other, and none has a compass."""
     folder = written(tmp_path / "log", noise=1.0, compass=False)
     frame = pd.read_csv(folder / "log.csv")
     frame[(frame["vehicle"].isin(["red", "mast"])) | ~frame["kind"].isin(["x", "y"])].to_csv(
@@ -210,7 +210,7 @@ def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
     truth[truth["vehicle"] == "blue"].assign(x=lambda frame: frame["x"] + 50).to_csv(folder / "truth.csv", index=False)
     found = check_poses(co.read_log(folder, frame="body"))
     assert ["error_m" in row for row in found.vehicles] == [row["vehicle"] == "blue" for row in found.vehicles]
-    assert ["blue: fixes lie -5" in doubt for doubt in found.doubts] == [True]
+    assert ["blue: fixes lie -5" in warning for warning in found.warnings] == [True]
 
 
 def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:

@@ -78,6 +78,23 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
     np.testing.assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
 
 
+def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path: Path) -> None:
+    t = np.arange(0, 10, 0.5)
+    fixes = pd.DataFrame({"t": t, "vehicle": "car", "x": 5 * t, "y": 0.0, "std": 2.5})
+    motion = pd.DataFrame({"t": t, "vehicle": "car", "vx": 5.0, "vy": 0.0})
+    (tmp_path / "log").mkdir()
+    write(fixes, tmp_path / "log" / "fixes.csv")
+    write(motion, tmp_path / "log" / "motion.csv")
+    log = read_log(tmp_path / "log")
+    assert log.recording.sensors.gnss_std[:2] == pytest.approx((2.5, 2.5))
+    assert any("std of fixes.csv is the standard deviation of each of x, y" in one for one in log.summary.assumed)
+    mixed = read_log(write(fixes.assign(vx=5.0, vy=0.0, value=1.0), tmp_path / "mixed.csv"))
+    assert mixed.recording.sensors.gnss_std[:2] == pytest.approx(co.Sensors().gnss_std[:2])
+    unused = " ".join(map(str, mixed.summary.unused))
+    assert "column std, which belongs to no kind (name it x_std)" in unused
+    assert "column value" in unused
+
+
 def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path: Path) -> None:
     """The observer turns at 0.5 rad/s and measures a road-side unit between the steps; closed form, there and at the
     step."""

@@ -185,7 +185,7 @@ def test_innovations_are_filterpys(folders: Path) -> None:
 
 def test_the_check_finds_nothing_wrong_where_nothing_is(folders: Path) -> None:
     found = check(read_log(folders / "with"))
-    assert found.doubts == ()
+    assert found.warnings == ()
     assert all(0.7 < row["nis"] < 1.3 for row in found.vehicles)
     (ranges,) = [row for row in found.measurements if row["measurement"] == "range"]
     assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
@@ -203,9 +203,9 @@ def test_a_picture_without_innovations_says_so(tmp_path: Path) -> None:
 def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> None:
     moved = truth(drive(4, gap=15.0)).assign(x=lambda frame: frame["x"] - 40, y=lambda frame: frame["y"] + 9)
     write(moved, tmp_path / "vicon.csv")
-    doubts = check(read_log(folders / "without", truth=tmp_path / "vicon.csv")).doubts
-    assert len(doubts) == 4
-    east, north = re.findall(r"lie (\S+) m east and (\S+) m north", doubts[0])[0]
+    warnings = check(read_log(folders / "without", truth=tmp_path / "vicon.csv")).warnings
+    assert len(warnings) == 4
+    east, north = re.findall(r"lie (\S+) m east and (\S+) m north", warnings[0])[0]
     assert float(east) == pytest.approx(40, abs=0.7)
     assert float(north) == pytest.approx(-9, abs=0.7)
 
@@ -232,14 +232,14 @@ WRONG = {
 def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
     kinds, change, message = WRONG[case]
     frame = _changed(long(seen(drive(4, gap=15.0)), messages=False), kinds, change)
-    doubts = check(read_log(write(frame, tmp_path / "log.csv"))).doubts
-    assert any(pd.Series([doubt]).str.contains(message, regex=True)[0] for doubt in doubts), doubts
+    warnings = check(read_log(write(frame, tmp_path / "log.csv"))).warnings
+    assert any(pd.Series([warning]).str.contains(message, regex=True)[0] for warning in warnings), warnings
 
 
 def test_stamps_in_milliseconds_are_found(tmp_path: Path) -> None:
     frame = long(seen(drive(4, gap=15.0)), messages=False)
     file = write(frame.assign(t=1000 * frame["t"]), tmp_path / "log.csv")
-    assert any("Is t in ms" in doubt for doubt in check(read_log(file, dt=100, max_gap=1e4)).doubts)
+    assert any("Is t in ms" in warning for warning in check(read_log(file, dt=100, max_gap=1e4)).warnings)
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
@@ -264,8 +264,8 @@ def test_velocities_clockwise_from_north_are_found(tmp_path: Path) -> None:
     frame = long(seen(drive(4, gap=15.0)), messages=False)
     x, y = (frame["kind"] == "vx").to_numpy(), (frame["kind"] == "vy").to_numpy()
     swapped = frame.assign(kind=np.where(x, "vy", np.where(y, "vx", frame["kind"])))
-    doubts = check(read_log(write(swapped, tmp_path / "log.csv"))).doubts
-    assert any("anticlockwise of the odometry" in doubt for doubt in doubts)
+    warnings = check(read_log(write(swapped, tmp_path / "log.csv"))).warnings
+    assert any("anticlockwise of the odometry" in warning for warning in warnings)
 
 
 def shell(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -65,7 +65,7 @@ def test_marginals_of_a_star_are_those_of_the_dense_inverse(problem: Problem) ->
     scheme, frame = structure(problem)
     assert frame.star is not None
     blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in problem.factors])
-    cov, dx = marginals(frame, blocks, gradient, many=True)
+    cov, dx = marginals(frame, blocks, gradient)
     for b in range(RUNS):
         J = problem.jacobian(linear, b).toarray()
         inverse = np.linalg.inv(J.T @ J)

@@ -13,6 +13,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import random_graph
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
@@ -22,6 +23,7 @@ from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.arrowhead import structure
+from coopoc.optimize.assess import SMALL, assess
 from coopoc.optimize.backends.gtsam_forms import forms
 from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, values, which_turn
 from coopoc.optimize.curvature import matrix, newton_decrease, true_blocks
@@ -31,7 +33,6 @@ from coopoc.optimize.fuse import fused
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.linear_start import linear_start, project
 from coopoc.optimize.local_problem import LocalProblem
-from coopoc.optimize.marginals import bayes_tree_marginals
 from coopoc.optimize.race import expected
 from coopoc.optimize.search import Search
 from coopoc.optimize.sparse import Sparse, _made, sparse
@@ -290,6 +291,21 @@ def test_marginals_are_those_of_gtsams_bayes_tree(dimension: int) -> None:
     still = ~problem.movable
     theirs[still[:, :, None] | still[:, None, :]] = 0.0
     assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
+
+
+def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_bayes_tree() -> None:
+    """A graph with a constraint is not evaluated by tapes, and too large here for a dense inverse."""
+    problem = from_graph(random_graph(215, 2, steps=110))
+    x = solve(problem).x
+    first, last = problem.names[0], problem.names[-1]
+    found = assess(problem.constrain("range", (first, last), upper=1e6), x)
+    still = ~problem.movable
+    theirs = bayes_tree_marginals(problem.whiten(x)[1], still, len(problem.names), problem.space.dof)
+    theirs[still[:, :, None] | still[:, None, :]] = 0.0
+    assert len(problem.names) > SMALL
+    assert found.active is not None
+    assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
+    assert found.remaining < 1e-6
 
 
 @pytest.mark.parametrize("seed", [212, 213, 214])

@@ -1,7 +1,7 @@
 """Real logs and graphs with the mistakes that people make: each is refused, or named by `check`, or known as invisible.
 
 The data are MR.CLAM 6 (Vicon, wheels, cameras), CATS (receivers on a road) and the graph mrclam5a; as they are, `check`
-has no doubt that another test does not know.
+has no warning that another test does not know.
 """
 
 from __future__ import annotations
@@ -106,9 +106,9 @@ CLAM: dict[str, tuple[Edit, str]] = {
 
 
 def said(read: Callable[[], Any]) -> list[str]:
-    """The error of a reader, or the doubts of the check."""
+    """The error of a reader, or the warnings of the check."""
     try:
-        return list(check(read()).doubts)
+        return list(check(read()).warnings)
     except co.InputError as error:
         return [str(error)]
 
@@ -120,14 +120,14 @@ def test_a_mistake_in_mrclam_is_named(clam: Path, tmp_path: Path, mistake: str) 
         (tmp_path / file.name).write_bytes(file.read_bytes())
     edit(tmp_path)
     found = said(lambda: load_log(tmp_path))
-    assert any(re.search(message, doubt) for doubt in found), found
+    assert any(re.search(message, warning) for warning in found), found
 
 
-def test_mrclam_as_it_is_raises_no_doubt_and_a_mark_of_its_encoding_changes_nothing(clam: Path, tmp_path: Path) -> None:
+def test_mrclam_as_it_is_raises_no_warning_and_a_byte_order_mark_changes_nothing(clam: Path, tmp_path: Path) -> None:
     for file in clam.glob("*.dat"):
         (tmp_path / file.name).write_bytes(b"\xef\xbb\xbf" + file.read_bytes())
     marked, plain = load_log(tmp_path), load_log(clam)
-    assert check(plain).doubts == ()
+    assert check(plain).warnings == ()
     np.testing.assert_array_equal(marked.recording.relative, plain.recording.relative)
 
 
@@ -173,7 +173,7 @@ def test_a_mistake_in_nmea_of_a_receiver(shared: Path, tmp_path: Path, mistake: 
     if mistake in NMEA:
         assert NMEA[mistake][1] in found[0]
     else:
-        assert all("smaller than stated" in doubt for doubt in found)
+        assert all("smaller than stated" in warning for warning in found)
 
 
 def without_stamps(part: Any) -> Any:

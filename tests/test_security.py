@@ -394,7 +394,7 @@ def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row() -> None:
     assert "</" not in text.replace(r"\<", "")
     assert "<!" not in text.replace(r"\<", "")
     assert "2 < 3" in text
-    assert len(text.split("\n\n")[0].splitlines()) == 4
+    assert len(text.split("\n\n")[1].splitlines()) == 4
     assert not any(line.startswith("#") for line in text.splitlines())
 
 

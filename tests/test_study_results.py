@@ -107,7 +107,7 @@ def test_the_bound_is_not_the_best_under_any_knowledge(rows: list[dict[str, Any]
     frame = pd.DataFrame(rows).assign(rt_le_m=lambda f: np.where(f["method"] == "bound", 0.1, f["rt_le_m"]))
     table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m", intervals=False)
     assert table.header[-1] == "Cramér-Rao bound, nominal"
-    for line in table.to_markdown().splitlines()[2:4]:
+    for line in table.to_markdown().splitlines()[4:6]:
         assert line.count("**") == 2
         assert "**" not in line.split("|")[-2]
 

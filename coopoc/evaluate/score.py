@@ -118,15 +118,15 @@ def scores(
         error = np.linalg.norm(moved.position - truth.position, axis=1)
         relative = None
         stamps = estimates[name].t + offset, named[name].t
-        said = remarks(stamps, (estimate.position, truth.position), max_diff)
+        found = remarks(stamps, (estimate.position, truth.position), max_diff)
         if len(ends(estimate.position, delta, unit)) < 2:
-            said = (*said, f"no relative error: the drive is shorter than {delta:g} {unit}.")
+            found = (*found, f"no relative error: the drive is shorter than {delta:g} {unit}.")
         elif estimate.rotation is not None and truth.rotation is not None:
             both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
             relative = float(np.sqrt(np.square(relative_error(*both, delta, unit)).mean()))
         missed = len(estimates[name].t) - len(raw)
         spread = (rms_interval(raw, blocks), rms_interval(error, blocks), float(error.max()))
-        rows.append(Score(name, len(raw), missed, *spread, relative, _nees(moved, truth), said))
+        rows.append(Score(name, len(raw), missed, *spread, relative, _nees(moved, truth), found))
     return rows
 
 

@@ -1,1 +1,1 @@
-"""Compiled kernels: the same answers as the NumPy code that they stand beside, in machine code, float64."""
+"""Compiled kernels: the mathematics of every method, in machine code and float64; tests hold them against oracles."""

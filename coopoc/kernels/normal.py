@@ -1,4 +1,4 @@
-"""Normal equations J^T J dx = -J^T r in square blocks: the compiled twin of `coopoc.optimize.normal`."""
+"""Normal equations J^T J dx = -J^T r in square blocks, summed measurement by measurement."""
 
 from __future__ import annotations
 

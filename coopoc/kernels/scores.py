@@ -1,4 +1,4 @@
-"""Errors and NEES of a track in one pass: the compiled twin of `coopoc.evaluate.metrics`."""
+"""Errors and NEES of a track in one pass."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Marginals of stars, whose nodes only meet at a separator: the compiled twin of `coopoc.optimize.arrowhead`."""
+"""Marginals of stars, whose nodes only meet at a separator of one node."""
 
 from __future__ import annotations
 

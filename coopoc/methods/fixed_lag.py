@@ -32,22 +32,27 @@ BACKENDS = ("gauss-newton", "gtsam")
 class FixedLagSmoother:
     """The joint filter's star over the steps t-lag..t, given what the steps before left when they were eliminated.
 
-    At every step one Gauss-Newton step of the window: heldings are made linear anew at the smoothed points, the oldest
-    step is eliminated into the prior of the next, D - D (J + D)^-1 D with D the stiffness of the motion, and the newest
-    point is the estimate: causal, and in a linear model the filter's own for every lag (performance.md section 1.2). A
-    lag of 0 is JointFilter, but for measured ranges below `min_range`, whose angles are widened here (`relative_std`).
-    Messages are brought forward as there; MovingHorizon puts them at their true time.
+    At every step one Gauss-Newton step of the window: its measurements are linearised anew at the smoothed points, the
+    oldest step is eliminated into the prior of the next, D - D (J + D)^-1 D with D the information of the motion, and
+    the newest point is the estimate: causal, and in a linear model the filter's own for every lag. A lag of 0 is
+    JointFilter, but for measured ranges below `min_range`, whose angles are widened here (`relative_std`). Messages are
+    brought forward as there; MovingHorizon puts them at their true time.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         lag: steps.
         backend: "gauss-newton", batched over the runs, or "gtsam", its incremental fixed-lag smoother, which loops over
-            the runs and makes each helding linear once, when it comes.
+            the runs and linearises each measurement once, when it comes.
         smoothed: answer each step when it leaves the window, `lag` steps late; the last ones at the end of the drive.
-        exact: False keeps heldings as converted vectors.
+        exact: False keeps relative measurements as converted vectors.
 
     Raises:
-        InputError: a lag < 0, another backend. MissingLibraryError: no gtsam.
+        InputError: a lag < 0, another backend.
+        MissingLibraryError: gtsam is not installed.
+
+    References:
+        Sibley, Matthies, Sukhatme, Sliding window filter with application to planetary landing, Journal of Field
+        Robotics 27(5), 2010.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))

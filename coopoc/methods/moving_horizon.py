@@ -34,7 +34,7 @@ MOVING = "windows were still moving after 11 Gauss-Newton steps"
 class MovingHorizon:
     """argmin over x_{t-N..t} of |x_{t-N} - x_a|^2_{P^-1} + sum |x_{k+1} - x_k - dt u_k|^2 + sum |h(x_k) - z_k|^2.
 
-    x holds the ego and the neighbours of its star at each step (methods.md section 6.9). The arrival cost (x_a, P) is
+    x holds the ego and the neighbours of its star at each step. The arrival cost (x_a, P) is
     what the steps before the horizon leave when they are eliminated one by one, as a filter does. A message that comes
     late is put where it belongs: its fix at the step at which it was sent, its velocity in the place of the older one
     that stood in for it. A velocity that stands in n times makes the same error n times (see star_steps). A fix that is

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from .constraint import Constraint, values
+from .constraint import bounded, values
 from .local import chain, local
 from .problem import Problem
 
@@ -70,20 +70,6 @@ class Active:
     def holds(self) -> bool:
         """True if any direction is taken away."""
         return bool(self.along.shape[1] < self.along.shape[0])
-
-
-def bounded(constraint: Constraint) -> Bools:
-    """(M, size) True where a side is finite."""
-    return np.asarray(np.isfinite(constraint.lower) | np.isfinite(constraint.upper))
-
-
-def steerable(problem: Problem, constraint: Constraint) -> Bools:
-    """(M, size) True where a side is finite and a node can move: the rows that a solver gets."""
-    free = problem.movable
-    if free is None:
-        return bounded(constraint)
-    moves = np.asarray(free[constraint.nodes].any(axis=(1, 2)))
-    return np.asarray(bounded(constraint) & moves[:, None])
 
 
 def constraint_rows(problem: Problem, x: Floats) -> Rows:

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from .linear import opposite
 from .normal import Pattern, pattern
 from .problem import Problem
 
@@ -60,16 +59,16 @@ class Arrow:
 
 def structure(problem: Problem) -> tuple[Pattern, Arrow]:
     """Pattern and arrowhead of a problem, kept for the next problems of the same structure: a drive has few."""
-    factors = tuple((f.nodes.shape[1], f.nodes.tobytes(), opposite(f, problem.movable)) for f in problem.factors)
+    factors = tuple((f.nodes.shape[1], f.nodes.tobytes()) for f in problem.factors)
     still = b"" if problem.movable is None else (~problem.movable).tobytes()
     return _structure(len(problem.names), problem.space.dof, problem.separator, factors, still)
 
 
 @lru_cache(maxsize=512)
 def _structure(
-    n: int, dof: int, separator: tuple[int, ...], factors: tuple[tuple[int, bytes, bool], ...], still: bytes
+    n: int, dof: int, separator: tuple[int, ...], factors: tuple[tuple[int, bytes], ...], still: bytes
 ) -> tuple[Pattern, Arrow]:
-    nodes = [(np.frombuffer(raw, np.int64).reshape(-1, arity), signs) for arity, raw, signs in factors]
+    nodes = [np.frombuffer(raw, np.int64).reshape(-1, arity) for arity, raw in factors]
     scheme = pattern(n, nodes, np.frombuffer(still, bool).reshape(n, dof) if still else None)
     return scheme, _arrow(np.array(separator or range(n), dtype=np.int64), scheme)
 
@@ -169,30 +168,27 @@ def eliminate(frame: Arrow, blocks: Floats, gradient: Floats, damping: Floats) -
     return dx
 
 
-def marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool = False) -> tuple[Floats, Floats]:
+def marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     """(B, n, dof, dof) diagonal blocks of (J^T J)^-1, and dx (B, n, dof) of J^T J dx = -gradient.
-
-    Args:
-        many: as of a Linear.
 
     Raises:
         numpy.linalg.LinAlgError: a singular block.
     """
     batch, d, n = len(blocks), blocks.shape[-1], len(frame.separator) + int((frame.group >= 0).sum())
-    if many and frame.star is not None:
+    if frame.star is not None:
         return _compiled(frame.star, blocks, gradient)
     corner, arm, head = _parts(frame, blocks, np.zeros((batch, n, d)))
     cov = np.empty((batch, n, d, d))
     dx, eta = np.empty_like(gradient), gradient[:, frame.separator].reshape(batch, -1, 1)
     if not frame.group.size:
-        separator = _inverse(corner, many)
+        separator = np.linalg.inv(corner)
         cov[:, frame.separator], dx[:, frame.separator] = _own(separator, d), -(separator @ eta).reshape(batch, -1, d)
         return cov, dx
     there = frame.group >= 0
     side = np.where(there[None, :, :, None], gradient[:, frame.group], 0.0).reshape(batch, len(frame.group), -1, 1)
-    inverse = _inverse(head, many)
+    inverse = np.linalg.inv(head)
     reduced = inverse @ arm
-    separator = _inverse(corner - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1), many)
+    separator = np.linalg.inv(corner - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1))
     transposed = reduced.swapaxes(-1, -2)
     step = separator @ ((transposed @ side).sum(axis=1) - eta)
     cov[:, frame.separator], dx[:, frame.separator] = _own(separator, d), step.reshape(batch, -1, d)
@@ -212,23 +208,6 @@ def _compiled(star: Star, blocks: Floats, gradient: Floats) -> tuple[Floats, Flo
     if not star_marginals(star, blocks, gradient, found, (0,) * d).all():
         raise np.linalg.LinAlgError("a block is not positive definite")
     return found
-
-
-def _inverse(matrix: Floats, many: bool) -> Floats:
-    """Of symmetric (..., m, m); many 3x3 by cofactors, found for all at once: twenty times faster than by LAPACK.
-
-    Raises:
-        numpy.linalg.LinAlgError: a singular one.
-    """
-    if matrix.shape[-1] != 3 or not many:
-        return np.linalg.inv(matrix)
-    (a, b, c), (_, d, e), (*_, f) = np.moveaxis(matrix, (-2, -1), (0, 1))
-    first, second, third = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * first + b * second + c * third
-    if (determinant == 0).any():
-        raise np.linalg.LinAlgError("Singular matrix")
-    rows = [first, second, third, second, a * f - c * c, b * c - a * e, third, b * c - a * e, a * d - b * b]
-    return np.asarray(np.stack(rows, axis=-1) / determinant[..., None]).reshape(matrix.shape)
 
 
 def _own(matrix: Floats, d: int) -> Floats:

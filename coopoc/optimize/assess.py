@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,9 +11,10 @@ import numpy as np
 from ..arrays import Bools, Floats
 from .active import Active, active_at
 from .arrowhead import marginals, structure
+from .cholesky import cholesky_of, with_still
+from .curvature import matrix as sparse_matrix
 from .dense import diagonal_blocks, is_small, normal_matrix
 from .linear import Linear
-from .marginals import bayes_tree_marginals
 from .normal import Pattern, normal_equations
 from .problem import Problem
 from .sparse import Sparse, sparse
@@ -25,8 +25,6 @@ CANCELLED = 1e-7
 """Share of its terms that a row may keep along a direction that it does not see."""
 SMALL = 200
 """Nodes up to which a problem without a separator is assessed densely."""
-LARGE = 1000
-"""Nodes beyond which GTSAM's Bayes tree finds the marginals: 10,000 poses take 0.3 s there, and 75 s by columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +136,7 @@ def _as_blocks(problem: Problem, linear: Linear) -> tuple[Floats, Marginals]:
         if problem.separator or len(gradient[0]) <= SMALL:
             cov, dx = (each[0] for each in marginals(frame, blocks, gradient))
         else:
-            cov, dx = _sparse(problem.jacobian(linear), gradient[0], scheme.still)
+            cov, dx = _sparse(sparse_matrix(scheme, blocks[0]), gradient[0])
         return cov, dx, bool(bounded(scheme, blocks, cov[None]).all())
 
     return gradient[0], unconstrained
@@ -154,13 +152,15 @@ def bounded(scheme: Pattern, blocks: Floats, cov: Floats) -> Bools:
     return sound
 
 
-def _sparse(J: Any, gradient: Floats, still: Bools | None) -> tuple[Floats, Floats]:
-    """Marginals (n, dof, dof) and Gauss-Newton step (n, dof) through one sparse factorisation."""
-    factored = factorise(J.T @ J, still)
-    dx = -factored.solve(gradient.ravel()).reshape(gradient.shape)
-    if len(gradient) > LARGE and find_spec("gtsam"):
-        return bayes_tree_marginals(J, still, *gradient.shape), dx
-    return _diagonal_blocks(factored.solve, *gradient.shape), dx
+def _sparse(matrix: Any, gradient: Floats) -> tuple[Floats, Floats]:
+    """Marginals (n, dof, dof) and Gauss-Newton step (n, dof) by one sparse factorisation of J^T J."""
+    cholesky = cholesky_of(matrix)
+    if cholesky is None:
+        raise np.linalg.LinAlgError("J^T J is not positive definite")
+    n, dof = gradient.shape
+    row = np.arange(n * dof).reshape(n, dof, 1).repeat(dof, axis=2)
+    cov = cholesky.inverse(row.ravel(), row.swapaxes(1, 2).ravel()).reshape(row.shape)
+    return cov, -cholesky.solve(gradient.ravel()).reshape(gradient.shape)
 
 
 def _restricted(J: Any, gradient: Floats, still: Bools | None, active: Active) -> tuple[Floats, Floats, bool]:
@@ -169,11 +169,7 @@ def _restricted(J: Any, gradient: Floats, still: Bools | None, active: Active) -
     With Z the directions that remain: cov = Z (Z^T J^T J Z)^-1 Z^T, and the step solves the same system after the least
     step onto what holds.
     """
-    hessian = J.T @ J
-    if still is not None:
-        from scipy.sparse import diags_array
-
-        hessian = hessian + diags_array(still.ravel().astype(np.float64))
+    hessian = with_still(J.T @ J, still)
     solve, _ = _within(hessian, active.along)
     dx = active.onto - solve(gradient.ravel() + hessian @ active.onto)
     solve, own = _within(hessian, active.exact)
@@ -189,18 +185,16 @@ def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats
     if not ways.shape[1]:
         return np.zeros_like, np.zeros(ways.shape[0])
     reduced = ways.T @ hessian @ ways
-    factored = factorise(reduced, None)
+    factored = factorise(reduced)
     return lambda rhs: ways @ factored.solve(ways.T @ rhs), (ways @ reduced @ ways.T).diagonal()
 
 
-def factorise(matrix: Any, still: Bools | None) -> Any:
-    """Sparse LU of a symmetric matrix, 1 added to the diagonal of what is `still`; LinAlgError if it is singular."""
-    from scipy.sparse import diags_array
+def factorise(matrix: Any) -> Any:
+    """Sparse LU of a symmetric matrix; LinAlgError if it is singular."""
     from scipy.sparse.linalg import splu
 
-    whole = matrix if still is None else matrix + diags_array(still.ravel().astype(np.float64))
     try:
-        return splu(whole.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
     except RuntimeError as singular:
         raise np.linalg.LinAlgError(str(singular)) from singular
 
@@ -246,7 +240,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
     if len(length) <= SMALL:
         values, ways = np.linalg.eigh(square.toarray())
         return np.asarray(ways[:, values <= 1e-10 * values.max(initial=1.0)].T)
-    factored = factorise(square + diags_array(np.full(len(length), 1e-12)), None)
+    factored = factorise(square + diags_array(np.full(len(length), 1e-12)))
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
         ways = np.linalg.qr(factored.solve(ways))[0]

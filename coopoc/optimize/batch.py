@@ -68,14 +68,16 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
     solver = known.solver(problem, options)
     scheme, frame = structure(problem)
     count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
-    per = max(1, CHUNK // (len(scheme.rows) + frame.group.size * max(len(frame.separator), 1)))
+    per = max(
+        1, CHUNK // (sum(place.size for place in scheme.places) + frame.group.size * max(len(frame.separator), 1))
+    )
     parts = []
     for first in range(0, count, per):
         part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
         end = solver(part, (somewhere if part.linear else initial_guess)(part))
         linear = part.linearise(end.x)
         blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in part.factors])
-        cov, left = _marginals(frame, blocks, gradient, linear.many)
+        cov, left = _marginals(frame, blocks, gradient)
         sound = bounded(scheme, blocks, cov)
         if part.movable is not None:
             cov *= part.movable[:, :, None] & part.movable[:, None, :]
@@ -97,12 +99,12 @@ def _repeated(found: Batch, problem: Problem, backend: Backend, options: Options
     return found
 
 
-def _marginals(frame: Arrow, blocks: Floats, gradient: Floats, many: bool) -> tuple[Floats, Floats]:
+def _marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
     """Marginals and Gauss-Newton steps of the realisations, NaN where one is singular."""
     try:
-        return marginals(frame, blocks, gradient, many)
+        return marginals(frame, blocks, gradient)
     except np.linalg.LinAlgError:
         if len(blocks) == 1:
             return np.full((*gradient.shape, blocks.shape[-1]), np.nan), np.full_like(gradient, np.nan)
-        each = [_marginals(frame, a[None], b[None], many) for a, b in zip(blocks, gradient, strict=True)]
+        each = [_marginals(frame, a[None], b[None]) for a, b in zip(blocks, gradient, strict=True)]
         return np.concatenate([cov for cov, _ in each]), np.concatenate([dx for _, dx in each])

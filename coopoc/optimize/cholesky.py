@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 
 
 class Cholesky:
@@ -57,6 +57,32 @@ class Cholesky:
 
         found = selected_inverse(self._fronts, self._factor)
         return found[places(self._fronts, self._rank[rows], self._rank[columns])]
+
+
+def cholesky_of(matrix: Any) -> Cholesky | None:
+    """Factors of a sparse symmetric matrix (SciPy's, any format), or None: it is not positive definite.
+
+    >>> from scipy.sparse import csc_array
+    >>> cholesky_of(csc_array([[2.0, 1.0], [1.0, 2.0]])).solve(np.array([3.0, 3.0])).round(6)
+    array([1., 1.])
+    >>> cholesky_of(csc_array([[1.0, 2.0], [2.0, 1.0]])) is None
+    True
+    """
+    from scipy.sparse import triu
+
+    upper = triu(matrix, format="csc")
+    upper.sort_indices()
+    if not (np.isfinite(upper.data).all() and (upper.diagonal() > 0).all()):
+        return None
+    cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64))
+    return cholesky if cholesky.factor(upper.data) else None
+
+
+def with_still(matrix: Any, added: Floats | Bools | None) -> Any:
+    """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
+    from scipy.sparse import diags_array
+
+    return matrix if added is None else matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
 
 
 def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:

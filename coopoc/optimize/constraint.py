@@ -89,3 +89,16 @@ def values(
     nothing: npt.NDArray[np.float64] = np.zeros((len(constraint.nodes), constraint.lower.shape[-1]))
     assert constraint.constants is not None
     return known.differentiate(vector, rotation, nothing, constraint.constants)
+
+
+def bounded(constraint: Constraint) -> Bools:
+    """(M, size) True where a side is finite."""
+    return np.asarray(np.isfinite(constraint.lower) | np.isfinite(constraint.upper))
+
+
+def steerable(constraint: Constraint, movable: Bools | None) -> Bools:
+    """(M, size) True where a side is finite and a node can move, `movable` (n, dof): the rows that a solver gets."""
+    if movable is None:
+        return bounded(constraint)
+    moves = np.asarray(movable[constraint.nodes].any(axis=(1, 2)))
+    return np.asarray(bounded(constraint) & moves[:, None])

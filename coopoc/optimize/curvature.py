@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from .arrowhead import structure
+from .cholesky import cholesky_of
 from .factor import Factor, unchecked
 from .linear import Linear, linearise, opposite
-from .normal import Pattern, assemble, normal_equations, squares
+from .normal import Pattern, assemble, normal_equations
 from .problem import Problem
 from .sparse import Sparse, sparse
 
@@ -77,8 +78,8 @@ def _by_tapes(system: Sparse, x: Floats) -> float | None:
 def _solved(scheme: Pattern, blocks: Floats, rhs: Floats) -> Floats | None:
     """H^-1 rhs of symmetric blocks (P, dof, dof); None unless H is positive definite."""
     if scheme.nodes > SMALL:
-        factored = pivots(matrix(scheme, blocks))
-        return None if factored is None else np.asarray(factored.solve(rhs))
+        factored = cholesky_of(matrix(scheme, blocks))
+        return None if factored is None else factored.solve(rhs)
     whole = dense(scheme, blocks)
     try:
         np.linalg.cholesky(whole)
@@ -99,7 +100,7 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
     own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
     at = np.arange(problem.space.dof)
     blocks[own[:, None], at, at] += damping[0, scheme.pairs[own, 0]]
-    factored = pivots(matrix(scheme, blocks))
+    factored = cholesky_of(matrix(scheme, blocks))
     if factored is None:
         raise np.linalg.LinAlgError("the cost curves downwards here")
     return np.asarray(-factored.solve(gradient.ravel()).reshape(gradient.shape))
@@ -108,16 +109,14 @@ def newton_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
 def true_blocks(problem: Problem, linear: Linear) -> Floats:
     """(P, dof, dof) blocks of the exact Hessian of a single problem, in the pattern's order."""
     x = linear.x[0]
-    parts = [part for k in range(len(problem.factors)) for part in _hessian(problem, k, x, linear)]
-    blocks: Floats = assemble(structure(problem)[0], parts)[0]
-    return blocks
+    return assemble(structure(problem)[0], [_hessian(problem, k, x, linear) for k in range(len(problem.factors))])
 
 
 def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats]:
-    """Second derivatives of what each measurement of a factor costs, as `squares` orders them: (1, M, dof, dof)."""
+    """Second derivatives (M, dof, dof) of what each measurement of a factor costs, as `assemble` takes them."""
     factor, jacobians = problem.factors[k], linear.jacobian[k]
     if factor.measurement.linear and factor.loss is None:
-        return squares(Linear(linear.x, (linear.residual[k],), (jacobians,), linear.cost), [factor.nodes])
+        return _squares([np.broadcast_to(s[0], (len(factor.nodes), *s.shape[2:])) for s in jacobians], factor.nodes)
     pair, opposed = factor.nodes.shape[1] == 2, opposite(factor, problem.movable)
     count, dof = len(factor.nodes), problem.space.dof
     local, bare = x[factor.nodes], unchecked(factor, loss=None)
@@ -138,10 +137,22 @@ def _hessian(problem: Problem, k: int, x: Floats, linear: Linear) -> list[Floats
             problem, factor, whole, x, _gradients(problem, bare, local, np.zeros((1, count, arity, dof)))[0]
         )
     if not pair or opposed:
-        return [whole[None]]
+        return [whole]
     first, second, between = whole[:, :dof, :dof], whole[:, dof:, dof:], whole[:, :dof, dof:]
-    swapped = (factor.nodes[:, 0] > factor.nodes[:, 1])[:, None, None]
-    return [first[None], second[None], np.where(swapped, np.swapaxes(between, 1, 2), between)[None]]
+    return [first, second, _ordered(between, factor.nodes)]
+
+
+def _squares(jacobians: list[Floats], nodes: Ints) -> list[Floats]:
+    """S_i^T S_i of the derivatives (M, size, dof) by one node, or also S_j^T S_j and S_i^T S_j (i the smaller)."""
+    products: list[Floats] = [np.swapaxes(s, 1, 2) @ s for s in jacobians]
+    if len(jacobians) == 2:
+        products.append(_ordered(np.swapaxes(jacobians[0], 1, 2) @ jacobians[1], nodes))
+    return products
+
+
+def _ordered(between: Floats, nodes: Ints) -> Floats:
+    """Blocks (M, dof, dof) of two nodes, rows of the smaller one."""
+    return np.where((nodes[:, 0] > nodes[:, 1])[:, None, None], np.swapaxes(between, 1, 2), between)
 
 
 def _with_loss(problem: Problem, factor: Factor, whole: Floats, x: Floats, gradient: Floats) -> Floats:
@@ -175,22 +186,6 @@ def _gradients(problem: Problem, factor: Factor, local: Floats, step: Floats) ->
         jacobians = jacobians[1:]
     parts = [(np.swapaxes(s, -1, -2) @ residual[..., None])[..., 0] for s in jacobians]
     return np.concatenate(parts, axis=-1)
-
-
-def pivots(matrix: Any) -> Any:
-    """Factors of a sparse symmetric matrix if all pivots of its L D L^T are positive, else None."""
-    from scipy.sparse.linalg import splu
-
-    if not np.isfinite(matrix.data).all():
-        return None
-    try:
-        factored = splu(
-            matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
-    except RuntimeError:  # a pivot of exactly zero
-        return None
-    symmetric = np.array_equal(factored.perm_r, factored.perm_c)
-    return factored if symmetric and (factored.U.diagonal() > 0).all() else None
 
 
 def dense(scheme: Pattern, blocks: Floats) -> Floats:

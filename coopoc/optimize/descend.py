@@ -145,16 +145,16 @@ def _promised(problem: Problem, linear: Linear, dx: Floats, added: Floats, exact
 
     1/2 |r|^2 - 1/2 |r + J dx|^2 takes any step, of a constrained programme too; the other takes Newton's only.
     """
-    slope, bend = np.zeros(len(dx)), np.zeros(len(dx))
+    directional, curvature = np.zeros(len(dx)), np.zeros(len(dx))
     for factor, r, jacobians in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
         moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(jacobians, factor.nodes.T, strict=True))
         moved = np.broadcast_to(moved, r.shape)
-        slope += np.einsum("bmk,bmk->b", r, moved)
+        directional += np.einsum("bmk,bmk->b", r, moved)
         if not exact:
-            bend += np.einsum("bmk,bmk->b", moved, moved)
+            curvature += np.einsum("bmk,bmk->b", moved, moved)
     if exact:
-        bend = -slope - np.einsum("bni,bni->b", added, dx * dx)
-    return -slope - 0.5 * bend
+        curvature = -directional - np.einsum("bni,bni->b", added, dx * dx)
+    return -directional - 0.5 * curvature
 
 
 def _share(before: Floats, after: Floats, promised: Floats, exact: bool) -> Floats:

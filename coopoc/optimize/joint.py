@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from .assess import factorise
+from .cholesky import cholesky_of, with_still
 from .problem import Problem
 from .sparse import sparse
 
@@ -74,8 +74,7 @@ def _solver(problem: Problem, x: Floats) -> tuple[Ints, Callable[[Floats], Float
     shape = len(problem.names), problem.space.dof
     still = None if problem.movable is None else ~problem.movable
     number = np.arange(shape[0] * shape[1]).reshape(shape)
-    try:
-        factored = factorise(J.T @ J, still)
-    except np.linalg.LinAlgError:
-        raise free from None
+    factored = cholesky_of(with_still(J.T @ J, still))
+    if factored is None:
+        raise free
     return number if still is None else np.where(still, -1, number), factored.solve

@@ -10,8 +10,9 @@ import numpy as np
 from ..arrays import Floats
 from .active import Active, constraint_rows
 from .arrowhead import structure
+from .cholesky import cholesky_of
 from .constraint import Constraint, values
-from .curvature import SLACK, STEP, is_minimum, matrix, pivots, true_blocks
+from .curvature import SLACK, STEP, is_minimum, matrix, true_blocks
 from .local import chain, local
 from .problem import Problem
 from .space import Space
@@ -35,7 +36,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
     curved = cost + _constraint_curvature(problem, x, active.multipliers)
     curved = curved + SLACK * diags_array(np.asarray(J.multiply(J).sum(axis=0)).ravel())
     within = active.along.T @ curved @ active.along
-    return not within.shape[0] or pivots(within) is not None
+    return not within.shape[0] or cholesky_of(within) is not None
 
 
 def _constraint_curvature(problem: Problem, x: Floats, multipliers: Floats) -> Any:

@@ -26,20 +26,17 @@ class Linear:
         residual: per factor (B, M, size).
         jacobian: per factor and node (B or 1, M or 1, size, dof).
         cost: (B,) 1/2 sum of rho.
-        many: of a problem with realisations, whose normal equations kernels may compute; how many take part must not
-            decide that, since a realisation's digits shall not depend on the others.
     """
 
     x: Floats
     residual: tuple[Floats, ...]
     jacobian: tuple[tuple[Floats, ...], ...]
     cost: Floats
-    many: bool = False
 
     def pick(self, which: Bools | Ints) -> Linear:
         """The realisations `which` of B."""
         jacobian = tuple(tuple(s[which] if len(s) > 1 else s for s in nodes) for nodes in self.jacobian)
-        return Linear(self.x[which], tuple(r[which] for r in self.residual), jacobian, self.cost[which], self.many)
+        return Linear(self.x[which], tuple(r[which] for r in self.residual), jacobian, self.cost[which])
 
     def by_node(self, factors: Sequence[Factor]) -> list[tuple[Floats, ...]]:
         """Per factor one derivative for each of its nodes."""
@@ -49,7 +46,7 @@ class Linear:
         ]
 
 
-def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats, many: bool = False) -> Linear:
+def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats) -> Linear:
     """Factors around x (B, n, ambient); what is not `movable` (n, dof) has no derivative."""
     residuals, jacobians, cost = [], [], np.zeros(len(x))
     for factor in factors:
@@ -65,7 +62,7 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
             jacobian = _masked(factor, jacobian, movable)
         residuals.append(residual)
         jacobians.append(jacobian)
-    return Linear(x, tuple(residuals), tuple(jacobians), cost, many)
+    return Linear(x, tuple(residuals), tuple(jacobians), cost)
 
 
 def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:

@@ -234,7 +234,7 @@ class Problem:
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (B, n, ambient)."""
-        return linearise(self.space, self.factors, self.movable, x, self.batch is not None)
+        return linearise(self.space, self.factors, self.movable, x)
 
     def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
         """Residual r (rows,) and sparse Jacobian J (rows, n dof) of a single problem at x (n, ambient): cost = 1/2 r.r.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from .active import steerable
+from .constraint import steerable
 from .losses import Loss
 from .measurements import Measurement
 from .problem import Problem
@@ -73,7 +73,8 @@ def structure_of(problem: Problem) -> Structure:
     """The structure of a problem."""
     factors = (Term(f.measurement, f.nodes.tobytes(), f.std is None, f.loss) for f in problem.factors)
     constraints = (
-        Term(c.measurement, c.nodes.tobytes(), steered=steerable(problem, c).tobytes()) for c in problem.constraints
+        Term(c.measurement, c.nodes.tobytes(), steered=steerable(c, problem.movable).tobytes())
+        for c in problem.constraints
     )
     fixed = b"" if problem.movable is None else (~problem.movable).tobytes()
     return Structure(len(problem.names), problem.space, fixed, tuple(factors), tuple(constraints))

@@ -138,7 +138,7 @@ def _remove_others(folder: Path, made: Mapping[str, list[dict[str, Any]]]) -> No
 def _save_table(table: Table, path: Path) -> dict[str, Any]:
     for form, suffix in FORMATS.items():
         store.write(Path(f"{path}.{suffix}"), table.render(form))
-    return {"caption": " ".join(table.below), "table": vars(table)}
+    return {"caption": " ".join(table.words), "table": vars(table)}
 
 
 def _save_figure(plot: Any, path: Path) -> dict[str, Any]:

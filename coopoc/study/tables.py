@@ -30,7 +30,7 @@ class Table:
     Args:
         header: column titles, with units.
         rows: entries, as many per row as titles.
-        caption: with the noise settings; it goes under the table in every format.
+        caption: with the noise settings; it goes above the table in every format.
         best: "min" or "max": the number in bold.
         along: "row" or "column": where the best number is sought.
         unranked: row labels and titles (or parts of a title between commas) that are never the best: bounds, oracles.
@@ -42,11 +42,11 @@ class Table:
         InputError: a row of another length than the header.
 
     >>> print(Table(("K", "KF"), ((1, Interval(0.8, 0.75, 0.85, 30)),), "RT-LE [m].").to_markdown())
+    RT-LE [m].
+    <BLANKLINE>
     |   K |                KF |
     |----:|------------------:|
     |   1 | 0.80 [0.75, 0.85] |
-    <BLANKLINE>
-    RT-LE [m].
     """
 
     header: tuple[str, ...]
@@ -89,7 +89,7 @@ class Table:
         return text
 
     def to_markdown(self) -> str:
-        """GitHub Markdown, best in bold, caption and notes below."""
+        """GitHub Markdown, best in bold, the caption above and notes below."""
         bold = self._bold()
         body = [
             [_mark(markdown(self.text(e)), (i, j) in bold, "**{}**") for j, e in enumerate(row)]
@@ -97,7 +97,8 @@ class Table:
         ]
         header, sides = [markdown(title) for title in self.header], self._sides("left", "right")
         grid = tabulate(body, header, "pipe", disable_numparse=True, colalign=sides)
-        return "\n\n".join([grid, *map(markdown, self.below)])
+        above, below = [markdown(self.caption)] if self.caption else [], map(markdown, self.notes)
+        return "\n\n".join([*above, grid, *below])
 
     def to_csv(self) -> str:
         """Full precision; an interval takes three columns: mean, low, high. No text is a formula of a spreadsheet."""
@@ -117,7 +118,7 @@ class Table:
         lines = [
             r"\begin{table}",
             r"\centering",
-            rf"\caption{{{tex(' '.join(self.below))}}}",
+            rf"\caption{{{tex(' '.join(self.words))}}}",
             r"\smallskip",
             r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{{''.join(self._sides('l', 'r'))}}}",
@@ -141,7 +142,7 @@ class Table:
         for i, row in enumerate(self.rows):
             cells = [self._html(e, (i, j) in bold) for j, e in enumerate(row)]
             body.append("<tr>" + "".join(cells) + "</tr>")
-        caption = f"<caption>{escape(visible(' '.join(self.below)))}</caption>"
+        caption = f"<caption>{escape(visible(' '.join(self.words)))}</caption>"
         return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
     def _repr_html_(self) -> str:
@@ -179,7 +180,7 @@ class Table:
         return tuple(words if any(isinstance(e, str) for e in column) else numbers for column in columns)
 
     @property
-    def below(self) -> list[str]:
+    def words(self) -> list[str]:
         """Caption and notes."""
         return [text for text in (self.caption, *self.notes) if text]
 

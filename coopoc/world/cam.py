@@ -7,9 +7,19 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError, MissingLibraryError
+from ..errors import MissingLibraryError
 from .cam_structure import DIRECTIONS, Elements, structure
-from .data_dictionary import Origin, course_of, exact, heading_of, place_of, position_of, referenced_place, whole
+from .data_dictionary import (
+    Origin,
+    coding,
+    course_of,
+    exact,
+    heading_of,
+    place_of,
+    position_of,
+    referenced_place,
+    whole,
+)
 
 NO_SPEED, NO_YAW_RATE, NO_DIRECTION = np.array(16383), np.array(32767), np.array(2)
 """Unavailable."""
@@ -70,11 +80,9 @@ def encode(elements: Elements, std: tuple[float, float, float], instant: float =
     (41, 129)
     """
     codec = _codec()
-    try:
+    with coding("elements", elements, "cannot be encoded", "Take those of to_elements."):
         codec.set_val(structure(elements, std, instant, path))
         return bytes(codec.to_uper())
-    except Exception as error:
-        raise InputError("elements", elements, f"cannot be encoded ({error})", "Take those of to_elements.") from None
 
 
 def decode(message: bytes) -> Elements:
@@ -92,15 +100,13 @@ def decode(message: bytes) -> Elements:
     True
     """
     codec = _codec()
-    try:
+    with coding("message", f"{len(message)} bytes", "is no CAM", "Give PER unaligned."):
         codec.from_uper(message)
         content = codec.get_val()["cam"]["camParameters"]
         place = referenced_place(content["basicContainer"]["referencePosition"])
         fast = content["highFrequencyContainer"][1]
         heading, speed = fast["heading"]["headingValue"], fast["speed"]["speedValue"]
         rate, direction = fast["yawRate"]["yawRateValue"], DIRECTIONS.index(fast["driveDirection"])
-    except Exception as error:
-        raise InputError("message", f"{len(message)} bytes", f"is no CAM ({error})", "Give PER unaligned.") from None
     return Elements(place, np.array(heading), np.array(speed), np.array(rate), np.array(direction))
 
 

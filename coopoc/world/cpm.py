@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..errors import InputError, MissingLibraryError
+from ..errors import MissingLibraryError
 from .cpm_structure import ABSENT, CPM, OBJECTS, RADAR, SENSORS, VEHICLE, Elements, coordinates, left_out, perceived
 from .data_dictionary import (
     LINE,
     NO_HEADING,
     Origin,
+    coding,
     course_of,
     heading_of,
     place_of,
@@ -98,7 +99,7 @@ def encode(
     (70, 110)
     """
     pack = partial(_codec().encode, check_constraints=True)
-    try:
+    with coding("elements", elements, "cannot be encoded", "Take those of to_elements."):
         angle = {"value": int(elements.orientation), "confidence": 127}
         containers = [(VEHICLE, pack("OriginatingVehicleContainer", {"orientationAngle": angle}))]
         if sensors:
@@ -115,8 +116,6 @@ def encode(
             "payload": {"managementContainer": management, "cpmContainers": wrapped},
         }
         return bytes(pack("CollectivePerceptionMessage", message))
-    except Exception as error:
-        raise InputError("elements", elements, f"cannot be encoded ({error})", "Take those of to_elements.") from None
 
 
 def decode(message: bytes) -> Elements:
@@ -135,7 +134,7 @@ def decode(message: bytes) -> Elements:
     [[100, 100, 100], [100, 100, 100]]
     """
     codec = _codec()
-    try:
+    with coding("message", f"{len(message)} bytes", "is no CPM", "Give PER unaligned."):
         found = codec.decode("CollectivePerceptionMessage", message)
         if found["header"]["messageId"] != CPM:
             raise ValueError(f"messageId {found['header']['messageId']}")
@@ -157,8 +156,6 @@ def decode(message: bytes) -> Elements:
             vectors,
             confidence,
         )
-    except Exception as error:
-        raise InputError("message", f"{len(message)} bytes", f"is no CPM ({error})", "Give PER unaligned.") from None
 
 
 @cache

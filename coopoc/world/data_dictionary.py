@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, Ints
+from ..errors import InputError
 
 AXIS, FLATTENING = 6378137.0, 1 / 298.257223563
 """m, and none: WGS84."""
@@ -20,6 +23,15 @@ NO_PLACE, LEAST_PLACE = np.array([900000001, 1800000001, 800001]), np.array([-90
 NO_HEADING = np.array(3601)
 Origin = tuple[float, float, float]
 """Latitude and longitude in degrees, and height in m, of the local frame."""
+
+
+@contextmanager
+def coding(field: str, value: object, wrong: str, hint: str) -> Iterator[None]:
+    """Errors of a codec, which may be of any class, as an InputError that names the field."""
+    try:
+        yield
+    except Exception as error:
+        raise InputError(field, value, f"{wrong} ({error})", hint) from None
 
 
 def whole(exact: Floats, least: Ints, unavailable: Ints) -> Ints:

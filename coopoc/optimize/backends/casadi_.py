@@ -19,8 +19,8 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ...plugins import one_of
-from ..active import steerable
 from ..backend import Backend, Capabilities, Solver, SolverResult
+from ..constraint import steerable
 from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..problem import Problem
 from ..symbolic import LOSSES, Structure, numbers_of, structure_of
@@ -128,7 +128,7 @@ def _numbers(problem: Problem, x: Floats) -> Floats:
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
     """Lower and upper sides of the numbers that are bounded and can change."""
-    kept = [(c, steerable(problem, c)) for c in problem.constraints]
+    kept = [(c, steerable(c, problem.movable)) for c in problem.constraints]
     lower, upper = [c.lower[which] for c, which in kept], [c.upper[which] for c, which in kept]
     return np.concatenate([np.empty(0), *lower]), np.concatenate([np.empty(0), *upper])
 

@@ -7,8 +7,8 @@ from functools import partial
 import numpy as np
 
 from ...arrays import Floats
-from ..assess import factorise
 from ..backend import Backend, Capabilities, Solver, SolverResult
+from ..cholesky import cholesky_of, with_still
 from ..curvature import newton_step
 from ..dense import damped_step
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
@@ -63,13 +63,13 @@ def linear_step(problem: Problem) -> Step:
 
 
 def _sparse_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
-    from scipy.sparse import diags_array
-
     out = np.empty_like(damping)
     still = None if problem.movable is None else ~problem.movable
     for b, residual in enumerate(zip(*linear.residual, strict=True)):
         J = problem.jacobian(linear, b)
-        factored = factorise(J.T @ J + diags_array(damping[b].ravel()), still)
+        factored = cholesky_of(with_still(J.T @ J, damping[b] + (0 if still is None else still)))
+        if factored is None:
+            raise np.linalg.LinAlgError("J^T J is not positive definite")
         out[b] = -factored.solve(J.T @ np.concatenate([r.ravel() for r in residual])).reshape(out[b].shape)
     return out
 

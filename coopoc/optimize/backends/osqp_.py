@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..active import bounded, constraint_rows
+from ..active import constraint_rows
 from ..arrowhead import structure
 from ..backend import Backend, Capabilities, Solver, SolverResult
+from ..constraint import bounded
 from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..linear import Linear
 from ..local import local

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...arrays import Bools, Floats
+from ..cholesky import cholesky_of
 from .qcqp import Multipliers, Quadratic
 
 DENSE = 500
@@ -169,7 +170,7 @@ class Sparse:
         less, shift, factored = L.sparse, -1e-7 * self.scale, None
         while factored is None:
             shift *= 10.0
-            factored = positive(self.shifted(less, shift))
+            factored = cholesky_of(self.shifted(less, shift))
         size = self.problem.bound
         whole = LinearOperator((size, size), matvec=lambda v: self.times(v.reshape(-1, 1))[:, 0] - less @ v.ravel())
         inverse = LinearOperator((size, size), matvec=lambda v: self._solve(factored, v.ravel()))
@@ -189,12 +190,3 @@ def factorise(matrix: Any) -> Any:
     from scipy.sparse.linalg import splu
 
     return splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-
-def positive(matrix: Any) -> Any | None:
-    """The factorisation of a positive definite matrix, else None: its pivots D of L D L^T are all positive."""
-    try:
-        factored = factorise(matrix)
-    except RuntimeError:  # a pivot of exactly zero
-        return None
-    return factored if np.array_equal(factored.perm_r, factored.perm_c) and (factored.U.diagonal() > 0).all() else None

@@ -9,13 +9,14 @@ from tqdm import tqdm
 
 from ...arrays import Floats
 from ...errors import InputError
+from ..cholesky import cholesky_of
 from ..problem import Problem
 from .manifold import Stationary, minimise, retract
 from .newton import minimise_sparsely
 from .qcqp import Multipliers, Quadratic
 from .quadratic import quadratic
 from .relaxation import TIGHT, Relaxation, rounded
-from .schur import Reduced, Sparse, lower_bound, positive, reduce
+from .schur import Reduced, Sparse, lower_bound, reduce
 
 START = 2
 """Columns beyond d at a random start: with none to spare the first steps end in local minima."""
@@ -109,7 +110,7 @@ def scaled_bound(reduced: Sparse, L: Multipliers) -> float:
     shift = ROUNDING * reduced.scale
     for _ in range(BISECTIONS):
         middle = 0.5 * (share + fails)
-        if positive(reduced.shifted(middle * less, -shift)) is None:
+        if cholesky_of(reduced.shifted(middle * less, -shift)) is None:
             fails = middle
         else:
             share = middle

@@ -1,4 +1,4 @@
-"""Marginal covariances of large problems, by GTSAM's elimination of our own Jacobian."""
+"""Marginal covariances by GTSAM: its Bayes tree of the rows of a Jacobian."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from coopoc.arrays import Bools, Floats
 
 
 def bayes_tree_marginals(J: Any, still: Bools | None, n: int, dof: int) -> Floats:
