@@ -10,7 +10,7 @@ from backends_star import TOLERANCE, Job, Row, as_good, single
 from scipy.optimize import least_squares
 
 from coopoc.optimize import Problem
-from coopoc.optimize.factor import Factor
+from coopoc.optimize.model.factor import Factor
 
 COUNT = 20
 """Stars per call."""

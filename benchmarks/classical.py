@@ -23,13 +23,13 @@ from tabulate import tabulate
 from timing import medians, timed
 
 import coopoc as co
-from coopoc.kernels.joint_filter import follow
+from coopoc.kernels.stars.joint_filter import follow
 from coopoc.methods.cooperative_map import Windows
 from coopoc.methods.star import POSITION, assumptions, measurements
 from coopoc.methods.window import dead_reckoned
 from coopoc.optimize.batch import solve_batch
-from coopoc.optimize.initial import converted
-from coopoc.optimize.problem import Problem
+from coopoc.optimize.initialisation.initial import converted
+from coopoc.optimize.model.problem import Problem
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, to_vector
 from coopoc.world.v2x import FIX_AND_VELOCITY

@@ -22,7 +22,7 @@ from coopoc.optimize import Problem, pose
 from coopoc.optimize.backends import gauss_newton, gtsam_
 from coopoc.optimize.backends.gtsam_forms import forms
 from coopoc.optimize.backends.gtsam_native import native_graph, values, which_turn
-from coopoc.optimize.initial import initial_guess
+from coopoc.optimize.initialisation.initial import initial_guess
 
 ROUNDS = 15
 

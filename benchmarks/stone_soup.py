@@ -19,7 +19,7 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, IteratedKalmanUpdater, KalmanUpdater
 
-from coopoc.kernels.joint_filter import follow
+from coopoc.kernels.stars.joint_filter import follow
 from coopoc.methods.cooperative_map import CooperativeMAP, Windows
 from coopoc.methods.star import POSITION, assumptions, measurements
 from coopoc.methods.window import dead_reckoned

@@ -11,7 +11,7 @@ from hard_graphs import worse_odometry
 from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.formats.rotations import to_orientation
-from coopoc.optimize.space import exp
+from coopoc.optimize.model.space import exp
 
 
 @dataclass(frozen=True, eq=False)

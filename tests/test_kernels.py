@@ -15,7 +15,7 @@ from filterpy.kalman import KalmanFilter
 from scipy.optimize import least_squares
 
 from coopoc import V2X, CooperativeMAP, Fleet, JointFilter, NoiseModel, Sensors, observe
-from coopoc.kernels import compile as kernels
+from coopoc.kernels.compiling import compile as kernels
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -91,7 +91,7 @@ def test_the_snapshot_is_the_least_squares_solution_of_scipy(crossing: Fleet) ->
 
 
 def test_the_angle_is_atan2() -> None:
-    from coopoc.kernels.relative import angle
+    from coopoc.kernels.stars.relative import angle
 
     for turn in np.concatenate([np.linspace(-3.14, 3.14, 301), [0.0, 1e-9, -1e-300, 0.2449, -0.245]]):
         assert angle(3 * math.sin(turn), 3 * math.cos(turn)) == pytest.approx(turn, rel=1e-15, abs=0)
@@ -114,7 +114,7 @@ def test_importing_the_package_imports_no_numba() -> None:
 def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> None:
     """A cache from before a type was renamed cannot be read: the kernel compiles anew and is kept again."""
     (tmp_path / "own.py").write_text(
-        "from coopoc.kernels.compile import compiled\n\n\n@compiled\ndef twice(x):\n    return 2.0 * x\n\n\n"
+        "from coopoc.kernels.compiling.compile import compiled\n\n\n@compiled\ndef twice(x):\n    return 2.0 * x\n\n\n"
         "print(twice(4.0), sum(twice.stats.cache_hits.values()))\n"
     )
 

@@ -47,8 +47,8 @@ def test_angles_side_by_side_are_those_of_atan2() -> None:
     """Where all are small, where some are, and where one is missing."""
     import numba
 
-    from coopoc.kernels.batched import pack, put, take
-    from coopoc.kernels.relative import angle
+    from coopoc.kernels.compiling.batched import pack, put, take
+    from coopoc.kernels.stars.relative import angle
 
     @numba.njit
     def call(sine, cosine, out):  # type: ignore[no-untyped-def]
@@ -61,7 +61,7 @@ def test_angles_side_by_side_are_those_of_atan2() -> None:
 
 
 def test_sine_and_cosine_are_those_of_the_library() -> None:
-    from coopoc.kernels.relative import sine_and_cosine
+    from coopoc.kernels.stars.relative import sine_and_cosine
 
     turns = np.concatenate([np.linspace(-7, 7, 2001), np.linspace(-1e4, 1e4, 301), np.arange(-8, 9) * math.pi / 4])
     for turn in turns:

@@ -103,7 +103,7 @@ def test_the_filter_is_filterpys(crossing: Fleet) -> None:
 
 def matrix(members: int, rng: np.random.Generator, share: float) -> tuple[Any, Any, Any, Any]:
     """A covariance, an information of few pairs, who shares it, and the plan of one component."""
-    from coopoc.kernels.components import arrange
+    from coopoc.kernels.fleets.components import arrange
 
     n = 3 * members
     near = np.triu(rng.random((members, members)) < share, 1)
@@ -122,8 +122,8 @@ def matrix(members: int, rng: np.random.Generator, share: float) -> tuple[Any, A
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
 def test_what_a_sparse_information_adds_is_what_numpy_inverts(members: int, share: float) -> None:
     """From the upper triangle of P and the lower one of F, whatever stands in the others' place of P."""
-    from coopoc.kernels.components import STRIDE
-    from coopoc.kernels.low_rank import scratch, update
+    from coopoc.kernels.fleets.components import STRIDE
+    from coopoc.kernels.fleets.low_rank import scratch, update
 
     rng = np.random.default_rng(members)
     spread, info, near, plan = matrix(members, rng, share)
@@ -140,7 +140,7 @@ def test_what_a_sparse_information_adds_is_what_numpy_inverts(members: int, shar
 
 
 def test_components_merge_where_vehicles_meet_and_stay_together() -> None:
-    from coopoc.kernels.components import BEGIN, HOME, MEMBER, arrange, connect
+    from coopoc.kernels.fleets.components import BEGIN, HOME, MEMBER, arrange, connect
 
     arrange, connect = callable_part(arrange), callable_part(connect)
     label, plan = np.full(5, -1), np.zeros((6, 6), np.int64)

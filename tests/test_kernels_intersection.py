@@ -9,8 +9,8 @@ import pytest
 from conftest import callable_part
 from scipy.optimize import minimize_scalar
 
-from coopoc.kernels import fusion as kernel
-from coopoc.kernels.fusion import Fusion
+from coopoc.kernels.stars import fusion as kernel
+from coopoc.kernels.stars.fusion import Fusion
 
 add_up, best_weight, describe, fuse = map(
     callable_part, (kernel.add_up, kernel.best_weight, kernel.describe, kernel.fuse)

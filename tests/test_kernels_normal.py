@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from coopoc.optimize import Factor, Problem, pose, solve, solve_batch
-from coopoc.optimize.arrowhead import marginals, structure
-from coopoc.optimize.initial import initial_guess
-from coopoc.optimize.normal import normal_equations
+from coopoc.optimize.algebra.arrowhead import marginals, structure
+from coopoc.optimize.algebra.normal import normal_equations
+from coopoc.optimize.initialisation.initial import initial_guess
 
 RUNS = 9
 

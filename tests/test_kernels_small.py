@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import as_written
-from coopoc.kernels.elimination import eliminate, predict, substitute
-from coopoc.kernels.lanes import LANES
-from coopoc.kernels.small import store
+from coopoc.kernels.compiling.compile import as_written
+from coopoc.kernels.compiling.lanes import LANES
+from coopoc.kernels.compiling.small import store
+from coopoc.kernels.stars.elimination import eliminate, predict, substitute
 
 BLOCKS = 4
 

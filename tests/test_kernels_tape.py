@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopoc.kernels.graph_tape import Tape, accumulate
-from coopoc.kernels.operations import Operation
+from coopoc.kernels.graphs.graph_tape import Tape, accumulate
+from coopoc.kernels.graphs.operations import Operation
 
 ca = pytest.importorskip("casadi")
 

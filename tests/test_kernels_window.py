@@ -156,7 +156,7 @@ def test_what_does_not_settle_is_solved_damped(
     monkeypatch: pytest.MonkeyPatch, crossing: Fleet, robust: str | None
 ) -> None:
     """A window by itself, with the uses of messages that came before it."""
-    from coopoc.kernels import window
+    from coopoc.kernels.windows import window
 
     channel = V2X(max_neighbours=4, latency=0.1, loss=0.5, max_age=0.3)
     recording = observe(crossing.between(0, 12), S2, channel, runs=2)

@@ -155,9 +155,9 @@ def test_checks_of_single_arrays_and_numbers() -> None:
 
 CODE = """
 import numpy as np
-from coopoc.kernels.batched import put, take
-from coopoc.kernels.compile import as_written, part
-from coopoc.kernels.lanes import subtract
+from coopoc.kernels.compiling.batched import put, take
+from coopoc.kernels.compiling.compile import as_written, part
+from coopoc.kernels.compiling.lanes import subtract
 
 @part
 def copied(array, at):

@@ -21,7 +21,7 @@ from coopoc.methods.noise_model import resolve
 from coopoc.methods.star import ACCELERATION_STD, assumptions, measurements
 from coopoc.methods.window import points_of, steps_of
 from coopoc.methods.window_problem import Arrival, arrival_of, limited, solution_of, window_problem
-from coopoc.optimize.window import WindowStep
+from coopoc.optimize.model.window import WindowStep
 from coopoc.world.inbox import inbox
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import spherical, to_vector, wrap
@@ -176,7 +176,7 @@ class Last(NamedTuple):
 
 
 def last_window(recording: Recording, known: NoiseModel, length: int, exact: bool, run: int) -> Last:
-    from coopoc.kernels.horizon import Settings, advance, each_group, empty
+    from coopoc.kernels.windows.horizon import Settings, advance, each_group, empty
 
     box, steps = inbox(recording, 0, FixedLagSmoother().message), len(recording.t)
     seen, assumed = measurements(recording, 0, box), assumptions(recording, known)

@@ -14,8 +14,8 @@ from scipy import optimize, stats
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe, posterior_bound
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
-from coopoc.kernels.fleet_graph import measurement
-from coopoc.kernels.relative import components
+from coopoc.kernels.fleets.fleet_graph import measurement
+from coopoc.kernels.stars.relative import components
 from coopoc.methods.admm import ConsensusADMM
 from coopoc.methods.batch_smoother import BatchSmoother
 from coopoc.methods.catalogue import METHODS

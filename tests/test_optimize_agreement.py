@@ -32,7 +32,7 @@ from coopoc.optimize import (
     solve_gnc_batch,
 )
 from coopoc.optimize.backend import capability_table, require_backend
-from coopoc.optimize.space import exp
+from coopoc.optimize.model.space import exp
 
 
 def range_only() -> Problem:

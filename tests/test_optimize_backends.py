@@ -17,7 +17,7 @@ from coopoc.optimize import Backend, Factor, Problem, SolverResult, Status, back
 from coopoc.optimize.backends import osqp_programme
 from coopoc.optimize.backends.casadi_ import METHODS
 from coopoc.optimize.backends.gauss_newton import linear_step
-from coopoc.optimize.initial import converted, initial_guess
+from coopoc.optimize.initialisation.initial import converted, initial_guess
 from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()

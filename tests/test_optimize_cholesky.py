@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu
 
-from coopoc.optimize.cholesky import Cholesky
+from coopoc.optimize.algebra.cholesky import Cholesky
 
 
 def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:

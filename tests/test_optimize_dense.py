@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from coopoc.optimize import Loss, Problem, pose, solve, solve_batch
-from coopoc.optimize.assess import assess
-from coopoc.optimize.dense import NUMBERS, damped_step, diagonal_blocks, is_small, normal_matrix
-from coopoc.optimize.descend import _damping
+from coopoc.optimize.algebra.dense import NUMBERS, damped_step, diagonal_blocks, is_small, normal_matrix
+from coopoc.optimize.assessment.assess import assess
+from coopoc.optimize.descent.descend import _damping
 
 
 def plane() -> Problem:
@@ -72,7 +72,7 @@ def test_one_matrix_and_blocks_assess_alike(monkeypatch: pytest.MonkeyPatch) -> 
     for problem in (plane(), space()):
         x = solve(problem).x
         whole = assess(problem, x)
-        monkeypatch.setattr("coopoc.optimize.dense.NUMBERS", 0)
+        monkeypatch.setattr("coopoc.optimize.algebra.dense.NUMBERS", 0)
         blocks = assess(problem, x)
         monkeypatch.undo()
         assert whole.covariance == pytest.approx(blocks.covariance, rel=1e-9, abs=1e-12)

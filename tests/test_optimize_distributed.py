@@ -13,10 +13,10 @@ from scipy.optimize import least_squares
 from coopoc import InputError
 from coopoc.formats.edges import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
-from coopoc.optimize.agent import agents_of
-from coopoc.optimize.distributed import owners, solve_distributed
+from coopoc.optimize.agents.agent import agents_of
+from coopoc.optimize.agents.distributed import owners, solve_distributed
+from coopoc.optimize.agents.links import links_of
 from coopoc.optimize.graphs import from_graph
-from coopoc.optimize.links import links_of
 
 
 def chain(robots: int = 3, length: int = 4) -> Problem:

@@ -22,23 +22,23 @@ from coopoc import InputError
 from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
-from coopoc.optimize.arrowhead import structure
-from coopoc.optimize.assess import SMALL, assess
+from coopoc.optimize.algebra.arrowhead import structure
+from coopoc.optimize.algebra.sparse import Sparse, _made, sparse
+from coopoc.optimize.assessment.assess import SMALL, assess
+from coopoc.optimize.assessment.curvature import matrix, newton_decrease, true_blocks
 from coopoc.optimize.backends.gtsam_forms import forms
 from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, values, which_turn
-from coopoc.optimize.curvature import matrix, newton_decrease, true_blocks
-from coopoc.optimize.dual import Dual
-from coopoc.optimize.factor import Factor
-from coopoc.optimize.fuse import fused
+from coopoc.optimize.descent.local_problem import LocalProblem
+from coopoc.optimize.descent.trust_region import arrive
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
-from coopoc.optimize.linear_start import linear_start, project
-from coopoc.optimize.local_problem import LocalProblem
-from coopoc.optimize.race import expected
-from coopoc.optimize.search import Search
-from coopoc.optimize.sparse import Sparse, _made, sparse
-from coopoc.optimize.starts import chained, separated
-from coopoc.optimize.trilateration import located
-from coopoc.optimize.trust_region import arrive
+from coopoc.optimize.initialisation.linear_start import linear_start, project
+from coopoc.optimize.initialisation.race import expected
+from coopoc.optimize.initialisation.starts import chained, separated
+from coopoc.optimize.initialisation.trilateration import located
+from coopoc.optimize.model.dual import Dual
+from coopoc.optimize.model.factor import Factor
+from coopoc.optimize.model.fuse import fused
+from coopoc.optimize.model.search import Search
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
@@ -181,7 +181,7 @@ def test_tapes_are_the_formulas(
 ) -> None:
     """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences, run by the
     kernel of large problems and by CasADi, which runs small ones."""
-    monkeypatch.setattr("coopoc.optimize.layout.DENSE", most)
+    monkeypatch.setattr("coopoc.optimize.algebra.layout.DENSE", most)
     graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
     problem = from_graph(graph, objective, start="file")
     rho = None if loss is None else Loss(loss, 2.0)

@@ -19,7 +19,7 @@ from coopoc.formats.rotations import to_orientation
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.commands import solve_file
 from coopoc.optimize.graphs import from_graph, loop_closures
-from coopoc.optimize.space import exp
+from coopoc.optimize.model.space import exp
 
 STEPS, REACH = 120, 12.0
 ODOMETRY, LOOPS = (0.05, 0.02), (0.1, 0.03)

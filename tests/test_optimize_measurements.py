@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from coopoc import InputError
 from coopoc.optimize import MEASUREMENTS, Problem, backends, measurement, solve
-from coopoc.optimize import dual as dual_numbers
-from coopoc.optimize.dual import seeds
-from coopoc.optimize.space import Space, exp
+from coopoc.optimize.model import dual as dual_numbers
+from coopoc.optimize.model.dual import seeds
+from coopoc.optimize.model.space import Space, exp
 
 VECTORS = np.random.default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
 

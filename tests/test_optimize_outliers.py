@@ -16,9 +16,9 @@ from coopoc.formats.edges import PoseEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graphs import from_graph, loop_closures
-from coopoc.optimize.outliers import mark
-from coopoc.optimize.predictions import predicted
-from coopoc.optimize.space import exp
+from coopoc.optimize.model.space import exp
+from coopoc.optimize.robust.outliers import mark
+from coopoc.optimize.robust.predictions import predicted
 
 STD = np.array([0.02, 0.02, 0.01])
 

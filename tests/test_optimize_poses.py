@@ -16,7 +16,7 @@ from coopoc.formats.edges import PoseEdges, RangeEdges
 from coopoc.formats.graph import Graph
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
 from coopoc.optimize.graphs import from_graph
-from coopoc.optimize.space import Space, exp, log
+from coopoc.optimize.model.space import Space, exp, log
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.optimize import progress
+from coopoc.optimize.descent import progress
 
 
 def ranged() -> co.Problem:

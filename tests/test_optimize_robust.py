@@ -13,8 +13,8 @@ from scipy.optimize import approx_fprime, least_squares
 from scipy.stats import chi2
 
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, solve, solve_gnc, solve_gnc_batch
-from coopoc.optimize.curvature import is_minimum
-from coopoc.optimize.surrogates import SURROGATES
+from coopoc.optimize.assessment.curvature import is_minimum
+from coopoc.optimize.robust.surrogates import SURROGATES
 
 M = gtsam.noiseModel.mEstimator
 GTSAMS = {"huber": M.Huber, "cauchy": M.Cauchy, "geman-mcclure": M.GemanMcClure, "truncated": M.TruncatedLeastSquares}

@@ -15,7 +15,7 @@ from oracles import pose_filter as oracle
 from scipy.linalg import expm
 
 import coopoc as co
-from coopoc.kernels.pose_filter import PoseOptions, follow
+from coopoc.kernels.poses.pose_filter import PoseOptions, follow
 from coopoc.methods import pose_unit
 from coopoc.world.frames import in_world
 from coopoc.world.inbox import inbox

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import AnyArray, Ints
-from .compile import as_written
+from .compiling.compile import as_written
 
 
 @as_written

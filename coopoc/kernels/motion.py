@@ -6,7 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 from ..arrays import AnyArray, Floats
-from .compile import compiled, part
+from .compiling.compile import compiled, part
 
 ROUNDING = 1e-9
 """s, by how much sums of time steps may miss a time."""

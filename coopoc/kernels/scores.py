@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import compiled, part
+from .compiling.compile import compiled, part
 
 
 @part

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from .compile import compiled, part
+from .compiling.compile import compiled, part
 from .motion import ROUNDING, MotionNoise, process_variance, push, since
 
 LEAST = 1e-4

@@ -18,7 +18,7 @@ from .track import Track
 from .whole_fleet import Answer, fleet_track
 
 if TYPE_CHECKING:
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
 
 OWN = "ADMM exchanges positions only: its covariance is that of each vehicle's own filter, without the neighbours' gain"
 
@@ -81,7 +81,7 @@ class ConsensusADMM:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.consensus import follow
+            from ..kernels.fleets.consensus import follow
 
             certain = PENALTY / np.median(assumed.fix.min(axis=-1))
             rho = max(LEAST, certain) if self.rho is None else self.rho

@@ -20,8 +20,8 @@ from .track import Track
 from .whole_fleet import Answer, fleet_track
 
 if TYPE_CHECKING:
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
-    from ..kernels.fleet_normal import Drive
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.fleet_normal import Drive
 
 NOT_CAUSAL = "not causal: every estimate depends on the whole drive"
 
@@ -68,9 +68,9 @@ class BatchSmoother:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.block_tridiagonal import Memory
-            from ..kernels.fleet_normal import alone
-            from ..kernels.fleet_smoother import smooth
+            from ..kernels.fleets.block_tridiagonal import Memory
+            from ..kernels.fleets.fleet_normal import alone
+            from ..kernels.fleets.fleet_smoother import smooth
 
             steps, start = (
                 self.exact_steps if len(assumed.std) else 0,
@@ -116,7 +116,7 @@ class Settling:
 
 def _drives(measured: Measured, pairs: Pairs, assumed: Assumed) -> Iterator[Drive]:
     """Each run as the sweeps take it."""
-    from ..kernels.fleet_normal import Drive
+    from ..kernels.fleets.fleet_normal import Drive
 
     shape = measured.gnss.shape
     fix_weight: Floats = np.where(np.isnan(measured.gnss), 0.0, 1.0 / assumed.fix)

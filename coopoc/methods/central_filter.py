@@ -18,7 +18,7 @@ from .track import Track
 from .whole_fleet import Answer, fleet_track
 
 if TYPE_CHECKING:
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
 
 UPLOAD = Message("fix, velocity and relative measurements", 8, per_neighbour=4)
 """To the centre: fix (3), velocity (3), id and time (2); range, two angles and id for each vehicle that is measured."""
@@ -59,7 +59,7 @@ class CentralFilter:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.central import begin, follow
+            from ..kernels.fleets.central import begin, follow
 
             runs, steps, vehicles = measured.active.shape
             x, cov = np.full(measured.gnss.shape, np.nan), np.full((*measured.gnss.shape, 3), np.nan)

@@ -13,13 +13,13 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..optimize.backend import require_backend
 from ..optimize.batch import solve_batch
-from ..optimize.gnc import ROUNDS, solve_gnc
-from ..optimize.initial import converted
-from ..optimize.outliers import Candidates, mark, reweigh
-from ..optimize.problem import Problem
+from ..optimize.initialisation.initial import converted
+from ..optimize.model.problem import Problem
+from ..optimize.robust.gnc import ROUNDS, solve_gnc
+from ..optimize.robust.outliers import Candidates, mark, reweigh
+from ..optimize.robust.surrogates import EASY, RATE, SETTLED, surrogate_of
 from ..optimize.solution import Status
 from ..optimize.solve import solve
-from ..optimize.surrogates import EASY, RATE, SETTLED, surrogate_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -120,7 +120,7 @@ class CooperativeMAP:
         """The robust loss as the kernels take it."""
         from scipy.special import gammaincinv
 
-        from ..kernels.gnc import GNC
+        from ..kernels.windows.gnc import GNC
 
         freedom = 3.0 * np.maximum(np.arange(self.window + 1), 1)
         bound = 2.0 * gammaincinv(0.5 * freedom, self.threshold)
@@ -173,7 +173,7 @@ class Windows:
     def __init__(
         self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, positions: Positions, length: int
     ) -> None:
-        from ..kernels.window import Fresh
+        from ..kernels.windows.window import Fresh
 
         self.recording, self.ego, self.box, self.known, self.length = recording, ego, box, known, length
         seen = measurements(recording, ego, replace(box, fresh=box.newest >= 0), positions.x)
@@ -186,13 +186,13 @@ class Windows:
 
     def solve(self, gnc: Any) -> Any:
         """By compiled Gauss-Newton, batched over the runs."""
-        from ..kernels.window import Settings, windows
+        from ..kernels.windows.window import Settings, windows
 
         return windows(self.seen, self.assumed, self.fresh, Settings(self.length, TOLERANCE, LEAST_GROUND), gnc)
 
     def nothing(self) -> Any:
         """Every problem still to be solved."""
-        from ..kernels.window import LOST, Found
+        from ..kernels.windows.window import LOST, Found
 
         shape = (self.recording.runs, len(self.recording.t))
         neighbours = np.full((shape[0], len(self.box.link), 3), np.nan)
@@ -200,14 +200,14 @@ class Windows:
 
     def count(self, ended: Ints) -> dict[str, int]:
         """Of the kernels' fallbacks."""
-        from ..kernels.window import BLIND, MET
+        from ..kernels.windows.window import BLIND, MET
 
         return {CONVERTED: int((ended == MET).sum()), REJECTED: int((ended == BLIND).sum())}
 
     def problems(self, ended: Ints) -> Iterator[tuple[int, int, Problem, Ints]]:
         """Run, step, problem and the vehicle of each point, of all windows that are not solved."""
-        from ..kernels.lanes import LANES
-        from ..kernels.window import LOST, gather_window, new_windows
+        from ..kernels.compiling.lanes import LANES
+        from ..kernels.windows.window import LOST, gather_window, new_windows
 
         for first in range(0, len(ended), LANES):
             lost = np.argwhere(ended[first : first + LANES].T == LOST)

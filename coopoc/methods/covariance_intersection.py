@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from ..kernels.intersection import follow
+from ..kernels.stars.intersection import follow
 from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording

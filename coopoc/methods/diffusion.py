@@ -16,7 +16,7 @@ from .track import Track
 from .whole_fleet import Answer, fleet_track
 
 if TYPE_CHECKING:
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
 
 DRIFT = "diffusion on L alone: positions come from the fixes of first meetings only and drift with the velocity noise"
 
@@ -72,7 +72,7 @@ class Diffusion:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.diffusion import follow
+            from ..kernels.fleets.diffusion import follow
 
             x = follow(measured, pairs, assumed, int(self.rounds), self.anchored)
             return Answer(x, None, self.rounds, () if self.anchored else (DRIFT,))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..kernels.drift import Drift
-from ..kernels.joint_filter import follow
+from ..kernels.stars.drift import Drift
+from ..kernels.stars.joint_filter import follow
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message

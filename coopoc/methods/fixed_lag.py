@@ -10,9 +10,9 @@ import numpy as np
 
 from ..errors import InputError
 from ..optimize.backend import require_backend
-from ..optimize.factor import Factor
 from ..optimize.incremental import FixedLag
-from ..optimize.problem import Problem
+from ..optimize.model.factor import Factor
+from ..optimize.model.problem import Problem
 from ..plugins import unknown
 from ..world.inbox import Inbox
 from ..world.recording import Recording
@@ -92,18 +92,18 @@ class FixedLagSmoother:
         return follow_egos(self, recording, egos, drive, known.notes + notes + looped, missing=True)
 
     def _settings(self, known: NoiseModel, lag: int) -> Any:
-        from ..kernels.horizon import Settings
+        from ..kernels.windows.horizon import Settings
 
         return Settings(lag + 1, self.exact and known.exact_relative, 0, 0.0, -1.0, self.smoothed)
 
     def _follow(self, recording: Recording, box: Inbox, known: NoiseModel, seen: Any, assumed: Any) -> Any:
-        from ..kernels.horizon import horizons
+        from ..kernels.windows.horizon import horizons
 
         return horizons(seen, assumed, box.arrival, self._settings(known, self.lag))
 
     def _by_gtsam(self, recording: Recording, box: Inbox, known: NoiseModel, seen: Any, assumed: Any) -> Any:
         """The same steps, gathered by the kernels, in gtsam's incremental smoother."""
-        from ..kernels.horizon import advance, each_group, empty
+        from ..kernels.windows.horizon import advance, each_group, empty
 
         found, settings = empty(seen), self._settings(known, self.lag)._replace(smoothed=False)
         for runs, horizon in each_group(seen, settings.length):

@@ -17,7 +17,7 @@ from .track import Track
 from .whole_fleet import Answer, fleet_track
 
 if TYPE_CHECKING:
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
 
 LOOPS = "GBP's covariance of a step leaves out the loops of the network, which makes it over-confident"
 
@@ -76,7 +76,7 @@ class GaussianBeliefPropagation:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.belief_propagation import follow
+            from ..kernels.fleets.belief_propagation import follow
 
             settings = int(self.rounds), float(self.damping), self.carry == "belief"
             return Answer(*follow(measured, pairs, assumed, *settings), self.rounds, (LOOPS,))

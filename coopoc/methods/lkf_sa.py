@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..kernels.lkf_sa import follow
+from ..kernels.stars.lkf_sa import follow
 from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording

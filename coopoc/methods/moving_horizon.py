@@ -100,7 +100,7 @@ class MovingHorizon:
 
     def _follow(self, recording: Recording, ego: int, box: Inbox, known: NoiseModel, counts: Counter[str]) -> Any:
         """The elimination's estimates; where the backend has to solve a window, those of the backend."""
-        from ..kernels.horizon import Settings, horizons
+        from ..kernels.windows.horizon import Settings, horizons
 
         exact = self.exact and known.exact_relative
         age = recording.v2x.max_age / recording.dt + 1e-9
@@ -113,7 +113,7 @@ class MovingHorizon:
         return self._by_backend(recording, box, known, (seen, assumed, arrival, settings), counts)
 
     def _by_backend(self, recording: Recording, box: Inbox, known: NoiseModel, given: Any, counts: Counter[str]) -> Any:
-        from ..kernels.horizon import advance, each_group, empty
+        from ..kernels.windows.horizon import advance, each_group, empty
 
         seen, assumed, arrival, settings = given
         found = empty(seen)

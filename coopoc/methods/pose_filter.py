@@ -26,7 +26,7 @@ from .pose_unit import Members
 from .track import Track
 
 if TYPE_CHECKING:
-    from ..kernels.pose_filter import PoseOptions
+    from ..kernels.poses.pose_filter import PoseOptions
 
 Unit = Literal["solo", "star", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
@@ -184,7 +184,7 @@ class PoseFilter:
         place: Floats | None = None,
     ) -> tuple[Floats, Floats, Floats]:
         """States, covariances, and cost and number of measurements of a unit; `kept` and `place` as of `seen`."""
-        from ..kernels.pose_filter import follow, follow_apart
+        from ..kernels.poses.pose_filter import follow, follow_apart
 
         noise = pose_unit.pose_noise(self.assumed or recording.sensors, recording.dt, self.gate)
         measured, options = pose_unit.seen(recording, members, links, kept, place), self.options()
@@ -194,7 +194,7 @@ class PoseFilter:
 
     def options(self) -> PoseOptions:
         """As the kernel takes them."""
-        from ..kernels.pose_filter import PoseOptions
+        from ..kernels.poses.pose_filter import PoseOptions
 
         fusion = get_args(Fusion).index(self.fusion)
         return PoseOptions(6 if self.lasting else 4, 1 + self.exact, self.invariant, fusion, 0)

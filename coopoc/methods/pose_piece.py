@@ -9,9 +9,9 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
-from ..optimize.factor import Factor, of_recorded
-from ..optimize.problem import Problem
-from ..optimize.space import Space, pose
+from ..optimize.model.factor import Factor, of_recorded
+from ..optimize.model.problem import Problem
+from ..optimize.model.space import Space, pose
 from ..world.frames import turned
 from ..world.recording import Recording
 from ..world.sensors import Sensors

@@ -12,7 +12,7 @@ from ..arrays import Floats, checked, number
 from ..errors import InputError
 from ..optimize.backend import require_backend
 from ..optimize.incremental import Estimates, FixedLag
-from ..optimize.space import log
+from ..optimize.model.space import log
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import Message

@@ -15,9 +15,9 @@ from .motion_history import names_of, seconds
 from .pose_measurement import BodyMeasurement, OwnMeasurement
 
 if TYPE_CHECKING:
-    from ..kernels.pose_filter import PoseOptions
-    from ..kernels.pose_members import PoseSeen
-    from ..kernels.pose_motion import PoseNoise
+    from ..kernels.poses.pose_filter import PoseOptions
+    from ..kernels.poses.pose_members import PoseSeen
+    from ..kernels.poses.pose_motion import PoseNoise
 
 
 class PoseEstimate(NamedTuple):
@@ -73,7 +73,7 @@ class PoseStream:
             InputError: a first step without fix and compass where `begin` does not give them; one seen twice;
                 neighbours of a vehicle alone.
         """
-        from ..kernels.pose_filter import follow
+        from ..kernels.poses.pose_filter import follow
 
         self._check(own, seen)
         self._own[:, :-1], self._own[:, -1] = self._own[:, 1:], np.nan
@@ -114,7 +114,7 @@ class PoseStream:
     def _seen(self, seen: Sequence[BodyMeasurement]) -> tuple[PoseSeen, Any]:
         """Arguments of the kernel for two steps, the last one and this; columns of this step's members, and what was
         newest of each."""
-        from ..kernels.pose_members import PoseSeen
+        from ..kernels.poses.pose_members import PoseSeen
 
         steps = self._own.shape[1] if self._step else 1
         now = np.array([0, *(self._columns[one.id] for one in seen if one.place is None)])

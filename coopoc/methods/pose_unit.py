@@ -14,9 +14,9 @@ from ..world.v2x import Message
 from .star import ACCELERATION_STD, FORGOTTEN
 
 if TYPE_CHECKING:
-    from ..kernels.pose_filter import PoseMemory
-    from ..kernels.pose_members import PoseSeen
-    from ..kernels.pose_motion import PoseNoise
+    from ..kernels.poses.pose_filter import PoseMemory
+    from ..kernels.poses.pose_members import PoseSeen
+    from ..kernels.poses.pose_motion import PoseNoise
 
 ODOMETRY = Message("fix, compass, velocity and yaw rate", 10)
 """Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2)."""
@@ -85,7 +85,7 @@ def seen(
         kept: (R, links) whether a measurement counts in a run; None for all.
         place: (links, 3) m, of what is measured and no member; None: landmarks stand at their fix.
     """
-    from ..kernels.pose_members import PoseSeen
+    from ..kernels.poses.pose_members import PoseSeen
 
     step = recording.links.step[links]
     relative = recording.relative[:, links]
@@ -111,8 +111,8 @@ def seen(
 
 def memory(most: int, d: int) -> PoseMemory:
     """Room for the state of `most` members of d numbers."""
-    from ..kernels.pose_filter import PoseMemory
-    from ..kernels.pose_update import new_poses
+    from ..kernels.poses.pose_filter import PoseMemory
+    from ..kernels.poses.pose_update import new_poses
 
     return PoseMemory(new_poses(max(most, 2) * d), np.zeros(2 * most))
 
@@ -138,7 +138,7 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
         dt: s.
         gate: standard deviations of an innovation beyond which a measurement is left out.
     """
-    from ..kernels.pose_motion import PoseNoise
+    from ..kernels.poses.pose_motion import PoseNoise
 
     x, y, z = (std * std for std in sensors.fix_std)
     compass = max(float(np.hypot(sensors.heading_std, sensors.heading_bias_std)), LEAST_HEADING_STD)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..optimize.convex.relaxation import shor
-from ..optimize.problem import Problem
+from ..optimize.model.problem import Problem
 from ..optimize.solve import solve
 from ..world.inbox import Inbox
 from ..world.recording import Recording

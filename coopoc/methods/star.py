@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..kernels.messages import Assumptions, Measurements
-from ..kernels.relative import components
+from ..kernels.stars.messages import Assumptions, Measurements
+from ..kernels.stars.relative import components
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import to_vector
@@ -99,7 +99,7 @@ def star_steps(
 
 
 def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
-    """Measurements and messages of one ego, as `coopoc.kernels.messages.Measurements`.
+    """Measurements and messages of one ego, as `coopoc.kernels.stars.messages.Measurements`.
 
     Args:
         recording: of all vehicles.
@@ -127,7 +127,7 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 
 
 def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
-    """The noise that a filter assumes, as `coopoc.kernels.messages.Assumptions`: a message holds a fix and a velocity,
+    """The noise that a filter assumes, as `coopoc.kernels.stars.messages.Assumptions`: a message holds a fix and a velocity,
     whose error the fix of `age` steps ago has made age times."""
     velocity_noise, fixes = known.velocity_noise, np.ascontiguousarray(known.fix_variance(recording))
     process = np.zeros((1, 1, 1, 3)) if len(velocity_noise) else np.ascontiguousarray(known.process_variance(recording))

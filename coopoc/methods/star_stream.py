@@ -11,9 +11,19 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
-from ..kernels.messages import Assumptions
 from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
-from ..kernels.star_stream import FIX, MESSAGE, MESSAGE_AGE, RELATIVE, VELOCITY, Noise, packed, resized, stream_step
+from ..kernels.stars.messages import Assumptions
+from ..kernels.stars.star_stream import (
+    FIX,
+    MESSAGE,
+    MESSAGE_AGE,
+    RELATIVE,
+    VELOCITY,
+    Noise,
+    packed,
+    resized,
+    stream_step,
+)
 from .motion_history import MotionHistory, check_step, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import NoiseModel
 from .star import ACCELERATION_STD, FORGOTTEN, relative_noise

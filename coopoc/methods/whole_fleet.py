@@ -15,7 +15,7 @@ from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
 if TYPE_CHECKING:
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
 
 
 class Answer(NamedTuple):
@@ -62,7 +62,7 @@ def fleet_track(
         InputError: an ego that is unknown, absent at times or without a fix at first; a recording that not all vehicles
             observed.
     """
-    from ..kernels.answers import bring_forward, dead_reckon, newest
+    from ..kernels.fleets.answers import bring_forward, dead_reckon, newest
 
     began = time.perf_counter()
     columns = check_recording(recording).columns(egos, missing=True)
@@ -93,8 +93,8 @@ def kernel_arguments(
     recording: Recording, met: Exchange, known: NoiseModel, arrival: Ints
 ) -> tuple[Measured, Pairs, Assumed]:
     """Arguments of the kernels by name; a pair takes part if its messages arrive and both vehicles are active."""
-    from ..kernels.fleet_graph import Assumed, Measured, Pairs
-    from ..kernels.relative import components
+    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.stars.relative import components
 
     active = located(recording)
     both = active[:, met.step, met.first] & active[:, met.step, met.second]

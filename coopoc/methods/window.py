@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..optimize.window import WindowStep
+from ..optimize.model.window import WindowStep
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from .noise_model import NoiseModel

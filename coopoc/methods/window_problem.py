@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Bools, Floats, number
-from ..optimize.constraint import Constraint
-from ..optimize.factor import Factor
-from ..optimize.measurements import measurement
-from ..optimize.problem import Problem
+from ..optimize.model.constraint import Constraint
+from ..optimize.model.factor import Factor
+from ..optimize.model.measurements import measurement
+from ..optimize.model.problem import Problem
+from ..optimize.model.window import WindowStep
 from ..optimize.solution import Solution, Status
 from ..optimize.solve import solve
-from ..optimize.window import WindowStep
 from .noise_model import NoiseModel
 from .star import FORGOTTEN
 from .window import Span, places

@@ -15,7 +15,7 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError, MissingLibraryError
 from ..one_file import in_file
 from ..plugins import find, names, suggestion, unknown
-from .problem import Problem
+from .model.problem import Problem
 
 Options: TypeAlias = dict[str, Any]
 

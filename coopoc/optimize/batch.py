@@ -9,12 +9,12 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
-from .arrowhead import Arrow, marginals, structure
-from .assess import bounded
+from .algebra.arrowhead import Arrow, marginals, structure
+from .algebra.normal import normal_equations
+from .assessment.assess import bounded
 from .backend import Backend, Options, require_backend
-from .initial import initial_guess, somewhere
-from .normal import normal_equations
-from .problem import Problem
+from .initialisation.initial import initial_guess, somewhere
+from .model.problem import Problem
 from .solve import POSITION_TOLERANCE
 
 CHUNK = 40_000

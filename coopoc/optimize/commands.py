@@ -16,12 +16,12 @@ from ..errors import InputError
 from ..formats import load_graph
 from ..formats.graph import Graph
 from .backend import backends
-from .gnc import solve_gnc
 from .graphs import Objective, Start, from_graph, loop_closures, read_graph
-from .hypotheses import AGREEING
-from .problem import Problem
-from .race import expected as expected_cost
-from .search import Search
+from .initialisation.race import expected as expected_cost
+from .model.problem import Problem
+from .model.search import Search
+from .robust.gnc import solve_gnc
+from .robust.hypotheses import AGREEING
 from .solution import Solution, Status
 from .solve import solve
 

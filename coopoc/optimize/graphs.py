@@ -15,15 +15,15 @@ from ..formats import load_graph
 from ..formats.edges import ENDS
 from ..formats.graph import Graph
 from ..plugins import one_of
-from .factor import Factor
-from .incremental_start import incremental_start
-from .linear_start import parts
-from .problem import Problem
-from .race import race
-from .search import Search
-from .space import Space
-from .sparse import keep
-from .starts import STARTS, contenders, separated
+from .algebra.sparse import keep
+from .initialisation.incremental_start import incremental_start
+from .initialisation.linear_start import parts
+from .initialisation.race import race
+from .initialisation.starts import STARTS, contenders, separated
+from .model.factor import Factor
+from .model.problem import Problem
+from .model.search import Search
+from .model.space import Space
 
 Objective = Literal["chordal", "geodesic"]
 Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]

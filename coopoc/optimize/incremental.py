@@ -16,11 +16,11 @@ from .backend import require_backend
 from .backends.gauss_newton import linear_step
 from .backends.gtsam_forms import forms
 from .backends.gtsam_native import estimate, linearised, native_graph, tangent, values, which_turn
-from .descend import descend
-from .factor import Factor
-from .initial import initial_guess, somewhere
-from .problem import Problem
-from .space import Space
+from .descent.descend import descend
+from .initialisation.initial import initial_guess, somewhere
+from .model.factor import Factor
+from .model.problem import Problem
+from .model.space import Space
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,9 @@ import numpy as np
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from .cholesky import cholesky_of, with_still
-from .problem import Problem
-from .sparse import sparse
+from .algebra.cholesky import cholesky_of, with_still
+from .algebra.sparse import sparse
+from .model.problem import Problem
 
 if TYPE_CHECKING:
     from .solution import Solution

@@ -11,12 +11,12 @@ import numpy as np
 from ..arrays import Floats
 from ..errors import InputError
 from ..plugins import suggestion
-from .space import Space
+from .model.space import Space
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from .problem import Problem
+    from .model.problem import Problem
 
 NAMED = 30
 """Nodes up to which a picture shows names and ellipses."""

@@ -10,18 +10,18 @@ import numpy as np
 
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
-from .active import constraint_rows
-from .assess import Assessment, assess
+from .algebra.sparse import sparse
+from .assessment.active import constraint_rows
+from .assessment.assess import Assessment, assess
+from .assessment.curvature import newton_decrease
+from .assessment.lagrangian import is_constrained_minimum
 from .backend import Backend, Options, require_backend
-from .curvature import newton_decrease
-from .descend import MAX_ITERATIONS
-from .fuse import fused
-from .initial import initial_guess, somewhere
-from .lagrangian import is_constrained_minimum
-from .problem import Problem
-from .search import Search
+from .descent.descend import MAX_ITERATIONS
+from .initialisation.initial import initial_guess, somewhere
+from .model.fuse import fused
+from .model.problem import Problem
+from .model.search import Search
 from .solution import Solution, SolveError, Status
-from .sparse import sparse
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""

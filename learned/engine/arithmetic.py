@@ -12,7 +12,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic, register_jitable
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import Function
+from coopoc.kernels.compiling.compile import Function
 
 PAD = 16
 """Columns of matrices come in multiples of this: whole vectors in either precision."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import compiled
+from coopoc.kernels.compiling.compile import compiled
 from coopoc.learned.engine.arguments import Drives, Found, Matrices, Memory, Moments, Update
 
 from . import backward, forward

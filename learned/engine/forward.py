@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import compiled
+from coopoc.kernels.compiling.compile import compiled
 from coopoc.learned.engine.arguments import Drives, Matrices, Memory
 
 from . import places as on

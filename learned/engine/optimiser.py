@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compile import compiled, summing
+from coopoc.kernels.compiling.compile import compiled, summing
 from coopoc.learned.engine.arguments import Found, Moments, Update
 
 from .arithmetic import Index, borrowed, part

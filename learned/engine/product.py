@@ -12,7 +12,7 @@ from llvmlite import ir
 from numba.core import types
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import summing
+from coopoc.kernels.compiling.compile import summing
 
 from .arithmetic import ONE, PAD, ZERO, Index, apart, inside, instructions
 from .tile import ADD, BYTES, GATE, RELU, Tile, shapes, stays

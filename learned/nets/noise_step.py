@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
-from coopoc.kernels.compile import as_written, inside
+from coopoc.kernels.compiling.compile import as_written, inside
 
 from .noise_guess import EVEN, GNSS_STD, LEAST, MEMORY, SHARE, SHARED, SPEED
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray
-from coopoc.kernels.compile import compiled
+from coopoc.kernels.compiling.compile import compiled
 
 from ..engine.arithmetic import part, sigmoid, tanh
 from ..training.clients import Batch

@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
-from coopoc.kernels.compile import as_written, inner, inside
-from coopoc.kernels.elimination import rescale
-from coopoc.kernels.joint import Joint, joint_within
-from coopoc.kernels.joint_filter import step, write
-from coopoc.kernels.lanes import LANES
-from coopoc.kernels.messages import (
+from coopoc.kernels.compiling.compile import as_written, inner, inside
+from coopoc.kernels.compiling.lanes import LANES
+from coopoc.kernels.compiling.small import add, load, square, store
+from coopoc.kernels.stars.elimination import rescale
+from coopoc.kernels.stars.joint import Joint, joint_within
+from coopoc.kernels.stars.joint_filter import step, write
+from coopoc.kernels.stars.messages import (
     HELD,
     MOVED,
     NEW,
@@ -34,8 +35,7 @@ from coopoc.kernels.messages import (
     largest,
     star_within,
 )
-from coopoc.kernels.relative import vector
-from coopoc.kernels.small import add, load, square, store
+from coopoc.kernels.stars.relative import vector
 
 SUMS, LAST, STEP, JOINED, GUESSED, VELOCITY, WORTH, SIZE = 0, 12, 24, 25, 26, 29, 32, 35
 """Of a vehicle: motion m, its variance m^2, 1/r and (fix - motion)/r, each summed since departure, three axes each; the

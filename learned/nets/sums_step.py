@@ -10,13 +10,13 @@ import math
 import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
-from coopoc.kernels.compile import as_written, inner, storage
-from coopoc.kernels.joint import joint_in
-from coopoc.kernels.joint_filter import step
-from coopoc.kernels.lanes import LANES
-from coopoc.kernels.messages import ROW, Assumptions, Star, star_in
-from coopoc.kernels.small import load, store
-from coopoc.kernels.star_stream import answered, see
+from coopoc.kernels.compiling.compile import as_written, inner, storage
+from coopoc.kernels.compiling.lanes import LANES
+from coopoc.kernels.compiling.small import load, store
+from coopoc.kernels.stars.joint import joint_in
+from coopoc.kernels.stars.joint_filter import step
+from coopoc.kernels.stars.messages import ROW, Assumptions, Star, star_in
+from coopoc.kernels.stars.star_stream import answered, see
 from coopoc.methods.star import FORGOTTEN
 
 from .star_gain import LAST, SIZE, STEP, SUMS, Accounts, add_step, relocate, revalue, revise, settle
@@ -73,7 +73,7 @@ def sums_step(
         given: (7,) fix m, velocity m/s, dt s.
         variances: (6,) of a fix and of the motion m^2.
         inbox: (k, ROW_SIZE).
-        numbers: of the star and its Gaussian, as in `coopoc.kernels.star_stream`.
+        numbers: of the star and its Gaussian, as in `coopoc.kernels.stars.star_stream`.
         index: members of the last star, `most`, the number of the step; columns (3 most,); place in the last star (M,).
         accounts: of `accounts_in`.
         fixes: (1, 1, M, 3) m^2 of the last messages.

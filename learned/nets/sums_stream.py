@@ -15,7 +15,7 @@ from torch import nn
 
 from coopoc.arrays import Floats, number
 from coopoc.errors import InputError
-from coopoc.kernels.star_stream import resized
+from coopoc.kernels.stars.star_stream import resized
 from coopoc.methods.motion_history import fix_or_none, names_of, numbers, three
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.stream import motion_noise

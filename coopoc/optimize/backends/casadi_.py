@@ -20,10 +20,10 @@ from ...arrays import Floats
 from ...errors import InputError
 from ...plugins import one_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..constraint import steerable
-from ..descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
-from ..problem import Problem
-from ..symbolic import LOSSES, Structure, numbers_of, structure_of
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
+from ..model.constraint import steerable
+from ..model.problem import Problem
+from ..model.symbolic import LOSSES, Structure, numbers_of, structure_of
 from .casadi_programme import NlpSolver, Programme, programme
 
 DENSE = 200

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..symbolic import Structure, expressions
+from ..model.symbolic import Structure, expressions
 
 QUIET = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
 IPOPT = {

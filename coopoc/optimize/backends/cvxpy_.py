@@ -23,8 +23,8 @@ from ..convex.qcqp import Multipliers
 from ..convex.quadratic import TERMS, quadratic
 from ..convex.relaxation import first_vectors, polished, rounded, small
 from ..convex.schur import Dense, lower_bound
-from ..linear import entries
-from ..problem import Problem
+from ..model.linear import entries
+from ..model.problem import Problem
 from . import gauss_newton
 
 RELAXATIONS = ("auto", "qp", "sdp")

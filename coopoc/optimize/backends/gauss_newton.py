@@ -7,15 +7,15 @@ from functools import partial
 import numpy as np
 
 from ...arrays import Floats
+from ..algebra.cholesky import cholesky_of, with_still
+from ..algebra.dense import damped_step
+from ..algebra.sparse import Sparse, sparse
+from ..assessment.curvature import newton_step
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..cholesky import cholesky_of, with_still
-from ..curvature import newton_step
-from ..dense import damped_step
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
-from ..linear import Linear
-from ..problem import Problem
-from ..sparse import Sparse, sparse
-from ..trust_region import arrive
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
+from ..descent.trust_region import arrive
+from ..model.linear import Linear
+from ..model.problem import Problem
 
 PATIENCE = 40
 """Gauss-Newton steps before the exact Hessian takes over: with large residuals J^T J alone creeps or overshoots."""

@@ -16,12 +16,12 @@ import numpy as np
 
 from ...arrays import Floats
 from ...plugins import one_of
+from ..algebra.sparse import sparse
 from ..backend import Backend, Capabilities, Options, Solver, SolverResult, looped
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
-from ..linear import Linear
-from ..problem import Problem
-from ..sparse import sparse
-from ..trust_region import arrive
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
+from ..descent.trust_region import arrive
+from ..model.linear import Linear
+from ..model.problem import Problem
 from .gtsam_forms import forms
 from .gtsam_native import estimate, fix_nodes, native_graph, values, which_turn
 from .gtsam_optimizers import OPTIMIZERS, all_native, as_it_comes, gnc, levenberg_marquardt

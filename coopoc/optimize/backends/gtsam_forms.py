@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats, frozen
-from ..factor import Factor
-from ..problem import Problem
-from ..space import Space, log
+from ..model.factor import Factor
+from ..model.problem import Problem
+from ..model.space import Space, log
 
 POINT, POSE = False, True
 SAME = 1e-12

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..factor import Factor
-from ..linear import linearise
-from ..losses import Loss
-from ..problem import Problem
-from ..space import Space
+from ..model.factor import Factor
+from ..model.linear import linearise
+from ..model.losses import Loss
+from ..model.problem import Problem
+from ..model.space import Space
 from .gtsam_forms import Form, pose_of
 
 ESTIMATORS = {

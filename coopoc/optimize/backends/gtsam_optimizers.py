@@ -9,8 +9,8 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..factor import Factor
-from ..problem import Problem
+from ..model.factor import Factor
+from ..model.problem import Problem
 from .gtsam_forms import Form, Part, pose_of
 from .gtsam_native import fix_nodes, native_graph
 

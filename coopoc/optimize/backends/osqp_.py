@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..active import constraint_rows
-from ..arrowhead import structure
+from ..algebra.arrowhead import structure
+from ..algebra.normal import Pattern, normal_equations
+from ..assessment.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..constraint import bounded
-from ..descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
-from ..linear import Linear
-from ..local import local
-from ..normal import Pattern, normal_equations
-from ..problem import Problem
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
+from ..model.constraint import bounded
+from ..model.linear import Linear
+from ..model.local import local
+from ..model.problem import Problem
 from .osqp_programme import CLOSE, Infeasible, Programme, filled
 
 FAR = 1e-6

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..problem import Problem
+from ..model.problem import Problem
 from ..solution import Solution
 from .qcqp import multipliers
 from .quadratic import quadratic

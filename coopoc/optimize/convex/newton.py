@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..cholesky import Cholesky
+from ..algebra.cholesky import Cholesky
 from .manifold import MAX_ITERATIONS, Stationary, retract
 from .qcqp import Multipliers, Quadratic, multipliers
 from .schur import Sparse

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ...errors import InputError
-from ..factor import Factor
-from ..problem import Problem
+from ..model.factor import Factor
+from ..model.problem import Problem
 from .qcqp import Quadratic
 
 Terms = list[tuple[Floats, Ints]]

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..problem import Problem
+from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve
 from .cones import semidefinite

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...arrays import Bools, Floats
-from ..cholesky import cholesky_of
+from ..algebra.cholesky import cholesky_of
 from .qcqp import Multipliers, Quadratic
 
 DENSE = 500

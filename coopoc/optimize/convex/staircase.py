@@ -9,8 +9,8 @@ from tqdm import tqdm
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..cholesky import cholesky_of
-from ..problem import Problem
+from ..algebra.cholesky import cholesky_of
+from ..model.problem import Problem
 from .manifold import Stationary, minimise, retract
 from .newton import minimise_sparsely
 from .qcqp import Multipliers, Quadratic

@@ -8,9 +8,9 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..factor import Factor
-from ..initial import converted
-from ..problem import Problem
+from ..initialisation.initial import converted
+from ..model.factor import Factor
+from ..model.problem import Problem
 from .quadratic import TERMS, one_weight
 
 

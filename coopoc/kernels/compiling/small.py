@@ -1,0 +1,257 @@
+"""Small matrices of any fixed size as tuples of numbers, unrolled by the compiler.
+
+A vector of d numbers is a tuple of d, a d x d matrix a tuple of d * d, row by row. A number is a float, or LANES runs
+side by side (`coopoc.kernels.compiling.batched`): one text serves both. Memory is a flat array of floats, or an array (., LANES).
+
+Products and sums are fused where `plus` and `less` stand and nowhere else, so that all runs get the digits of a run
+alone.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+from .symbolic import Number, Numbers, less, plus, unrolled
+
+
+def order(matrix: Numbers) -> int:
+    """d of a d x d matrix."""
+    return math.isqrt(len(matrix))
+
+
+def _entries(d: int) -> list[tuple[int, int]]:
+    return [(i, j) for i in range(d) for j in range(d)]
+
+
+def _dot(first: Number, a: Numbers, b: Numbers, how: Callable[[Number, Number, Number], Number] = less) -> Number:
+    """first - a b, or + with `plus`, product by product."""
+    for x, y in zip(a, b, strict=True):
+        first = how(first, x, y)
+    return first
+
+
+def _rounded(a: Numbers, b: Numbers) -> Number:
+    """a b, every product and sum rounded by itself."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+@unrolled
+def load(memory: Any, at: Any, like: Any) -> Any:
+    """Tuple number `at` of those, as long as `like`, that stand in memory one after the other."""
+    return memory.read(at, len(like))
+
+
+@unrolled
+def store(memory: Any, at: Any, values: Any) -> Any:
+    """Write tuple number `at`."""
+    memory.write(at, values)
+
+
+@unrolled
+def add(a: Any, b: Any) -> Any:
+    """a + b."""
+    return [x + y for x, y in zip(a, b, strict=True)]
+
+
+@unrolled
+def subtract(a: Any, b: Any) -> Any:
+    """a - b."""
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+@unrolled
+def negate(a: Any) -> Any:
+    """-a."""
+    return [-x for x in a]
+
+
+@unrolled
+def times(a: Any, b: Any) -> Any:
+    """a_i b_i."""
+    return [x * y for x, y in zip(a, b, strict=True)]
+
+
+@unrolled
+def scale(a: Any, number: Any) -> Any:
+    """a_i times a number."""
+    return [x * number for x in a]
+
+
+@unrolled
+def zeros(number: Any, like: Any) -> Any:
+    """As many zeros as `like` has numbers, of the kind of `number`."""
+    return [number * 0.0 for _ in like]
+
+
+@unrolled
+def square(row: Any) -> Any:
+    """A matrix of zeros for vectors as long as `row`."""
+    return [row[0] * 0.0 for _ in range(len(row) ** 2)]
+
+
+@unrolled
+def first3(v: Any) -> Any:
+    """The first three numbers."""
+    return v[:3]
+
+
+@unrolled
+def with_first3(v: Any, three: Any) -> Any:
+    """A vector with other first three numbers."""
+    return [*three, *v[3:]]
+
+
+@unrolled
+def add_corner(a: Any, b: Any) -> Any:
+    """A with B (3, 3) added to its upper left corner."""
+    d = order(a)
+    return [a[d * i + j] + b[3 * i + j] if max(i, j) < 3 else a[d * i + j] for i, j in _entries(d)]
+
+
+@unrolled
+def scale_rows(v: Any, a: Any) -> Any:
+    """diag(v) A."""
+    return [v[i] * a[i * len(v) + j] for i, j in _entries(len(v))]
+
+
+@unrolled
+def choose_each(sign: Any, a: Any, b: Any) -> Any:
+    """a_i where the number `sign` is positive, else b_i."""
+    return [sign.choose(x, y) for x, y in zip(a, b, strict=True)]
+
+
+@unrolled
+def transpose(a: Any) -> Any:
+    """A^T."""
+    d = order(a)
+    return [a[j * d + i] for i, j in _entries(d)]
+
+
+@unrolled
+def mirrored(a: Any) -> Any:
+    """The symmetric matrix of which only the upper triangle of A counts."""
+    d = order(a)
+    return [a[min(i, j) * d + max(i, j)] for i, j in _entries(d)]
+
+
+@unrolled
+def from_upper(u: Any) -> Any:
+    """A symmetric matrix from its upper triangle, row by row, in d (d + 1) / 2 numbers."""
+    d = (math.isqrt(8 * len(u) + 1) - 1) // 2
+    place = {pair: k for k, pair in enumerate((i, j) for i in range(d) for j in range(i, d))}
+    return [u[place[min(i, j), max(i, j)]] for i, j in _entries(d)]
+
+
+@unrolled
+def add_diagonal(a: Any, v: Any) -> Any:
+    """A + diag(v)."""
+    d = len(v)
+    return [a[i * d + j] + v[i] if i == j else a[i * d + j] for i, j in _entries(d)]
+
+
+@unrolled
+def outer_scale(a: Any, u: Any, v: Any) -> Any:
+    """diag(u) A diag(v)."""
+    d = order(a)
+    return [a[i * d + j] * u[i] * v[j] for i, j in _entries(d)]
+
+
+@unrolled
+def minus_product(a: Any, b: Any) -> Any:
+    """-A B."""
+    d = order(a)
+    return [_dot(-(a[i * d] * b[j]), a[i * d + 1 : i * d + d], b[d + j :: d]) for i, j in _entries(d)]
+
+
+@unrolled
+def less_transposed_product(t: Any, a: Any, b: Any) -> Any:
+    """T - A^T B."""
+    d = order(t)
+    return [_dot(t[i * d + j], a[i::d], b[j::d]) for i, j in _entries(d)]
+
+
+@unrolled
+def minus_apply(a: Any, v: Any) -> Any:
+    """-A v."""
+    d = len(v)
+    return [_dot(-(a[i * d] * v[0]), a[i * d + 1 : i * d + d], v[1:]) for i in range(d)]
+
+
+@unrolled
+def less_applied(t: Any, a: Any, v: Any) -> Any:
+    """t - A v."""
+    d = len(v)
+    return [_dot(t[i], a[i * d : i * d + d], v) for i in range(d)]
+
+
+@unrolled
+def less_transposed_applied(t: Any, a: Any, v: Any) -> Any:
+    """t - A^T v."""
+    return [_dot(t[i], a[i :: len(v)], v) for i in range(len(v))]
+
+
+@unrolled
+def apply(a: Any, v: Any) -> Any:
+    """A v, every product and sum rounded by itself."""
+    d = len(v)
+    return [_rounded(a[i * d : i * d + d], v) for i in range(d)]
+
+
+@unrolled
+def plus_applied(t: Any, a: Any, v: Any) -> Any:
+    """t + A v, every product and sum rounded by itself."""
+    d, out = len(v), []
+    for i in range(d):
+        total = t[i]
+        for k in range(d):
+            total = total + a[i * d + k] * v[k]
+        out.append(total)
+    return out
+
+
+@unrolled
+def inverse(m: Any) -> Any:
+    """The inverse of a symmetric positive definite matrix, whose upper triangle counts: of 3 x 3 by its adjugate, of
+    any other size by M = L D L^T."""
+    return _adjugate(m) if len(m) == 9 else _factorised(m)
+
+
+def _adjugate(m: Numbers) -> Numbers:
+    a, b, c = less(m[4] * m[8], m[5], m[5]), less(m[2] * m[5], m[1], m[8]), less(m[1] * m[5], m[2], m[4])
+    s = plus(plus(m[0] * a, m[1], b), m[2], c).over()
+    d, e, f = less(m[0] * m[8], m[2], m[2]) * s, less(m[1] * m[2], m[0], m[5]) * s, less(m[0] * m[4], m[1], m[1]) * s
+    a, b, c = a * s, b * s, c * s
+    return [a, b, c, b, d, e, c, e, f]
+
+
+def _factorised(m: Numbers) -> Numbers:
+    """u_ij = l_ij d_j, p = 1 / d; w = L^-1; M^-1 = w^T D^-1 w."""
+    d = order(m)
+    p: list[Number] = []
+    u: dict[tuple[int, int], Number] = {}
+    l: dict[tuple[int, int], Number] = {}  # noqa: E741
+    w: dict[tuple[int, int], Number] = {}
+    for j in range(d):
+        left = [l[j, k] for k in range(j)]
+        p.append(_dot(m[j * d + j], left, [u[j, k] for k in range(j)]).over())
+        for i in range(j + 1, d):
+            u[i, j] = _dot(m[j * d + i], [l[i, k] for k in range(j)], [u[j, k] for k in range(j)])
+            l[i, j] = u[i, j] * p[j]
+    for j in range(d):
+        for i in range(j + 1, d):
+            between = range(j + 1, i)
+            w[i, j] = _dot(-l[i, j], [l[i, k] for k in between], [w[k, j] for k in between])
+
+    def entry(i: int, j: int) -> Number:
+        total = p[j] if i == j else w[j, i] * p[j]
+        for k in range(j + 1, d):
+            total = total + w[k, i] * w[k, j] * p[k]
+        return total
+
+    upper = {pair: entry(*pair) for pair in _entries(d) if pair[0] <= pair[1]}
+    return [upper[min(i, j), max(i, j)] for i, j in _entries(d)]

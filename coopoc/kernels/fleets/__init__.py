@@ -1,0 +1,1 @@
+"""Whole fleets: filters, smoothers and algorithms that iterate over messages."""

@@ -1,0 +1,1 @@
+"""Sums and factors of graphs: tapes, sparse Cholesky, selected inversion, normal equations."""

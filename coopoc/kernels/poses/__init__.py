@@ -1,0 +1,1 @@
+"""Pose filters: positions with headings, from what is measured on board."""

@@ -1,0 +1,316 @@
+"""What the last message of each member of a star holds at a step, for LANES runs side by side.
+
+The one place that defines a message: the members of the star, the place of each in the last one, its motion
+since then, and its position as broadcast, brought forward to now. A message that is missing or lost has held = 0, one
+whose position was used before, or has no fix, has new = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from numpy import uint64
+
+from ...arrays import AnyArray, Bools, Floats, Ints
+from ..compiling.batched import choose, put, take
+from ..compiling.compile import inner, inside, storage
+from ..compiling.lanes import LANES
+from ..compiling.small import add, load, scale, store, times
+
+MOVED, PROCESS, POSITION, VARIANCE = range(4)
+"""Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
+as broadcast and brought forward, and its variance m^2."""
+SENT, USES, AGE, HELD, NEW = range(5)
+"""Rows of a member in `Star.status`: the step of the message, for how many steps in a row its velocity has served, its
+age in steps, 1 if there is one, and 1 if its position counts."""
+NOWHERE = 1e18
+"""m^2, variance of a position that is not known."""
+ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
+NONE = cast(int, np.int64(0))
+"""Members before the first star. For a constant of Python's numba would compile the whole step once more."""
+
+
+class Measurements(NamedTuple):
+    """What one ego has measured and received in R runs of T steps; M links, neighbours of a step nearest first.
+
+    Attributes:
+        gnss: (R, T, N, 3) m.
+        velocity: (R, T, N, 3) m/s.
+        broadcast: (R, T, N, 3) m, position in the neighbours' messages.
+        relative: (R, M, 5) of `components`.
+        neighbour: (M,) columns.
+        start: (T+1,) first link of each step.
+        newest: (R, M) step of the newest message held, -1 for none.
+        fresh: (R, M) whether it is new.
+    """
+
+    gnss: Floats
+    velocity: Floats
+    broadcast: Floats
+    relative: Floats
+    neighbour: Ints
+    start: Ints
+    newest: Ints
+    fresh: Bools
+    ego: int
+    dt: float
+
+
+class Assumptions(NamedTuple):
+    """What a filter assumes of them; arrays are broadcastable to (R, T, N, 3) m^2.
+
+    Attributes:
+        process: of one step.
+        fixes: of the ego's fixes.
+        broadcast: of positions in messages.
+        growth: variance of a position of age a: that of one step times a (growth[0] a + growth[1]).
+        relative_std: (3,) m, rad, rad; of no length for unit covariances.
+        min_range: m.
+        flat: m^2, prior of a member that joins.
+        acceleration: m/s^2, change of a velocity since it was sent.
+        velocity_noise: `NoiseModel.velocity_noise`, from which `process` is made; of no length: it is given.
+    """
+
+    process: Floats
+    fixes: Floats
+    broadcast: Floats
+    growth: tuple[float, float]
+    relative_std: Floats
+    min_range: float
+    flat: float
+    acceleration: float
+    velocity_noise: Floats
+
+
+class Star(NamedTuple):
+    """The members of a star at a step, the ego first, in LANES runs.
+
+    Attributes:
+        member: (most,) column.
+        previous: (most,) index in the last star, -1 for a member that joins.
+        status: (5 most, LANES).
+        motion: (12 most, LANES).
+        relative: (8 most, LANES): range m, sine and cosine of azimuth and of inclination, and three standard
+            deviations, infinite where nothing was measured.
+        last_member: of the last star.
+        last_status: of the last star.
+    """
+
+    member: Ints
+    previous: Ints
+    status: Floats
+    motion: Floats
+    relative: Floats
+    last_member: Ints
+    last_status: Floats
+
+
+@storage
+def star_in(memory: AnyArray, columns: AnyArray, most: int) -> Star:
+    """A star of up to `most` members in memory (>= 30 most LANES,) and columns (>= 3 most,)."""
+    rows = memory[: 30 * most * LANES].reshape((30 * most, LANES))
+    return Star(
+        columns[:most],
+        columns[most : 2 * most],
+        rows[: 5 * most],
+        rows[5 * most : 17 * most],
+        rows[17 * most : 25 * most],
+        columns[2 * most : 3 * most],
+        rows[25 * most :],
+    )
+
+
+@storage
+def star_within(most: int) -> Star:
+    """Room for `most` members, made by compiled code."""
+    return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)
+
+
+def new_star(most: int) -> Star:
+    """Room for `most` members."""
+    columns = [np.zeros(most, np.int64) for _ in range(3)]
+    status, motion, relative, last = (np.zeros((rows * most, LANES)) for rows in (5, 12, 8, 5))
+    return Star(columns[0], columns[1], status, motion, relative, columns[2], last)
+
+
+@inner
+def largest(start: AnyArray) -> int:
+    """Members of the largest star."""
+    most = 0
+    for t in range(len(start) - 1):
+        most = max(most, start[t + 1] - start[t])
+    return 1 + most
+
+
+@inner
+def gather(star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int, old: int) -> int:
+    """Fill the star of step t for runs (first, last), at most LANES, the last one repeated; the number of its members.
+
+    Args:
+        old: members of the last star.
+    """
+    n = 1 + seen.start[t + 1] - seen.start[t]
+    remember(star, old)
+    for k in range(n):
+        link = seen.start[t] + k - 1
+        star.member[k] = member = seen.ego if k == 0 else seen.neighbour[link]
+        star.previous[k] = place = index_of(member, star.last_member, old)
+        for lane in range(uint64(LANES)):
+            run = min(runs[0] + int(lane), runs[1])
+            receive(star, seen, known, (run, t, link), (k, place, lane))
+            if k > 0:
+                measured(star.relative, five_of(seen.relative, run, link), known.relative_std, k, lane)
+        if len(known.velocity_noise):
+            velocity = load(star.motion, 4 * k + MOVED, ROW)
+            store(star.motion, 4 * k + PROCESS, motion_variance(known.velocity_noise, velocity, seen.dt))
+        interpret(star, known, k, seen.dt)
+    return int(n)
+
+
+@inner
+def remember(star: Star, old: int) -> None:
+    """Make the star the last one."""
+    for k in range(old):
+        star.last_member[k] = star.member[k]
+        for row in (uint64(5 * k + SENT), uint64(5 * k + USES)):
+            put(star.last_status, row, take(star.status, row))
+
+
+@inside
+def clear(values: AnyArray) -> None:
+    """Fill with zeros."""
+    for i in range(len(values)):
+        store(values, i, (0.0,))
+
+
+@inside
+def index_of(member: int, members: AnyArray, count: int) -> int:
+    """Index of a member, -1 if it is not among the first `count`."""
+    place = -1
+    for i in range(count):
+        if members[i] == member:
+            place = i
+    return place
+
+
+@inside
+def receive(star: Star, seen: Measurements, known: Assumptions, source: Any, target: Any) -> None:
+    """Copy the last message of a member in one run: velocity, process noise, position, its variance, and its status."""
+    (run, t, link), (k, place, lane) = source, target
+    i, here, before, status = uint64(run), uint64(link), uint64(5 * max(place, 0)), uint64(5 * k)
+    sent = t if k == 0 else seen.newest[i, here]
+    when = sent if sent >= 0 else t
+    again = place >= 0 and star.last_status[before + uint64(SENT), lane] == sent
+    star.status[status + uint64(SENT), lane] = sent
+    star.status[status + uint64(USES), lane] = star.last_status[before + uint64(USES), lane] + 1.0 if again else 1.0
+    star.status[status + uint64(AGE), lane] = t - when
+    star.status[status + uint64(HELD), lane] = 1.0 if sent >= 0 else 0.0
+    j, m, at = uint64(when), uint64(star.member[k]), uint64(12 * k)
+    put_lane(star.motion, at, lane, three_of(seen.velocity, i, j, m))
+    put_lane(star.motion, at + uint64(3), lane, three_of(known.process, i, j, m))
+    fresh = k == 0 or seen.fresh[i, here]
+    x, y, z = three_of(seen.gnss, i, j, m) if k == 0 else three_of(seen.broadcast, i, j, m)
+    there = math.isfinite(x + y + z)
+    put_lane(star.motion, at + uint64(6), lane, (x, y, z) if there else (0.0, 0.0, 0.0))
+    variance = three_of(known.fixes, i, j, m) if k == 0 else three_of(known.broadcast, i, j, m)
+    put_lane(star.motion, at + uint64(9), lane, variance if there else (NOWHERE, NOWHERE, NOWHERE))
+    star.status[status + uint64(NEW), lane] = 1.0 if fresh and there else 0.0
+
+
+@inside
+def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
+    """What the last message of member k means now: the velocity moves it, the position is brought forward.
+
+    A velocity that serves for the n-th step in a row makes the same error n times: the variance of the sum is n^2 of
+    that of one step, so this step adds 2 n - 1 of it. It has changed since it was sent, too.
+    """
+    uses, age = take(star.status, uint64(5 * k + USES)), take(star.status, uint64(5 * k + AGE))
+    held = take(star.status, uint64(5 * k + HELD))
+    late, often = dt * dt * age * known.acceleration, 2.0 * uses - 1.0
+    one = load(star.motion, 4 * k + PROCESS, ROW)
+    late = late * late
+    one = one[0] + late, one[1] + late, one[2] + late
+    velocity = load(star.motion, 4 * k + MOVED, ROW)
+    moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
+    flat = 0.0 * age + known.flat
+    grown = scale(one, age * (known.growth[0] * age + known.growth[1]))
+    store(star.motion, 4 * k + MOVED, moved)
+    store(
+        star.motion,
+        4 * k + PROCESS,
+        (
+            choose(held, often * one[0], flat),
+            choose(held, often * one[1], flat),
+            choose(held, often * one[2], flat),
+        ),
+    )
+    store(star.motion, 4 * k + POSITION, add(load(star.motion, 4 * k + POSITION, ROW), scale(moved, age)))
+    store(star.motion, 4 * k + VARIANCE, add(load(star.motion, 4 * k + VARIANCE, ROW), grown))
+
+
+@inside
+def position_or_nan(star: Star, k: int, axis: int, lane: int) -> float:
+    """Position m of member k by its last message, NaN if no message with a position is held."""
+    known = star.status[5 * k + HELD, lane] > 0.0 and star.motion[12 * k + 3 * VARIANCE + axis, lane] < NOWHERE
+    return star.motion[12 * k + 3 * POSITION + axis, lane] if known else np.nan
+
+
+@inside
+def measured(relative: AnyArray, seen: Any, std: AnyArray, k: int, lane: int) -> None:
+    """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
+    d, sa, ca, si, ci = seen
+    at, unit = uint64(8 * k), len(std) == 0
+    has_azimuth, has_inclination = sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
+    relative[at, lane] = max(d, 0.0)
+    range_std, azimuth_std, inclination_std = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
+    azimuth = sa, ca if has_azimuth else 1.0, si if has_inclination else 1.0
+    put_lane(relative, at + uint64(1), lane, azimuth)
+    relative[at + uint64(4), lane] = ci
+    deviations = (
+        range_std if d >= 0.0 else math.inf,
+        azimuth_std if has_azimuth else math.inf,
+        inclination_std if has_inclination else math.inf,
+    )
+    put_lane(relative, at + uint64(5), lane, deviations)
+
+
+@inside
+def motion_variance(velocity_noise: AnyArray, velocity: Any, dt: float) -> Any:
+    """Variance m^2 of the motion of one step at a measured velocity m/s: of the ratio, at least the floor."""
+    u, v, w = velocity
+    a, b, c = abs(u), abs(v), abs(w)
+    if velocity_noise[2] > 0.0:
+        a = b = c = math.sqrt(u * u + v * v + w * w)
+    ratio, floor = velocity_noise[0], velocity_noise[1]
+    std = dt * max(ratio * a, floor), dt * max(ratio * b, floor), dt * max(ratio * c, floor)
+    return times(std, std)
+
+
+@inside
+def three_of(values: AnyArray, run: Any, t: Any, member: Any) -> Any:
+    """Three of what is broadcastable to (R, T, N, 3)."""
+    one = uint64(1)
+    i, j = min(run, uint64(values.shape[0]) - one), min(t, uint64(values.shape[1]) - one)
+    k = min(member, uint64(values.shape[2]) - one)
+    return values[i, j, k, uint64(0)], values[i, j, k, one], values[i, j, k, uint64(2)]
+
+
+@inside
+def five_of(relative: AnyArray, run: int, link: int) -> Any:
+    """The five numbers of a measurement of `components`."""
+    i, j = uint64(run), uint64(link)
+    return (
+        relative[i, j, uint64(0)],
+        relative[i, j, uint64(1)],
+        relative[i, j, uint64(2)],
+        relative[i, j, uint64(3)],
+        relative[i, j, uint64(4)],
+    )
+
+
+@inside
+def put_lane(memory: AnyArray, at: Any, lane: int, values: Any) -> None:
+    """Write three numbers of one run."""
+    memory[at, lane], memory[at + uint64(1), lane], memory[at + uint64(2), lane] = values

@@ -1,0 +1,1 @@
+"""Windows of a star's last steps, solved anew at every step."""

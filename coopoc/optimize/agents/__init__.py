@@ -1,0 +1,1 @@
+"""A graph solved by its robots, which exchange what they share."""

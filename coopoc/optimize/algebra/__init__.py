@@ -1,0 +1,1 @@
+"""Linear algebra of a problem at a point: tapes of derivatives, normal equations, factors."""

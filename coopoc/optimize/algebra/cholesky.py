@@ -1,0 +1,139 @@
+"""Sparse Cholesky factors of a Hessian with their analysis kept: solve, definiteness, marginals of any unknowns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+
+
+class Cholesky:
+    """A = L L^T of matrices of one pattern; ordering and structure are found once.
+
+    `factor` before all else; what is asked is of the matrix that was factored last.
+
+    Args:
+        indptr: (u + 1,) of the upper triangle, CSC with sorted rows and no diagonal left out.
+        indices: of its rows.
+        group: (u,) ascending, the node of each unknown; the last of a node has the neighbours of all. None: each is
+            alone.
+
+    >>> cholesky = Cholesky(np.array([0, 1, 3]), np.array([0, 0, 1]))
+    >>> cholesky.factor(np.array([2.0, 1.0, 2.0])), cholesky.solve(np.array([3.0, 3.0])).round(6)
+    (True, array([1., 1.]))
+    """
+
+    def __init__(self, indptr: Ints, indices: Ints, group: Ints | None = None) -> None:
+        from ...kernels.graphs.graph_cholesky import places
+
+        size = len(indptr) - 1
+        self._fronts = analysed(indptr, indices, np.arange(size) if group is None else group)
+        self._rank = np.argsort(self._fronts.order)
+        column = np.repeat(np.arange(size), np.diff(indptr))
+        self._place = places(self._fronts, self._rank[indices], self._rank[column])
+        self._factor = np.empty(int(self._fronts.start[-1]))
+
+    def factor(self, values: Floats) -> bool:
+        """Factor an upper triangle's values; whether it is positive definite."""
+        from ...kernels.graphs.graph_cholesky import factorise
+
+        return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
+
+    def solve(self, rhs: Floats) -> Floats:
+        """(u,) A^-1 rhs."""
+        from ...kernels.graphs.graph_cholesky import solved
+
+        return solved(self._fronts, self._factor, rhs)
+
+    def inverse(self, rows: Ints, columns: Ints) -> Floats:
+        """A^-1 at pairs of unknowns (K,), each of which A has an entry for.
+
+        See `selected_inverse`; time and memory are those of the factor, not of the inverse.
+        """
+        from ...kernels.graphs.graph_cholesky import places
+        from ...kernels.graphs.graph_inverse import selected_inverse
+
+        found = selected_inverse(self._fronts, self._factor)
+        return found[places(self._fronts, self._rank[rows], self._rank[columns])]
+
+
+def cholesky_of(matrix: Any) -> Cholesky | None:
+    """Factors of a sparse symmetric matrix (SciPy's, any format), or None: it is not positive definite.
+
+    >>> from scipy.sparse import csc_array
+    >>> cholesky_of(csc_array([[2.0, 1.0], [1.0, 2.0]])).solve(np.array([3.0, 3.0])).round(6)
+    array([1., 1.])
+    >>> cholesky_of(csc_array([[1.0, 2.0], [2.0, 1.0]])) is None
+    True
+    """
+    from scipy.sparse import triu
+
+    upper = triu(matrix, format="csc")
+    upper.sort_indices()
+    if not (np.isfinite(upper.data).all() and (upper.diagonal() > 0).all()):
+        return None
+    cholesky = Cholesky(upper.indptr.astype(np.int64), upper.indices.astype(np.int64))
+    return cholesky if cholesky.factor(upper.data) else None
+
+
+def with_still(matrix: Any, added: Floats | Bools | None) -> Any:
+    """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
+    from scipy.sparse import diags_array
+
+    return matrix if added is None else matrix + diags_array(np.asarray(added, dtype=np.float64).ravel())
+
+
+def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
+    """Fronts of a pattern, its groups of unknowns in the order of approximate minimum degree.
+
+    References:
+        Amestoy, Davis, Duff, An approximate minimum degree ordering algorithm, SIAM J. Matrix Anal. 1996.
+    """
+    from scipy.sparse import coo_array
+
+    from ...kernels.graphs.graph_fronts import RELAXED, Fronts, elimination_tree, structures, supernodes
+
+    name, begin, width = np.unique(group, return_index=True, return_counts=True)
+    n, last = len(name), begin + width - 1
+    which = np.repeat(np.arange(n), width)
+    length = np.diff(indptr)[last]
+    column = np.repeat(np.arange(n), length)
+    row = which[indices[_runs(indptr[last], length)]]
+    both = np.concatenate([row, column]), np.concatenate([column, row])
+    pattern = coo_array((np.ones(2 * len(row)), both), shape=(n, n)).tocsr()
+    both_ways = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
+    order, parent = elimination_tree(*both_ways, minimum_degree(*both_ways))
+    at, below = structures(*both_ways, order, parent)
+    head = supernodes(parent, at, below, width[order], np.array(RELAXED))
+    first = np.concatenate([[0], np.cumsum(width[order])])
+    top = head[1:] - 1
+    of = np.repeat(np.arange(len(top)), at[top + 1] - at[top])
+    rows = below[_runs(at[top], at[top + 1] - at[top])]
+    sort = np.lexsort((rows, of))
+    wide = width[order][rows[sort]]
+    count = np.bincount(of[sort], wide, len(top)).astype(np.int64)
+    columns = np.diff(first[head])
+    return Fronts(
+        _runs(begin[order], width[order]),
+        first[head],
+        np.concatenate([[0], np.cumsum(count)]),
+        _runs(first[rows[sort]], wide),
+        np.concatenate([[0], np.cumsum(columns * (columns + count))]),
+        np.repeat(np.arange(len(top)), columns),
+    )
+
+
+def minimum_degree(indptr: Ints, indices: Ints) -> Ints:
+    """(n,) which of a symmetric pattern's nodes is eliminated as the k-th, by CasADi's AMD."""
+    import casadi as ca
+
+    n = len(indptr) - 1
+    return np.array(ca.Sparsity(n, n, indptr.tolist(), indices.tolist()).amd(), dtype=np.int64)
+
+
+def _runs(first: Ints, length: Ints) -> Ints:
+    """first[k], first[k] + 1, ... of each length[k]."""
+    total = np.cumsum(length)
+    return np.asarray(np.arange(total[-1] if len(total) else 0) + np.repeat(first - (total - length), length))

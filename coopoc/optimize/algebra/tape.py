@@ -1,0 +1,168 @@
+"""The tapes of a kind: its cost, gradient and curvature by the steps of its nodes, written from its one definition.
+
+CasADi runs the measurement's own formula, differentiates what it costs and hands over a list of scalar operations,
+which the kernel in kernels/graphs/graph_tape.py runs for all measurements.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from ...arrays import Floats, Ints
+from ..model.factor import Factor
+from ..model.losses import Loss
+from ..model.measurements import Measurement
+from ..model.space import Space
+
+if TYPE_CHECKING:
+    from ...kernels.graphs.graph_tape import Tape
+
+Model = Literal["cost", "gauss-newton", "newton"]
+
+
+class NoTape(Exception):
+    """A formula that CasADi cannot run, or one with an operation that no tape has."""
+
+
+class Kind(NamedTuple):
+    """All that the tape of a factor depends on.
+
+    Attributes:
+        measurement: of its kind.
+        space: of the problem.
+        full: its weight is a matrix.
+        loss: rho.
+    """
+
+    measurement: Measurement
+    space: Space
+    full: bool
+    loss: Loss | None
+
+
+class Written(NamedTuple):
+    """A tape and what its outputs are: the cost, then entries (row, column) of the gradient (column -1) and of the
+    upper triangle of the curvature, by the dof of the first node and then of the second.
+
+    Attributes:
+        tape: for the kernel.
+        entries: (outputs, 2); the cost has -1 twice.
+        function: the same as CasADi's Function of (nodes, numbers) -> outputs.
+    """
+
+    tape: Tape
+    entries: Ints
+    function: Any
+
+
+def kind_of(factor: Factor, space: Space) -> Kind:
+    """The kind of a factor."""
+    return Kind(factor.measurement, space, factor.std is None, factor.loss)
+
+
+def numbers_of(factor: Factor) -> Floats:
+    """(P, M) the tape's inputs that are no nodes: z, constants and weights of a single realisation."""
+    weight = 1.0 / factor.std if factor.std is not None else factor.sqrt_information
+    assert weight is not None
+    assert factor.constants is not None
+    first, second = factor.z.shape[1], factor.z.shape[1] + factor.constants.shape[1]
+    out = np.empty((second + weight[0].size, len(factor.nodes)))
+    out[:first], out[first:second], out[second:] = factor.z.T, factor.constants.T, weight.reshape(len(weight), -1).T
+    return out
+
+
+@lru_cache(maxsize=256)
+def write(kind: Kind, model: Model) -> Written:
+    """The tape of a kind.
+
+    Raises:
+        NoTape: the formula has none.
+    """
+    import casadi as ca
+
+    nodes, number, steps, parts = _cost(kind)
+    cost, white, square, rho = parts
+    zero = ca.SX.zeros(steps.size1())
+    outputs, entries = [cost], [(-1, -1)]
+    if model != "cost":
+        slope = ca.gradient(cost, steps)
+        if model == "newton":
+            curvature = ca.hessian(cost, steps)[0]
+        else:
+            J = ca.jacobian(white, steps)
+            curvature = ca.mtimes(J.T, J) * ca.substitute(ca.jacobian(rho, square), square, ca.sumsqr(white))
+        for i in range(steps.size1()):
+            outputs.append(slope[i])
+            entries.append((i, -1))
+        for i in range(steps.size1()):
+            for j in range(i, steps.size1()):
+                outputs.append(curvature[i, j])
+                entries.append((i, j))
+    here = ca.substitute(ca.vertcat(*outputs), steps, zero)
+    here = ca.cse(here)
+    kept = [k for k in range(here.size1()) if not here[k].is_zero()]
+    found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found))
+    function = ca.Function("tape", [nodes, number], found)
+    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
+
+
+def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
+    """Symbols of the nodes, the numbers and the steps; the cost, the whitened residual, and rho of its square."""
+    import casadi as ca
+
+    from ..model import symbolic
+
+    known, space = kind.measurement, kind.space
+    arity, size = known.arity, known.size(space.dimension)
+    nodes = ca.SX.sym("nodes", arity * space.ambient)
+    steps = ca.SX.sym("steps", arity * space.dof)
+    widths = known.given(space.dimension), known.constants, size ** (1 + kind.full)
+    number, square = ca.SX.sym("number", sum(widths)), ca.SX.sym("square")
+    given = [number[sum(widths[:k]) : sum(widths[: k + 1])] for k in range(3)]
+    try:
+        white = symbolic.white(known, space, nodes, steps, given, kind.full)
+        rho = symbolic.robust(square, kind.loss)
+    except Exception as problem:  # the formula is the user's: whatever it raises, the plain way takes it
+        raise NoTape(f"{known.name} does not run on CasADi's numbers: {problem}") from problem
+    cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
+    return nodes, number, steps, (cost, white, square, rho)
+
+
+def _tape(function: Any) -> Tape:
+    """The operations of a CasADi function of one vector."""
+    from ...kernels.graphs.graph_tape import Tape
+    from ...kernels.graphs.operations import Operation
+
+    known, constant, read_in, write_out = _known(), int(Operation.CONST), int(Operation.INPUT), int(Operation.OUTPUT)
+    count = function.n_instructions()
+    code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
+    for k in range(count):
+        found = function.instruction_id(k)
+        if found not in known:
+            raise NoTape(f"no tape has CasADi's operation {found}")
+        code[k] = operation = known[found]
+        read, written = function.instruction_input(k), function.instruction_output(k)
+        if operation == constant:
+            place[k, 0], value[k] = written[0], function.instruction_constant(k)
+        elif operation == read_in:
+            place[k, :2] = written[0], read[1]
+        elif operation == write_out:
+            place[k, :2] = written[1], read[0]
+        else:
+            place[k] = written[0], read[0], read[-1]
+    return Tape(code, place, value, function.sz_w())
+
+
+@lru_cache(maxsize=1)
+def _known() -> dict[int, int]:
+    """CasADi's number of an operation -> ours."""
+    import casadi as ca
+
+    from ...kernels.graphs.operations import Operation
+
+    known = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
+    return known | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}  # of one slot, which is read twice

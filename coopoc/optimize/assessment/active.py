@@ -1,0 +1,193 @@
+"""Active constraints at a point: their multipliers, the directions that remain, and the largest violation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ..model.constraint import bounded, values
+from ..model.local import chain, local
+from ..model.problem import Problem
+
+NEAR = 5e-7
+"""m or rad, a step this long reaches the bound: the constraint is active."""
+DEPENDENT = 1e-9
+"""Singular value, of rows of length 1, below which they are dependent."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """All numbers of a problem that are bounded, at x.
+
+    Args:
+        value: (rows,).
+        lower: as `value`.
+        upper: as `value`.
+        matrix: (rows, n dof) sparse derivative of the values by the steps.
+        place: (rows, 3) constraint, row of its nodes and component.
+    """
+
+    value: Floats
+    lower: Floats
+    upper: Floats
+    matrix: Any
+    place: Ints
+
+    @property
+    def outside(self) -> Floats:
+        """(rows,) by how much each is violated."""
+        return np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Active:
+    """The constraints that hold at x: equalities, and the inequalities with a multiplier.
+
+    Args:
+        multipliers: (rows,) of `Rows`, the gradient of the cost plus matrix^T multipliers vanishes at a minimum; at a
+            lower bound they are <= 0, at an upper one >= 0.
+        constraint_gradient: (n dof,) matrix^T multipliers.
+        onto: (n dof,) the least step onto what holds.
+        along: (n dof, k) sparse, orthonormal directions in which all that holds stays as it is.
+        exact: the same for the equalities alone.
+        violation: the largest of any constraint.
+        violated: which, in words.
+    """
+
+    multipliers: Floats
+    constraint_gradient: Floats
+    onto: Floats
+    along: Any
+    exact: Any
+    violation: float
+    violated: str
+
+    @property
+    def holds(self) -> bool:
+        """True if any direction is taken away."""
+        return bool(self.along.shape[1] < self.along.shape[0])
+
+
+def constraint_rows(problem: Problem, x: Floats) -> Rows:
+    """The constraints of a single problem at x (n, ambient)."""
+    from scipy.sparse import vstack
+
+    parts = [_rows_of(problem, x, k) for k in range(len(problem.constraints))]
+    value, lower, upper = (np.concatenate([p[0][side] for p in parts]) for side in range(3))
+    return Rows(value, lower, upper, vstack([p[1] for p in parts], format="csr"), np.concatenate([p[2] for p in parts]))
+
+
+def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats, Floats], Any, Ints]:
+    from scipy.sparse import csr_array
+
+    item, space = problem.constraints[k], problem.space
+    known, which = item.measurement, bounded(item)
+    seen = local(space, known, x[None], item.nodes)
+    value, jacobian = values(known, item, *seen)
+    jacobians = chain(
+        space, known, x[None], item.nodes, seen, np.broadcast_to(jacobian, (*value.shape, jacobian.shape[-1]))
+    )
+    if len(jacobians) < known.arity:
+        jacobians = (-jacobians[0], jacobians[0])
+    row, component = np.nonzero(which)
+    data = np.stack([s[0, row, component] for s in jacobians], axis=1)
+    if problem.movable is not None:
+        data = data * problem.movable[item.nodes[row]]
+    columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
+    starts = np.arange(0, data.size + 1, known.arity * space.dof)
+    matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
+    place = np.stack([np.full(len(row), k), row, component], axis=1)
+    return (value[0][which], item.lower[which], item.upper[which]), matrix, place
+
+
+def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
+    """The constraints that hold at x (n, ambient), where the gradient of the cost is (n, dof).
+
+    Multipliers are the least-squares ones with the signs that a minimum needs; an inequality that does not push does
+    not hold. Constraints that share no direction are looked at apart from each other.
+    """
+    rows = constraint_rows(problem, x)
+    length = np.sqrt(np.asarray(rows.matrix.multiply(rows.matrix).sum(axis=1)).ravel())
+    reach = NEAR * length
+    low, high = rows.value - rows.lower <= reach, rows.upper - rows.value <= reach
+    equal, touched = rows.lower == rows.upper, np.flatnonzero((low | high) & (length > 0))
+    multipliers, onto = np.zeros(len(length)), np.zeros(gradient.size)
+    along: list[tuple[Ints, Floats]] = []
+    exact: list[tuple[Ints, Floats]] = []
+    for members, columns, block in _apart(rows.matrix[touched]):
+        own = touched[members]
+        unit = block / length[own, None]
+        found = _multipliers(unit, gradient.ravel()[columns], low[own] | equal[own], high[own] | equal[own])
+        multipliers[own] = found / length[own]
+        pushes = equal[own] | (found != 0)
+        gap = (rows.value - np.where(multipliers < 0, rows.lower, rows.upper))[own] / length[own]
+        onto[columns], ways = _split(unit[pushes], gap[pushes])
+        along.append((columns, ways))
+        exact.append((columns, _split(unit[equal[own]], gap[equal[own]])[1]))
+    constraint_gradient, worst = rows.matrix.T @ multipliers, int(rows.outside.argmax())
+    violation, violated = float(rows.outside[worst]), _words(problem, rows, worst)
+    ways, fixed = (_directions(gradient.size, blocks) for blocks in (along, exact))
+    return Active(multipliers, constraint_gradient, onto, ways, fixed, violation, violated)
+
+
+def _apart(matrix: Any) -> Iterator[tuple[Ints, Ints, Floats]]:
+    """Rows that share no column with the others: their numbers, their columns and the dense block."""
+    from scipy.sparse.csgraph import connected_components
+
+    matrix.eliminate_zeros()
+    count, label = connected_components(abs(matrix) @ abs(matrix).T, directed=False)
+    for group in range(count):
+        members = np.flatnonzero(label == group)
+        part = matrix[members]
+        columns = np.unique(part.indices)
+        yield members, columns, part[:, columns].toarray()
+
+
+def _multipliers(unit: Floats, gradient: Floats, low: Bools, high: Bools) -> Floats:
+    """Least |gradient + unit^T m| with m <= 0 where only the lower bound is near and m >= 0 where only the upper is."""
+    from scipy.optimize import lsq_linear
+
+    scale = max(np.abs(gradient).max(), 1e-300)
+    bounds = (np.where(low, -np.inf, 0.0), np.where(high, np.inf, 0.0))
+    found = lsq_linear(unit.T, -gradient / scale, bounds, method="bvls", tol=1e-14)
+    return np.asarray(scale * found.x)
+
+
+def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:
+    """The least step that undoes the gaps of the rows, and orthonormal directions (columns) that no row sees."""
+    if not len(unit):
+        return np.zeros(unit.shape[1]), np.eye(unit.shape[1])
+    left, values, right = np.linalg.svd(unit)
+    rank = int((values > DEPENDENT).sum())
+    return -right[:rank].T @ ((left[:, :rank].T @ gap) / values[:rank]), right[rank:].T
+
+
+def _directions(size: int, blocks: list[tuple[Ints, Floats]]) -> Any:
+    """(size, k) sparse: the blocks' directions on their columns, and each coordinate that is in no block."""
+    from scipy.sparse import csc_array
+
+    kept: Ints = np.setdiff1d(np.arange(size), np.concatenate([np.empty(0, np.int64), *(c for c, _ in blocks)]))
+    rows, cols, top = [kept], [np.arange(len(kept))], len(kept)
+    data: list[Floats] = [np.ones(len(kept))]
+    for columns, block in blocks:
+        rows.append(np.repeat(columns, block.shape[1]))
+        cols.append(top + np.tile(np.arange(block.shape[1]), len(columns)))
+        data.append(block.ravel())
+        top += block.shape[1]
+    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))
+    return csc_array(entries, shape=(size, top))
+
+
+def _words(problem: Problem, rows: Rows, worst: int) -> str:
+    """Which constraint is violated most, of which nodes, and by how much."""
+    k, row, component = rows.place[worst].tolist()
+    item = problem.constraints[k]
+    nodes = " and ".join(problem.names[n] for n in item.nodes[row])
+    below = rows.value[worst] < rows.lower[worst]
+    side, bound = ("below its lower", rows.lower[worst]) if below else ("above its upper", rows.upper[worst])
+    which = f", component {component}," if item.lower.shape[1] > 1 else ""
+    return f"{item.kind} of {nodes}{which} is {rows.outside[worst]:.3g} {side} bound {bound:.6g}"

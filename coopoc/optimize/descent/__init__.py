@@ -1,0 +1,1 @@
+"""Outer loops: from a start to a minimum."""

@@ -1,0 +1,195 @@
+"""Levenberg-Marquardt: the outer loop that every backend with a linear step shares, for B problems at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ...errors import InputError
+from ..backend import SolverResult
+from ..model.linear import Linear
+from ..model.problem import Problem
+from .progress import progress
+
+Step = Callable[[Linear, Floats], Floats]
+"""(linearisation, damping (B, n, dof)) -> dx (B, n, dof): (J^T J + diag(damping)) dx = -J^T r, else LinAlgError."""
+
+MAX_ITERATIONS = 500
+"""About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
+TOLERANCE = 1e-8
+"""m or rad, largest move of a node in the last step."""
+LINEAR = 1e-6
+"""Share by which a step may be off where the problem is linear: one that is not longer than TOLERANCE over it is the
+last."""
+GIVE_UP = 1e12
+"""Damping beyond which no step can help."""
+LEAST_DAMPING = 1e-9
+"""Damping below which none is left: far below any diagonal it changes no digit of a step."""
+FLAT = 1e-15
+"""Share of the cost below which a promised decrease is rounding: no step can be judged there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where the loop ended.
+
+    Args:
+        x: (B, n, ambient).
+        iterations: (B,) linear steps taken.
+        converged: (B,) the last step was below the tolerance.
+        record: (iterations, 3) of a single problem: the cost before each step, its damping, and which share of the
+            promised decrease came true; empty for B realisations.
+    """
+
+    x: Floats
+    iterations: Ints
+    converged: Bools
+    record: Floats = field(default_factory=lambda: np.empty((0, 3)))
+
+
+def descend(
+    problem: Problem,
+    step: Step,
+    x: Floats,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+    exact: bool = False,
+) -> Descent:
+    """Gauss-Newton steps, damped where the linear model does not hold (Levenberg-Marquardt with Marquardt's scaling).
+
+    (J^T J + mu diag(J^T J)) dx = -J^T r, mu = 0 at first. A step that raises the cost is refused; mu then grows, and
+    also where the cost falls by less than a quarter of what the model promised: plain Gauss-Newton overshoots for ever
+    where the true curvature exceeds twice that of J^T J, as in range-only problems of flat geometry. A realisation
+    leaves the batch when no point of it moves by more than `tolerance`, or where the promise is lost in rounding.
+
+    Args:
+        problem: one or B realisations.
+        step: the backend's linear solver.
+        x: (B, n, ambient) start.
+        max_iterations: of linear steps.
+        tolerance: m.
+        exact: the step's matrix is the exact Hessian, not J^T J.
+
+    Raises:
+        InputError: max_iterations that is no whole number >= 0, tolerance that is not > 0.
+    """
+    check_limits(max_iterations, tolerance)
+    best, count = x.copy(), np.zeros(len(x), dtype=np.int64)
+    done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
+    active, now = np.arange(len(x)), problem
+    linear, near = problem.linearise(best), tolerance / LINEAR if problem.linear else tolerance
+    record: list[tuple[float, float, float]] = []
+    with progress("solve") as counted:
+        for _ in range(max_iterations):
+            counted(float(linear.cost.sum()))
+            dx, added, solved = _try(step, problem, linear, mu[active])
+            count[active] += 1
+            with np.errstate(all="ignore"):
+                trial = now.linearise(problem.space.retract(linear.x, dx))
+                small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
+                better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
+            promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx, added, exact)
+            share = _share(linear.cost, trial.cost, promised, exact)
+            if problem.batch is None:
+                record.append((linear.cost[0], mu[0], share[0]))
+            mu[active] = _damping(mu[active], better, share)
+            best[active[better]] = trial.x[better]
+            flat = solved & (promised <= FLAT * linear.cost) & (not problem.constraints)
+            there = (better & small) | flat
+            done[active[there]] = True
+            going = ~there & (mu[active] < GIVE_UP)
+            if not going.any():
+                break
+            if not better[going].all():
+                linear = now.linearise(best[active]).pick(going)
+            else:
+                linear = trial if going.all() else trial.pick(going)
+            if not going.all():
+                active = active[going]
+                now = problem.pick(active) if problem.batch else problem
+    return Descent(best, count, done, np.array(record).reshape(-1, 3))
+
+
+def one_step(problem: Problem, step: Step, x: Floats) -> SolverResult:
+    """The result from x (B, n, ambient) of all that a linear problem needs, one step; what is singular stays."""
+    count = np.ones(len(x), dtype=np.int64)
+    try:
+        dx = step(problem.linearise(x), np.zeros((*x.shape[:2], problem.space.dof)))
+    except np.linalg.LinAlgError:
+        return SolverResult(x, count)
+    dx[~np.isfinite(dx).all(axis=(1, 2))] = 0.0
+    return SolverResult(problem.space.retract(x, dx), count)
+
+
+def minimise(problem: Problem, step: Step, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
+    """The result from x (B, n, ambient) of one step where the problem is linear, else of `descend`."""
+    if problem.linear and max_iterations:
+        return one_step(problem, step, x)
+    end = descend(problem, step, x, max_iterations, tolerance)
+    return SolverResult(end.x, end.iterations, extras={"record": end.record})
+
+
+def check_limits(max_iterations: int, tolerance: float) -> None:
+    """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
+    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
+        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
+    if not isinstance(tolerance, float | int) or not tolerance > 0:
+        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
+
+
+def _promised(problem: Problem, linear: Linear, dx: Floats, added: Floats, exact: bool) -> Floats:
+    """(B,) decrease of the cost that the model expects of a step: J^T J, or the exact H dx = -g - added dx.
+
+    1/2 |r|^2 - 1/2 |r + J dx|^2 takes any step, of a constrained programme too; the other takes Newton's only.
+    """
+    directional, curvature = np.zeros(len(dx)), np.zeros(len(dx))
+    for factor, r, jacobians in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
+        moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(jacobians, factor.nodes.T, strict=True))
+        moved = np.broadcast_to(moved, r.shape)
+        directional += np.einsum("bmk,bmk->b", r, moved)
+        if not exact:
+            curvature += np.einsum("bmk,bmk->b", moved, moved)
+    if exact:
+        curvature = -directional - np.einsum("bni,bni->b", added, dx * dx)
+    return -directional - 0.5 * curvature
+
+
+def _share(before: Floats, after: Floats, promised: Floats, exact: bool) -> Floats:
+    """Share (B,) of the promised decrease that came true; where rounding hides it, what the model is worth there:
+    Newton's is right near a minimum, J^T J may not be."""
+    telling = promised > 1e-9 * before
+    return np.where(telling, (before - after) / np.where(telling, promised, 1.0), 1.0 if exact else 0.5)
+
+
+def _damping(mu: Floats, better: Bools, share: Floats) -> Floats:
+    """The next mu (B,) by the share of the promised decrease that came true; once there is some it moves by factors, so
+    that the range below the first is tried, too."""
+    lower = np.where(mu > LEAST_DAMPING, mu / 5.0, 0.0)
+    kept = np.where(share > 0.75, lower, np.where(share < 0.25, np.where(mu > 0, 4.0 * mu, 1e-2), mu))
+    return np.where(better, kept, np.where(mu > 0, 10.0 * mu, 1e-3))
+
+
+def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Floats, Bools]:
+    """The step, its damping, and for which realisations it is finite; a singular system counts as none."""
+    damping = np.zeros((*linear.x.shape[:2], problem.space.dof))
+    if mu.any():
+        damping = mu[:, None, None] * np.maximum(diagonal(problem, linear), 1e-9)
+    try:
+        with np.errstate(all="ignore"):
+            dx = step(linear, damping)
+    except np.linalg.LinAlgError:
+        return np.zeros_like(damping), damping, np.zeros(len(linear.x), dtype=bool)
+    finite = np.asarray(np.isfinite(dx).all(axis=(1, 2)))
+    return np.where(finite[:, None, None], dx, 0.0), damping, finite
+
+
+def diagonal(problem: Problem, linear: Linear) -> Floats:
+    """(B, n, dof) diagonal of J^T J."""
+    total = np.zeros((*linear.x.shape[:2], problem.space.dof))
+    for factor, jacobians in zip(problem.factors, linear.by_node(problem.factors), strict=True):
+        for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
+            np.add.at(total.swapaxes(0, 1), column, np.square(jacobian).sum(axis=-2).swapaxes(0, 1))
+    return total

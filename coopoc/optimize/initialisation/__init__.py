@@ -1,0 +1,1 @@
+"""Where a solve starts, and which of several starts is believed."""

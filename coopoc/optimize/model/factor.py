@@ -1,0 +1,182 @@
+"""Factor: M measurements of one kind between points, with their standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import InitVar, dataclass, fields
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...arrays import Bools, Floats, Ints
+from ...errors import InputError
+from .inputs import check_constants, check_nodes, check_root, check_std, check_values, fitting, whitening
+from .losses import Loss
+from .measurements import Measurement, lookup
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """M measurements z of one kind; each adds 1/2 rho(|W (h(x) - z)|^2) to the cost, angles wrapped.
+
+    Args:
+        kind: a registered measurement.
+        nodes: (M, arity); of two, the first observes the second.
+        z: (M, k) or (B, M, k) for B noise realisations: m, rad; kinds that compare poses have k = d + d^2 (see `pose`).
+        std: size, (size,), (M, size) or (B, M, size) standard deviations, W = diag(1/std); infinite: no information (a
+            measurement that this realisation lacks).
+        sqrt_information: instead of std, (size, size), (M, size, size) or (B, M, size, size), W^T W = cov^-1.
+        constants: (M, c) or (c,) known numbers of the kind, such as dt s of a speed.
+        loss: rho, None for least squares.
+        cov: instead of std, covariances shaped as sqrt_information.
+
+    Raises:
+        InputError: shapes, a node paired with itself, z that is not finite, a distance <= 0, an angle beyond 2 pi
+            (degrees), a rotation that is none, a std that is not positive or an angle's that exceeds pi, a covariance
+            that is not positive definite.
+
+    >>> Factor("range", [[0, 1]], [[5.0]], std=0.1)
+    Factor(range x 1)
+    """
+
+    kind: str
+    nodes: Ints
+    z: Floats
+    std: Floats | None = None
+    sqrt_information: Floats | None = None
+    constants: Floats | None = None
+    loss: Loss | None = None
+    cov: InitVar[npt.ArrayLike | None] = None
+
+    def __post_init__(self, cov: npt.ArrayLike | None) -> None:
+        known = self.measurement
+        object.__setattr__(self, "kind", known.name)
+        object.__setattr__(self, "nodes", check_nodes(known, self.nodes))
+        object.__setattr__(self, "z", check_values(known, self.z, len(self.nodes)))
+        object.__setattr__(self, "constants", check_constants(known, self.constants, len(self.nodes)))
+        given = [
+            name
+            for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
+            if v is not None
+        ]
+        if len(given) != 1:
+            allowed = "exactly one of std, cov and sqrt_information must be given"
+            raise InputError("std", " and ".join(given) or "nothing", allowed, "Give std=.")
+        shape = (*self.z.shape[:-1], self.size)
+        if self.std is not None:
+            object.__setattr__(self, "std", check_std(known, self.std, shape))
+        else:
+            root = whitening(known.name, cov) if cov is not None else self.sqrt_information
+            assert root is not None
+            object.__setattr__(self, "sqrt_information", check_root(known, root, shape))
+        _ = self.batch  # refuses numbers of realisations that differ
+
+    @property
+    def measurement(self) -> Measurement:
+        """The measurement of the factor."""
+        return lookup(self.kind)
+
+    @cached_property
+    def dimension(self) -> int | None:
+        """2 or 3, or None if the kind's z looks the same in both."""
+        return fitting(self.measurement, self.z.shape[-1])
+
+    @cached_property
+    def size(self) -> int:
+        """Residuals per measurement."""
+        return self.measurement.size(self.dimension or 3)
+
+    @cached_property
+    def batch(self) -> int | None:
+        """B, or None for a single realisation."""
+        arrays = (self.z, 3), (self.std, 3), (self.sqrt_information, 4)
+        sizes = {len(a) for a, rank in arrays if a is not None and a.ndim == rank}
+        if not sizes:
+            return None
+        if len(sizes - {1}) > 1:
+            raise InputError("std", f"for {sorted(sizes)} realisations", "must agree with z", "Give one axis B.")
+        return max(sizes)
+
+    @property
+    def informative(self) -> Bools:
+        """(M,) or (B, M) True where the measurement carries information."""
+        if self.std is not None:
+            informed = np.isfinite(self.std).any(axis=-1)
+        else:
+            assert self.sqrt_information is not None
+            informed = (self.sqrt_information != 0).any(axis=(-2, -1))
+        return np.broadcast_to(informed, (*informed.shape[:-1], len(self.nodes)))
+
+    @property
+    def root(self) -> Floats:
+        """W as (M, size, size), or (B, M, size, size)."""
+        size = self.size
+        if self.std is not None:
+            root = np.zeros((*self.std.shape[:-2], len(self.nodes), size * size))
+            root[..., :: size + 1] = 1.0 / self.std
+            return root.reshape(*root.shape[:-1], size, size)
+        assert self.sqrt_information is not None
+        root = self.sqrt_information
+        if root.shape[-3] == len(self.nodes):
+            return root
+        return np.broadcast_to(root, (*root.shape[:-3], len(self.nodes), size, size))
+
+    def whiten(self, residual: Floats) -> Floats:
+        """W residual (..., M, size)."""
+        if self.std is not None:
+            return residual / self.std
+        assert self.sqrt_information is not None
+        return np.asarray((self.sqrt_information @ residual[..., None])[..., 0])
+
+    def whiten_jacobian(self, jacobian: Floats) -> Floats:
+        """W jacobian (..., M, size, D)."""
+        if self.std is not None:
+            return jacobian / self.std[..., None]
+        assert self.sqrt_information is not None
+        return np.asarray(self.sqrt_information @ jacobian)
+
+    def pick(self, which: Ints | int) -> Factor:
+        """The realisations `which` of B; an int gives a single one."""
+        chosen = {
+            name: None if (a := getattr(self, name)) is None else _pick(a, rank, which)
+            for name, rank in (("z", 3), ("std", 3), ("sqrt_information", 4))
+        }
+        return unchecked(self, **chosen)
+
+    def __repr__(self) -> str:
+        return f"Factor({self.kind} x {len(self.nodes)}{'' if self.batch is None else f', {self.batch} realisations'})"
+
+
+def of_recorded(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
+    """A factor of nodes (M, arity) and z (M, k) that come from checked arrays; std, as in Factor, is checked.
+
+    >>> of_recorded("range", np.array([[0, 1]]), np.array([[5.0]]), np.array([0.1]))
+    Factor(range x 1)
+    """
+    known, made = lookup(kind), object.__new__(Factor)
+    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=check_constants(known, None, len(nodes)))
+    made.__dict__.update(std=None, sqrt_information=None, loss=None)
+    made.__dict__["std"] = check_std(known, std, (len(nodes), made.size))
+    return made
+
+
+def unchecked(factor: Factor, **changes: Any) -> Factor:
+    """The factor with changes that come from checked arrays and need not be checked again."""
+    changed = object.__new__(Factor)
+    kept = factor.__dict__
+    changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
+    return changed
+
+
+@cache
+def _fields() -> tuple[str, ...]:
+    return tuple(field.name for field in fields(Factor))
+
+
+def _pick(array: Floats, rank: int, which: Ints | int) -> Floats:
+    if array.ndim < rank:
+        return array
+    if len(array) == 1:
+        return array[0] if isinstance(which, int) else array
+    return array[which]

@@ -1,0 +1,176 @@
+"""Nodes, values and standard deviations as users give them, checked."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from ...arrays import Bools, Floats, Ints, checked, frozen, refuse
+from ...errors import InputError
+from .measurements import Measurement
+from .space import Space
+
+
+def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
+    """W with W^T W = cov^-1 of covariances (..., size, size): the inverse of their Cholesky factor.
+
+    Raises:
+        InputError: not square, not finite, not symmetric, not positive definite; it names the first that is bad.
+
+    >>> whitening("range", [[4.0]])
+    array([[0.5]])
+    """
+    array = numbers("cov", cov)
+    if array.ndim < 2 or array.shape[-1] != array.shape[-2]:
+        raise InputError("cov", array.shape, "must be square matrices", "Give variances on the diagonal, m^2 or rad^2.")
+    flat = array.reshape(-1, *array.shape[-2:])
+    mirrored = np.isclose(flat, np.swapaxes(flat, 1, 2), rtol=1e-6, atol=1e-300) & np.isfinite(flat)
+    least = np.full(len(flat), np.nan)
+    symmetric: Bools = np.asarray(mirrored.all(axis=(1, 2)))
+    least[symmetric] = np.linalg.eigvalsh(flat[symmetric])[:, 0]
+    if not (least > 0).all():
+        k = int(np.flatnonzero(~(least > 0))[0])
+        why = f"smallest eigenvalue {least[k]:.3g}" if symmetric[k] else "not symmetric or not finite"
+        hint = "Give a covariance, not an information matrix, with no exact direction."
+        raise InputError(f"cov of {kind}", f"number {k}: {why}", "must be symmetric positive definite", hint)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(array)))
+
+
+@lru_cache(maxsize=256)
+def fitting(known: Measurement, given: int) -> int | None:
+    """The dimension whose z has `given` numbers; None if both have; InputError if none has."""
+    fits = [d for d in (2, 3) if (d == 3 or known.plane is not None) and known.given(d) == given]
+    if not fits:
+        allowed = sorted({known.given(d) for d in (2, 3) if d == 3 or known.plane is not None})
+        hint = "Write poses with coopoc.optimize.pose." if known.compares_poses else "Give one per component."
+        words = f"must have {' or '.join(map(str, allowed))}"
+        raise InputError(f"z of {known.name}", f"{given} numbers per row", words, hint)
+    return fits[0] if len(fits) == 1 else None
+
+
+def numbers(field: str, values: npt.ArrayLike) -> Floats:
+    """Read-only array of what a user gave; InputError if it is no array of numbers."""
+    return checked(field, values)
+
+
+def check_nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
+    """(M, arity) whole numbers, no node paired with itself."""
+    array = checked("nodes", nodes, dtype=int)
+    if array.ndim != 2 or array.shape[1] != known.arity:
+        hint = "Give one row per measurement."
+        raise InputError("nodes", array.shape, f"must have shape (M, {known.arity}) for {known.name}", hint)
+    refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
+    if known.arity == 2 and (same := array[:, 0] == array[:, 1]).any():
+        hint = "A vehicle does not measure itself."
+        raise InputError("nodes", array[same][0].tolist(), "must be two different points", hint)
+    return array
+
+
+def check_constants(known: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
+    """(M, c) finite numbers, as many as the kind has."""
+    if constants is None and known.constants == 0:
+        return _no_constants(count)
+    given = numbers(f"constants of {known.name}", [] if constants is None else constants)
+    if known.constants == given.size == 0:
+        return _no_constants(count)
+    fits = (
+        given.ndim in (1, 2)
+        and given.shape[-1] == known.constants
+        and given.size in (known.constants, count * known.constants)
+    )
+    if not fits or not np.isfinite(given).all():
+        hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
+        raise InputError(
+            "constants", given.tolist(), f"must be {known.constants} finite numbers for {known.name}", hint
+        )
+    return frozen(np.broadcast_to(given, (count, known.constants)))
+
+
+@lru_cache(maxsize=16)
+def _no_constants(count: int) -> Floats:
+    return frozen(np.empty((count, 0)))
+
+
+def check_values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
+    """z as (M, k) or (B, M, k): finite, distances > 0, angles in radians, rotations that are some."""
+    array = numbers(f"z of {known.name}", z)
+    if array.ndim not in (2, 3) or array.shape[-2] != count:
+        given = known.given()
+        shape = f"must have shape ({count}, {given}) or (B, {count}, {given}) for {known.name}"
+        raise InputError("z", array.shape, shape, "One row per row of nodes.")
+    dimension = fitting(known, array.shape[-1]) or 3
+    if not np.isfinite(array).all():
+        bad = np.argwhere(~np.isfinite(array))[0]
+        hint = "Drop the measurement, or give it std = inf and any finite z."
+        raise InputError(f"z of {known.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", hint)
+    if known.compares_poses:
+        _check_rotations(known, Space(dimension, has_rotation=True).rotation(array))
+        return array
+    for k, component in enumerate(known.kept(dimension)):
+        _check_component(known, known.components[component], array[..., k])
+    return array
+
+
+def _check_component(known: Measurement, component: str, column: Floats) -> None:
+    if component == "distance" and (column <= 0).any():
+        hint = "Coincident vehicles have no direction: drop the pair."
+        raise InputError(f"z of {known.name}", column.min(), "must be a distance > 0 m", hint)
+    if component == "angle" and (np.abs(column) > 2 * np.pi).any():
+        hint = "This looks like degrees: use np.deg2rad."
+        raise InputError(f"z of {known.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
+
+
+def _check_rotations(known: Measurement, rotation: Floats) -> None:
+    error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(rotation.shape[-1])).max(axis=(-1, -2))
+    if (error > 1e-6).any() or (np.linalg.det(rotation) < 0).any():
+        raise InputError(
+            f"z of {known.name}",
+            f"a rotation off by {error.max():.1g}",
+            "must hold rotation matrices",
+            "Make it with coopoc.optimize.pose(position, angle).",
+        )
+
+
+def check_std(known: Measurement, std: npt.ArrayLike | float, shape: tuple[int, ...]) -> Floats:
+    """std as (M or 1, size) or (B, M or 1, size): > 0, angles at most pi."""
+    if isinstance(std, float):
+        return _one_std(known, std, shape[-1])
+    return _checked_std(known, std, shape)
+
+
+@lru_cache(maxsize=256)
+def _one_std(known: Measurement, std: float, size: int) -> Floats:
+    """Of all components: measurements that are added one by one share the array."""
+    return _checked_std(known, std, (1, size))
+
+
+def _checked_std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
+    array, size = numbers(f"std of {known.name}", std), shape[-1]
+    wide = np.broadcast_to(array, (size,)) if array.ndim < 2 and array.size in (1, size) else array
+    wide = wide[None] if wide.ndim == 1 else wide
+    fits = wide.ndim in (2, 3) and wide.shape[-1] == size and wide.shape[-2] in (1, shape[-2])
+    if not fits:
+        allowed = f"must have shape ({size},) or {(shape[-2], size)} or (B, M, {size})"
+        raise InputError("std", array.shape, allowed, "One standard deviation per component.")
+    if not (wide > 0).all():
+        hint = "Give standard deviations; infinity means no information."
+        raise InputError(f"std of {known.name}", array[~(array > 0)][0], "must be > 0", hint)
+    kept = known.kept(3 if size == len(known.components) else 2)
+    angles = wide[..., [known.components[k] in ("angle", "turn") for k in kept]]
+    if (np.isfinite(angles) & (angles > np.pi)).any():
+        raise InputError(f"std of {known.name}", angles.max(), "must be <= pi rad", "Angles are in radians.")
+    return frozen(wide)
+
+
+def check_root(known: Measurement, root: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """sqrt_information as (M or 1, size, size) or (B, M or 1, size, size), finite."""
+    array, size = numbers("sqrt_information", root), shape[-1]
+    array = array[None] if array.ndim == 2 else array
+    if array.ndim not in (3, 4) or array.shape[-2:] != (size, size) or array.shape[-3] not in (1, shape[-2]):
+        allowed = f"must have shape ({size}, {size}), (M, {size}, {size}) or (B, M, {size}, {size})"
+        raise InputError(f"sqrt_information of {known.name}", array.shape, allowed, "W with W^T W = cov^-1.")
+    if not np.isfinite(array).all():
+        raise InputError("sqrt_information", "not finite", "must be finite", "Invert a positive definite covariance.")
+    return frozen(array)

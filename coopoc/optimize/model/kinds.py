@@ -1,0 +1,106 @@
+"""The kinds of measurement that we know: fixes, odometry, ranges and angles, of points and of poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ...world import spherical as polar
+from .measurements import measurement
+
+VECTOR = ("coordinate",) * 3
+PLANE = (0, 1)
+
+
+@measurement("position", arity=1, components=VECTOR, linear=True, plane=PLANE)  # type: ignore[arg-type]
+def position(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
+    """Where a node is, such as a GNSS fix: m."""
+    return x, y, z
+
+
+@measurement("displacement", arity=2, components=VECTOR, linear=True, plane=PLANE)  # type: ignore[arg-type]
+def displacement(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
+    """The world vector from the first node to the second, such as odometry dt u: m."""
+    return dx, dy, dz
+
+
+@measurement("range", arity=2, components=("distance",), plane=(0,))
+def range_(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
+    """Distance between two nodes: m."""
+    return polar.spherical(dx, dy, dz, m)[:1]
+
+
+@measurement("azimuth", arity=2, components=("angle",), plane=(0,))
+def azimuth(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
+    """Angle of the second node as the first sees it, atan2(dy, dx) in the world frame: rad."""
+    return polar.spherical(dx, dy, dz, m)[1:2]
+
+
+@measurement("inclination", arity=2, components=("angle",))
+def inclination(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
+    """Angle from +z of the second node as the first sees it: rad."""
+    return polar.spherical(dx, dy, dz, m)[2:]
+
+
+@measurement("spherical", arity=2, components=("distance", "angle", "angle"), plane=PLANE)
+def spherical(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
+    """Range, azimuth and inclination (in the plane: range and azimuth) of the second node from the first: m, rad."""
+    return polar.spherical(dx, dy, dz, m)
+
+
+@measurement("speed", arity=2, components=("distance",), plane=(0,), constants=1)
+def speed(dx: Any, dy: Any, dz: Any, dt: Any, m: Any = np) -> Sequence[Any]:
+    """Mean speed between two positions of a vehicle that are dt apart (the constant, s): m/s."""
+    return (polar.spherical(dx, dy, dz, m)[0] / dt,)
+
+
+@measurement("relative_position", arity=2, components=VECTOR, frame="body", plane=PLANE)  # type: ignore[arg-type]
+def relative_position(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
+    """The second node in the body frame of the first, R_i^T (p_j - p_i): m."""
+    return x, y, z
+
+
+@measurement("bearing", arity=2, components=("angle",), frame="body", plane=(0,))
+def bearing(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
+    """Angle of the second node from the first's forward axis, anticlockwise about its up axis: rad."""
+    return polar.spherical(x, y, z, m)[1:2]
+
+
+@measurement("body_spherical", arity=2, components=("distance", "angle", "angle"), frame="body", plane=PLANE)
+def body_spherical(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
+    """Range, bearing and inclination (in the plane: range and bearing) in the body frame of the first: m, rad."""
+    return polar.spherical(x, y, z, m)
+
+
+def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
+    """Rz^T (t - tz) and Log(Rz^T R), the error of a relative pose (t, R) against a measured (tz, Rz): m, rad."""
+    *at, turned = measured
+    gap = [x - at[0], y - at[1], z - at[2]]
+    moved = [sum(turned[k][i] * gap[k] for k in range(3)) for i in range(3)]
+    error = [[sum(turned[k][i] * R[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    half = [0.5 * (error[2][1] - error[1][2]), 0.5 * (error[0][2] - error[2][0]), 0.5 * (error[1][0] - error[0][1])]
+    sine = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
+    cosine = 0.5 * (error[0][0] + error[1][1] + error[2][2] - 1.0)
+    if isinstance(R[2][2], float):  # in the plane one angle suffices
+        return *moved, 0.0, 0.0, m.atan2(half[2], cosine)
+    turning = sine > 1e-12
+    root = m.sqrt(m.where(turning, sine, 1.0))
+    small = m.where(cosine > 0.0, 1.0 + sine / 6.0, np.nan)  # half a turn has no direction
+    ratio = m.where(turning, m.atan2(root, cosine) / root, small)
+    return *moved, *(ratio * h for h in half)
+
+
+def chordal(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
+    """t - tz and the nine entries of R - Rz: PyFG's objective, quadratic in positions and rotation matrices: m, 1."""
+    *at, turned = measured
+    return x - at[0], y - at[1], z - at[2], *(R[i][j] - turned[i][j] for i in range(3) for j in range(3))
+
+
+_TURN = (*VECTOR, "turn", "turn", "turn")
+_CHORD = ("coordinate",) * 12
+for _name, _arity in (("pose", 1), ("relative_pose", 2)):
+    _options = {"arity": _arity, "frame": "relative", "compares_poses": True}
+    measurement(_name, components=_TURN, plane=(0, 1, 5), **_options)(geodesic)  # type: ignore[arg-type]
+    measurement(f"{_name}_chordal", components=_CHORD, plane=(0, 1, 3, 4, 6, 7), **_options)(chordal)  # type: ignore[arg-type]

@@ -1,0 +1,238 @@
+"""The measurement registry: one formula on components serves NumPy, torch and CasADi, and is differentiated exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ...arrays import Bools, Floats, instance, number
+from ...errors import InputError
+from ...one_file import in_file
+from ...plugins import find, names, one_of, unknown
+from ...world import spherical as polar
+from . import dual
+from .space import Space, exp
+
+Component = Literal["coordinate", "distance", "angle", "turn"]
+Frame = Literal["world", "body", "relative"]
+Formula = Callable[..., Sequence[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """A sensor's measurement of one node (arity 1) or of a second node from a first (arity 2).
+
+    Args:
+        name: kind of the factors that carry it.
+        arity: 1 or 2 nodes.
+        frame: of the formula's vector. "world": the vector x, y, z of the point, or second - first. "body": that vector
+            as the first node, a pose, sees it, R_i^T (p_j - p_i). "relative": it and the 3x3 components of R_i^T R_j;
+            of one node, its own position and rotation.
+        components: nature of each residual: a coordinate, a distance (m, > 0), an angle (rad, residuals wrap) or part
+            of a rotation vector (rad).
+        formula: (x, y, z, m) or (x, y, z, R, m), with the `constants` before m -> one number per component; m is a
+            namespace with sqrt, atan2 and where.
+        linear: the formula is the world vector itself.
+        plane: components that a problem of dimension 2 keeps (z = 0 there); None if it has none of them.
+        constants: how many known numbers each measurement carries, such as the time between two positions.
+        compares_poses: z is a pose (Space.ambient numbers), and the formula also gets it: (x, y, z, R, pose z, m).
+    """
+
+    name: str
+    arity: int
+    frame: Frame
+    components: tuple[Component, ...]
+    formula: Formula
+    linear: bool = False
+    plane: tuple[int, ...] | None = None
+    constants: int = 0
+    compares_poses: bool = False
+
+    def kept(self, dimension: int) -> tuple[int, ...]:
+        """Components in a space of 2 or 3 dimensions; InputError if there are none."""
+        if dimension == 3:
+            return tuple(range(len(self.components)))
+        if self.plane is None:
+            raise InputError("kind", repr(self.name), "does not exist in two dimensions", "Use points (x, y, z).")
+        return self.plane
+
+    def size(self, dimension: int = 3) -> int:
+        """Residuals per measurement."""
+        return len(self.kept(dimension))
+
+    def given(self, dimension: int = 3) -> int:
+        """Numbers z per measurement."""
+        return Space(dimension, has_rotation=True).ambient if self.compares_poses else self.size(dimension)
+
+    def angles(self, dimension: int = 3) -> Bools:
+        """(size,) True where a component is an angle."""
+        return np.array([self.components[k] == "angle" for k in self.kept(dimension)])
+
+    def predict(self, vector: Floats, constants: Sequence[float] = ()) -> Floats:
+        """(..., size) h of vectors (..., d), for kinds that see no rotation."""
+        nothing = np.zeros(self.size(vector.shape[-1]))
+        return np.stack(np.broadcast_arrays(*self.residual([*np.moveaxis(vector, -1, 0)], nothing, constants, np)), -1)
+
+    def residual(self, local: Sequence[Any], z: Iterable[Any], constants: Iterable[Any], m: Any) -> list[Any]:
+        """h(x) - z in any namespace; angles are not wrapped.
+
+        Args:
+            local: x, y[, z] of the vector, then, if the frame is relative, the d^2 components of the rotation.
+            z: `given` numbers.
+            constants: `constants` numbers.
+        """
+        dimension = 2 if len(local) in (2, 6) else 3
+        kept = self.kept(dimension)
+        arguments = embed(local, dimension)
+        if self.compares_poses:
+            return [self.formula(*arguments, embed([*z], dimension), m)[k] for k in kept]
+        found = self.formula(*arguments, *constants, m)
+        return [found[k] - number for k, number in zip(kept, z, strict=True)]
+
+    def differentiate(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> tuple[Floats, Floats]:
+        """(..., size) residuals and (..., size, E) their derivative by the local vector and, if relative, its turning.
+
+        Args:
+            local: (..., d) vector.
+            rotation: (..., d, d) or None.
+            z: (..., given).
+            given: (..., constants).
+        """
+        if self.linear:
+            return local - z, np.eye(local.shape[-1])
+        numbers = _seed(local, rotation)
+        parts = self.residual(numbers, columns(z), columns(given), dual)
+        shape, coordinates = local.shape[:-1], len(numbers[0].derivative)
+        value = np.empty((*shape, len(parts)))
+        jacobian = np.empty((*shape, len(parts), coordinates))
+        by_part = jacobian.transpose(len(shape), len(shape) + 1, *range(len(shape)))
+        for k, part in enumerate(parts):
+            value[..., k] = part.value
+            by_part[k] = part.derivative
+        return self.wrapped(value), jacobian
+
+    def difference(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> Floats:
+        """(..., size) residuals h(x) - z, angles in [-pi, pi); arguments as `differentiate`."""
+        if self.linear:
+            return local - z
+        numbers = columns(local)
+        if rotation is not None:
+            numbers += columns(rotation.reshape(*rotation.shape[:-2], -1))
+        parts = self.residual(numbers, columns(z), columns(given), np)
+        return self.wrapped(np.stack(np.broadcast_arrays(*parts), axis=-1))
+
+    def wrapped(self, gap: Floats) -> Floats:
+        """`gap` (..., size) with its angles in [-pi, pi), in place."""
+        dimension = 3 if gap.shape[-1] == len(self.components) else 2
+        for k, component in enumerate(self.kept(dimension)):
+            if self.components[component] == "angle":
+                gap[..., k] = polar.wrap(gap[..., k])
+        return gap
+
+
+def columns(array: Floats) -> list[Floats]:
+    """The components of (..., k), views (...)."""
+    return [array[..., k] for k in range(array.shape[-1])]
+
+
+def embed(numbers: Sequence[Any], dimension: int) -> list[Any]:
+    """x, y, z and, if there are more numbers, the 3x3 components of the rotation: a plane is z = 0 in space."""
+    d = dimension
+    at = [*numbers[:d], *[0.0 * numbers[0]] * (3 - d)]  # of the namespace's own type
+    if len(numbers) == d:
+        return at
+    turned = [[numbers[d + d * i + j] if max(i, j) < d else float(i == j) for j in range(3)] for i in range(3)]
+    return [*at, turned]
+
+
+def _seed(local: Floats, rotation: Floats | None) -> list[dual.Dual]:
+    """Dual numbers of the vector (d of them) and of the rotation R Exp(w) at w = 0, by the vector and w."""
+    d = local.shape[-1]
+    if rotation is None:
+        return list(dual.seeds(local))
+    turns = Space(d, has_rotation=True).angles
+    found = list(dual.seeds(local, d + turns))
+    generators = exp(0.5 * np.pi * np.eye(turns)) - exp(-0.5 * np.pi * np.eye(turns))
+    jacobians = rotation[..., None, :, :] @ (0.5 * generators)
+    for i in range(d):
+        for j in range(d):
+            jacobian = np.moveaxis(jacobians[..., i, j], -1, 0)
+            still = np.zeros((d, *jacobian.shape[1:]))
+            found.append(dual.Dual(rotation[..., i, j], np.concatenate([still, jacobian])))
+    return found
+
+
+MEASUREMENTS: dict[str, Measurement] = {}
+
+
+def measurement(
+    name: str,
+    arity: int,
+    components: tuple[Component, ...],
+    frame: Frame = "world",
+    linear: bool = False,
+    plane: tuple[int, ...] | None = None,
+    constants: int = 0,
+    compares_poses: bool = False,
+) -> Callable[[Formula], Formula]:
+    """Register a formula as a measurement (see Measurement for the arguments); the formula itself is returned.
+
+    Raises:
+        InputError: the name is taken, so that nothing is silently overwritten; an arity other than 1 or 2, an unknown
+            component or frame, or `linear` without three coordinates of a world vector.
+
+    >>> MEASUREMENTS["range"].difference(np.array([3.0, 4.0, 0.0]), None, np.array([4.0]), np.empty(0))
+    array([1.])
+    """
+
+    instance("name", name, str, 'Give the kind of its factors, such as "range".')
+    if isinstance(arity, bool) or not isinstance(arity, int) or arity not in (1, 2):
+        raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
+    given = components if isinstance(components, tuple | list) else ()
+    if not given or not all(isinstance(one, str) and one in get_args(Component) for one in given):
+        hint = "Give one per number that the formula returns."
+        raise InputError("components", components, f"must be among {get_args(Component)}", hint)
+    one_of("frame", frame, get_args(Frame))
+    constants = number("constants", constants, 0, kind=int, allowed=">= 0", hint="How many numbers each one carries.")
+    if instance("linear", linear, bool) and (tuple(components) != ("coordinate",) * 3 or frame != "world"):
+        raise InputError(
+            "linear", linear, "means that the formula is the vector itself, in the world frame", "Leave it out."
+        )
+
+    def register(formula: Formula) -> Formula:
+        if name in MEASUREMENTS and not _edited(MEASUREMENTS[name].formula, formula):
+            raise InputError("measurement", repr(name), "is registered already", "Choose another name.")
+        MEASUREMENTS[name] = Measurement(
+            name, arity, frame, tuple(components), formula, linear, plane, constants, compares_poses
+        )
+        return formula
+
+    return register
+
+
+def lookup(kind: str) -> Measurement:
+    """The measurement of a kind: a registered one, an entry point of "coopoc.measurements" or "folder/mine.py:NAME".
+
+    Raises:
+        InputError: no such kind (lists the kinds and the nearest one), or the object is no measurement.
+    """
+    if not isinstance(kind, str):
+        raise unknown("kind", kind, sorted(MEASUREMENTS))
+    if kind in MEASUREMENTS:
+        return MEASUREMENTS[kind]
+    if not in_file(kind) and kind not in names("coopoc.measurements"):
+        raise unknown("kind", kind, sorted({*MEASUREMENTS, *names("coopoc.measurements")}))
+    found = find("coopoc.measurements", kind)
+    for known in MEASUREMENTS.values():
+        if known.formula is found:
+            return known
+    raise InputError("kind", repr(kind), "is no measurement", "Decorate the formula: @measurement(name, arity, ...).")
+
+
+def _edited(before: Formula, after: Formula) -> bool:
+    """Whether both come from one file that was loaded again after a change ("mine.py:NAME")."""
+    same = before.__code__.co_filename == after.__code__.co_filename
+    return same and before.__module__ != after.__module__

@@ -1,0 +1,333 @@
+"""Problem: nodes and factors between them; whitened residuals, their exact Jacobian and the cost."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cache, cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...arrays import Bools, Floats, Ints, frozen, instance
+from ...errors import InputError
+from ...world.sensors import Sensors
+from .constraint import Constraint
+from .factor import Factor
+from .growing import Growing
+from .inputs import numbers
+from .linear import Linear, linearise, sparse_jacobian
+from .measurements import lookup
+from .nodes import check_item, indices, no_such_node, points, rows
+from .search import Search
+from .space import Space
+from .window import Noise, WindowStep, recorded_steps, window_factors
+
+if TYPE_CHECKING:
+    from ...world.recording import Recording
+    from .losses import Loss
+
+Nodes = str | int | Sequence[str | int] | Sequence[Sequence[str | int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """minimise over n nodes 1/2 sum_k rho(|W_k (h_k(x) - z_k)|^2), for one or for B noise realisations at once.
+
+    A node is a point or a pose in 2 or 3 dimensions, a row of x: its position and, in a problem with poses, its
+    rotation matrix (see Space).
+
+    Args:
+        names: (n,) unique names of the nodes.
+        factors: the measurements.
+        x0: (n, ambient) or (B, n, ambient) where the solver starts. None: the converted measurements' linear solution;
+            poses need an x0.
+        separator: nodes that the others hang on, such as the ego at each step. What remains without them must fall into
+            small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
+        dimension: 2 or 3.
+        poses: the nodes that have a rotation.
+        fixed: nodes that stay at x0, such as the first pose of a graph without fixes.
+        constraints: what must hold exactly.
+        search: how x0 was found, such as the start of a graph that won; a Solution counts its work.
+
+    Raises:
+        InputError: repeated names, unknown nodes, kinds that need a pose, shapes that do not agree.
+
+    >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
+    >>> problem = problem.add("displacement", ("a", "b"), [5, 0, 0], std=1.0)
+    >>> problem.cost(np.array([[0, 0, 0], [6.0, 0, 0]]))
+    0.5
+    """
+
+    names: tuple[str, ...]
+    factors: Sequence[Factor] = ()
+    x0: Floats | None = None
+    separator: tuple[int, ...] = ()
+    dimension: int = 3
+    poses: tuple[int, ...] = ()
+    fixed: tuple[int, ...] = ()
+    constraints: tuple[Constraint, ...] = ()
+    search: Search = Search()
+
+    def __post_init__(self) -> None:
+        for field in ("names", "factors", "separator", "poses", "fixed", "constraints"):
+            if not isinstance(value := getattr(self, field), Iterable):
+                raise InputError(field, repr(value)[:60], "must be a sequence", "Give a tuple, () for none.")
+        object.__setattr__(self, "names", tuple(str(name) for name in self.names))
+        if len(self._place) != len(self.names):
+            twice = sorted({n for n in self.names if self.names.count(n) > 1})
+            raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
+        for field in ("separator", "poses", "fixed"):
+            object.__setattr__(self, field, tuple(self.index(node) for node in getattr(self, field)))
+        if len(set(self.separator)) < len(self.separator):
+            raise InputError(
+                "separator", self.separator, "must not name a point twice", "Name each point of the separator once."
+            )
+        Space(self.dimension)  # refuses any other than 2 and 3
+        items: tuple[object, ...] = (*self.factors, *self.constraints)
+        for item in items:
+            if not isinstance(item, Factor | Constraint):
+                hint = "Add measurements with Problem.add, constraints with Problem.constrain."
+                raise InputError("factors, constraints", repr(item)[:60], "must be Factors and Constraints", hint)
+            check_item(item, self.names, self.poses, self.dimension)
+        if self.x0 is not None:
+            object.__setattr__(self, "x0", frozen(points(self.space, len(self.names), "x0", self.x0)))
+        if self.fixed and self.x0 is None:
+            raise InputError(
+                "fixed", [self.names[k] for k in self.fixed[:3]], "needs an x0 to be fixed at", "Give x0=."
+            )
+        sizes = {b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None and b > 1}
+        if len(sizes) > 1:
+            hint = "Use the same number of realisations throughout."
+            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
+
+    @cached_property
+    def space(self) -> Space:
+        """Where the nodes live."""
+        return Space(self.dimension, bool(self.poses))
+
+    @cached_property
+    def movable(self) -> Bools | None:
+        """(n, dof) False where a node cannot move: it is fixed, or a point that has no rotation. None: all are free."""
+        space, n = self.space, len(self.names)
+        if not self.fixed and len(self.poses) in (0, n):
+            return None
+        movable = np.ones((n, space.dof), dtype=bool)
+        if space.has_rotation:
+            movable[np.setdiff1d(np.arange(n), self.poses), space.dimension :] = False
+        movable[list(self.fixed)] = False
+        return movable
+
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        return {name: k for k, name in enumerate(self.names)}
+
+    @cached_property
+    def _turning(self) -> frozenset[int]:
+        return frozenset(self.poses)
+
+    @property
+    def _start_batch(self) -> int | None:
+        return len(self.x0) if self.x0 is not None and self.x0.ndim == 3 else None
+
+    @cached_property
+    def batch(self) -> int | None:
+        """B noise realisations, or None for a single problem."""
+        sizes = [b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None]
+        return max(sizes) if sizes else None
+
+    @cached_property
+    def linear(self) -> bool:
+        """True if the residuals are linear in x and the cost is quadratic."""
+        return all(f.measurement.linear and f.loss is None for f in self.factors)
+
+    def index(self, node: str | int) -> int:
+        """Index of a node given by name or index; InputError if there is none."""
+        if isinstance(node, str) and node in self._place:
+            return self._place[node]
+        if isinstance(node, int | np.integer) and 0 <= node < len(self.names):
+            return int(node)
+        raise no_such_node(node, self.names)
+
+    def add(
+        self,
+        kind: str,
+        nodes: Nodes,
+        z: npt.ArrayLike,
+        std: npt.ArrayLike | None = None,
+        *,
+        cov: npt.ArrayLike | None = None,
+        sqrt_information: npt.ArrayLike | None = None,
+        constants: npt.ArrayLike | None = None,
+        loss: Loss | None = None,
+    ) -> Problem:
+        """The problem with one more measurement, or with M of one kind; the arguments are those of Factor.
+
+        Args:
+            nodes: one node ("a"), a pair (("a", "b")), or a list of M nodes or pairs; names or indices.
+            z: (size,), a number, or (M, size).
+        """
+        index = indices(self.index, kind, nodes)
+        factor = Factor(
+            kind,
+            index,
+            rows(kind, z, len(index)),
+            std=std,  # type: ignore[arg-type]
+            sqrt_information=sqrt_information,  # type: ignore[arg-type]
+            constants=constants,  # type: ignore[arg-type]
+            loss=loss,
+            cov=cov,
+        )
+        return self._with(factor)
+
+    def _with(self, factor: Factor) -> Problem:
+        """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
+        check_item(factor, self.names, self._turning, self.dimension)
+        sizes = {b for b in (self.batch, factor.batch) if b is not None and b > 1}
+        if len(sizes) > 1:
+            hint = "Use the same number of realisations throughout."
+            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
+        before = self.factors if isinstance(self.factors, Growing) else Growing(self.factors)
+        grown = self.replace_unchecked(factors=before.plus(factor))
+        kept: dict[str, Any] = {
+            name: self.__dict__[name] for name in ("_place", "_turning", "space", "movable") if name in self.__dict__
+        }
+        batches = [b for b in (self.batch, factor.batch) if b is not None]
+        grown.__dict__.update(kept, batch=max(batches) if batches else None)
+        return grown
+
+    def constrain(
+        self,
+        kind: str,
+        nodes: Nodes,
+        lower: npt.ArrayLike = -np.inf,
+        upper: npt.ArrayLike = np.inf,
+        constants: npt.ArrayLike | None = None,
+    ) -> Problem:
+        """The problem with lower <= h(x) <= upper for the kind's formula h; the arguments are those of Constraint.
+
+        >>> Problem(("a",)).constrain("position", "a", lower=[0, 0, -np.inf]).constraints
+        (Constraint(-inf <= position <= inf x 1),)
+        """
+        index = indices(self.index, kind, nodes)
+        size = lookup(kind).size(self.dimension)
+        low, high = (
+            np.broadcast_to(numbers(name, v), (len(index), size)) if np.ndim(v) == 0 else numbers(name, v)
+            for name, v in (("lower", lower), ("upper", upper))
+        )
+        constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
+        return replace(self, constraints=(*self.constraints, constraint))
+
+    def pick(self, which: Ints | int) -> Problem:
+        """The realisations `which` of B; an int gives a single problem."""
+        x0 = self.x0 if self._start_batch is None or self.x0 is None else self.x0[which]
+        return self.replace_unchecked(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
+
+    def replace_unchecked(self, **changes: Any) -> Problem:
+        """The problem with changes that come from checked parts and need not be checked again."""
+        changed = object.__new__(Problem)
+        kept = self.__dict__
+        changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
+        return changed
+
+    def linearise(self, x: Floats) -> Linear:
+        """Whitened residuals and derivatives at x (B, n, ambient)."""
+        return linearise(self.space, self.factors, self.movable, x)
+
+    def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
+        """Residual r (rows,) and sparse Jacobian J (rows, n dof) of a single problem at x (n, ambient): cost = 1/2 r.r.
+
+        A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
+        """
+        linear = self.linearise(self._at(x))
+        return np.concatenate([r.ravel() for r in linear.residual]), self.jacobian(linear)
+
+    def jacobian(self, linear: Linear, which: int = 0) -> Any:
+        """Sparse Jacobian (rows, n dof) of one of the realisations of `linearise`, CSR."""
+        return sparse_jacobian(linear, self.factors, (len(self.names), self.space.dof), which)
+
+    def cost(self, x: npt.ArrayLike) -> float:
+        """1/2 sum of rho of a single problem at x (n, ambient)."""
+        return float(self.linearise(self._at(x)).cost[0])
+
+    def _at(self, x: npt.ArrayLike) -> Floats:
+        """x (1, n, ambient) of a single problem."""
+        return points(self.space, len(self.names), "x", x, (2,))[None]
+
+    @classmethod
+    def from_snapshot(
+        cls, recording: Recording, step: int, ego: int | str, run: int | None = 0, noise: Noise | None = None
+    ) -> Problem:
+        """The star of one step: fixes of the ego and its linked neighbours, spherical factors between them.
+
+        All messages of the step are taken as received; `CooperativeMAP` obeys the channel instead. Missing
+        measurements are treated as in `from_window`.
+
+        Args:
+            recording: of the measurements.
+            step: t.
+            ego: column or id.
+            run: realisation, None for all R at once.
+            noise: noise model, default the recording's sensors.
+
+        Raises:
+            InputError: unknown ego, step or run.
+        """
+        return cls.from_window(recording, step, ego, 1, run, noise)
+
+    @classmethod
+    def from_window(
+        cls,
+        recording: Recording,
+        step: int,
+        ego: int | str,
+        length: int,
+        run: int | None = 0,
+        noise: Noise | None = None,
+    ) -> Problem:
+        """The stars of the last `length` steps, one point per vehicle and step, joined by odometry dt u.
+
+        A missing fix makes no factor; of a relative measurement its parts make one each where some are missing. In a
+        problem of all R realisations what one of them lacks has an infinite std. Arguments and errors as
+        `from_snapshot`; the first step of the window must exist.
+        """
+        steps, names = recorded_steps(recording, step, ego, length, run, noise)
+        return cls.from_steps(steps, recording.sensors if noise is None else noise.sensors, names)
+
+    @classmethod
+    def from_steps(
+        cls, steps: Sequence[WindowStep], sensors: Sensors | None, names: Sequence[str] | None = None
+    ) -> Problem:
+        """The problem of consecutive steps, oldest first; the ego's points are the separator (see `window_factors`).
+
+        Args:
+            steps: the measurements of each.
+            sensors: relative noise; None: unit covariance of the converted vectors.
+            names: of the points, step by step; default their numbers.
+        """
+        if not isinstance(steps, Sequence) or not steps:
+            raise InputError("steps", repr(steps)[:60], "must be one or more", "Give WindowSteps, oldest first.")
+        for step in steps:
+            instance("steps", step, WindowStep)
+        if sensors is not None:
+            instance("sensors", sensors, Sensors)
+        count, factors, ego = window_factors(steps, sensors)
+        return cls(tuple(names or map(str, range(count))), factors, separator=ego)
+
+    def __repr__(self) -> str:
+        count: Counter[str] = Counter()
+        for factor in self.factors:
+            count[factor.kind] += len(factor.nodes)
+        kinds = ", ".join(f"{number} {kind}" for kind, number in count.items())
+        runs = "" if self.batch is None else f", {self.batch} realisations"
+        what = "points" if not self.poses else "poses" if len(self.poses) == len(self.names) else "nodes"
+        plane = " in the plane" if self.dimension == 2 else ""
+        bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
+        return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
+
+
+@cache
+def _fields() -> tuple[str, ...]:
+    return tuple(field.name for field in fields(Problem))

@@ -1,0 +1,146 @@
+"""Space: where the nodes of a problem live, and how a small step moves them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...arrays import Floats, checked, number, refuse
+from ...errors import InputError
+
+
+@dataclass(frozen=True)
+class Space:
+    """Points of dimension d, or poses too: a node is `ambient` numbers, and moves in `dof` directions.
+
+    A point is its position (d,) m. Where there are poses (`has_rotation`) every node is its position and then its
+    rotation matrix row by row, d + d^2 numbers, the identity for points. A step (dp, w) moves it to
+    (p + dp, R Exp(w)): dp in world coordinates, m, and w in the body's, rad.
+
+    Args:
+        dimension: 2 or 3.
+        has_rotation: some nodes have a rotation.
+
+    >>> Space(3, has_rotation=True).ambient, Space(3, has_rotation=True).dof
+    (12, 6)
+    """
+
+    dimension: int = 3
+    has_rotation: bool = False
+
+    def __post_init__(self) -> None:
+        number("dimension", self.dimension, 2, 3, kind=int, allowed="2 or 3", hint="Roads are flat (2) or not (3).")
+
+    @property
+    def ambient(self) -> int:
+        """Numbers per node."""
+        return self.dimension + self.has_rotation * self.dimension**2
+
+    @property
+    def angles(self) -> int:
+        """Directions in which a pose turns."""
+        return self.has_rotation * (1 if self.dimension == 2 else 3)
+
+    @property
+    def dof(self) -> int:
+        """Directions in which a node moves."""
+        return self.dimension + self.angles
+
+    def position(self, x: Floats) -> Floats:
+        """(..., d) m of nodes (..., ambient)."""
+        at: Floats = x[..., : self.dimension]
+        return at
+
+    def rotation(self, x: Floats) -> Floats:
+        """(..., d, d) of nodes (..., ambient)."""
+        d = self.dimension
+        if not self.has_rotation:
+            return np.broadcast_to(np.eye(d), (*x.shape[:-1], d, d))
+        turned: Floats = x[..., d:].reshape(*x.shape[:-1], d, d)
+        return turned
+
+    def join(self, position: Floats, rotation: Floats | None = None) -> Floats:
+        """Nodes (..., ambient) from positions (..., d) and rotations (..., d, d), default the identity."""
+        if not self.has_rotation:
+            return np.asarray(position, dtype=np.float64)
+        turned = np.eye(self.dimension) if rotation is None else np.asarray(rotation, dtype=np.float64)
+        flat = turned.reshape(*turned.shape[:-2], self.dimension**2)
+        return np.concatenate([position, np.broadcast_to(flat, (*np.shape(position)[:-1], flat.shape[-1]))], axis=-1)
+
+    def retract(self, x: Floats, step: Floats) -> Floats:
+        """Nodes (..., ambient) after a step (..., dof): p + dp, R Exp(w)."""
+        if not self.has_rotation:
+            return np.asarray(x + step)
+        d = self.dimension
+        return self.join(x[..., :d] + step[..., :d], self.rotation(x) @ exp(step[..., d:]))
+
+
+def carried(space: Space, x: Floats, before: Floats, after: Floats) -> Floats:
+    """Nodes x (..., ambient) moved as the rigid body that takes a pose from `before` (ambient,) to `after`.
+
+    >>> carried(Space(2, True), pose([3.0, 0.0]), pose([1.0, 0.0]), pose([1.0, 0.0], np.pi / 2)).round(3)[:2]
+    array([1., 2.])
+    """
+    turn = space.rotation(after) @ space.rotation(before).T
+    gap = space.position(x) - space.position(before)
+    return space.join(space.position(after) + gap @ turn.T, turn @ space.rotation(x))
+
+
+def exp(w: Floats) -> Floats:
+    """Rotation matrices (..., 2, 2) of angles (..., 1), or (..., 3, 3) of rotation vectors (..., 3), rad.
+
+    Exp(w) = I + sin|w|/|w| [w]x + (1 - cos|w|)/|w|^2 [w]x^2 (Rodrigues).
+
+    >>> exp(np.array([np.pi / 2])).round(3)
+    array([[ 0., -1.],
+           [ 1.,  0.]])
+    """
+    if w.shape[-1] == 1:
+        c, s = np.cos(w[..., 0]), np.sin(w[..., 0])
+        return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    safe = np.where(angle > 1e-8, angle, 1.0)
+    first = np.where(angle > 1e-8, np.sin(safe) / safe, 1.0)
+    second = np.where(angle > 1e-8, 2.0 * np.square(np.sin(0.5 * safe) / safe), 0.5)
+    turn = cross(w)
+    matrix: Floats = np.eye(3) + first * turn + second * (turn @ turn)
+    return matrix
+
+
+def log(rotation: Floats) -> Floats:
+    """Angles (..., 1) or rotation vectors (..., 3), rad, of rotation matrices (..., d, d): the inverse of `exp`."""
+    if rotation.shape[-1] == 2:
+        return np.arctan2(rotation[..., 1, :1], rotation[..., 0, :1])
+    from scipy.spatial.transform import Rotation
+
+    flat = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
+
+
+def cross(w: Floats) -> Floats:
+    """(..., 3, 3) matrices [w]x with [w]x v = w x v."""
+    x, y, z = np.moveaxis(w, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
+    """Poses (..., d + d^2) from positions (..., d) m and headings (...) rad in 2-D or rotation vectors (..., 3) in 3-D.
+
+    >>> pose([1.0, 2.0], np.pi / 2).round(3) + 0.0
+    array([ 1.,  2.,  0., -1.,  1.,  0.])
+    """
+    at, w = checked("position", position), checked("turn", turn)
+    refuse("turn", w, ~np.isfinite(w), "must be finite", "Give rad.")
+    if not at.ndim or at.shape[-1] not in (2, 3):
+        allowed = "must have shape (..., 2) or (..., 3)"
+        raise InputError("position", f"shape {at.shape}", allowed, "Give x, y or x, y, z of each.")
+    space = Space(at.shape[-1], has_rotation=True)
+    wanted = at.shape[:-1] if space.dimension == 2 else (*at.shape[:-1], 3)
+    if w.ndim > len(wanted) or any(n not in (1, m) for n, m in zip(w.shape[::-1], wanted[::-1], strict=False)):
+        hint = "A heading for each position in the plane, a rotation vector in space."
+        raise InputError("turn", f"shape {w.shape}", f"must fit to {wanted}", hint)
+    w = np.broadcast_to(w[..., None], (*at.shape[:-1], 1)) if space.dimension == 2 else w
+    return space.join(at, exp(np.broadcast_to(w, (*at.shape[:-1], space.angles))))

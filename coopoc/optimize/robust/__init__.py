@@ -1,0 +1,1 @@
+"""Outliers: graduated non-convexity, and candidates that known inliers predict."""

@@ -1,0 +1,109 @@
+"""Candidates: measurements that may be outliers, in groups that share a weight, and the problem with those weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...arrays import Floats, Ints, checked, instance
+from ...errors import InputError
+from ..model.factor import unchecked
+from ..model.local import local
+from ..model.problem import Problem
+
+Candidates = Sequence[int | tuple[int, Sequence[int]]]
+"""Factors by their index, all rows of them or some: [0, (2, [1, 3])]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Marked:
+    """Where the M candidates stand: factor, row and group (M,), groups numbered from 0."""
+
+    factor: Ints
+    row: Ints
+    group: Ints
+
+    def sums(self, values: Sequence[Floats]) -> Floats:
+        """(B, G) sums over each group of one array (B, rows) or (rows,) per factor."""
+        parts = {int(k): np.atleast_2d(values[k]) for k in np.unique(self.factor)}
+        total = np.zeros((int(self.group.max()) + 1, max(map(len, parts.values()))))
+        for k, part in parts.items():
+            here = self.factor == k
+            np.add.at(total, self.group[here], part[:, self.row[here]].T)
+        return total.T
+
+    def among(self, rows: Sequence[Ints]) -> Marked:
+        """Those of some rows of each factor, of a problem that has these alone; groups keep their numbers."""
+        number = np.cumsum([len(own) > 0 for own in rows]) - 1
+        kept = np.concatenate(
+            [np.flatnonzero((self.factor == k) & np.isin(self.row, own)) for k, own in enumerate(rows)]
+        )
+        row = [np.searchsorted(rows[k], r) for k, r in zip(self.factor[kept], self.row[kept], strict=True)]
+        return Marked(number[self.factor[kept]], np.array(row, dtype=np.int64), self.group[kept])
+
+
+def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
+    """The candidates, checked."""
+    instance("problem", problem, Problem)
+    places: list[tuple[int, int]] = []
+    for item in candidates if isinstance(candidates, Sequence) else [candidates]:
+        k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
+        if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 0 <= k < len(problem.factors):
+            allowed = f"must be a factor in 0..{len(problem.factors) - 1} or (factor, rows)"
+            raise InputError("candidates", repr(item), allowed, "See problem.factors.")
+        factor = problem.factors[k]
+        if factor.loss is not None:
+            raise InputError(
+                "candidates", repr(factor), f"has a {factor.loss.name} loss already", "Leave its loss out."
+            )
+        chosen = range(len(factor.nodes)) if rows is None else checked("candidates", rows, "(M,)", (-1,), int).tolist()
+        if bad := [r for r in chosen if not 0 <= r < len(factor.nodes)]:
+            raise InputError("candidates", bad[:3], f"must be rows of {factor!r}", "Rows count from 0.")
+        places += [(int(k), r) for r in chosen]
+    if not places or len(set(places)) < len(places):
+        hint = "Name the factors that may hold outliers."
+        raise InputError("candidates", list(candidates)[:3], "must name measurements, each once", hint)
+    labels = np.arange(len(places)) if groups is None else np.asarray(groups)
+    if labels.shape != (len(places),):
+        allowed = f"must have shape ({len(places)},), one label per candidate measurement"
+        raise InputError("groups", labels.shape, allowed, "Leave it out to judge each alone.")
+    factor_of, row = np.array(places).T
+    return Marked(factor_of, row, np.unique(labels, return_inverse=True)[1])
+
+
+def reweigh(problem: Problem, marked: Marked, weight: Floats, x0: Floats) -> Problem:
+    """The problem of B realisations from x0 (B, n, ambient), with W of the candidates times sqrt(weight) (B, G)."""
+    factors = list(problem.factors)
+    for k in np.unique(marked.factor):
+        factor, here = factors[k], marked.factor == k
+        root = np.ones((len(weight), len(factor.nodes), 1))
+        root[:, marked.row[here], 0] = np.sqrt(weight[:, marked.group[here]])
+        if factor.std is None:
+            factors[k] = unchecked(factor, sqrt_information=factor.sqrt_information * root[..., None])
+        else:
+            with np.errstate(divide="ignore"):  # no weight is an infinite std
+                factors[k] = unchecked(factor, std=factor.std / root)
+    return replace(problem, factors=tuple(factors), x0=x0)
+
+
+def squares(problem: Problem, marked: Marked, x: Floats) -> Floats:
+    """(B, G) r^2 of each group at x (B, n, ambient)."""
+    found: list[Floats] = [np.empty(0)] * len(problem.factors)
+    for k in np.unique(marked.factor):
+        factor = problem.factors[k]
+        seen = local(problem.space, factor.measurement, x, factor.nodes)
+        assert factor.constants is not None
+        residual = factor.whiten(factor.measurement.difference(*seen, factor.z, factor.constants))
+        found[k] = np.square(residual).sum(axis=-1)
+    return marked.sums(found)
+
+
+def bounds(problem: Problem, marked: Marked, threshold: float) -> Floats:
+    """(B or 1, G) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
+    from scipy.special import gammaincinv
+
+    freedom = marked.sums([(f.root != 0).any(axis=-1).sum(axis=-1).astype(np.float64) for f in problem.factors])
+    return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
