@@ -59,7 +59,7 @@ fuzz: $(VENV)/.ready-fuzz
 	OMP_NUM_THREADS=1 PYTHONPATH=tests $(VENV)/bin/python -m fuzz.every --minutes $(MINUTES)
 
 docs: $(VENV)/.ready-docs
-	NO_MKDOCS_2_WARNING=1 OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
+	NO_MKDOCS_2_WARNING=1 JUPYTER_CONFIG_PATH=docs OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
 
 help:
 	@sed -n 's/^# \(make [a-z-]* .*\)/\1/p' Makefile

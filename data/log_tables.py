@@ -303,6 +303,8 @@ def _no_column(file: str, column: str, frame: pd.DataFrame) -> InputError:
     near = [h for h in headers if h.lower() in USUAL.get(column, ())]
     header = near[0] if near else "..."
     wanted = f'columns={{"{column}": "{header}"}} (--columns {column}={header})'
+    if column == "kind":
+        wanted += ', or name the columns: kinds={"...": "speed_kmh"} (--kinds ...=speed_kmh)'
     hint = (
         f"Did you mean {near[0]}? Pass {wanted}." if near else suggestion(column, headers, f"Add it, or pass {wanted}.")
     )

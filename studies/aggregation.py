@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
-from coopoc.study.numbers import Where, interval, listed, mean, per_seed, present
+from coopoc.study.numbers import Where, interval, listed, mean, per_seed, present, seed_means
 from coopoc.study.pivot import across, crossed
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
@@ -19,6 +19,7 @@ from . import lineup, scene
 from .federations import CONDITIONS, GRAPHS, RULES, WIRES, fitted, members, trained
 
 if TYPE_CHECKING:
+    from coopoc.study.plot import Plot
     from coopoc.study.results import Results
 
 LOST = 1e6
@@ -86,6 +87,24 @@ def _table(results: Results, scenario: int, value: str, text: str) -> Table | No
     caption = f"{scene.caption(results, text, **at)} {conditions}. {note}"
     rows = [((look(method).label,), {"method": method}) for method in methods]
     return crossed(results, ("Rule",), rows, columns, caption, best="min", along="column", decimals=3)
+
+
+def _figure(results: Results) -> Plot | None:
+    """Multiples of the mean's RT-LE under iid, one panel per condition, a dot per training seed."""
+    from coopoc.study.multiples import multiples
+
+    at = {"scenario": 2}
+    whole = mean(results, {**at, "condition": "iid", "method": "mean"})
+    if whole is None:
+        return None
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for rule in RULES:
+        for condition in CONDITIONS:
+            each = seed_means(results, {**at, "condition": condition, "method": rule})
+            if each:
+                found.setdefault((rule, "none"), {})[condition.capitalize()] = [value / whole for value in each]
+    text = "RT-LE of the kept weights as a multiple of the mean's under iid, a dot per training seed."
+    return multiples(found, scene.caption(results, text, **at))
 
 
 def _costs(results: Results) -> Table | None:
@@ -170,6 +189,7 @@ STUDY = Study(
     | {
         "costs": _costs,
     },
+    figures={"multiples": _figure},
     findings=_findings,
     limitations=(
         "The selected round depends on the reports of all participating clients, the poisoned one included.",

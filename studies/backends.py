@@ -28,12 +28,14 @@ from . import lineup, scene
 if TYPE_CHECKING:
     import pandas as pd
 
+    from coopoc.study.plot import Plot
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
 BACKENDS = ("gauss-newton", "gtsam", "casadi", "osqp", "cvxpy")
 CONVEX = ("ranges", "converted")
 """Problems that cvxpy can state: angles have no convex form."""
+KS = (2, 6, 10)
 WINDOW = 5
 SAME_M = 1e-3
 """m, closer than which two answers are one minimum."""
@@ -173,6 +175,19 @@ def _median(results: Results, where: Where, value: str) -> float | None:
     return None if kept is None else float(results.select(kept)[value].median())
 
 
+def _figure(results: Results) -> Plot | None:
+    """Time of a solve against neighbours, one panel per problem."""
+    from coopoc.study.lines import Line, Panel, panels
+
+    def line(backend: str, problem: str) -> Line:
+        at = {"method": backend, "problem": problem}
+        return Line({"method": backend}, {k: _median(results, {**at, "max_neighbours": k}, "whole_ms") for k in KS})
+
+    shown = [Panel([line(b, p) for b in BACKENDS], WORDS[p].capitalize(), "Neighbours K", KS) for p in PROBLEMS]
+    text = "Milliseconds of one solve() from its first guess, checks and covariance included, median."
+    return panels(shown, scene.caption(results, text, runs=1), 9.6, ylabel="Time [ms]", log=True)
+
+
 def _findings(results: Results) -> dict[str, str]:
     frame = results.frame
     if "same" not in frame:
@@ -196,7 +211,7 @@ STUDY = lineup.study(
     recipe=None,
     grid=[
         {"max_neighbours": k, "problem": problem, "method": backend}
-        for k in (2, 6, 10)
+        for k in KS
         for problem in PROBLEMS
         for backend in BACKENDS
         if backend != "cvxpy" or problem in CONVEX
@@ -205,6 +220,7 @@ STUDY = lineup.study(
     scored=False,
     shares=("max_neighbours",),
     tables={"agreement": _agreement, "cost": _cost},
+    figures={"cost": _figure},
     findings=_findings,
     limitations=(
         "The reference solver is local, too: where there are several minima it does not show which is the lowest.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Number, interval, listed, mean, present, ran, seed_std
+from coopoc.study.numbers import Number, interval, listed, mean, present, ran, seed_means, seed_std
 from coopoc.study.pivot import across, crossed
 
 from . import lineup, scene
@@ -13,6 +13,7 @@ from .error_cdf import CASES, LINEUP, case, meaningful, worse_than_gnss
 from .lineup import HEAD, labelled, of
 
 if TYPE_CHECKING:
+    from coopoc.study.plot import Plot
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
@@ -22,6 +23,8 @@ CHOICES = {
     for reading in ("axis", "speed")
 }
 """Pairs of choices, as selections."""
+STARTS = {"gnss": "First fix", "true": "True start"}
+READINGS = {"axis": "per axis", "speed": "of the speed"}
 
 
 def _cases(results: Results, choice: dict[str, str]) -> dict[str, dict[str, Any]]:
@@ -43,6 +46,25 @@ def _table(results: Results, choice: dict[str, str]) -> Table | None:
     caption = " ".join(["RT-LE.", *(scene.caption(results, **at) for at in cases.values())])
     digits = scene.decimals(results.settings)
     return crossed(results, HEAD, labelled(LINEUP), columns, caption, decimals=digits)
+
+
+def _figure(results: Results) -> Plot | None:
+    """Multiples of one reference under each pair of choices, a dot per training seed."""
+    from coopoc.study.multiples import multiples
+
+    at = case(2, 0.15)
+    reference = mean(results, of("kalman", "oracle", **CHOICES["gnss_axis"], **at))
+    if reference is None:
+        return None
+    found: dict[tuple[str, str], dict[str, list[float]]] = {}
+    for pair in LINEUP[2:]:  # fixes and unit covariances lie far beyond
+        for choice in CHOICES.values():
+            each = seed_means(results, of(*pair, **choice, **at))
+            if each:
+                title = f"{STARTS[choice['start']]}, {READINGS[choice['velocity_reading']]}"
+                found.setdefault(pair, {})[title] = [value / reference for value in each]
+    text = "RT-LE as a multiple of the first panel's oracle Kalman filter, a dot per training seed. First panel:"
+    return multiples(found, scene.caption(results, text, **CHOICES["gnss_axis"], **at))
 
 
 def _findings(results: Results) -> dict[str, str]:
@@ -80,6 +102,7 @@ STUDY = lineup.study(
     where=meaningful,
     shares=("scenario", "velocity_ratio", "velocity_reading"),
     tables={name: partial(_table, choice=choice) for name, choice in CHOICES.items()},
+    figures={"choices": _figure},
     findings=_findings,
     limitations=("KalmanNet's published loop starts at the true position, which no vehicle knows.",),
     minutes=30,

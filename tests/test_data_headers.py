@@ -120,3 +120,9 @@ def test_places_need_no_times(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text("vehicle,x,y\nmast,5,6\npost,7,6\n")
     with pytest.raises(co.InputError, match="t = in no file"):
         co.read_log(tmp_path / "c.csv")
+
+
+def test_a_wide_table_with_other_headers_is_told_how_to_name_its_columns(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("t,vehicle,Tempo\n0,red,8\n1,red,8\n")
+    with pytest.raises(co.InputError, match=r'kinds=\{"...": "speed_kmh"\} \(--kinds ...=speed_kmh\)'):
+        co.read_log(tmp_path)

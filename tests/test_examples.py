@@ -1,9 +1,8 @@
-"""The examples and the README's Python run as they stand; the lazy names of the package are those that types see."""
+"""The examples run as they stand; the lazy names of the package are those that types see."""
 
 from __future__ import annotations
 
 import ast
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,14 +17,6 @@ def test_first_steps_runs() -> None:
     out = subprocess.run([sys.executable, "-W", "error", script], capture_output=True, text=True, check=True).stdout
     assert out.count("SOLVED") == 4
     assert "FedKalmanNet" in out
-
-
-def test_readme_python_runs(tmp_path: Path) -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
-    assert blocks
-    script = tmp_path / "readme.py"
-    script.write_text("\n".join(blocks))
-    subprocess.run([sys.executable, "-W", "error", script], cwd=tmp_path, capture_output=True, text=True, check=True)
 
 
 def test_lazy_names_are_the_typed_names() -> None:

@@ -100,9 +100,9 @@ def test_the_angle_is_atan2() -> None:
 def test_machine_code_is_stale_after_a_change_of_any_file_beside_it(tmp_path: Path) -> None:
     file = tmp_path / "a.py"
     file.write_text("one")
-    before = kernels._stamp.__wrapped__((tmp_path,))
+    before = kernels._stamp.__wrapped__(tmp_path)
     file.write_text("other")
-    assert kernels._stamp.__wrapped__((tmp_path,)) != before
+    assert kernels._stamp.__wrapped__(tmp_path) != before
 
 
 def test_importing_the_package_imports_no_numba() -> None:

@@ -28,6 +28,34 @@ def imports(path: Path) -> set[str]:
     return found
 
 
+ROOMS = {
+    "optimize": [
+        "model",
+        "algebra",
+        "assessment",
+        "descent",
+        "initialisation",
+        "agents",
+        "robust",
+        "convex",
+        "backends",
+    ],
+    "kernels": ["compiling", "graphs", "stars", "windows", "poses", "fleets"],
+}
+"""Folders of a floor, each of which imports those before it only; modules beside them stand above or below all."""
+
+
+@pytest.mark.parametrize("floor", ROOMS)
+def test_rooms_of_a_floor_import_one_way(floor: str) -> None:
+    order = ROOMS[floor]
+    assert {p.parent.name for p in (ROOT / "coopoc" / floor).glob("*/__init__.py")} == set(order)
+    for path in sorted((ROOT / "coopoc" / floor).glob("*/*.py")):
+        for name in imports(path):
+            target = name.removeprefix(f"coopoc.{floor}.").split(".")[0]
+            if name.startswith(f"coopoc.{floor}.") and target in order:
+                assert order.index(target) <= order.index(path.parent.name), f"{path} imports {name}"
+
+
 @pytest.mark.parametrize("path", sorted((ROOT / "coopoc").rglob("*.py")), ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_run_one_way(path: Path) -> None:
     floor = path.relative_to(ROOT / "coopoc").parts[0].removesuffix(".py")

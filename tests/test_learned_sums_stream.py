@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -184,15 +180,6 @@ def test_what_a_stream_cannot_take_is_refused_and_changes_nothing(crossing: Flee
         CooperativeGain(net(), sums=False).start()
     with pytest.raises(InputError, match=r"sensors = .*those of the NoiseModel"):
         CooperativeGain(NoiseModel.nominal(NOISE)).start(NOISE)
-
-
-def test_the_blocks_of_the_page_run() -> None:
-    page = (Path(__file__).resolve().parents[1] / "docs" / "cooperative_gain.md").read_text()
-    code = "\n".join(re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL))
-    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    alone, together = map(float, done.stdout.splitlines()[0].split())
-    assert together < 0.7 * alone
 
 
 @pytest.mark.parametrize("wrong", [None, [1], ["b"], [RelativeMeasurement("b", [9.0, 0.1, 1.57])]])

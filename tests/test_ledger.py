@@ -122,9 +122,10 @@ def test_the_card_of_a_training_names_the_bytes_it_moved() -> None:
 def test_the_page_of_the_budget_runs() -> None:
     (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "budget.md").read_text(), flags=re.DOTALL)
     account: dict[str, Any] = {}
-    exec(block.replace("drive.rate(", "found = drive.rate("), account)
-    rate, once, seconds = account["found"]
-    assert (once, seconds) == (account["training"].per_vehicle("training"), once / account["drive"].rate())
+    exec(block, account)
+    rate, once = account["drive"].rate("on air", "broadcast"), account["training"].per_vehicle("training")
+    seconds = break_even(account["training"], account["drive"])
+    assert seconds == once / account["drive"].rate()
     assert rate == pytest.approx(2.2 * 382, rel=0.02)  # what the ego itself broadcasts
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -420,17 +419,6 @@ def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
     assert numbers.shape == (7, 6)
     assert (numbers[:, :5] < 2.5 * np.sqrt(3)).all(), "better than the fixes, however bad the log is"
     assert (numbers[:, 5] > 50).all(), "steps per second"
-
-
-def test_documented_code_runs() -> None:
-    """The blocks of docs/streaming.md on filters; those on files are run by the tests of the export."""
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "streaming.md").read_text(), flags=re.DOTALL)
-    about_filters = [block for block in blocks if "onnx" not in block]
-    assert len(about_filters) == 3
-    for block in about_filters:
-        found: dict[str, Any] = {}
-        exec(block, found)
-        assert np.isfinite(found["x"]).all()
 
 
 def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:

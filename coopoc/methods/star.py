@@ -127,7 +127,7 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 
 
 def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
-    """The noise that a filter assumes, as `coopoc.kernels.stars.messages.Assumptions`: a message holds a fix and a velocity,
+    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity,
     whose error the fix of `age` steps ago has made age times."""
     velocity_noise, fixes = known.velocity_noise, np.ascontiguousarray(known.fix_variance(recording))
     process = np.zeros((1, 1, 1, 3)) if len(velocity_noise) else np.ascontiguousarray(known.process_variance(recording))

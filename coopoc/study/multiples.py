@@ -12,8 +12,8 @@ from .marks import series
 from .plot import Plot, canvas
 from .style import NEUTRAL, look
 
-NEAR, FAR = (0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 2.0), (0.5, 1.0, 2.0, 5.0, 10.0)
-"""Ticks of an axis up to 2, and of a longer one."""
+NEAR, BOTH, FAR = (0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 2.0), (0.8, 1.0, 1.25, 1.6, 2.0), (0.5, 1.0, 2.0, 5.0, 10.0)
+"""Ticks of an axis from about 1 to 2, of one that begins well below 1, and of a longer one."""
 
 
 def multiples(
@@ -57,7 +57,8 @@ def multiples(
                     gid=series(method, noise_model),
                 )
             panel.set(title=case, xscale="log", xlabel="× reference")
-            panel.xaxis.set_major_locator(FixedLocator(NEAR if panel.get_xlim()[1] < 2.1 else FAR))
+            low, high = panel.get_xlim()
+            panel.xaxis.set_major_locator(FixedLocator(FAR if high > 2.1 else BOTH if low < 0.85 else NEAR))
             panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
             panel.xaxis.set_minor_formatter(NullFormatter())
         labels = [f"{look(method).label}{_of(noise_model)}" for method, noise_model in found]

@@ -113,6 +113,14 @@ def per_seed(results: Results, where: Where) -> Floats:
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
+def seed_means(results: Results, where: Where) -> list[float]:
+    """Mean RT-LE of each training seed, m; of a method that is not trained its mean, and nothing if it was not run."""
+    if not present(results, where):
+        return []
+    each = per_seed(results, where)
+    return list(each.mean(axis=(1, 2))) if len(each) else [float(results.values("rt_le_m", where).mean())]
+
+
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where) if present(results, where) else np.empty(0)

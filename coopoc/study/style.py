@@ -73,6 +73,11 @@ METHODS = {
     "cooperative-newest": Look("Cooperative gain, newest fix", "#E57373", "h"),
     "individual": Look("Individual KalmanNet", "#9370C9", "h"),
     "oracle": Look("Oracle KF", "#5B3A1E", "d"),
+    "gauss-newton": Look("gauss-newton", GREEN, "^"),
+    "gtsam": Look("gtsam", BLUE, "s"),
+    "casadi": Look("casadi", VERMILLION, "v"),
+    "osqp": Look("osqp", PURPLE, "D"),
+    "cvxpy": Look("cvxpy", ORANGE, "o"),
     "bound": Look("Cramér-Rao bound", BLACK, ""),
 }
 _SPARE = tuple((color, marker) for marker in "<>d8H" for color in (BLUE, VERMILLION, GREEN, PURPLE, ORANGE))

@@ -58,6 +58,7 @@ def storage(function: Function) -> Function:
     return cast(Function, _made(function, set(), inline="always"))
 
 
+KERNELS = Path(__file__).resolve().parents[1]
 PATIENCE = 2.0
 """s of compiling after which a line on stderr reports it."""
 
@@ -110,11 +111,11 @@ def _within(function: Function, liberties: set[str], **options: bool) -> Functio
 
 
 def _kept(made: Any, function: Function) -> Function:
-    folders = {Path(__file__).parent, Path(function.__code__.co_filename).parent}
     try:
         made.enable_caching()
         file = made._cache._cache_file
-        file._source_stamp, file._load_index = _stamp(tuple(sorted(folders))), partial(_index_or_none, file._load_index)
+        file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+        file._load_index = partial(_index_or_none, file._load_index)
     except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
         pass
     return cast(Function, made)
@@ -129,6 +130,6 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
 
 
 @cache
-def _stamp(folders: tuple[Path, ...]) -> tuple[tuple[str, int, int], ...]:
-    files = sorted(file for folder in folders for file in folder.glob("*.py"))
+def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
+    files = sorted({*KERNELS.rglob("*.py"), *folder.glob("*.py")})
     return tuple((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)

@@ -1,7 +1,8 @@
 """Small matrices of any fixed size as tuples of numbers, unrolled by the compiler.
 
 A vector of d numbers is a tuple of d, a d x d matrix a tuple of d * d, row by row. A number is a float, or LANES runs
-side by side (`coopoc.kernels.compiling.batched`): one text serves both. Memory is a flat array of floats, or an array (., LANES).
+side by side (`coopoc.kernels.compiling.batched`): one text serves both. Memory is a flat array of floats, or an array
+(., LANES).
 
 Products and sums are fused where `plus` and `less` stand and nowhere else, so that all runs get the digits of a run
 alone.

@@ -1,4 +1,4 @@
-"""Fixes with time-correlated errors, in the blocks of `coopoc.kernels.stars.joint`: z = x + drift + common + white noise.
+"""Fixes with time-correlated errors, in the blocks of the joint filter: z = x + drift + common + white noise.
 
 A state is (position, drift), six numbers. The error that all fixes have in common is the position of one more block
 behind the members'; its drift is zero. Both errors are Gauss-Markov: e_t = keep e_{t-1} + w, in steady state.
@@ -12,7 +12,7 @@ from ..compiling.compile import inner, inside
 from ..compiling.small import add, add_diagonal, first3, load, store, subtract, times, zeros
 from ..compiling.symbolic import unrolled
 from .elimination import rescale
-from .joint import Joint, block_of
+from .joint import Joint, block_of, place
 from .messages import MOVED, NEW, POSITION, PROCESS, ROW, VARIANCE, Star
 
 NOTHING = 1e-18
@@ -115,6 +115,8 @@ def add_drifting_fixes(star: Star, joint: Joint, drift: Drift, members: int, n: 
     """Add every member's position as broadcast: information about its position, its drift and the common error."""
     row, common = (0.0,) * 6, n - 2
     for k in range(members):
+        if k > 0:
+            place(star, joint, k, row)
         new = load(star.status, 5 * k + NEW, (0.0,))[0]
         p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)
         weight, state = (new / p, new / q, new / r), load(joint.state, k, row)

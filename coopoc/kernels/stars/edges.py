@@ -1,7 +1,7 @@
 """A relative measurement as an edge from the ego to a neighbour: information matrix E and information vector eta.
 
-A measurement is the eight numbers of `coopoc.kernels.stars.messages.Star.relative`, the last three its standard deviations;
-an infinite one stands for a component that was not measured. A number is a float, or LANES runs side by side.
+A measurement is the eight numbers of `messages.Star.relative`, the last three its standard deviations; an infinite one
+stands for a component that was not measured. A number is a float, or LANES runs side by side.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Symmetric positive definite matrices of d x d blocks in information form: eliminate, substitute, predict.
 
-A matrix of n x n blocks stands in memory as `coopoc.kernels.compiling.small` keeps it: block (i, j), j >= i, is tuple number
+A matrix of n x n blocks stands in memory as `compiling.small` keeps it: block (i, j), j >= i, is tuple number
 i stride + j; those below the diagonal are never read. The arguments `block` and `row` are any tuples of d * d and of d
 numbers: the compiler takes d from their lengths. A number is a float, or LANES runs side by side.
 """

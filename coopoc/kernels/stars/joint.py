@@ -161,6 +161,20 @@ def first_place(star: Star, k: int, ego: Any) -> Any:
 
 
 @inside
+def place(star: Star, joint: Joint, k: int, row: Any) -> None:
+    """Put a member of which nothing was known where its first message with a position does: what was measured of it is
+    linear there, and not where it was assumed to be until now."""
+    state = load(joint.state, k, row)
+    own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
+    new, at = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5, first3(state)
+    x, y, z = load(star.motion, 4 * k + POSITION, ROW)
+    there = choose(new, x, at[0]), choose(new, y, at[1]), choose(new, z, at[2])
+    known = own - LEAST_KNOWN
+    found = choose(known, at[0], there[0]), choose(known, at[1], there[1]), choose(known, at[2], there[2])
+    store(joint.state, k, with_first3(state, found))
+
+
+@inside
 def placed(joint: Joint, k: int, seen: Any, row: Any) -> Any:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]

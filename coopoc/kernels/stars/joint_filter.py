@@ -25,6 +25,7 @@ from .joint import (
     exact_information,
     joint_within,
     move,
+    place,
     predict_state,
     rearrange,
     relative_information,
@@ -117,6 +118,8 @@ def step(star: Star, joint: Joint, known: Assumptions, refine: bool, drift: Drif
 def add_fixes(star: Star, joint: Joint, n: int, row: Any) -> None:
     """Add every member's position as broadcast."""
     for k in range(n):
+        if k > 0:
+            place(star, joint, k, row)
         new = load(star.status, 5 * k + NEW, (0.0,))[0]
         p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)
         gap = subtract(load(star.motion, 4 * k + POSITION, ROW), first3(load(joint.state, k, row)))

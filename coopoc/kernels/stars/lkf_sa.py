@@ -1,6 +1,6 @@
 """The Laplacian Kalman filter of one ego's star in information form, run by run with the three axes side by side.
 
-Memory is that of `coopoc.kernels.stars.joint` with one number per member and axis; lanes are axes, the last one repeated.
+Memory is that of the joint filter with one number per member and axis; lanes are axes, the last one repeated.
 """
 
 from __future__ import annotations

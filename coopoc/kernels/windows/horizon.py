@@ -1,7 +1,7 @@
 """Moving horizons and fixed-lag smoothers of one ego's star: a window of steps behind an arrival cost.
 
 A Gauss-Newton step of the window eliminates it step by step up to the newest, solves that, and substitutes back
-(`coopoc.kernels.windows.sweep`); a step that leaves the window becomes the arrival cost of the next. LANES runs go side by
+(`windows.sweep`); a step that leaves the window becomes the arrival cost of the next. LANES runs go side by
 side.
 """
 

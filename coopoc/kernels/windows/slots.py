@@ -39,6 +39,7 @@ class Window(NamedTuple):
         edge: (9 places, LANES), information of the relative measurements around the points.
         eta: (3 places, LANES), their information vectors.
         point: (3 places, LANES) m.
+        located: (places, LANES) 1 where a position or a whole vector has told where the member is, else 0.
         odometry: (1, LANES) GNC weight of the ego's odometry.
         layout: slots h + 1, and most members, places of a slot.
     """
@@ -56,6 +57,7 @@ class Window(NamedTuple):
     edge: Floats
     eta: Floats
     point: Floats
+    located: Floats
     odometry: Floats
     layout: tuple[int, int]
 
@@ -77,6 +79,7 @@ def new_window(length: int, most: int) -> Window:
         np.zeros((9 * places, LANES)),
         np.zeros((3 * places, LANES)),
         np.zeros((3 * places, LANES)),
+        np.zeros((places, LANES)),
         np.ones((1, LANES)),
         (length + 1, most),
     )

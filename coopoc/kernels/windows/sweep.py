@@ -1,6 +1,6 @@
 """One Gauss-Newton step of a window of stars: on through its steps, solve the newest, and back.
 
-A step's information matrix goes on to the next one block by block (`coopoc.kernels.stars.elimination.predict`): with motion
+A step's information matrix goes on to the next one block by block (`stars.elimination.predict`): with motion
 of information D the block k leaves A - U (A_kk + D)^-1 U^T, U its columns, which are kept. Going back, the point was
 (A_kk + D)^-1 (eta_k + D d - U z), d being the move of the next one and z those of all others.
 """
@@ -12,8 +12,8 @@ from typing import Any
 from numpy import uint64
 
 from ...arrays import AnyArray
-from ..compiling.batched import take
-from ..compiling.compile import inner
+from ..compiling.batched import choose, put, take
+from ..compiling.compile import inner, inside
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -34,7 +34,7 @@ from ..compiling.small import (
 from ..stars.edges import AT_GAP, EXACT, edge
 from ..stars.elimination import predict
 from ..stars.joint import Joint, add_relative, block_of, copy, rearrange, solve
-from ..stars.messages import MOVED, POSITION, RELATIVE, Assumptions, clear
+from ..stars.messages import MOVED, NEW, POSITION, RELATIVE, Assumptions, clear
 from ..stars.relative import completed, vector
 from .back import Past, advance_points, go_back, kept_of, process_information
 from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, place_of, star_at
@@ -42,22 +42,31 @@ from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, place_of, st
 
 @inner
 def start_points(window: Window, past: Past, known: Assumptions, t: int) -> None:
-    """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it.
+    """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it, and
+    one that nothing has located yet where its first position puts it, with its earlier points.
 
     Its relative measurements are converted vectors, weighted by that geometry.
     """
     ego, before = place_of(window.layout, t, 0), place_of(window.layout, t - 1, 0)
     for k in range(count_of(window.sizes, t)):
         place, previous = ego + k, window.previous[ego + k]
-        fix = load(window.motion, 4 * place + POSITION, ROW)
+        fix, new = load(window.motion, 4 * place + POSITION, ROW), take(window.status, uint64(5 * place + NEW))
+        there = 0.0 * new + 1.0 if k == 0 else max(new, whole_of(window, place))
+        at = fix
         if previous >= 0:
-            fix = add(load(window.point, before + previous, ROW), load(window.motion, 4 * place + MOVED, ROW))
+            located = take(window.located, uint64(before + previous))
+            at = add(load(window.point, before + previous, ROW), load(window.motion, 4 * place + MOVED, ROW))
+            first = new - located - 0.5  # > 0: its first position
+            at = choose_each(first, fix, at)
+            there = max(there, located)
+            if any_above(first):
+                locate_before(window, place, t, first, at)
         elif k > 0:
             origin = load(window.point, ego, ROW)
-            gap = subtract(fix, origin)
-            fix = add(origin, vector(completed(load(window.relative, place, RELATIVE), gap)))
-        store(window.point, place, fix)
-        store(past.at, place, fix)
+            at = add(origin, vector(completed(load(window.relative, place, RELATIVE), subtract(fix, origin))))
+        put(window.located, uint64(place), there)
+        store(window.point, place, at)
+        store(past.at, place, at)
         if k > 0:
             gap = subtract(fix, load(window.point, ego, ROW))
             put_edge(window, past, known, place, gap, AT_GAP, 0.0 * gap[0] + 1.0)
@@ -72,10 +81,37 @@ def start_points(window: Window, past: Past, known: Assumptions, t: int) -> None
 
 
 @inner
+def whole_of(window: Window, place: int) -> Any:
+    """1 where all components of a relative measurement were measured, else 0."""
+    z = load(window.relative, place, RELATIVE)
+    return choose(1e300 - (z[5] + z[6] + z[7]), 0.0 * z[0] + 1.0, 0.0 * z[0])
+
+
+@inside
+def any_above(values: Any) -> bool:
+    """True if any of these runs has a number > 0."""
+    return not values <= 0.0 * values
+
+
+@inner
+def locate_before(window: Window, place: int, t: int, mask: Any, at: Any) -> None:
+    """Bring the earlier points of a member, which nothing had located, to where its first position puts them."""
+    here, step = place, t
+    while window.previous[here] >= 0 and step > 0 and t - step < len(window.sizes) - 1:
+        at = subtract(at, load(window.motion, 4 * here + MOVED, ROW))
+        here, step = place_of(window.layout, step - 1, window.previous[here]), step - 1
+        lost = choose(mask, 0.5 - take(window.located, uint64(here)), 0.0 * at[0])
+        store(window.point, here, choose_each(lost, at, load(window.point, here, ROW)))
+        put(window.located, uint64(here), choose(lost, 0.0 * at[0] + 1.0, take(window.located, uint64(here))))
+
+
+@inner
 def put_edge(window: Window, past: Past, known: Assumptions, place: int, gap: Any, how: Any, mask: Any) -> None:
     """The relative measurement of a place, linear at the vector `gap`, where the mask is positive: E and E v + eta."""
     z = load(window.relative, place, RELATIVE)
     information, eta = edge(gap, z, (known.relative_std, known.min_range), how)
+    o, used = 0.0 * gap[0], max(take(window.located, uint64(place)), whole_of(window, place)) - 0.5
+    information, eta = choose_each(used, information, zeros(o, ONE)), choose_each(used, eta, zeros(o, ROW))
     eta = plus_applied(eta, information, gap)
     store(window.edge, place, choose_each(mask, information, load(window.edge, place, ONE)))
     store(window.eta, place, choose_each(mask, eta, load(window.eta, place, ROW)))

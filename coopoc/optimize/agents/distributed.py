@@ -115,7 +115,7 @@ def solve_distributed(
 def owners(problem: Problem) -> tuple[str, ...]:
     """(n,) the letter of each node's name; of a point among poses that of the first pose measured with it.
 
-    >>> from .space import pose
+    >>> from ..model.space import pose
     >>> problem = Problem(("a0", "L0"), x0=pose(np.zeros((2, 2))), dimension=2, poses=(0,))
     >>> owners(problem.add("range", ("a0", "L0"), 5.0, std=1.0))
     ('a', 'a')
