@@ -17,8 +17,8 @@ from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graphs import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
-from coopoc.optimize.robust.compatible import predicted
 from coopoc.optimize.robust.outliers import mark
+from coopoc.optimize.robust.predictions import predicted
 
 STD = np.array([0.02, 0.02, 0.01])
 
@@ -94,11 +94,13 @@ def test_predictions_are_those_of_dense_algebra() -> None:
         assert spread[k] == pytest.approx(np.log(np.linalg.det(S)), rel=1e-6)
 
 
-def test_known_inliers_that_leave_nodes_free_are_refused() -> None:
-    problem = Problem(("A0", "B0"), x0=pose(np.zeros((2, 2))), dimension=2, poses=(0, 1), fixed=(0,))
-    problem = problem.add("relative_pose", ("A0", "B0"), pose([1.0, 0.0]), std=STD)
+def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused() -> None:
+    problem = Problem(("A0", "A1", "L0"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1), fixed=(0,))
+    problem = problem.add("relative_position", ("A1", "L0"), [1.0, 0.0], std=0.1)
+    problem = problem.add("range", ("A0", "A1"), 1.0, std=0.1)
+    problem = problem.add("relative_pose", ("A0", "A1"), pose([1.0, 0.0]), std=STD)
     with pytest.raises(co.InputError, match=r"candidates.*known inliers that hold all nodes.*all"):
-        solve_gnc(problem, [0], start="known")
+        solve_gnc(problem.replace_unchecked(x0=pose(np.array([[0.0, 0], [1, 0], [2, 0]]))), [2], start="known")
 
 
 def test_points_join_as_poses_do() -> None:
@@ -123,3 +125,29 @@ def test_the_command_names_what_it_rejects(tmp_path: Path, capsys: pytest.Captur
     write_graph(chain, tmp_path / "chain.g2o")
     with pytest.raises(co.InputError, match="outliers"):
         solve_file(tmp_path / "chain.g2o", outliers=True)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "torus"])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_wrong_loops_of_a_drive_in_space_are_found(shape: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Oracle: the labels, and the solution of the graph that never had the wrong ones."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    from unseen_graphs import joined, surface
+
+    drive_, loops = surface(seed, 15, 30, shape)
+    edges = drive_.relative(loops, 0.1, 0.02, wrong=0.2)
+    gap = drive_.position[loops[:, 1]] - drive_.position[loops[:, 0]]
+    error = np.einsum("mji,mj->mi", drive_.rotation[loops[:, 0]], gap) - edges.position
+    bad = np.linalg.norm(error, axis=1) > 1.0  # ten standard deviations
+    odometry = drive_.relative(drive_.chain(), 0.1, 0.02)
+    solution = solve_gnc(
+        problem := from_graph(drive_.graph(relative_pose=joined(odometry, edges)), start="odometry"),
+        loop_closures(problem),
+        start="known",
+    )
+    rejected = solution.extras["weights"] < 0.5
+    assert solution.status is Status.SOLVED
+    assert not (bad & ~rejected).any()
+    assert (~bad & rejected).sum() <= 0.02 * len(loops)
+    clean = co.solve(from_graph(drive_.graph(relative_pose=joined(odometry, edges.rows(np.flatnonzero(~bad))))))
+    assert np.abs(solution.position - clean.position).max() < 0.3

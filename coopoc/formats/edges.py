@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -35,6 +35,14 @@ class Edges:
             object.__setattr__(self, field.name, frozen(getattr(self, field.name), dtype))
         if not len(self.stamps):
             object.__setattr__(self, "stamps", frozen(np.full(len(self.nodes), np.nan)))
+
+    def rows(self, chosen: Ints) -> Self:
+        """Some of the measurements.
+
+        >>> RangeEdges([[0, 1], [0, 2]], [5.0, 6.0], [0.1, 0.1]).rows(np.array([1])).distance
+        array([6.])
+        """
+        return replace(self, **{field.name: getattr(self, field.name)[chosen] for field in fields(self)})  # type: ignore[arg-type, type-var]
 
 
 @dataclass(frozen=True, eq=False)

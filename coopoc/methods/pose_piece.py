@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
-from ..optimize.model.factor import Factor
+from ..optimize.model.factor import Factor, of_recorded
 from ..optimize.model.problem import Problem
 from ..optimize.model.space import Space, pose
 from ..world.frames import turned
@@ -19,6 +19,7 @@ from .pose_begin import body_of
 from .pose_unit import LEAST_HEADING_STD, LEAST_YAW_RATE_STD
 
 PLANE = Space(2, has_rotation=True)
+NOTHING = Problem((), dimension=2)
 LANDMARK_STD = 0.01
 """m, of the prior of a landmark, whose position is known."""
 
@@ -81,10 +82,10 @@ def pose_piece(drive: Drive, step: int, known: Mapping[str, Floats]) -> Problem:
     factors = [*_moves(drive, step, stayed, moved), *_own(drive, step, here, place)]
     fresh = [place[c] for c in marks if recording.ids[c] not in known]
     if fresh:
-        factors.append(Factor("position", _column(fresh), x0[fresh, :2], np.array(LANDMARK_STD)))
+        factors.append(of_recorded("position", _column(fresh), x0[fresh, :2], np.array(LANDMARK_STD)))
     factors += _relative(drive, links, place)
     poses = tuple(range(len(stayed) + len(here)))
-    return Problem(tuple(names), tuple(factors), x0, dimension=2, poses=poses)
+    return NOTHING.replace_unchecked(names=tuple(names), factors=tuple(factors), x0=x0, poses=poses)
 
 
 def _column(places: Sequence[int]) -> Ints:
@@ -137,7 +138,7 @@ def _moves(drive: Drive, step: int, columns: Sequence[int], moved: Floats) -> li
     speed = noise.assumed_velocity_std(drive.recording.velocity[drive.run, step, columns])[:, :2]
     turn = np.full((count, 1), max(noise.yaw_rate_std, LEAST_YAW_RATE_STD))
     pairs = np.arange(2 * count).reshape(2, count).T
-    return [Factor("relative_pose", pairs, moved, dt * np.hstack([speed, turn]))]
+    return [of_recorded("relative_pose", pairs, moved, dt * np.hstack([speed, turn]))]
 
 
 def _own(drive: Drive, step: int, columns: Sequence[int], place: Mapping[int, int]) -> list[Factor]:
@@ -147,19 +148,19 @@ def _own(drive: Drive, step: int, columns: Sequence[int], place: Mapping[int, in
     fixed = [c for c in columns if np.isfinite(fix[c, :2]).all()]
     if fixed:
         found.append(
-            Factor("position", _column([place[c] for c in fixed]), fix[fixed, :2], np.array(noise.fix_std[:2]))
+            of_recorded("position", _column([place[c] for c in fixed]), fix[fixed, :2], np.array(noise.fix_std[:2]))
         )
     headed = [c for c in columns if np.isfinite(compass[c])]
     if headed:
         turn = max(float(np.hypot(noise.heading_std, noise.heading_bias_std)), LEAST_HEADING_STD)
         z = pose(np.zeros((len(headed), 2)), compass[headed])
-        found.append(Factor("pose", _column([place[c] for c in headed]), z, np.array([np.inf, np.inf, turn])))
+        found.append(of_recorded("pose", _column([place[c] for c in headed]), z, np.array([np.inf, np.inf, turn])))
     given = drive.begin[:, [0, 1, 3]]
     begun = [c for c in columns if step == 0 and np.isfinite(given[c]).any()]
     if begun:
         std = np.where(np.isnan(given[begun]), np.inf, drive.spread[[0, 1, 3]])
         z = pose(np.nan_to_num(given[begun, :2]), np.nan_to_num(given[begun, 2]))
-        found.append(Factor("pose", _column([place[c] for c in begun]), z, std))
+        found.append(of_recorded("pose", _column([place[c] for c in begun]), z, std))
     return found
 
 
@@ -177,4 +178,4 @@ def _relative(drive: Drive, links: Ints, place: Mapping[int, int]) -> list[Facto
         ("range", far & ~seen, flat[:, None], both[:1]),
         ("bearing", seen & ~far, bearing[:, None], both[1:]),
     )
-    return [Factor(kind, pairs[rows], z[rows], std) for kind, rows, z, std in kinds if rows.any()]
+    return [of_recorded(kind, pairs[rows], z[rows], std) for kind, rows, z, std in kinds if rows.any()]

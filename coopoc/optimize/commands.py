@@ -13,12 +13,15 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
+from ..formats import load_graph
+from ..formats.graph import Graph
 from .backend import backends
-from .graphs import Objective, loop_closures, read_graph
+from .graphs import Objective, Start, from_graph, loop_closures, read_graph
 from .initialisation.race import expected as expected_cost
 from .model.problem import Problem
 from .model.search import Search
 from .robust.gnc import solve_gnc
+from .robust.hypotheses import AGREEING
 from .solution import Solution, Status
 from .solve import solve
 
@@ -52,7 +55,10 @@ def solve_file(
         output: file for the solution with all nodes, as JSON; a summary goes to stdout.
         outliers: find wrong loop closures and relative poses between robots, and leave them out (solve_gnc).
     """
-    problem = read_graph(file, objective, "apart" if start == "relaxed" else start)
+    begin: Start = "apart" if start == "relaxed" else start
+    problem = (
+        known_inliers_first(load_graph(file), objective, begin) if outliers else read_graph(file, objective, begin)
+    )
     if start == "relaxed":
         from .convex import staircase
 
@@ -69,16 +75,32 @@ def solve_file(
     print(json.dumps(summary, indent=1))
     if solution.status is not Status.SOLVED:
         print(f"coopoc: {solution.status.value}", file=sys.stderr)
+    for joint in solution.extras.get("joined", ()):
+        if joint["rival"] >= AGREEING:
+            print(
+                "coopoc: {body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint),
+                file=sys.stderr,
+            )
     if size is not None and not 1 / UNLIKELY < size < UNLIKELY:
         print(f"coopoc: residuals are {size:.2g} times what the file states. {MISTAKEN}", file=sys.stderr)
     return int(solution.status is not Status.SOLVED)
+
+
+def known_inliers_first(graph: Graph, objective: Objective, start: Start) -> Problem:
+    """The problem of a graph from where its known inliers lead, all but relative poses beside each robot's odometry."""
+    problem = from_graph(graph, objective, "odometry")
+    doubtful = [row for _, rows in loop_closures(problem) for row in rows]
+    known = graph.relative_pose.rows(np.setdiff1d(np.arange(len(graph.relative_pose)), doubtful))
+    began = from_graph(replace(graph, relative_pose=known), objective, start)
+    return problem.replace_unchecked(x0=began.x0, search=began.search)
 
 
 def without_outliers(problem: Problem, backend: str) -> Solution:
     """The solution without relative poses that GNC rejects; extras["rejected"] has their names.
 
     Raises:
-        InputError: no relative pose but odometry, which is taken as right, or odometry leaves poses free.
+        InputError: no relative pose but odometry, which is taken as right, or relative poses that do not decide how
+            robots stand to each other.
     """
     candidates = loop_closures(problem)
     if not candidates:
@@ -115,7 +137,7 @@ def described(solution: Solution) -> dict[str, Any]:
         "build_seconds": solution.build_seconds,
         "solve_seconds": solution.solve_seconds,
         "unobservable": list(solution.unobservable),
-    } | {key: solution.extras[key] for key in ("rejected",) if key in solution.extras}
+    } | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}
 
 
 def nodes(solution: Solution) -> dict[str, Any]:

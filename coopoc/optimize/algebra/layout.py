@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import NamedTuple, TypeAlias
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -111,22 +112,28 @@ class Layout:
 
 
 def layout_of(problem: Problem) -> Layout | None:
-    """The layout of a single problem, that of a former one if it is small; None if a kind has no tape."""
+    """The layout of a single problem, shared with others of its structure; None if a kind has no tape."""
     space, factors = problem.space, problem.factors
     structure = Structure(
         (len(problem.names), space.dof),
         b"" if problem.movable is None else problem.movable.tobytes(),
         tuple((kind_of(factor, space), factor.nodes.tobytes()) for factor in factors),
     )
-    return (_shared if len(problem.names) * space.dof <= DENSE else _layout)(structure)
+    if len(problem.names) * space.dof <= DENSE:
+        return _small(structure)
+    if (layout := _LARGE.get(structure)) is None and (layout := _made(structure)) is not None:
+        _LARGE[structure] = layout
+    return layout
 
 
-def _layout(structure: Structure) -> Layout | None:
+def _made(structure: Structure) -> Layout | None:
     try:
         return Layout(structure)
     except NoTape:
         return None
 
 
-_shared = lru_cache(maxsize=256)(_layout)
+_small = lru_cache(maxsize=256)(_made)
 """Small problems come by the thousand with few structures."""
+_LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
+"""Of large ones the problem that is at hand and those that differ from it in numbers alone."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -32,12 +33,12 @@ class Sparse:
     layout: Layout
     numbers: tuple[Floats, ...]
 
-    @property
+    @cached_property
     def entries(self) -> Entries:
         """Of its Hessians."""
         return self.layout.entries
 
-    @property
+    @cached_property
     def size(self) -> int:
         """m."""
         return self.entries.size

@@ -112,13 +112,15 @@ def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Iterable[int
     if not space.has_rotation:
         at = found.atPoint3 if d == 3 else found.atPoint2
         return np.array([at(key) for key in keys]).reshape(x.shape)
+    position, rotation = x[:, :d], np.tile(np.eye(d), (len(x), 1, 1))
+    pose, point = getattr(found, f"atPose{d}"), getattr(found, f"atPoint{d}")
     for i, (turns, key) in enumerate(zip(posed, keys, strict=True)):
         if turns:
-            pose = getattr(found, f"atPose{d}")(key)
-            x[i] = space.join(pose.translation(), pose.rotation().matrix())
+            at = pose(key)
+            position[i], rotation[i] = at.translation(), at.rotation().matrix()
         else:
-            x[i] = space.join(getattr(found, f"atPoint{d}")(key))
-    return x
+            position[i] = point(key)
+    return space.join(position, rotation)
 
 
 def which_turn(problem: Problem) -> list[bool]:

@@ -32,9 +32,7 @@ SLOW = 0.2
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
 NEAR = 1e-3
-"""Share of the cost from which on the exact Hessian makes the last steps, unless J^T J's promise fell to LAST."""
-LAST = 1e-3
-"""Share of the promise before: J^T J converges as fast."""
+"""Share of the cost from which on the exact Hessian makes the last steps."""
 STILL = 12
 """Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
@@ -111,7 +109,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             if model == "gauss-newton":
                 off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
                 doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
-                doubt = DOUBT if promised <= NEAR * cost and doubt >= 0 and promised > LAST * last else doubt
+                doubt = DOUBT if promised <= NEAR * cost and doubt >= 0 else doubt
                 model = "newton" if doubt >= DOUBT else model
             last = promised
             if not converged:

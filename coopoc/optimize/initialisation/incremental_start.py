@@ -12,6 +12,7 @@ from ..algebra.sparse import sparse
 from ..descent.trust_region import arrive
 from ..model.part import restricted
 from ..model.problem import Problem
+from ..model.space import carried
 from .trilateration import located
 
 STAGE = 25
@@ -27,10 +28,12 @@ HOLDING = 2
 
 
 class Growth(NamedTuple):
-    """Where a start is: nodes (n, ambient), which of them are solved (n,), and iterations so far."""
+    """Where a start is: nodes (n, ambient), which are solved (n,), by how many ranges points were placed (n,), and
+    iterations so far."""
 
     x: Floats
     solved: Bools
+    ranges: Ints
     iterations: int
 
 
@@ -46,7 +49,8 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     assert problem.x0 is not None
     longest = max(len(places) for places in graph.robots.values())
     count = int(np.clip(longest // STAGE, 1, STAGES))
-    now = Growth(problem.x0.copy(), np.zeros(len(graph.names), dtype=bool), 0)
+    n = len(graph.names)
+    now = Growth(problem.x0.copy(), np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64), 0)
     for stage in range(count):
         now = _extended(graph, problem, now, (stage + 1) / count)
     return now.x, now.iterations
@@ -61,38 +65,31 @@ def _extended(graph: Graph, problem: Problem, now: Growth, share: float) -> Grow
         used[new] = True
         old = new[now.solved[new]]
         if len(old) and len(old) < len(places):
-            x[places[len(old) :]] = _carried(problem, x, old[-1], places[len(old) :])
-    used |= _joining(graph, x, used, space.dimension)
+            x[places[len(old) :]] = carried(space, problem.x0[places[len(old) :]], problem.x0[old[-1]], x[old[-1]])
+    used |= _joining(graph, now, used, space.dimension)
     part = restricted(problem, used, x)
     system = sparse(part, least=0)
     if system is None:
-        return Growth(x, used, now.iterations)
+        return now._replace(solved=used)
     end = arrive(system, np.array(part.x0), STEPS, TOLERANCE)
     x[used] = end.x
-    return Growth(x, used, now.iterations + end.iterations)
+    return now._replace(solved=used, iterations=now.iterations + end.iterations)
 
 
-def _carried(problem: Problem, x: Floats, last: int, later: Ints) -> Floats:
-    """Later poses (K, ambient) as x0 has them, moved as the last one was."""
-    space, x0 = problem.space, problem.x0
-    assert x0 is not None
-    turn = space.rotation(x[last]) @ space.rotation(x0[last]).T
-    gap = space.position(x0[later]) - space.position(x0[last])
-    return space.join(space.position(x[last]) + gap @ turn.T, turn @ space.rotation(x0[later]))
-
-
-def _joining(graph: Graph, x: Floats, used: Bools, d: int) -> Bools:
-    """(n,) which points the poses so far hold; those with ranges alone are placed anew by them, in x."""
+def _joining(graph: Graph, now: Growth, used: Bools, d: int) -> Bools:
+    """(n,) which points the poses so far hold; in x those with ranges alone are placed by them, and anew whenever these
+    have doubled: few may have placed them on the wrong side."""
     joins, nodes = np.zeros(len(used), dtype=bool), graph.ranges.nodes
     for edges in (graph.relative_point, graph.point_prior):
         if len(edges):
             joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
-    held = joins.copy()
-    for point in np.setdiff1d(np.flatnonzero(~graph.is_pose), np.flatnonzero(held)).tolist():
+    for point in np.flatnonzero(~graph.is_pose & ~joins).tolist():
         rows = np.flatnonzero((nodes == point).any(axis=1))
         other = nodes[rows].sum(axis=1) - point
         seen = used[other]
-        if seen.sum() >= HOLDING * d + 1:
-            x[point, :d] = located(x[other[seen], :d], graph.ranges.distance[rows[seen]])
-            joins[point] = True
+        count = int(seen.sum())
+        joins[point] = count >= HOLDING * d + 1
+        if joins[point] and count >= 2 * now.ranges[point]:
+            now.x[point, :d] = located(now.x[other[seen], :d], graph.ranges.distance[rows[seen]])
+            now.ranges[point] = count
     return joins

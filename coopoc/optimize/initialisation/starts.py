@@ -12,6 +12,7 @@ from ...formats.graph import Graph
 from ..model.space import Space
 from .linear_start import linear_start
 from .trilateration import located
+from .walk import Moves, Roots, walk
 
 
 def chained(graph: Graph, apart: bool = False) -> Floats:
@@ -19,14 +20,14 @@ def chained(graph: Graph, apart: bool = False) -> Floats:
     vertex in the file; where the file has none, or `apart`, from a place on a ring."""
     edges = graph.relative_pose.nodes
     letter = np.array([ord(name[0]) for name in graph.names])
-    return _landmarks(graph, *_walk(graph, letter[edges[:, 0]] == letter[edges[:, 1]], _roots(graph, apart)))
+    return _landmarks(graph, *_walked(graph, letter[edges[:, 0]] == letter[edges[:, 1]], _roots(graph, apart)))
 
 
 def tree(graph: Graph) -> Floats:
     """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
     between robots too; what it does not join hangs on as in `chained`."""
     every = np.ones(len(graph.relative_pose), dtype=bool)
-    return _landmarks(graph, *_walk(graph, every, _roots(graph, False)))
+    return _landmarks(graph, *_walked(graph, every, _roots(graph, False)))
 
 
 def file(graph: Graph) -> Floats:
@@ -78,11 +79,9 @@ def contenders(graph: Graph) -> tuple[str, ...]:
 
 NUDGE = 0.01
 """Share of a range."""
-Roots = list[tuple[int, Floats, Floats]]
-"""(pose, position, rotation) in the order in which the walk may start from them."""
 
 
-def _roots(graph: Graph, apart: bool) -> Roots:
+def _roots(graph: Graph, apart: bool) -> list[tuple[int, Floats, Floats]]:
     """Poses with a prior at that, then each robot's first."""
     priors, found = graph.pose_prior, []
     if not apart:
@@ -100,38 +99,12 @@ def _roots(graph: Graph, apart: bool) -> Roots:
     return found
 
 
-def _walk(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
-    """Positions, rotations and which are known, along paths of least variance over the `used` relative poses."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import dijkstra
-
-    edges, d, n = graph.relative_pose, graph.dimension, len(graph.names)
-    position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
-    known = np.zeros(n, dtype=bool)
+def _walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
+    """The walk along the `used` relative poses, whose length is their variance."""
+    edges = graph.relative_pose
     length = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12 if len(edges) else np.empty(0)
-    which = np.flatnonzero(used)
-    which = which[np.argsort(-length[which], kind="stable")]  # of parallel edges the last, and best, is kept
-    best = {}
-    for k, (i, j) in zip(which.tolist(), edges.nodes[which].tolist(), strict=True):
-        best[i, j], best[j, i] = (k, True), (k, False)
-    pairs = np.array(list(best), dtype=np.int64).reshape(-1, 2)
-    weight = length[[k for k, _ in best.values()]]
-    ways = csr_array((weight, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    for root, at, turned in roots:
-        if known[root]:
-            continue
-        distance, before = dijkstra(ways, indices=root, return_predecessors=True)
-        position[root], rotation[root], known[root] = at, turned, True
-        reached = np.flatnonzero(np.isfinite(distance) & ~known)
-        for j in reached[np.argsort(distance[reached], kind="stable")].tolist():
-            i = int(before[j])
-            k, forward = best[i, j]
-            moved, step = edges.position[k], edges.rotation[k]
-            if not forward:
-                moved, step = -step.T @ moved, step.T
-            position[j], rotation[j] = position[i] + rotation[i] @ moved, rotation[i] @ step
-        known[reached] = True
-    return position, rotation, known
+    moves = Moves(edges.nodes[used], edges.position[used], edges.rotation[used], length[used])
+    return walk(len(graph.names), graph.dimension, moves, roots)
 
 
 def _landmarks(graph: Graph, position: Floats, rotation: Floats, known: Bools) -> Floats:

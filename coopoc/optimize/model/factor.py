@@ -148,6 +148,19 @@ class Factor:
         return f"Factor({self.kind} x {len(self.nodes)}{'' if self.batch is None else f', {self.batch} realisations'})"
 
 
+def of_recorded(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
+    """A factor of nodes (M, arity) and z (M, k) that come from checked arrays; std, as in Factor, is checked.
+
+    >>> of_recorded("range", np.array([[0, 1]]), np.array([[5.0]]), np.array([0.1]))
+    Factor(range x 1)
+    """
+    known, made = lookup(kind), object.__new__(Factor)
+    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=check_constants(known, None, len(nodes)))
+    made.__dict__.update(std=None, sqrt_information=None, loss=None)
+    made.__dict__["std"] = check_std(known, std, (len(nodes), made.size))
+    return made
+
+
 def unchecked(factor: Factor, **changes: Any) -> Factor:
     """The factor with changes that come from checked arrays and need not be checked again."""
     changed = object.__new__(Factor)

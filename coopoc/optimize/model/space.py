@@ -76,6 +76,17 @@ class Space:
         return self.join(x[..., :d] + step[..., :d], self.rotation(x) @ exp(step[..., d:]))
 
 
+def carried(space: Space, x: Floats, before: Floats, after: Floats) -> Floats:
+    """Nodes x (..., ambient) moved as the rigid body that takes a pose from `before` (ambient,) to `after`.
+
+    >>> carried(Space(2, True), pose([3.0, 0.0]), pose([1.0, 0.0]), pose([1.0, 0.0], np.pi / 2)).round(3)[:2]
+    array([1., 2.])
+    """
+    turn = space.rotation(after) @ space.rotation(before).T
+    gap = space.position(x) - space.position(before)
+    return space.join(space.position(after) + gap @ turn.T, turn @ space.rotation(x))
+
+
 def exp(w: Floats) -> Floats:
     """Rotation matrices (..., 2, 2) of angles (..., 1), or (..., 3, 3) of rotation vectors (..., 3), rad.
 

@@ -65,7 +65,7 @@ def solve_gnc(
 
     start="known" begins with the known inliers alone, which candidates join where they are predicted (`compatible`),
     and then alternates with rho itself. Long drives with wrong loop closures need that: the first least squares over
-    all of them is of no use there.
+    all of them bends the whole drive. Robots that only candidates join are placed by those that agree most.
 
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
@@ -76,17 +76,19 @@ def solve_gnc(
             each on its own.
         backend: of `solve`, which solves every round.
         throw: as in `solve`.
-        start: "all" with full weights, or "known" inliers, which must hold all nodes.
+        start: "all" with full weights, or "known" inliers.
         options: of the backend.
 
     Returns:
         The Solution of the last weighted problem, whose cost, gradient and covariance are those of the weighted least
-        squares; iterations and times are of all rounds; extras has weights (M,), rounds and mu.
+        squares; iterations and times are of all rounds; extras has weights (M,), rounds and mu, and "joined", where
+        only candidates join parts: their first nodes, how many candidates agree on their place, how many agree on the
+        best other place (rival), and how many there are.
 
     Raises:
         InputError: candidates that do not exist, appear twice or have a loss, other groups than measurements, a
-            threshold outside (0, 1), an unknown loss or start, known inliers that leave nodes free where the start is
-            theirs, and what `solve` refuses.
+            threshold outside (0, 1), an unknown loss or start, known inliers that leave nodes free which the candidates
+            do not place where the start is theirs, and what `solve` refuses.
         SolveError: (if `throw`) as `solve`, or weights that did not settle.
 
     References:
@@ -112,6 +114,7 @@ def solve_gnc(
     weighted = reweigh(problem, marked, end.weight, end.x).pick(0)
     final = solve(weighted, backend, throw=throw and bool(end.settled[0]), **options)
     extras = {"weights": end.weight[0, marked.group], "rounds": int(end.rounds[0]), "mu": float(end.mu[0])}
+    extras |= {"joined": end.joined} if end.joined else {}
     solution = replace(
         final,
         extras=final.extras | extras,
@@ -168,13 +171,15 @@ def solve_gnc_batch(
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """x (B, n, ambient), weight (B, G), mu, rounds and settled (B,) of the last round of each realisation."""
+    """x (B, n, ambient), weight (B, G), mu, rounds and settled (B,) of the last round of each realisation; `joined` as
+    of Known."""
 
     x: Floats
     weight: Floats
     mu: Floats
     rounds: Ints
     settled: Bools
+    joined: tuple[dict[str, Any], ...]
 
 
 def _sharpen(
@@ -186,9 +191,11 @@ def _sharpen(
     start: Start = "all",
 ) -> _End:
     """The alternation, in which `inner` solves the weighted least squares of the realisations that still change."""
-    surrogate, bound, before = surrogate_of(loss, threshold), bounds(problem, marked, threshold), 0
+    surrogate, bound = surrogate_of(loss, threshold), bounds(problem, marked, threshold)
+    before, joined = 0, tuple[dict[str, Any], ...]()
     if start == "known":
-        x, weight, before = compatible(problem, marked, bound, inner)
+        known = compatible(problem, marked, bound, inner)
+        x, weight, before, joined = known.x, known.weight, known.rounds, known.joined
         ratio, mu = squares(problem, marked, x) / bound, np.array([surrogate.last])
     else:
         x = inner(problem)
@@ -208,4 +215,4 @@ def _sharpen(
         ratio = squares(part, marked, x[active]) / bound[active]
         mu[active] = surrogate.later(mu[active])
         rounds[active] += 1
-    return _End(x, weight, mu, rounds, ~np.isin(np.arange(len(x)), active))
+    return _End(x, weight, mu, rounds, ~np.isin(np.arange(len(x)), active), joined)

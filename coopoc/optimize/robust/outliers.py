@@ -35,6 +35,15 @@ class Marked:
             np.add.at(total, self.group[here], part[:, self.row[here]].T)
         return total.T
 
+    def among(self, rows: Sequence[Ints]) -> Marked:
+        """Those of some rows of each factor, of a problem that has these alone; groups keep their numbers."""
+        number = np.cumsum([len(own) > 0 for own in rows]) - 1
+        kept = np.concatenate(
+            [np.flatnonzero((self.factor == k) & np.isin(self.row, own)) for k, own in enumerate(rows)]
+        )
+        row = [np.searchsorted(rows[k], r) for k, r in zip(self.factor[kept], self.row[kept], strict=True)]
+        return Marked(number[self.factor[kept]], np.array(row, dtype=np.int64), self.group[kept])
+
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
     """The candidates, checked."""
