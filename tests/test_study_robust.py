@@ -96,7 +96,7 @@ def test_two_runners_that_start_together(study: Study, tmp_path: Path) -> None:
     statuses = sorted(process.returncode for process, _, _ in ends)
     assert statuses in ([0, 2], [0, 0]), ends
     for process, stdout, stderr in ends:
-        assert (process.returncode == 0) == stdout.startswith("| Neighbours K")
+        assert (process.returncode == 0) == ("| Neighbours K" in stdout)
         assert (process.returncode == 2) == ("is in use by another run. Wait until it ends" in stderr)
     assert plan(study, tmp_path)["finished"] == 9
 
@@ -133,7 +133,7 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
         $RUN --out disk > /dev/null; echo "room: $?"
         mount -o remount,ro disk
         $RUN --out disk; echo "read-only: $?"
-        {table} | head -1
+        {table} | head -3
         cp -a disk/small .
     """,
         tmp_path,
