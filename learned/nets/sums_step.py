@@ -19,24 +19,35 @@ from coopoc.kernels.stars.messages import ROW, Assumptions, Star, star_in
 from coopoc.kernels.stars.star_stream import answered, see
 from coopoc.methods.star import FORGOTTEN
 
-from .star_gain import LAST, SIZE, STEP, SUMS, Accounts, add_step, relocate, revalue, revise, settle
+from .star_gain import (
+    LAST,
+    SIZE,
+    STEP,
+    SUMS,
+    SumsHistory,
+    add_step,
+    difference,
+    initialise,
+    rescale_prior,
+    set_information,
+)
 
 RELATIVE, NEWS, MESSAGE, SENT, SLOT, ROW_SIZE = 0, 3, 4, 15, 19, 20
 """In the row of a neighbour: range m, azimuth and inclination rad; 1 for a message; its numbers, of which there are
-SENT: the sums, and the variance m^2 of a fix of now; the neighbour's row among the accounts."""
+SENT: the sums, and the variance m^2 of a fix of now; the neighbour's row in the history."""
 
 
 @storage
-def accounts_in(memory: AnyArray, vehicles: int, most: int) -> Accounts:
-    """Accounts of so many vehicles and of stars of up to `most` members, in memory (>= accounts_size,)."""
+def history_in(memory: AnyArray, vehicles: int, most: int) -> SumsHistory:
+    """History of so many vehicles and of stars of up to `most` members, in memory (>= history_size,)."""
     a, b = LANES * vehicles * SIZE, 3 * most * LANES
     shape = (3 * most, LANES)
     own = memory[:a].reshape((LANES, vehicles, SIZE))
-    return Accounts(own, memory[a : a + b].reshape(shape), memory[a + b : a + 2 * b].reshape(shape))
+    return SumsHistory(own, memory[a : a + b].reshape(shape), memory[a + b : a + 2 * b].reshape(shape))
 
 
-def accounts_size(vehicles: int, most: int) -> int:
-    """Numbers of `accounts_in`."""
+def history_size(vehicles: int, most: int) -> int:
+    """Numbers of `history_in`."""
     return int(LANES * (vehicles * SIZE + 6 * most))
 
 
@@ -61,7 +72,7 @@ def sums_step(
     inbox: AnyArray,
     numbers: AnyArray,
     index: AnyArray,
-    accounts: AnyArray,
+    history: AnyArray,
     fixes: AnyArray,
     relative: AnyArray,
     answer: AnyArray,
@@ -75,7 +86,7 @@ def sums_step(
         inbox: (k, ROW_SIZE).
         numbers: of the star and its Gaussian, as in `coopoc.kernels.stars.star_stream`.
         index: members of the last star, `most`, the number of the step; columns (3 most,); place in the last star (M,).
-        accounts: of `accounts_in`.
+        history: of `history_in`.
         fixes: (1, 1, M, 3) m^2 of the last messages.
         relative: of `assumed`.
         answer: (12 + 3 k,).
@@ -83,7 +94,7 @@ def sums_step(
     n, old, most, t = 1 + len(inbox), index[0], index[1], index[2]
     place, known = index[3 + 3 * most :], assumed(relative, fixes)
     star = star_in(numbers, index[3 : 3 + 3 * most], most)
-    joint, held = joint_in(numbers[30 * most * LANES :], most, ROW), accounts_in(accounts, len(place), most)
+    joint, held = joint_in(numbers[30 * most * LANES :], most, ROW), history_in(history, len(place), most)
     index[2] = t + 1
     for c in range(3):
         fixes[0, 0, 0, c] = variances[c]
@@ -102,13 +113,13 @@ def sums_step(
     for k in range(n):
         news = k == 0 or inbox[k - 1, NEWS] > 0.0
         for lane in range(LANES):
-            settle(star, held.vehicle[lane, star.member[k]], t, (k, lane, news))
-            revise(star, held, known, (0, t), (k, lane, news, True))
-    revalue(star, joint, held, n, old)
+            difference(star, held.vehicle[lane, star.member[k]], t, (k, lane, news))
+            set_information(star, held, known, (0, t), (k, lane, news, True))
+    rescale_prior(star, joint, held, n, old)
     step(star, joint, known, True, None, (n, old), ROW)
-    relocate(star, joint, n)
+    initialise(star, joint, n)
     for i in range(3 * n):
-        store(held.last_worth, i, load(held.worth, i, (0.0,)))
+        store(held.last_information, i, load(held.information, i, (0.0,)))
     place[:] = -1
     for k in range(n):
         place[star.member[k]] = k
@@ -118,15 +129,15 @@ def sums_step(
 
 
 @inner
-def restart(account: AnyArray, t: int) -> None:
+def restart(own: AnyArray, t: int) -> None:
     """Let the ego's next step begin here: without a position nothing is moved."""
-    account[STEP] = t
+    own[STEP] = t
     for i in range(LAST - SUMS):
-        account[LAST + i] = account[SUMS + i]
+        own[LAST + i] = own[SUMS + i]
 
 
 @inner
-def receive(star: Star, held: Accounts, known: Assumptions, row: AnyArray, slot: int, k: int) -> None:
+def receive(star: Star, held: SumsHistory, known: Assumptions, row: AnyArray, slot: int, k: int) -> None:
     """Copy the measurement of member k, and its message if one has come."""
     see(star, row, known.relative_std, k)
     if row[NEWS] > 0.0:
@@ -137,9 +148,9 @@ def receive(star: Star, held: Accounts, known: Assumptions, row: AnyArray, slot:
             known.fixes[0, 0, slot, c] = row[MESSAGE + LAST + c]
 
 
-def new_accounts(vehicles: int, most: int, old: Floats | None = None, before: tuple[int, int] = (0, 0)) -> Floats:
-    """Memory of `accounts_in`, with what an older one of sizes `before` held."""
-    found = np.zeros(accounts_size(vehicles, most))
+def new_history(vehicles: int, most: int, old: Floats | None = None, before: tuple[int, int] = (0, 0)) -> Floats:
+    """Memory of `history_in`, with what an older one of sizes `before` held."""
+    found = np.zeros(history_size(vehicles, most))
     found[: LANES * vehicles * SIZE].reshape(LANES, vehicles, SIZE)[..., STEP] = -1.0
     if old is not None:
         (m, k), a, b = before, LANES * vehicles * SIZE, LANES * before[0] * SIZE

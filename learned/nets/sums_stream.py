@@ -22,7 +22,7 @@ from coopoc.methods.stream import motion_noise
 
 from .noise_step import new_memory, noise_step, packed
 from .star_gain import LAST
-from .sums_step import MESSAGE, NEWS, RELATIVE, ROW_SIZE, SLOT, new_accounts, relative_assumed, sums_step
+from .sums_step import MESSAGE, NEWS, RELATIVE, ROW_SIZE, SLOT, new_history, relative_assumed, sums_step
 
 SENT = LAST + 3
 """Numbers of a message: the sums, and the variance of a fix of now."""
@@ -103,7 +103,7 @@ class SumsStream:
         self.members: list[str] = []
         self._known, self._variances, self._answer = np.zeros(7), np.zeros(6), np.zeros(12)
         self._numbers: Floats = np.zeros(0)
-        self._accounts: Floats = np.zeros(0)
+        self._history: Floats = np.zeros(0)
         self._index, self._fixes = np.zeros(3, np.int64), np.ones((1, 1, 0, 3))
         self._reserve(16, 8)
 
@@ -111,7 +111,7 @@ class SumsStream:
         """Room for so many vehicles, the ego among them, and for `most` members of the star."""
         before, most_before = self._fixes.shape[2], int(self._index[1])
         place = np.append(self._index[3 + 3 * most_before :], np.full(vehicles - before, -1))
-        self._accounts = new_accounts(vehicles, most, self._accounts, (before, most_before))
+        self._history = new_history(vehicles, most, self._history, (before, most_before))
         if most > most_before:
             self._numbers = resized(self._numbers, self._index[:2].copy(), most)
         head = [self._index[0], most, self._index[2]]
@@ -124,7 +124,7 @@ class SumsStream:
     def message(self) -> Floats:
         """(15,) what the vehicle broadcasts after this step: motion m, its variance m^2, 1/r and (fix - motion)/r, each
         summed since the start of the stream, and the variance r m^2 of a fix of now."""
-        own = self._accounts[:LAST]
+        own = self._history[:LAST]
         return np.concatenate([own, self._variances[:3]])
 
     @property
@@ -161,7 +161,7 @@ class SumsStream:
         inbox[:, SLOT] = slots
         self.noise(self._known, self._variances)
         answer = np.empty(12 + 3 * len(names))
-        memory = self._numbers, self._index, self._accounts, self._fixes
+        memory = self._numbers, self._index, self._history, self._fixes
         if not sums_step(self._known, self._variances, inbox, *memory, self.relative, answer):
             return np.full(3, np.nan), None
         self.members, self._answer = names, answer
@@ -179,7 +179,7 @@ class SumsStream:
         known[:3], known[3:6], known[6] = fix_or_none(gnss), three("velocity", velocity), _length(dt)
 
     def _places(self, names: Sequence[str]) -> list[int]:
-        """Rows of the vehicles among the accounts, with room for all."""
+        """Rows of the vehicles in the history, with room for all."""
         for name in names:
             self.slots.setdefault(name, 1 + len(self.slots))
         vehicles, most = self._fixes.shape[2], len(self._inbox)
