@@ -27,7 +27,8 @@ from tabulate import tabulate
 from timing import medians
 
 import coopoc as co
-from coopoc.methods.kalman import solo_filter
+from coopoc.kernels.solo import FixNoise
+from coopoc.methods.kalman import drive_of, filtered
 from coopoc.world import exchange, sensing
 from coopoc.world.spherical import to_vector
 from coopoc.world.v2x import NO_MESSAGE
@@ -116,8 +117,7 @@ def linear(recording: co.Recording) -> Linear:
             keys[links.step, links.observer], keys[links.step, links.neighbour], vectors, roots, strict=True
         )
     ]
-    variance = KNOWN.process_variance(recording)
-    start = solo_filter(recording.gnss, recording.velocity, variance, KNOWN.gnss_variance, recording.dt)[0][0]
+    start = solo(recording)[0]
     return Linear(fixes, ties, start)
 
 
@@ -360,12 +360,18 @@ def growth(sizes: Sequence[tuple[int, int]]) -> str:
     return tabulate(lines, header, tablefmt="github", floatfmt=".3g")
 
 
+def solo(recording: co.Recording) -> np.ndarray:
+    """Positions of all vehicles by the solo filter's kernel."""
+    seen = drive_of(recording, KNOWN, range(len(recording.ids)))
+    return filtered(seen, FixNoise(KNOWN.gnss_variance))[0]
+
+
 def solo_rows(recording: co.Recording) -> list[Row]:
     """All vehicles; filterpy's is one vehicle's time times their number."""
     variance, vehicles = KNOWN.process_variance(recording), len(recording.ids)
 
     def ours() -> Any:
-        return solo_filter(recording.gnss, recording.velocity, variance, KNOWN.gnss_variance, recording.dt)
+        return solo(recording)
 
     def peer(vehicle: int) -> np.ndarray:
         filter_ = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
@@ -385,7 +391,7 @@ def solo_rows(recording: co.Recording) -> list[Row]:
         return Row(words, call, away, away < 1e-9)
 
     return [
-        row("solo filter, compiled", ours, ours()[0][0]),
+        row("solo filter, compiled", ours, ours()[0]),
         row(
             "Kalman, compiled",
             lambda: co.Kalman()(recording, range(vehicles)),

@@ -9,7 +9,8 @@ import pytest
 from oracles import solo as oracle
 
 from coopoc import GNSS, V2X, AdaptiveKalman, Fleet, NoiseModel, Recording, Sensors, VariationalKalman, observe
-from coopoc.methods.kalman import solo_filter
+from coopoc.kernels.solo import FixNoise
+from coopoc.methods.kalman import drive_of, filtered
 
 S2 = Sensors.paper_scenario2()
 
@@ -34,7 +35,7 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
     model = NoiseModel.identity() if noise == "identity" else NoiseModel.nominal(S2)
     q, r = np.broadcast_to(model.process_variance(seen), seen.gnss.shape), model.gnss_variance
     start = crossing.position[0] if known else None
-    x, p = solo_filter(seen.gnss, seen.velocity, q, r, seen.dt, start)
+    x, p, _ = filtered(drive_of(seen, model, range(len(seen.ids))), FixNoise(r), start)
     for run, n, c in np.ndindex(3, 4, 3):
         series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
         mean, variance = oracle.kalman(*series, None if start is None else start[n, c])

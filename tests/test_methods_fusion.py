@@ -12,9 +12,10 @@ from scipy.optimize import least_squares
 import coopoc as co
 from coopoc import GNSS, V2X, Fleet, InputError, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, rt_le
+from coopoc.kernels.solo import FixNoise
 from coopoc.methods.catalogue import METHODS as METHODS_BY_NAME
 from coopoc.methods.covariance_intersection import CovarianceIntersection
-from coopoc.methods.kalman import solo_filter
+from coopoc.methods.kalman import drive_of, filtered
 from coopoc.methods.mds import MDS
 from coopoc.methods.qcqp_relaxation import QCQPRelaxation
 from coopoc.world.inbox import inbox
@@ -63,8 +64,7 @@ def test_a_late_message_is_no_surer_than_it_is() -> None:
     fleet = co.load_fleet("town10").between(0, 200)
     recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0), runs=20, observers=[0])
     known = NoiseModel.nominal(recording.sensors)
-    process = np.broadcast_to(known.process_variance(recording), recording.gnss.shape)
-    own = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
+    own = filtered(drive_of(recording, known, range(len(recording.ids))), FixNoise(known.gnss_variance))[:2]
     box, share = inbox(recording, 0, SPLIT.message), []
     for run in range(recording.runs):
         for t, star in enumerate(messages.stars(recording, 0, box, run, known, own, messages.of_estimate)):

@@ -11,8 +11,9 @@ import pytest
 from oracles import covariance_intersection, drift, joint, lkf_sa, messages, msmv
 
 from coopoc import LKFSA, MSMV, V2X, CovarianceIntersection, Fleet, JointFilter, NoiseModel, Recording, Sensors, observe
+from coopoc.kernels.solo import FixNoise
 from coopoc.methods.drift_filter import DriftFilter
-from coopoc.methods.kalman import solo_filter
+from coopoc.methods.kalman import drive_of, filtered
 from coopoc.methods.noise_model import resolve
 from coopoc.methods.track import Method
 from coopoc.world.inbox import inbox
@@ -117,8 +118,7 @@ def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: 
     track, box = method(recording, [ego]), inbox(recording, ego, method.message)
     own, growth = None, messages.of_independent_steps if isinstance(method, MSMV) else messages.of_estimate
     if isinstance(method, MSMV | CovarianceIntersection):
-        process = np.broadcast_to(known.process_variance(recording), recording.gnss.shape)
-        own = solo_filter(recording.gnss, recording.velocity, process, known.gnss_variance, recording.dt)
+        own = filtered(drive_of(recording, known, range(len(recording.ids))), FixNoise(known.gnss_variance))[:2]
     assert track.covariance is not None
     assert track.neighbours is not None
     for run in range(recording.runs):

@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..arrays import AnyArray, Floats
-from .compiling.compile import compiled, part
+from .compiling.compile import compiled, inside
 
 ROUNDING = 1e-9
 """s, by how much sums of time steps may miss a time."""
@@ -33,16 +35,27 @@ class MotionNoise(NamedTuple):
     interval: float
 
 
-@part
-def process_variance(noise: MotionNoise, velocity: AnyArray, dt: float, axis: int) -> float:
-    """Variance m^2 of dt u on one axis."""
-    speed = abs(velocity[axis])
+NO_MOTION_NOISE = MotionNoise(np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0)
+"""Where the process noise of every step is given otherwise."""
+
+
+@inside
+def process_variance(noise: MotionNoise, velocity: Any, dt: float) -> Any:
+    """Variances m^2 of dt u on the three axes, of numbers or of vectors of them."""
+    u, v, w = velocity[0], velocity[1], velocity[2]
+    a, b, c = abs(u), abs(v), abs(w)
     if noise.of_speed > 0.0:
-        speed = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
+        a = b = c = math.sqrt(u * u + v * v + w * w)
     interval = noise.interval if noise.interval > 0.0 else dt
-    moved = interval * max(noise.ratio[axis] * speed, noise.floor)
-    variance: float = dt / interval * (noise.base[axis] ** 2 + moved * moved)
-    return variance
+    share, floor = dt / interval, noise.floor
+    moved_x = interval * max(noise.ratio[0] * a, floor)
+    moved_y = interval * max(noise.ratio[1] * b, floor)
+    moved_z = interval * max(noise.ratio[2] * c, floor)
+    return (
+        share * (noise.base[0] * noise.base[0] + moved_x * moved_x),
+        share * (noise.base[1] * noise.base[1] + moved_y * moved_y),
+        share * (noise.base[2] * noise.base[2] + moved_z * moved_z),
+    )
 
 
 # A history is one array (1 + capacity, 7), a ring. Row 0: first row in use, rows in use, seconds they span, seconds

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats
+from ..arrays import AnyArray, Floats, Ints
 from .compiling.compile import compiled, part
 from .motion import ROUNDING, MotionNoise, process_variance, push, since
 
@@ -40,6 +40,26 @@ class FixNoise(NamedTuple):
     window: float = math.inf
     rho: float = 1.0
     iterations: int = 0
+
+
+class Drive(NamedTuple):
+    """What solo filters run over, of all N vehicles, and which of them have one.
+
+    Attributes:
+        gnss: (R, T, N, 3) m, NaN for no fix and for an absent vehicle.
+        velocity: (R, T, N, 3) m/s, NaN for an absent vehicle.
+        process: (R, T, N, 3) m^2, variance of a step's motion beside that of `motion`.
+        motion: process noise that follows the measured velocity.
+        columns: (E,) of the vehicles.
+        dt: s.
+    """
+
+    gnss: Floats
+    velocity: Floats
+    process: Floats
+    motion: MotionNoise
+    columns: Ints
+    dt: float
 
 
 @part
@@ -99,79 +119,71 @@ def begin(x: float, late: float, known: bool, variance: float, rule: FixNoise) -
 
 
 @compiled
-def drive(
-    gnss: AnyArray,
-    velocity: AnyArray,
-    process: AnyArray,
-    rule: FixNoise,
-    dt: float,
-    known: bool,
-    x: AnyArray,
-    p: AnyArray,
-) -> AnyArray:
-    """Fill x m and p m^2 (R, T, N, 3), and return the believed variance of a fix at each step, if it is revised.
+def drive(seen: Drive, rule: FixNoise, known: bool, places: AnyArray, x: AnyArray, p: AnyArray) -> AnyArray:
+    """Fill x m and p m^2 at the places of the vehicles, and return the believed variance of a fix at each step, if it
+    is revised.
 
     A vehicle that was absent starts at its first fix.
 
     Args:
-        gnss: (R, T, N, 3) m, NaN for no fix and for an absent vehicle.
-        velocity: (R, T, N, 3) m/s, NaN for an absent vehicle.
-        process: (R, T, N, 3) m^2, NaN for an absent vehicle.
-        known: whether x[:, 0] is exact; if not, it is a fix.
+        seen: the vehicles and their measurements.
+        rule: noise of the fixes.
+        known: whether x[:, 0] is given and exact; if not, it is a fix.
+        places: (E,) of the vehicles in x and p.
+        x: (R, T, N or E, 3).
+        p: the same.
     """
     if math.isinf(rule.weight):
-        _drive_known(gnss, velocity, process, rule, dt, known, x, p)
+        _drive_known(seen, rule, known, places, x, p)
         return np.empty((0, 0, 0, 3))
-    runs, steps, vehicles = gnss.shape[:3]
+    runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], len(seen.columns)
     noise, states = np.empty(x.shape), np.empty((vehicles, 3, 5))
     for run in range(runs):
         for t in range(steps):
-            for n in range(vehicles):
+            for e in range(vehicles):
+                n, to = seen.columns[e], places[e]
+                q = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
                 for c in range(3):
-                    fix, now = gnss[run, t, n, c], states[n, c]
-                    moved = dt * velocity[run, t, n, c]
+                    fix, now = seen.gnss[run, t, n, c], states[e, c]
+                    moved = seen.dt * seen.velocity[run, t, n, c]
                     if t == 0:
-                        state = begin(x[run, 0, n, c], 0.0, known, rule.variance[c], rule)
+                        state = begin(x[run, 0, to, c] if known else fix, 0.0, known, rule.variance[c], rule)
                     elif math.isnan(now[0] + moved):
                         state = begin(fix, 0.0, False, rule.variance[c], rule)
                     else:
                         before = now[0], now[1], now[2], now[3], now[4]
-                        state = advance(before, moved, process[run, t, n, c], fix, 0.0, rule)
-                    put(states[n], c, state)
-                    x[run, t, n, c], p[run, t, n, c] = state[0], state[1] * state[3] + state[2]
-                    noise[run, t, n, c] = state[3]
+                        state = advance(before, moved, seen.process[run, t, n, c] + q[c], fix, 0.0, rule)
+                    put(states[e], c, state)
+                    x[run, t, to, c], p[run, t, to, c] = state[0], state[1] * state[3] + state[2]
+                    noise[run, t, to, c] = state[3]
     return noise
 
 
 @part
-def _drive_known(
-    gnss: AnyArray,
-    velocity: AnyArray,
-    process: AnyArray,
-    rule: FixNoise,
-    dt: float,
-    known: bool,
-    x: AnyArray,
-    p: AnyArray,
-) -> None:
+def _drive_known(seen: Drive, rule: FixNoise, known: bool, places: AnyArray, x: AnyArray, p: AnyArray) -> None:
     """`drive` with known noise of the fixes, where x and p are all of the state."""
-    runs, steps, vehicles = gnss.shape[:3]
+    runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], len(seen.columns)
     for run in range(runs):
-        for n in range(vehicles):
+        for e in range(vehicles):
             for c in range(3):
-                p[run, 0, n, c] = 0.0 if known else rule.variance[c]
+                p[run, 0, places[e], c] = 0.0 if known else rule.variance[c]
+                if not known:
+                    x[run, 0, places[e], c] = seen.gnss[run, 0, seen.columns[e], c]
         for t in range(1, steps):
-            for n in range(vehicles):
+            for e in range(vehicles):
+                n, to = seen.columns[e], places[e]
+                q = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
                 for c in range(3):
-                    fix, r = gnss[run, t, n, c], rule.variance[c]
-                    prior, variance = x[run, t - 1, n, c] + dt * velocity[run, t, n, c], p[run, t - 1, n, c]
+                    fix, r = seen.gnss[run, t, n, c], rule.variance[c]
+                    prior = x[run, t - 1, to, c] + seen.dt * seen.velocity[run, t, n, c]
+                    variance = p[run, t - 1, to, c]
                     if math.isnan(prior):
                         prior, variance = fix, r
                     else:
-                        variance += process[run, t, n, c]
+                        variance += seen.process[run, t, n, c] + q[c]
                         if not math.isnan(fix):
                             prior, variance = corrected(prior, variance, fix, r)
-                    x[run, t, n, c], p[run, t, n, c] = prior, variance
+                    x[run, t, to, c], p[run, t, to, c] = prior, variance
 
 
 def packed(motion: MotionNoise, rule: FixNoise) -> Floats:
@@ -196,8 +208,9 @@ def dead_reckon(
         return BAD_INPUT
     if history[0, 1] + 1 >= len(history) - 1:
         return HISTORY_FULL
+    variance = process_variance(motion, given[VELOCITY], dt)
     for c in range(3):
-        q[c], step[c] = process_variance(motion, given[VELOCITY], dt, c), dt * given[3 + c]
+        q[c], step[c] = variance[c], dt * given[3 + c]
     first, count, seen = history[0, 0], history[0, 1], history[0, 2]
     push(history, dt, step[:3], q)
     if missing > 0:

@@ -16,7 +16,7 @@ from ..kernels.solo import FixNoise
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
-from .kalman import axis_track, filtered
+from .kalman import axis_track, drive_of, filtered
 from .noise_model import NoiseModel
 from .options import check_options
 from .stream import FilterStream, motion_noise
@@ -75,9 +75,7 @@ class NoiseAdaptive(ABC):
         return np.sqrt(noise if noise.size else known)
 
     def _filtered(self, recording: Recording, columns: Sequence[int]) -> tuple[Floats, Floats, Floats]:
-        gnss, velocity = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
-        variance = NoiseModel.nominal(self.assumed).process_variance(recording, columns)
-        return filtered(gnss, velocity, variance, self.fixes, recording.dt, self.x0)
+        return filtered(drive_of(recording, NoiseModel.nominal(self.assumed), columns), self.fixes, self.x0)
 
 
 @dataclass(frozen=True, eq=False)

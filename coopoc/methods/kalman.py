@@ -11,12 +11,13 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..kernels.solo import FixNoise, drive
+from ..kernels.motion import MotionNoise
+from ..kernels.solo import Drive, FixNoise, drive
 from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel, resolve
 from .options import check_options
-from .stream import FilterStream, alone, motion_noise
+from .stream import NO_VARIANCE, FilterStream, alone, motion_noise, process_noise
 from .track import Track
 
 
@@ -48,9 +49,7 @@ class Kalman:
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos, missing=True)
         known = resolve(self.noise_model, recording)
-        gnss, velocity = recording.gnss.take(columns, axis=2), recording.velocity.take(columns, axis=2)
-        variance = known.process_variance(recording, columns)
-        x, p, _ = filtered(gnss, velocity, variance, FixNoise(known.gnss_variance), recording.dt, self.x0)
+        x, p, _ = filtered(drive_of(recording, known, columns), FixNoise(known.gnss_variance), self.x0)
         return axis_track(recording, columns, x, p, began)
 
     def start(
@@ -83,36 +82,31 @@ def axis_track(
     return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes)
 
 
-def filtered(
-    gnss: Floats, velocity: Floats, process: Floats, fixes: FixNoise, dt: float, x0: Floats | None = None
-) -> tuple[Floats, Floats, Floats]:
+def drive_of(recording: Recording, known: NoiseModel | MotionNoise, columns: npt.ArrayLike) -> Drive:
+    """What the solo filters of some vehicles run over, with the process noise of a noise model or of the velocity."""
+    process, motion = (NO_VARIANCE, known) if isinstance(known, MotionNoise) else process_noise(known, recording)
+    gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
+    return Drive(gnss, velocity, np.broadcast_to(process, gnss.shape), motion, np.asarray(columns), recording.dt)
+
+
+def filtered(seen: Drive, fixes: FixNoise, x0: Floats | None = None) -> tuple[Floats, Floats, Floats]:
     """Run a solo filter axis by axis: all covariances are diagonal, so that the three axes do not couple.
 
     Args:
-        gnss: (R, T, N, 3) m; NaN for a missing fix, which leaves the prediction.
-        velocity: (R, T, N, 3) m/s; NaN where a vehicle is absent, which starts anew at its first fix.
-        process: m^2 per step, broadcastable to (R, T, N, 3).
+        seen: measurements, and which vehicles are filtered.
         fixes: noise of the fixes, known or revised.
-        dt: s.
-        x0: (..., N, 3) m, exact at step 0; None starts at the first fix.
+        x0: (..., E, 3) m, exact at step 0; None starts at the first fix.
 
     Returns:
-        Position m, variance m^2, and believed variance of a fix m^2 (of no length where it is known), (R, T, N, 3).
+        Position m, variance m^2, and believed variance of a fix m^2 (of no length where it is known), (R, T, E, 3).
 
     Raises:
         InputError: x0 of another shape.
     """
-    if x0 is not None and np.shape(x0)[-2:] != gnss.shape[2:]:
-        raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {gnss.shape[2:]}", "One start per ego.")
-    x, p = np.empty(gnss.shape), np.empty(gnss.shape)
-    x[:, 0] = gnss[:, 0] if x0 is None else x0
-    gnss, velocity = np.ascontiguousarray(gnss), np.ascontiguousarray(velocity)
-    noise = drive(gnss, velocity, np.broadcast_to(process, gnss.shape), fixes, dt, x0 is not None, x, p)
-    return x, p, noise
-
-
-def solo_filter(
-    gnss: Floats, velocity: Floats, process_variance: Floats, gnss_variance: Floats, dt: float, x0: Floats | None = None
-) -> tuple[Floats, Floats]:
-    """Position m and variance m^2 (R, T, N, 3) of the Kalman filter: `filtered` with known noise of the fixes."""
-    return filtered(gnss, velocity, process_variance, FixNoise(np.asarray(gnss_variance)), dt, x0)[:2]
+    shape = *seen.gnss.shape[:2], len(seen.columns), 3
+    if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
+        raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
+    x, p = np.empty(shape), np.empty(shape)
+    if x0 is not None:
+        x[:, 0] = x0
+    return x, p, drive(seen, fixes, x0 is not None, np.arange(shape[2]), x, p)

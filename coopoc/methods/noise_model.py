@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,13 +87,12 @@ class NoiseModel:
         gnss = np.where(gnss > 0, gnss, recording.sensors.gnss_std)
         return cls("fitted", recording.sensors, _three(process), _three(gnss))
 
-    def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
-        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, N, 3) or to the columns of these."""
+    def process_variance(self, recording: Recording) -> Floats:
+        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, N, 3)."""
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None
         velocity = recording.velocity if self.velocity is None else self.velocity[None]
-        velocity = velocity if columns is None else velocity.take(columns, axis=2)
         floor = 1e-6 if self.velocity is not None else self.sensors.velocity_floor
         variance = np.empty(velocity.shape)
         for run, one in enumerate(velocity):  # a run at a time stays in the cache
@@ -102,14 +100,10 @@ class NoiseModel:
         return variance
 
     @property
-    def velocity_noise(self) -> Floats:
-        """(3,) parameters of a measured velocity's noise, the process noise: ratio, floor m/s, 1 for a ratio of the
-        speed; of no length where the process noise comes from elsewhere."""
-        another = type(self).process_variance is not NoiseModel.process_variance
-        if another or self.sensors is None or self.process_std is not None or self.velocity is not None:
-            return np.empty(0)
-        of_speed = float(self.sensors.velocity_reading == "speed")
-        return np.array([self.sensors.velocity_std_ratio, self.sensors.velocity_floor, of_speed])
+    def follows_measured_velocity(self) -> bool:
+        """Whether the process noise is constant or that of the measured velocity, so that `motion_noise` describes it;
+        if not, `process_variance` alone does."""
+        return type(self).process_variance is NoiseModel.process_variance and self.velocity is None
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""

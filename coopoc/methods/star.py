@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..kernels.solo import FixNoise, drive
 from ..kernels.stars.messages import Assumptions, Measurements
 from ..kernels.stars.relative import components
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.spherical import to_vector
-from .kalman import solo_filter
+from .kalman import drive_of
 from .noise_model import NoiseModel
+from .stream import process_noise
 
 FORGOTTEN = 1e6
 """m^2, prior variance of a vehicle that has just joined: nothing is known of it."""
@@ -129,10 +131,9 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
     """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity,
     whose error the fix of `age` steps ago has made age times."""
-    velocity_noise, fixes = known.velocity_noise, np.ascontiguousarray(known.fix_variance(recording))
-    process = np.zeros((1, 1, 1, 3)) if len(velocity_noise) else np.ascontiguousarray(known.process_variance(recording))
+    (process, motion), fixes = process_noise(known, recording), np.ascontiguousarray(known.fix_variance(recording))
     noise = relative_noise(known)
-    return Assumptions(process, fixes, fixes, (1.0, 0.0), *noise, FORGOTTEN, ACCELERATION_STD, velocity_noise)
+    return Assumptions(process, fixes, fixes, (1.0, 0.0), *noise, FORGOTTEN, ACCELERATION_STD, motion)
 
 
 def estimates(
@@ -150,9 +151,7 @@ def estimates(
     """
     links, x, p = recording.links, np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    process = known.process_variance(recording, members.tolist())
-    gnss, velocity = recording.gnss[:, :, members], recording.velocity[:, :, members]
-    x[:, :, members], p[:, :, members] = solo_filter(gnss, velocity, process, known.gnss_variance, recording.dt)
+    drive(drive_of(recording, known, members), FixNoise(known.gnss_variance), False, members, x, p)
     grown = assumptions(recording, known)._replace(broadcast=p, growth=growth, acceleration=acceleration)
     return grown, x
 

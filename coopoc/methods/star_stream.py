@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
+from ..kernels.motion import NO_MOTION_NOISE
 from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
 from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.star_stream import (
@@ -94,7 +95,7 @@ class StarStream:
     ) -> None:
         motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
         assumed = Assumptions(
-            fixes, fixes, fixes, (1.0, 0.0), *relative_noise(known), FORGOTTEN, ACCELERATION_STD, np.empty(0)
+            fixes, fixes, fixes, (1.0, 0.0), *relative_noise(known), FORGOTTEN, ACCELERATION_STD, NO_MOTION_NOISE
         )
         self.max_age = seconds("max_age", max_age)
         self._noise = packed(Noise(motion, assumed, float(max_age), refine))

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, number
 from ..errors import InputError
-from ..kernels.motion import MotionNoise
+from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
 from ..kernels.solo import ESTIMATE, GNSS, HISTORY_FULL, NO_FIX_YET, VELOCITY, FixNoise, packed, stream_step
 from ..world.recording import Recording, check_recording
 from .motion_history import MotionHistory, check_step, three
@@ -20,6 +20,7 @@ from .noise_model import NoiseModel, resolve
 from .track import Track
 
 State = TypeVar("State")
+NO_VARIANCE: Floats = np.zeros((1, 1, 1, 3))
 
 
 class Solo(Protocol[State]):
@@ -166,6 +167,13 @@ def motion_noise(known: NoiseModel, interval: float | None) -> MotionNoise:
     assert known.sensors is not None
     ratio, of_speed = np.full(3, known.sensors.velocity_std_ratio), known.sensors.velocity_reading == "speed"
     return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), interval)
+
+
+def process_noise(known: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
+    """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity."""
+    if known.follows_measured_velocity:
+        return NO_VARIANCE, motion_noise(known, None)
+    return np.ascontiguousarray(known.process_variance(recording)), NO_MOTION_NOISE
 
 
 def check_interval(interval: float) -> float:

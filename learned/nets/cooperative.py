@@ -9,6 +9,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.kernels.motion import NO_MOTION_NOISE
 from coopoc.methods.egos import Estimate, follow_egos
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.star import assumptions, measurements, relative_noise
@@ -54,10 +55,10 @@ class NetNoise(NoiseModel):
         fix, process = estimate_noise(model, recording, members)
         return cls("net", recording.sensors, fix=fix, process=process)
 
-    def process_variance(self, recording: Recording, columns: Sequence[int] | None = None) -> Floats:
-        """(R, T, N, 3) m^2, or the columns of it."""
+    def process_variance(self, recording: Recording) -> Floats:
+        """(R, T, N, 3) m^2."""
         assert self.process is not None
-        return self.process if columns is None else self.process.take(columns, axis=2)
+        return self.process
 
     def fix_variance(self, recording: Recording) -> Floats:
         """(R, T, N, 3) m^2."""
@@ -146,7 +147,7 @@ class CooperativeGain:
         if isinstance(model, NoiseNet):
             model = NetNoise.by(model, recording, recording.columns(egos, missing=True))
         process = np.ascontiguousarray(model.process_variance(recording))
-        known = assumptions(recording, model)._replace(process=process, velocity_noise=np.empty(0))
+        known = assumptions(recording, model)._replace(process=process, motion=NO_MOTION_NOISE)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
             x, cov, neighbours = follow(measurements(recording, ego, box), known, self.sums)

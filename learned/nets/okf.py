@@ -15,7 +15,7 @@ from coopoc.arrays import Floats, instance
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
-from coopoc.methods.kalman import solo_filter
+from coopoc.methods.kalman import drive_of, filtered
 from coopoc.methods.stream import FilterStream, check_interval
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording, check_recording
@@ -73,21 +73,20 @@ class OptimisedKF:
         array([1., 2., 0.])
         """
         check_interval(interval)
-        base, ratio = np.array(self.process_std, dtype=float), np.array(self.velocity_ratio, dtype=float)
-        motion = MotionNoise(base, ratio, 0.0, 0.0, float(interval))
-        return FilterStream(motion, FixNoise(np.square(self.gnss_std)), x0, history)
+        return FilterStream(self._motion(float(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
-        velocity = recording.velocity[:, :, columns]
-        dt = recording.dt
-        process = np.square(self.process_std) + (np.array(self.velocity_ratio) * dt * velocity) ** 2
-        fixes, fix_variance = recording.gnss[:, :, columns], np.square(self.gnss_std)
-        x, variance = solo_filter(fixes, velocity, process, fix_variance, dt, self.x0)
+        seen = drive_of(recording, self._motion(0.0), columns)
+        x, variance, _ = filtered(seen, FixNoise(np.square(self.gnss_std)), self.x0)
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         return Track(recording.t, tuple(columns), x, variance[..., None] * np.eye(3), silent, silent, seconds)
+
+    def _motion(self, interval: float) -> MotionNoise:
+        base, ratio = np.array(self.process_std, dtype=float), np.array(self.velocity_ratio, dtype=float)
+        return MotionNoise(base, ratio, 0.0, 0.0, interval)
 
 
 class NoiseParameters(Gain):

@@ -13,6 +13,7 @@ from coopoc.arrays import AnyArray, Floats
 from coopoc.kernels.compiling.compile import as_written, inner, storage
 from coopoc.kernels.compiling.lanes import LANES
 from coopoc.kernels.compiling.small import load, store
+from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.stars.joint import joint_in
 from coopoc.kernels.stars.joint_filter import step
 from coopoc.kernels.stars.messages import ROW, Assumptions, Star, star_in
@@ -52,17 +53,19 @@ def history_size(vehicles: int, most: int) -> int:
 
 
 def relative_assumed(std: Floats, min_range: float) -> Floats:
-    """(6,) standard deviations of relative measurements m, rad, rad, least range m, prior of a member that joins m^2,
-    and 1 for unit covariances, of which `std` has no length."""
+    """(9,) standard deviations of relative measurements m, rad, rad, least range m, prior of a member that joins m^2,
+    1 for unit covariances, of which `std` has no length, and three zeros."""
     unit = len(std) == 0
-    return np.array([*(np.ones(3) if unit else std), min_range, FORGOTTEN, float(unit)])
+    return np.array([*(np.ones(3) if unit else std), min_range, FORGOTTEN, float(unit), *np.zeros(3)])
 
 
 @storage
 def assumed(values: AnyArray, fixes: AnyArray) -> Assumptions:
     """What the filter assumes: of `relative_assumed`, and the variances (1, 1, M, 3) m^2 that vehicles sent."""
-    std = values[: 0 if values[5] > 0.0 else 3]
-    return Assumptions(fixes, fixes, fixes, (1.0, 0.0), std, values[3], values[4], 0.0, values[:0])
+    std, none = values[: 0 if values[5] > 0.0 else 3], values[6:9]
+    return Assumptions(
+        fixes, fixes, fixes, (1.0, 0.0), std, values[3], values[4], 0.0, MotionNoise(none, none, 0.0, 0.0, 0.0)
+    )
 
 
 @as_written

@@ -17,7 +17,8 @@ from ...arrays import AnyArray, Bools, Floats, Ints
 from ..compiling.batched import choose, put, take
 from ..compiling.compile import inner, inside, storage
 from ..compiling.lanes import LANES
-from ..compiling.small import add, load, scale, store, times
+from ..compiling.small import add, load, scale, store
+from ..motion import MotionNoise, process_variance
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
 """Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
@@ -70,7 +71,7 @@ class Assumptions(NamedTuple):
         min_range: m.
         flat: m^2, prior of a member that joins.
         acceleration: m/s^2, change of a velocity since it was sent.
-        velocity_noise: `NoiseModel.velocity_noise`, from which `process` is made; of no length: it is given.
+        motion: of one step, by the measured velocity, beside `process`.
     """
 
     process: Floats
@@ -81,7 +82,7 @@ class Assumptions(NamedTuple):
     min_range: float
     flat: float
     acceleration: float
-    velocity_noise: Floats
+    motion: MotionNoise
 
 
 class Star(NamedTuple):
@@ -162,9 +163,6 @@ def gather(star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int
             receive(star, seen, known, (run, t, link), (k, place, lane))
             if k > 0:
                 measured(star.relative, five_of(seen.relative, run, link), known.relative_std, k, lane)
-        if len(known.velocity_noise):
-            velocity = load(star.motion, 4 * k + MOVED, ROW)
-            store(star.motion, 4 * k + PROCESS, motion_variance(known.velocity_noise, velocity, seen.dt))
         interpret(star, known, k, seen.dt)
     return int(n)
 
@@ -229,10 +227,9 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
     uses, age = take(star.status, uint64(5 * k + USES)), take(star.status, uint64(5 * k + AGE))
     held = take(star.status, uint64(5 * k + HELD))
     late, often = dt * dt * age * known.acceleration, 2.0 * uses - 1.0
-    one = load(star.motion, 4 * k + PROCESS, ROW)
-    late = late * late
+    velocity, late = load(star.motion, 4 * k + MOVED, ROW), late * late
+    one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(known.motion, velocity, dt))
     one = one[0] + late, one[1] + late, one[2] + late
-    velocity = load(star.motion, 4 * k + MOVED, ROW)
     moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
     flat = 0.0 * age + known.flat
     grown = scale(one, age * (known.growth[0] * age + known.growth[1]))
@@ -274,18 +271,6 @@ def measured(relative: AnyArray, seen: Any, std: AnyArray, k: int, lane: int) ->
         inclination_std if has_inclination else math.inf,
     )
     put_lane(relative, at + uint64(5), lane, deviations)
-
-
-@inside
-def motion_variance(velocity_noise: AnyArray, velocity: Any, dt: float) -> Any:
-    """Variance m^2 of the motion of one step at a measured velocity m/s: of the ratio, at least the floor."""
-    u, v, w = velocity
-    a, b, c = abs(u), abs(v), abs(w)
-    if velocity_noise[2] > 0.0:
-        a = b = c = math.sqrt(u * u + v * v + w * w)
-    ratio, floor = velocity_noise[0], velocity_noise[1]
-    std = dt * max(ratio * a, floor), dt * max(ratio * b, floor), dt * max(ratio * c, floor)
-    return times(std, std)
 
 
 @inside

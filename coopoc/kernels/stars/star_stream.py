@@ -75,7 +75,7 @@ def packed(noise: Noise) -> Floats:
     motion, known = noise.motion, noise.known
     unit = float(len(known.relative_std) == 0)
     std = np.ones(3) if unit else known.relative_std
-    rest = [known.min_range, known.flat, known.acceleration, noise.max_age, float(noise.refine), unit]
+    rest = [known.min_range, known.flat, known.acceleration, noise.max_age, float(noise.refine), unit, *np.zeros(3)]
     return np.concatenate([motion.base, motion.ratio, motion[2:], known.fixes.ravel(), std, rest])
 
 
@@ -84,8 +84,8 @@ def unpacked(values: AnyArray) -> Noise:
     """The Noise of an array; a message holds a fix and a velocity."""
     motion = MotionNoise(values[:3], values[3:6], values[6], values[7], values[8])
     fixes = values[9:12].reshape((1, 1, 1, 3))
-    std = values[12 : 12 if values[20] > 0.0 else 15]
-    known = Assumptions(fixes, fixes, fixes, FIX_GROWTH, std, values[15], values[16], values[17], values[:0])
+    std, still = values[12 : 12 if values[20] > 0.0 else 15], MotionNoise(values[21:24], values[21:24], 0.0, 0.0, 0.0)
+    known = Assumptions(fixes, fixes, fixes, FIX_GROWTH, std, values[15], values[16], values[17], still)
     return Noise(motion, known, values[18], values[19] > 0.0)
 
 
@@ -231,9 +231,9 @@ def neighbour(star: Star, memory: Memory, noise: Noise, row: AnyArray, slot: int
     )
     interval = noise.motion.interval if noise.motion.interval > 0.0 else dt
     share = dt / interval
+    variance = process_variance(noise.motion, last, interval)
     for c in range(3):
-        one = process_variance(noise.motion, last, interval, c) * share * share
-        values = last[c], one, row[8 + c] if there else 0.0, noise.known.broadcast[0, 0, 0, c]
+        values = last[c], variance[c] * share * share, row[8 + c] if there else 0.0, noise.known.broadcast[0, 0, 0, c]
         for lane in range(LANES):
             for i in range(4):
                 star.motion[at + 3 * i + c, lane] = values[i]

@@ -20,9 +20,7 @@ from ..compiling.lanes import LANES
 from ..compiling.small import load, negate, store
 from ..stars.joint import Joint, new_joint
 from ..stars.messages import (
-    MOVED,
     NEW,
-    PROCESS,
     SENT,
     USES,
     VARIANCE,
@@ -30,7 +28,6 @@ from ..stars.messages import (
     Measurements,
     Star,
     interpret,
-    motion_variance,
     new_star,
     receive,
 )
@@ -186,9 +183,6 @@ def gather_arrived(
                 receive(star, seen, known, (run, step, link), (k, place, lane))
                 used_since = max(seen.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
-            if len(known.velocity_noise):
-                velocity = load(star.motion, 4 * k + MOVED, ROW)
-                store(star.motion, 4 * k + PROCESS, motion_variance(known.velocity_noise, velocity, seen.dt))
             interpret(star, known, k, seen.dt)
 
 
