@@ -25,6 +25,8 @@ from .log_rows import Rows, rows_of, stacked
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 LOST = ("lost", "-1")
 USUAL = {
+    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "car_id", "agent_id"),
+    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
     "t": ("time", "timestamp", "stamp", "time_s", "seconds", "sec", "datetime", "utc", "rostime"),
     "value": ("measurement", "val", "data"),
     "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
@@ -117,6 +119,8 @@ def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
             raise InputError(
                 f"{file}: row {row[k]}, column kind", repr(one), f"must be one of {', '.join(KINDS)}", hint.lstrip()
             )
+    if any(KINDS[one].group == "relative" for one in set(kind.tolist())):
+        _need_members(frame, file)
     message = kind == "message"
     value = np.full(len(frame), np.nan)
     if not message.all():
@@ -147,6 +151,8 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
         raise _no_column(file, "kind", frame)
     frame = _own_std(frame, used, tally, file)
     groups = {KINDS[kind].group for kind in used}
+    if "relative" in groups:
+        _need_members(frame, file)
     known = {"t", "vehicle", *used, *(f"{kind}_std" for kind in used)}
     known |= {"partner"} if groups & {"relative", "message"} else set()
     known |= {"arrival"} if "message" in used else set()
@@ -279,7 +285,11 @@ def _arrivals(frame: pd.DataFrame, file: str, row: Ints, message: Bools) -> Floa
 
 
 def _vehicles(frame: pd.DataFrame, path: Path, row: Ints) -> list[str]:
+    """Names of the vehicles; the file's own name without such a column, unless another one seems to hold them."""
     if "vehicle" not in frame.columns:
+        named_otherwise = [c for c in frame.columns if str(c).lower() in USUAL["vehicle"]]
+        if any(frame[c].nunique() > 1 for c in named_otherwise):
+            raise _no_column(path.name, "vehicle", frame)
         return [path.stem] * len(frame)
     try:
         return words(frame, "vehicle", path.name)
@@ -291,6 +301,12 @@ def _partners(frame: pd.DataFrame) -> AnyArray:
     if "partner" not in frame.columns:
         return np.full(len(frame), "", dtype=object)
     return np.array(["" if p != p or p is None else str(p).strip() for p in frame["partner"].tolist()], dtype=object)
+
+
+def _need_members(frame: pd.DataFrame, file: str) -> None:
+    """InputError for a table of relative measurements without a column partner."""
+    if "partner" not in frame.columns:
+        raise _no_column(file, "partner", frame)
 
 
 def _no_column(file: str, column: str, frame: pd.DataFrame) -> InputError:

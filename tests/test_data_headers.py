@@ -96,9 +96,9 @@ def test_one_name_may_have_another_header_in_each_table(tmp_path: Path) -> None:
     with pytest.raises(co.InputError, match=r"columns\['vehicle'\] = 'form': is in no table.* Did you mean from"):
         co.read_log(folder, columns={"vehicle": "car|form", "partner": "peer"}, kinds={"uwb": "range"})
     with pytest.raises(
-        co.InputError, match=r"radio.csv: columns\['vehicle'\] = 'peer\|from': are both there: peer, from"
+        co.InputError, match=r"radio.csv: columns\['vehicle'\] = 'car\|peer\|from': are both there: peer, from"
     ):
-        co.read_log(folder, columns={"vehicle": "peer|from", "partner": "peer"}, kinds={"uwb": "range"})
+        co.read_log(folder, columns={"vehicle": "car|peer|from", "partner": "peer"}, kinds={"uwb": "range"})
 
 
 def test_places_need_no_times(tmp_path: Path) -> None:
@@ -126,3 +126,17 @@ def test_a_wide_table_with_other_headers_is_told_how_to_name_its_columns(tmp_pat
     (tmp_path / "log.csv").write_text("t,vehicle,Tempo\n0,red,8\n1,red,8\n")
     with pytest.raises(co.InputError, match=r'kinds=\{"...": "speed_kmh"\} \(--kinds ...=speed_kmh\)'):
         co.read_log(tmp_path)
+
+
+def test_columns_that_others_call_observer_and_neighbour_are_named(tmp_path: Path) -> None:
+    """A table whose members stand under another header is no table of one vehicle that is named after the file."""
+    (tmp_path / "whole.csv").write_text(GOOD)
+    head, *rows = GOOD.splitlines()
+    odd = [head.replace("vehicle", "Observer").replace("partner", "neighbour"), *rows]
+    (tmp_path / "a.csv").write_text("\n".join(odd))
+    with pytest.raises(co.InputError, match=r"column partner = missing: .*columns=\{\"partner\": \"neighbour\"\}"):
+        co.load_recording(tmp_path / "a.csv")
+    with pytest.raises(co.InputError, match=r"column vehicle = missing: .*columns=\{\"vehicle\": \"Observer\"\}"):
+        co.read_log(tmp_path / "a.csv", columns={"partner": "neighbour"})
+    read = co.read_log(tmp_path / "a.csv", columns={"partner": "neighbour", "vehicle": "Observer"})
+    assert same(read.recording, co.load_recording(tmp_path / "whole.csv"))
