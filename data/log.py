@@ -11,6 +11,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
 from coopoc.plugins import one_of
 from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
@@ -110,7 +111,7 @@ def read_log(
     >>> read_log(file).recording
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
-    path, tally = Path(path), Tally()
+    path, tally = given_path(path), Tally()
     _check_options(dt, max_gap, clock, frame)
     body = frame == "body"
     if is_bag(path):

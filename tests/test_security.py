@@ -100,6 +100,7 @@ def status(*words: str) -> int:
     return int(ended.value.code or 0)
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     from safetensors.torch import save_file
@@ -114,6 +115,7 @@ def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_
     assert not mark.exists()
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 @pytest.mark.parametrize("card", ["[]", "{", "3", "[" * 100_000, "{}", '{"kind": "gain_net", "net": {"<b>": 1}}'])
 def test_a_damaged_card_is_named(tmp_path: Path, card: str) -> None:
     torch = pytest.importorskip("torch")
@@ -126,6 +128,7 @@ def test_a_damaged_card_is_named(tmp_path: Path, card: str) -> None:
         load(tmp_path / "net.safetensors")
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_a_net_of_ones_own_is_loaded_when_the_caller_names_its_file(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     from safetensors.torch import save_file

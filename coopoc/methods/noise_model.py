@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, instance
+from ..arrays import Floats, checked, instance
 from ..errors import InputError
 from ..plugins import suggestion
+from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
@@ -42,10 +43,18 @@ class NoiseModel:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        check_texts(self, "name")
+        object.__setattr__(self, "notes", texts("notes", self.notes))
+        if self.sensors is not None:
+            instance("sensors", self.sensors, Sensors)
+        if self.velocity is not None:
+            object.__setattr__(self, "velocity", checked("velocity", self.velocity, "(T, N, 3)", (-1, -1, 3)))
         for field in ("process_std", "gnss_std"):
-            value = getattr(self, field)
-            if value is not None and not all(np.isfinite(v) and v > 0 for v in value):
-                raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
+            if field == "gnss_std" or self.process_std is not None:
+                value = checked(field, getattr(self, field), "(3,)", (3,))
+                if not (np.isfinite(value) & (value > 0)).all():
+                    raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
+                object.__setattr__(self, field, _three(value))
 
     @classmethod
     def identity(cls) -> NoiseModel:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..evaluate.statistics import Interval
+from ..file_names import given_path
 from . import changes, store
 from .changes import Change, Direction, plain
 from .results import SEED, Results, ego_by_run
@@ -66,7 +67,7 @@ class Reference:
         """Write as JSON, one line per number."""
         lines = ",\n".join("  " + json.dumps(vars(number), default=float) for number in self.numbers)
         head = json.dumps({"study": self.study, "settings": dict(self.settings)}, indent=1, default=list)[:-2]
-        store.write(Path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
+        store.write(given_path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
 
     @classmethod
     def load(cls, path: str | Path) -> Reference:
@@ -75,7 +76,7 @@ class Reference:
         Raises:
             InputError: no such file, or a damaged one.
         """
-        path, hint = Path(path), "Write them with coopoc reference --write."
+        path, hint = given_path(path), "Write them with coopoc reference --write."
         given = store.content(
             path, {"study": str, "settings": dict, "numbers": list}, "holds no reference numbers", hint
         )

@@ -11,6 +11,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.egos import Estimate, follow_egos
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.options import check_options
 from coopoc.methods.star import assumptions, measurements, relative_noise
 from coopoc.methods.stream import alone
 from coopoc.methods.track import Track
@@ -99,6 +100,9 @@ class CooperativeGain:
     sums: bool = True
     name: str = "cooperative"
     cooperative: bool = True
+
+    def __post_init__(self) -> None:
+        check_options(self, kinds={"noise": (NoiseNet, NoiseModel)})
 
     @property
     def message(self) -> Message:
