@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -91,7 +92,7 @@ def listed(field: str, values: Any, hint: str) -> list[Any]:
     Traceback (most recent call last):
     coopoc.errors.InputError: egos = array(3): must be a sequence. Give [3].
     """
-    if not isinstance(values, str | bytes):
+    if not isinstance(values, str | bytes) and not np.ma.is_masked(values):
         try:
             return list(values)
         except Exception:  # a class from elsewhere may raise anything
@@ -149,6 +150,17 @@ def instance(field: str, value: object, kind: type[Kind], hint: str = "") -> Kin
     if not isinstance(value, kind):
         raise InputError(field, shown(value), f"must be a {kind.__name__}", hint or f"Give {kind.__name__}(...).")
     return value
+
+
+def named(field: str, values: object, hint: str) -> dict[str, Any]:
+    """A mapping from texts as a dict; InputError for anything else.
+
+    >>> named("stamps", {"a": 0.0}, "Give name -> s.")
+    {'a': 0.0}
+    """
+    if isinstance(values, Mapping) and all(isinstance(name, str) for name in values):
+        return dict(values)
+    raise InputError(field, shown(values), "must be a mapping from names", hint)
 
 
 def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hint: str) -> None:

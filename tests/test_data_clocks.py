@@ -11,6 +11,8 @@ import pytest
 
 from coopoc.data.log import read_log
 from coopoc.data.log_check import check
+from coopoc.data.log_poses import check_poses
+from coopoc.errors import InputError
 
 NAMES = ("tug", "barge", "pilot")
 
@@ -81,3 +83,32 @@ def test_a_truth_with_another_clock_is_named(tmp_path: Path, late: float) -> Non
         assert named is not None
         assert float(named[1]) == pytest.approx(abs(late), abs=0.1)
         assert (named[2] == "ahead of") == (late > 0)
+
+
+def bodily(folder: Path, late: float, truth_late: float = 0.0) -> tuple[str, ...]:
+    """What is said of the same log in body frames, with yaw rates, one clock and that of the truth moved."""
+    log, truth = tables(3)
+    t = np.unique(log.t)
+    rates = [
+        pd.DataFrame({"t": t, "vehicle": name, "kind": "yaw_rate", "value": 0.025 * np.cos(0.05 * t + k), "std": 2e-3})
+        for k, name in enumerate(NAMES)
+    ]
+    log = pd.concat([log, *rates], ignore_index=True)
+    log.assign(t=log.t + late * (log.vehicle == "barge")).to_csv(folder / "measurements.csv", index=False)
+    truth.assign(t=truth.t + truth_late).to_csv(folder / "truth.csv", index=False)
+    return tuple(check_poses(read_log(folder, frame="body")).warnings)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.5, -0.6])
+def test_the_clock_of_one_vehicle_is_found_in_body_frames(tmp_path: Path, late: float) -> None:
+    found = [text for text in bodily(tmp_path, late) if "its stamps are" in text]
+    assert len(found) == (late != 0)
+    for text in found:
+        (clock,) = re.findall(r"clock=\{'barge': (\S+)\}", text)
+        assert float(clock) == pytest.approx(late, rel=0.2)
+
+
+def test_other_clocks_of_the_truth_and_of_a_time_zone_are_named_in_body_frames(tmp_path: Path) -> None:
+    assert all("its fixes are 0.7" in text and "the clock of the truth" in text for text in bodily(tmp_path, 0.0, 0.7))
+    with pytest.raises(InputError, match=r"all vehicles are there\. barge: is there while no other .*'barge': 3600"):
+        bodily(tmp_path, 3600.0)

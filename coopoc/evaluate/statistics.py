@@ -84,7 +84,10 @@ def paired_ratio(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: int =
     2.0
     """
     a, b = _pair(a, b)
-    ratios = _resampled(a, resamples, seed) / _resampled(b, resamples, seed)
+    below = _resampled(b, resamples, seed)
+    if not below.all():
+        raise InputError("b", float(b.mean()), "must have means that are not zero", "Compare by paired_difference.")
+    ratios = _resampled(a, resamples, seed) / below
     return _interval(ratios, float(a.mean() / b.mean()), a, level)
 
 

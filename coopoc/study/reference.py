@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import instance, number
 from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..file_names import given_path
@@ -81,10 +82,23 @@ class Reference:
             path, {"study": str, "settings": dict, "numbers": list}, "holds no reference numbers", hint
         )
         try:
-            numbers = tuple(Number(**number) for number in given["numbers"])
-        except TypeError as error:
+            numbers = tuple(_sound(Number(**each)) for each in given["numbers"])
+        except (TypeError, InputError) as error:
             raise InputError("file", str(path), f"is damaged ({error})", hint) from None
         return cls(given["study"], given["settings"], numbers)
+
+
+def _sound(read: Number) -> Number:
+    """A number as `save` wrote it; InputError for a field of another kind."""
+    instance("where", read.where, dict)
+    instance("metric", read.metric, str)
+    if read.better not in ("lower", "higher"):
+        number("better", read.better, -np.inf, np.inf, allowed="lower, higher or a number")
+    number("value", read.value, -np.inf, np.inf, allowed="no NaN")
+    number("runs", read.runs, 1, 2**53, kind=int, allowed=">= 1")
+    for field in ("run_std", "tolerance"):
+        number(field, getattr(read, field), high=1e100)
+    return read
 
 
 def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
