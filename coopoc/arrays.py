@@ -85,7 +85,7 @@ def plain(values: object) -> AnyArray:
     return np.empty(0, dtype=object)
 
 
-def listed(field: str, values: Any, hint: str) -> list[Any]:
+def listed(field: str, values: Any, hint: str, allowed: str = "must be a sequence") -> list[Any]:
     """Entries of a sequence; InputError for one text, and for what has no entries.
 
     >>> listed("egos", np.array(3), "Give [3].")
@@ -97,7 +97,7 @@ def listed(field: str, values: Any, hint: str) -> list[Any]:
             return list(values)
         except Exception:  # a class from elsewhere may raise anything
             pass
-    raise InputError(field, shown(values), "must be a sequence", hint)
+    raise InputError(field, shown(values), allowed, hint)
 
 
 def number(

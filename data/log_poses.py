@@ -15,20 +15,18 @@ from coopoc.evaluate.pose_metrics import heading_error, pose_nees
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.methods.track import Track
-from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import wrap
 
 from .log import Log
-from .log_check import relative_residuals
-from .log_clocks import apart_warnings, clock_warnings, truth_warning
+from .log_body_clocks import GATE, clocks
+from .log_clocks import apart_warnings, truth_warning
 from .log_truth import frame_warning
 
 WRONG = 3.0
 """Times the stated standard deviation that residuals of a filter's own estimates are not expected to reach."""
 INCONSISTENT = 75.0
 """NEES of a pose, 3 if consistent: errors five times as large as stated."""
-GATE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,8 @@ def check_poses(log: Log) -> PoseCheck:
     who = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
     begin, start = begin_of(log, who, GATE)
     track = PoseFilter("fleet", gate=GATE, begin=begin)(rec, who)
-    vehicles, warnings = [], clocks(log, begin, who)
+    world, warnings = clocks(rec, begin, who)
+    vehicles = []
     for k, column in enumerate(who):
         fix = np.linalg.norm(rec.gnss[0, :, column, :2] - track.x[0, :, k, :2], axis=1)
         row: dict[str, Any] = {"vehicle": rec.ids[column], "fixes": int(np.isfinite(fix).sum())}
@@ -81,7 +80,7 @@ def check_poses(log: Log) -> PoseCheck:
         row["heading_std_deg"] = float(np.rad2deg(np.sqrt(track.heading_covariance[0, :, k, 3])).mean())
         row |= _errors(log, track, k)
         vehicles.append(row)
-        moved = frame_warning(rec, log.truth, column)
+        moved = truth_warning(world, log.truth, column) or frame_warning(rec, log.truth, column)
         warnings += moved
         if not moved and row.get("nees", 0.0) > INCONSISTENT:
             larger = np.sqrt(row["nees"] / 3)
@@ -97,33 +96,6 @@ def check_poses(log: Log) -> PoseCheck:
                 "turned, mirrored, in other units, of another partner, or less certain than stated."
             )
     return PoseCheck(log, f"{span}{start}", track, vehicles, measurements, warnings)
-
-
-def clocks(log: Log, begin: Floats | None, who: Sequence[int]) -> list[str]:
-    """What `log_clocks` says of a log in body frames, turned into the world by a filter of each vehicle alone.
-
-    Args:
-        log: all vehicles there throughout.
-        begin: first poses, None where fixes and compasses give them.
-        who: columns of the vehicles.
-    """
-    rec, size = log.recording, (len(log.recording.t), len(log.recording.ids))
-    track = PoseFilter("solo", gate=GATE, begin=begin)(rec, who)
-    assert track.heading is not None
-    assert track.heading_covariance is not None
-    assert track.covariance is not None
-    x, variance, heading, unsure = np.zeros((*size, 3)), np.zeros((*size, 3)), np.zeros(size), np.zeros(size)
-    x[:, list(rec.landmarks)] = rec.gnss[0][:, list(rec.landmarks)]
-    x[:, who], heading[:, who], unsure[:, who] = track.x[0], track.heading[0], track.heading_covariance[0, ..., 3]
-    variance[:, who] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
-    relative, at = rec.relative[:1].copy(), (rec.links.step, rec.links.observer)
-    relative[..., 1] = wrap(relative[..., 1] + heading[at])
-    first = rec.of_runs(slice(0, 1))
-    world = replace(first, body=None, velocity=turned(first.velocity, midway(heading)), relative=relative)
-    residual, expected = relative_residuals(world, x, variance)
-    expected[:, 1] = np.sqrt(expected[:, 1] ** 2 + unsure[at])
-    found = clock_warnings(world, x, residual, expected)
-    return found + [text for column in who for text in truth_warning(world, log.truth, column)]
 
 
 def together(log: Log) -> tuple[Log, str]:

@@ -277,7 +277,7 @@ def test_a_failed_run_raises_and_leaves_its_last_round(tmp_path: Path, capsys: p
 @flower
 def test_a_progress_file_is_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that is interrupted leaves the previous file."""
-    import coopoc.learned.flower.progress as module
+    import coopoc.learned.checkpoint as module
     from coopoc.learned.flower.rows import Row
 
     job, path = job_of(TINY), tmp_path / "p"
@@ -293,6 +293,11 @@ def test_a_progress_file_is_whole_or_absent(tmp_path: Path, monkeypatch: pytest.
     back = read(path, job)
     assert back is not None
     assert (back.usual, back.rows[0].number, back.state[0].tolist()) == (2.5, 0, [1.0, 1.0, 1.0])
+    damaged = bytearray(path.read_bytes())
+    damaged[-1] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(InputError, match=r"progress.*cannot be read"):
+        read(path, job)
 
 
 def replace_usual(progress: Progress) -> Progress:

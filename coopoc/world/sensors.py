@@ -79,7 +79,7 @@ class Sensors:
                     raise InputError(name, shown(value), "must be True or False", "Say whether there is one.")
             elif isinstance(field.default, tuple):
                 size = len(field.default)
-                given = listed(name, value, "Give metres in a tuple.")
+                given = listed(name, value, "Give metres in a tuple.", f"must be {size} numbers")
                 if len(given) != size:
                     raise InputError(name, value, f"must be {size} numbers", "Give metres in a tuple.")
                 object.__setattr__(self, name, tuple(number(name, v, hint=hint) for v in given))

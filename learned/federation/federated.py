@@ -30,7 +30,13 @@ from .rule import Combine, Rule
 from .server import SERVER, Exchange, Group, Protection, Server, Standing
 from .topology import Mesh, Topology, connected, disagreement
 
-KINDS = {"schedule": Schedule, "participation": Participation, "compression": Compression, "topology": Topology}
+KINDS = {
+    "aggregate": object,  # `rule` says what is none
+    "schedule": Schedule,
+    "participation": Participation,
+    "compression": Compression,
+    "topology": Topology,
+}
 
 
 @dataclass(frozen=True)
