@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -113,3 +114,24 @@ def test_other_clocks_of_the_truth_and_of_a_time_zone_are_named_in_body_frames(t
     assert [float(late) for late in found] == pytest.approx([0.7] * 3, rel=0.1)
     with pytest.raises(InputError, match=r"all vehicles are there\. barge: is there while no other .*'barge': 3600"):
         bodily(tmp_path, 3600.0)
+
+
+def test_stamps_that_go_back_in_a_file_are_told(tmp_path: Path) -> None:
+    log, _ = tables(3)
+    log.loc[log.index[3000:3400], "t"] -= 30
+    log.to_csv(tmp_path / "log{0}.csv", index=False)
+    assert "stamps go back in a file (24 times, first: log{0}.csv: row 3001, by 29.8 s)" in str(
+        read_log(tmp_path).summary
+    )
+    log, _ = tables(3)
+    log.sort_values(["vehicle", "kind"], kind="stable").to_csv(tmp_path / "log{0}.csv", index=False)
+    assert "go back" not in str(read_log(tmp_path).summary)
+
+
+@pytest.mark.parametrize(
+    "option", [{"columns": 3}, {"kinds": [1]}, {"ignore": 3}, {"origin": (1, 2)}, {"any_scale": "x"}, {"dt": "x"}]
+)
+def test_options_of_the_wrong_kind_are_refused(tmp_path: Path, option: dict[str, Any]) -> None:
+    tables(3)[0].to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(InputError, match=next(iter(option))):
+        read_log(tmp_path, **option)

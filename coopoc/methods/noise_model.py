@@ -152,17 +152,18 @@ components: information that is large in one direction and small in another lose
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
-    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST.
+    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST, and
+    no range finer than its angles bear (`_bent`).
 
     >>> resolve("identity", None).gnss_std
     (1.0, 1.0, 1.0)
     """
     if isinstance(noise_model, NoiseModel):
-        return _resolvable(noise_model)
+        return _resolvable(_bent(noise_model, recording))
     if noise_model == "identity":
         return NoiseModel.identity()
     if noise_model == "nominal":
-        return _resolvable(NoiseModel.nominal(check_recording(recording).sensors))
+        return _resolvable(_bent(NoiseModel.nominal(check_recording(recording).sensors), recording))
     raise InputError(
         "noise_model",
         repr(noise_model),
@@ -173,6 +174,34 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
             "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
         ),
     )
+
+
+def _bent(known: NoiseModel, recording: Recording | None) -> NoiseModel:
+    """With ranges no finer than the arc on which a vehicle lies whose angles are uncertain; a note says so.
+
+    A direction that is off by e shortens d to d cos e along the measured one: by d e^2 / 2, whose standard deviation is
+    d std^2 / sqrt(2). A finer range, taken for exact along a line, moves estimates by ten times what is claimed.
+
+    References:
+        Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
+    """
+    if known.sensors is None or not isinstance(recording, Recording) or not recording.relative.shape[1]:
+        return known
+    seen, noise = recording.relative[0], known.sensors
+    seen = seen[np.isfinite(seen[:, :2]).all(axis=1)]
+    if not len(seen):
+        return known
+    far, notes = float(np.median(seen[:, 0])), known.notes
+    arc = far * float(np.hypot(noise.azimuth_std**2, noise.inclination_std**2)) / np.sqrt(2.0)
+    if noise.range_std > far / 2:
+        given = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
+        notes = (*notes, f"{given}: none is negative, so that such errors have a mean, which no method expects")
+    if arc <= noise.range_std:
+        return replace(known, notes=notes)
+    std = float(np.hypot(arc, noise.range_std))
+    why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad put what is {far:.3g} m away on an arc"
+    notes = (*notes, f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why}")
+    return replace(known, sensors=replace(noise, range_std=std), notes=notes)
 
 
 def _resolvable(known: NoiseModel) -> NoiseModel:
@@ -188,7 +217,7 @@ def _resolvable(known: NoiseModel) -> NoiseModel:
     raised = {name: max(getattr(known.sensors, name), min(least, np.pi)) for name in names}
     beside = f"finer ones beside a fix of {max(known.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
-    return replace(known, sensors=replace(known.sensors, **raised), notes=(note,))
+    return replace(known, sensors=replace(known.sensors, **raised), notes=(*known.notes, note))
 
 
 def _three(values: Floats) -> tuple[float, float, float]:
