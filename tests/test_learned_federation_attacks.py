@@ -302,3 +302,19 @@ def test_a_progress_file_is_whole_or_absent(tmp_path: Path, monkeypatch: pytest.
 
 def replace_usual(progress: Progress) -> Progress:
     return progress._replace(usual=9.0, rows=tuple(replace(row, note="x") for row in progress.rows))
+
+
+@flower
+def test_what_a_client_says_went_wrong_is_one_line_of_text() -> None:
+    """The server prints it: no terminal may take it for a command, no reader for a round of its own."""
+    from coopoc.learned.flower.wire import Report, answer, reported
+
+    told = reported(answer(Report("a", 3, 1.0, failure="disk\x1b[2J\nround 9: validation 0.0" + 300 * "x")))
+    assert told.failure.startswith("disk [2J round 9: validation 0.0x")
+    assert len(told.failure) <= 200
+
+
+@pytest.mark.parametrize("given", [{"timeout": math.nan}, {"timeout": -1}, {"timeout": "x"}, {"patience": -1.0}])
+def test_a_wait_that_ends_at_once_or_never_is_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(given))):
+        Wait(**given)
