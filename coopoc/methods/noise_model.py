@@ -177,31 +177,38 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
 
 
 def _bent(known: NoiseModel, recording: Recording | None) -> NoiseModel:
-    """With ranges no finer than the arc on which a vehicle lies whose angles are uncertain; a note says so.
+    """With ranges no finer than the arc bends on which a vehicle lies whose direction is uncertain; a note says so.
 
-    A direction that is off by e shortens d to d cos e along the measured one: by d e^2 / 2, whose standard deviation is
-    d std^2 / sqrt(2). A finer range, taken for exact along a line, moves estimates by ten times what is claimed.
+    A direction that is off by e shortens d to d cos e along the assumed one: by d e^2 / 2, whose standard deviation is
+    d std^2 / sqrt(2). Of measured angles std is theirs; where there are none, that of the line between two fixes,
+    sqrt(2) std of a fix / d. A finer range, taken for exact along a line, moves estimates by ten times what is claimed.
 
     References:
         Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
     """
     if known.sensors is None or not isinstance(recording, Recording) or not recording.relative.shape[1]:
         return known
-    seen, noise = recording.relative[0], known.sensors
-    seen = seen[np.isfinite(seen[:, :2]).all(axis=1)]
+    noise, seen = known.sensors, recording.relative[0][np.isfinite(recording.relative[0, :, 0])]
+    directed = seen[np.isfinite(seen[:, 1])]
     if not len(seen):
         return known
-    far, notes = float(np.median(seen[:, 0])), known.notes
-    arc = far * float(np.hypot(noise.azimuth_std**2, noise.inclination_std**2)) / np.sqrt(2.0)
+    far, notes = float(np.median((directed if len(directed) else seen)[:, 0])), known.notes
     if noise.range_std > far / 2:
         given = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
-        notes = (*notes, f"{given}: none is negative, so that such errors have a mean, which no method expects")
+        return replace(known, notes=(*notes, f"{given}: none is negative, so that their errors have a mean"))
+    if len(directed):
+        arc = far * float(np.hypot(noise.azimuth_std**2, noise.inclination_std**2)) / np.sqrt(2.0)
+        why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad"
+    else:
+        fix = float(np.square(known.gnss_std[:2]).mean())
+        arc, why = np.sqrt(2.0) * fix / far, f"fixes of {np.sqrt(fix):.2g} m and no azimuth"
     if arc <= noise.range_std:
-        return replace(known, notes=notes)
+        return known
     std = float(np.hypot(arc, noise.range_std))
-    why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad put what is {far:.3g} m away on an arc"
-    notes = (*notes, f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why}")
-    return replace(known, sensors=replace(noise, range_std=std), notes=notes)
+    text = (
+        f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why} put what is {far:.3g} m away on an arc"
+    )
+    return replace(known, sensors=replace(noise, range_std=std), notes=(*notes, text))
 
 
 def _resolvable(known: NoiseModel) -> NoiseModel:
