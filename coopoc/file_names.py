@@ -58,6 +58,18 @@ def file_name(field: str, name: object, hint: str) -> str:
     raise InputError(field, given, allowed, hint)
 
 
+def replaceable(path: Path) -> Path:
+    """`path`, if a file that is written whole may take its place.
+
+    Raises:
+        InputError: a folder, or a device such as /dev/null, which a renamed file would replace for every program.
+    """
+    if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
+        kind = "a folder" if path.is_dir() else "a device or a pipe"
+        raise InputError("path", str(path), f"must be a file, and is {kind}", "Name a file to be written.")
+    return path
+
+
 def inside(folder: Path, path: Path) -> Path:
     """`path`, if it stays in `folder` once symbolic links are followed.
 

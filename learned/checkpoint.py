@@ -19,7 +19,7 @@ from torch import Tensor
 
 from coopoc.arrays import instance
 from coopoc.errors import InputError, shown
-from coopoc.file_names import given_path
+from coopoc.file_names import given_path, replaceable
 from coopoc.methods.options import check_options
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
@@ -94,7 +94,7 @@ def write(path: Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any]) ->
     except (TypeError, ValueError, RecursionError) as error:
         allowed = f"must hold what JSON can ({error})"
         raise InputError("card", shown(card), allowed, "Convert its values to numbers, texts and lists.") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
+    replaceable(path).parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}")
     partial.write_bytes(sealed(to_bytes(dict(tensors), metadata={"card": text})))
     os.replace(partial, path)

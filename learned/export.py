@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
-from coopoc.file_names import given_path
+from coopoc.file_names import given_path, replaceable
 from coopoc.world.noise import stream
 
 from .checkpoint import Checkpoint
@@ -177,7 +177,7 @@ def _example(net: GainNet) -> tuple[Tensor, ...]:
 def _kept(path: Path | str, write: Callable[[Path], None], net: GainNet, load: Callable[[Path], Run]) -> Path:
     """Write beside `path`, check, and only then put it there."""
     path = given_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    replaceable(path).parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         write(part)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -437,3 +438,18 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with pytest.warns(RuntimeWarning, match="is damaged and will be computed again"):
             assert store.load(tmp_path / "noise", path.stem) is None
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe"])
+def test_no_device_and_no_folder_is_replaced_by_a_file(folder: Path, tmp_path: Path, kind: str) -> None:
+    """As root, a report "written to" /dev/null took its place for every program of the machine."""
+    learned = pytest.importorskip("coopoc.learned")
+    out = tmp_path / "out.html"
+    os.mkfifo(out) if kind == "pipe" else out.mkdir()
+    before = os.stat(out).st_mode
+    weights = learned.Checkpoint(learned.NoiseParameters(), {})
+    results = Results.load(folder)
+    for write in (lambda: report([folder], out), lambda: results.to_csv(out), lambda: learned.save(out, weights)):
+        with pytest.raises(InputError, match=r"is a folder|must be a file, and is a device or a pipe"):
+            write()
+    assert os.stat(out).st_mode == before

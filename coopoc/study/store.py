@@ -15,6 +15,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..errors import InputError
+from ..file_names import replaceable
 from ..seals import UNSEALED, holds, sealed
 from .cell import Cell, Row
 
@@ -28,8 +29,10 @@ def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
     replaced, not followed.
 
     Raises:
+        InputError: a folder or a device at `path`.
         OSError: a full or read-only disk, with the path.
     """
+    replaceable(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(path, content)
