@@ -197,3 +197,12 @@ def test_usual_sensors_are_assumed_as_stated() -> None:
 def test_ranges_that_noise_reflects_at_zero_are_noted() -> None:
     seen = observed(in_line(4, 10.0), co.Sensors(range_std=1e3))
     assert any("none is negative" in note for note in co.JointFilter()(seen, [0]).notes)
+
+
+def test_an_estimate_that_its_fixes_contradict_is_noted() -> None:
+    """Ranges fifty times as long as stated pull the ego away from its fixes."""
+    seen = observed(in_line(4, 10.0), co.Sensors())
+    wrong = replace(seen, relative=seen.relative * [50.0, 1.0, 1.0])
+    for name in ("joint", "central-filter"):
+        assert not any("from most fixes" in note for note in METHODS[name]("nominal")(seen, [0]).notes)
+        assert any("over 26 m from most fixes in 2 of 2" in n for n in METHODS[name]("nominal")(wrong, [0]).notes), name
