@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from .errors import InputError
+from .errors import InputError, shown
 
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Ints: TypeAlias = npt.NDArray[np.int64]
@@ -56,10 +57,7 @@ def checked(
     coopoc.errors.InputError: t = shape (2,): must have shape (T,) = (3,). Give one entry per index of each axis.
     """
     kinds, word = KINDS[dtype]
-    try:
-        given = np.asarray(values)
-    except ValueError:  # rows of different lengths
-        given = np.empty(0, dtype=object)
+    given = plain(values)
     if given.dtype.kind not in kinds and (given.size or given.dtype == object):
         hint = "Convert it with numpy first: rows must be equally long, text is not parsed, floats are not rounded."
         raise InputError(field, f"dtype {given.dtype}", f"must be an array of {word}s", hint)
@@ -71,6 +69,35 @@ def checked(
         allowed = f"must have shape {axes} = {wanted}"
         raise InputError(field, f"shape {given.shape}", allowed, "Give one entry per index of each axis.")
     return frozen(given, dtype)
+
+
+def plain(values: object) -> AnyArray:
+    """Any value as an array; of dtype object what is none, such as rows of different lengths or masked entries.
+
+    >>> plain([[1], [2, 3]]).dtype, plain(np.ma.masked_less([1.0, 2.0], 1.5)).dtype
+    (dtype('O'), dtype('O'))
+    """
+    if not np.ma.is_masked(values):  # numpy gives the numbers behind a mask as if they were measured
+        try:
+            return np.asarray(values)
+        except Exception:  # a class from elsewhere may raise anything
+            pass
+    return np.empty(0, dtype=object)
+
+
+def listed(field: str, values: Any, hint: str, allowed: str = "must be a sequence") -> list[Any]:
+    """Entries of a sequence; InputError for one text, and for what has no entries.
+
+    >>> listed("egos", np.array(3), "Give [3].")
+    Traceback (most recent call last):
+    coopoc.errors.InputError: egos = array(3): must be a sequence. Give [3].
+    """
+    if not isinstance(values, str | bytes) and not np.ma.is_masked(values):
+        try:
+            return list(values)
+        except Exception:  # a class from elsewhere may raise anything
+            pass
+    raise InputError(field, shown(values), allowed, hint)
 
 
 def number(
@@ -103,7 +130,7 @@ def number(
     kinds, word = KINDS[kind]
     given = np.asarray(value if isinstance(value, int | float | np.generic | np.ndarray) else None)
     if given.ndim or given.dtype.kind not in kinds:
-        raise InputError(field, repr(value)[:60], f"must be a {word}, {allowed}", hint)
+        raise InputError(field, shown(value), f"must be a {word}, {allowed}", hint)
     found = kind(given.item())
     if not low <= found <= high:
         raise InputError(field, value, f"must be {allowed}", hint)
@@ -121,8 +148,19 @@ def instance(field: str, value: object, kind: type[Kind], hint: str = "") -> Kin
     coopoc.errors.InputError: track = None: must be a dict. Give dict(...).
     """
     if not isinstance(value, kind):
-        raise InputError(field, repr(value)[:60], f"must be a {kind.__name__}", hint or f"Give {kind.__name__}(...).")
+        raise InputError(field, shown(value), f"must be a {kind.__name__}", hint or f"Give {kind.__name__}(...).")
     return value
+
+
+def named(field: str, values: object, hint: str) -> dict[str, Any]:
+    """A mapping from texts as a dict; InputError for anything else.
+
+    >>> named("stamps", {"a": 0.0}, "Give name -> s.")
+    {'a': 0.0}
+    """
+    if isinstance(values, Mapping) and all(isinstance(name, str) for name in values):
+        return dict(values)
+    raise InputError(field, shown(values), "must be a mapping from names", hint)
 
 
 def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hint: str) -> None:

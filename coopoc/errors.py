@@ -21,10 +21,25 @@ class InputError(ValueError):
         return type(self), (self.field, self.value, self.allowed, self.hint)
 
 
-def _cut(text: object) -> str:
-    """What a file holds may be of any length."""
-    shown = str(text)
-    return shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}..."
+def shown(value: object, longest: int = 60) -> str:
+    """The repr of any value, cut; of an object whose own repr fails, its class.
+
+    >>> shown("a" * 100, 3), shown([1])
+    ("'aa", '[1]')
+    """
+    try:
+        return repr(value)[:longest]
+    except Exception:  # of a class from elsewhere, or a whole number of thousands of digits
+        return f"a {type(value).__name__}"
+
+
+def _cut(value: object) -> str:
+    """What a file holds may be of any length, and what a caller gives may have no text."""
+    try:
+        text = str(value)
+    except Exception:
+        text = shown(value)
+    return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
 
 
 class MissingLibraryError(ImportError):

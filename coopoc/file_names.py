@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 
-from .errors import InputError
+from .errors import InputError, shown
 
 _DEVICES = {"CON", "PRN", "AUX", "NUL", *(f"{port}{digit}" for port in ("COM", "LPT") for digit in range(1, 10))}
 _LONGEST = 200
@@ -16,14 +16,19 @@ def given_path(path: object) -> Path:
     """A path from text or a Path.
 
     Raises:
-        InputError: anything else.
+        InputError: anything else, and what no file system of Linux holds.
 
     >>> given_path("town.pyfg").suffix
     '.pyfg'
     """
-    if not isinstance(path, str | os.PathLike):
-        raise InputError("path", repr(path)[:60], "must be text or a Path", 'Give for example "graph.pyfg".')
-    return Path(path)
+    try:
+        given = os.fsencode(path) if isinstance(path, str | os.PathLike) else b""
+    except Exception:  # half a surrogate pair, or a class from elsewhere
+        given = b""
+    if not given or b"\0" in given or len(given) > 4095 or max(map(len, given.split(b"/"))) > 255:
+        allowed = "must be text or a Path, of at most 255 bytes per part and 4095 in all, without NUL"
+        raise InputError("path", shown(path), allowed, 'Give for example "graph.pyfg".')
+    return Path(os.fsdecode(given))
 
 
 def file_name(field: str, name: object, hint: str) -> str:
@@ -45,12 +50,24 @@ def file_name(field: str, name: object, hint: str) -> str:
         device = name.partition(".")[0].strip().upper() in _DEVICES
         if not device and name == name.strip(" .") and len(name.encode()) <= _LONGEST:
             return name
-    shown = repr(name) if len(repr(name)) < 60 else f"{repr(name)[:60]}..."
+    given = repr(name) if len(repr(name)) < 60 else f"{repr(name)[:60]}..."
     allowed = (
         f'must be a file name: at most {_LONGEST} bytes, printable, without < > : " / \\ | ? *, '
         "no dot or space at its ends, and no device of Windows such as CON"
     )
-    raise InputError(field, shown, allowed, hint)
+    raise InputError(field, given, allowed, hint)
+
+
+def replaceable(path: Path) -> Path:
+    """`path`, if a file that is written whole may take its place.
+
+    Raises:
+        InputError: a folder, or a device such as /dev/null, which a renamed file would replace for every program.
+    """
+    if os.path.lexists(path) and not (path.is_symlink() or path.is_file()):
+        kind = "a folder" if path.is_dir() else "a device or a pipe"
+        raise InputError("path", str(path), f"must be a file, and is {kind}", "Name a file to be written.")
+    return path
 
 
 def inside(folder: Path, path: Path) -> Path:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .arrays import Floats
-from .errors import InputError
+from .errors import InputError, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,7 +40,7 @@ def axes(ax: Axes | None) -> Axes:
     if ax is None:
         ax = Picture(figsize=(6.4, 5.2), dpi=150, layout="constrained").add_subplot()
     if not isinstance(ax, Known):
-        raise InputError("ax", repr(ax)[:60], "must be axes of matplotlib", "Take them from plt.subplots().")
+        raise InputError("ax", shown(ax), "must be axes of matplotlib", "Take them from plt.subplots().")
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(xlabel="East [m]", ylabel="North [m]")
     ax.grid(True, color="#EDF0F4")

@@ -11,7 +11,7 @@ from importlib import metadata
 from typing import Any
 
 from .entry_names import names_in
-from .errors import InputError
+from .errors import InputError, shown
 from .one_file import from_file, in_file
 
 GROUPS = {
@@ -95,6 +95,8 @@ def find(group: str, name: str) -> Any:
     ...
     coopoc.errors.InputError: nothing = 'x': must be one of (there is none). There is none to use.
     """
+    if not isinstance(name, str):
+        raise unknown(GROUPS.get(group, group), name, names(group))
     if in_file(name):
         return from_file(name, GROUPS.get(group, group))
     registered = points(group)
@@ -129,7 +131,7 @@ def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
     >>> suggestion("tracee", ("trace", "det"), "Pick one.")
     'Did you mean trace?'
     """
-    near = difflib.get_close_matches(str(name), list(known), n=1)
+    near = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), n=1)
     return f"Did you mean {near[0]}?" if near else otherwise
 
 
@@ -161,4 +163,4 @@ def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None
     listed = noun in GROUPS.values()
     other = "List all with: coopoc list." if listed else "Use one of these names." if known else "There is none to use."
     hint = suggestion(name, known, other if otherwise is None else otherwise)
-    return InputError(noun, repr(name), "must be one of " + (", ".join(known) or "(there is none)"), hint)
+    return InputError(noun, shown(name), "must be one of " + (", ".join(known) or "(there is none)"), hint)

@@ -142,9 +142,10 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
 
     given = frame[column]
     kind = getattr(given.dtype, "kind", "O")
-    if kind == "O" or isinstance(given.dtype, pd.StringDtype):
+    words = kind == "O" or isinstance(given.dtype, pd.StringDtype)
+    if words and len(given) and not pd.to_numeric(given, errors="coerce").notna().any():
         dates = pd.to_datetime(given, errors="coerce", format="ISO8601", utc=True)
-        if len(given) and dates.notna().all() and not pd.to_numeric(given, errors="coerce").notna().any():
+        if dates.notna().all():
             given, kind = dates, "M"
     if kind not in "mM":
         try:

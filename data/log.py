@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, checked, instance, named, number
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
 from coopoc.plugins import one_of
+from coopoc.world.axes import texts
 from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
@@ -24,7 +26,7 @@ from .log_body import body_vehicle, seen_by_vehicles
 from .log_files import check_headers, files_of, rows_of_file
 from .log_frame import local, on_one_clock, origin_of
 from .log_links import linked
-from .log_rows import Rows, check_arrivals, stacked, stamped
+from .log_rows import Rows, check_arrivals, in_order, stacked, stamped
 from .log_summary import Summary, Tally
 from .log_truth import truth_of
 from .log_vehicle import Vehicle, samples, vehicle
@@ -110,8 +112,9 @@ def read_log(
     >>> read_log(file).recording
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
-    path, tally = Path(path), Tally()
-    _check_options(dt, max_gap, clock, frame)
+    path, tally = given_path(path), Tally()
+    options = {"columns": columns, "kinds": kinds, "clock": clock, "ignore": ignore, "origin": origin}
+    _check_options(dt, max_gap, frame, any_scale, **options)
     body = frame == "body"
     if is_bag(path):
         if columns or kinds:
@@ -126,6 +129,7 @@ def read_log(
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
     rows = on_one_clock(stamped(rows), clock or {}, path.name)
+    in_order(rows, tally)
     check_time(rows.t, path.name)
     check_arrivals(rows)
     actual = stamped(rows_of_file(true, Tally(), columns, kinds, ())) if true else actual
@@ -230,14 +234,20 @@ def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
     return grid
 
 
-def _check_options(dt: float | None, max_gap: float | None, clock: Mapping[str, float] | None, frame: str) -> None:
+def _check_options(dt: float | None, max_gap: float | None, frame: str, any_scale: bool, **others: Any) -> None:
+    """InputError for an option of another kind; the rest are columns, kinds, clock, ignore and origin."""
     one_of("frame", frame, get_args(Frame))
+    instance("any_scale", any_scale, bool, "Give True or False.")
     for field, value in (("dt", dt), ("max_gap", max_gap)):
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
-    for one, ahead in (clock or {}).items():
-        if not np.isfinite(ahead):
-            raise InputError(f"clock[{one!r}]", f"{ahead} s", "must be finite", "Give the seconds that it is ahead.")
+        if value is not None:
+            number(field, value, 1e-12, allowed="> 0 s", hint="Give seconds.")
+    for field in ("columns", "kinds", "clock"):
+        named(field, others[field] or {}, f"Give {field}={{name: ...}}.")
+    for one, ahead in (others["clock"] or {}).items():
+        number(f"clock[{one!r}]", ahead, -np.inf, allowed="finite s", hint="Give the seconds that it is ahead.")
+    texts("ignore", others["ignore"])
+    if others["origin"] is not None:
+        checked("origin", others["origin"], "(3,)", (3,))
 
 
 def _summary(path: Path, recording: Recording, vehicles: Mapping[str, Vehicle], tally: Tally) -> Summary:

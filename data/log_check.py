@@ -79,7 +79,7 @@ def check(log: Log) -> Check:
             each = normalised_innovations(track, seen)
             if each is not None:
                 normalised[here, column] = each[0, :, 0]
-    relative, expected = _relative(rec, x, variance)
+    relative, expected = relative_residuals(rec, x, variance)
     vehicles, warnings = _vehicles(log, fix, normalised)
     measurements, more = _measurements(rec, relative, expected)
     clocks = [*apart_warnings(rec), *clock_warnings(rec, x, relative, expected)]
@@ -158,7 +158,7 @@ def _against_odometry(rec: Recording, column: int) -> tuple[float | None, float 
     return distance, float(np.angle(whole)) if abs(whole) > 0 else None
 
 
-def _relative(rec: Recording, x: Floats, variance: Floats) -> tuple[Floats, Floats]:
+def relative_residuals(rec: Recording, x: Floats, variance: Floats) -> tuple[Floats, Floats]:
     """Residuals (L, 3) of the relative measurements against the filters, and the deviations (L, 3) they should have."""
     links = rec.links
     gap = x[links.step, links.neighbour] - x[links.step, links.observer]

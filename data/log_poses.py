@@ -19,13 +19,14 @@ from coopoc.world.recording import Recording
 from coopoc.world.spherical import wrap
 
 from .log import Log
+from .log_body_clocks import GATE, clocks
+from .log_clocks import apart_warnings, truth_warning
 from .log_truth import frame_warning
 
 WRONG = 3.0
 """Times the stated standard deviation that residuals of a filter's own estimates are not expected to reach."""
 INCONSISTENT = 75.0
 """NEES of a pose, 3 if consistent: errors five times as large as stated."""
-GATE = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +59,17 @@ def check_poses(log: Log) -> PoseCheck:
     Raises:
         InputError: the vehicles share no two steps, or first poses are not known.
     """
-    log, span = together(log)
+    apart = apart_warnings(log.recording)
+    try:
+        log, span = together(log)
+    except InputError as error:
+        raise InputError(error.field, error.value, error.allowed, " ".join([*apart, error.hint])) from None
     rec = log.recording
     who = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
     begin, start = begin_of(log, who, GATE)
     track = PoseFilter("fleet", gate=GATE, begin=begin)(rec, who)
-    vehicles, warnings = [], []
+    world, warnings = clocks(rec, begin, who)
+    vehicles = []
     for k, column in enumerate(who):
         fix = np.linalg.norm(rec.gnss[0, :, column, :2] - track.x[0, :, k, :2], axis=1)
         row: dict[str, Any] = {"vehicle": rec.ids[column], "fixes": int(np.isfinite(fix).sum())}
@@ -74,9 +80,9 @@ def check_poses(log: Log) -> PoseCheck:
         row["heading_std_deg"] = float(np.rad2deg(np.sqrt(track.heading_covariance[0, :, k, 3])).mean())
         row |= _errors(log, track, k)
         vehicles.append(row)
-        apart = frame_warning(rec, log.truth, column)
-        warnings += apart
-        if not apart and row.get("nees", 0.0) > INCONSISTENT:
+        moved = truth_warning(world, log.truth, column) or frame_warning(rec, log.truth, column)
+        warnings += moved
+        if not moved and row.get("nees", 0.0) > INCONSISTENT:
             larger = np.sqrt(row["nees"] / 3)
             warnings.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
     measurements = []

@@ -12,6 +12,7 @@ from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.errors import InputError
 
 from .kinds import KINDS
+from .log_summary import Tally
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,4 +106,23 @@ def check_arrivals(rows: Rows) -> None:
             f"{rows.arrival[k]:.6f} s, sent at {rows.t[k]:.6f} s",
             "must not come before the message was sent",
             'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.',
+        )
+
+
+def in_order(rows: Rows, tally: Tally) -> None:
+    """Say where the stamps of one quantity go back within a file; its rows are taken in order of time."""
+    import pandas as pd  # here: the help of commands loads nothing heavy
+
+    codes = np.zeros(len(rows), dtype=np.int64)
+    for column in (rows.file, rows.vehicle, rows.kind, rows.partner):
+        own, known = pd.factorize(column)
+        codes = pd.factorize(codes * (len(known) + 1) + own)[0]
+    order = np.argsort(codes, kind="stable")
+    step = np.diff(rows.t[order])
+    back = np.flatnonzero((np.diff(codes[order]) == 0) & (step < 0))
+    if len(back):
+        first = order[back + 1].argmin()
+        given = f"{rows.place(int(order[back[first] + 1]))}, by {-step[back[first]]:.6g} s"
+        tally.assume(
+            f"rows are in order of time where stamps go back in a file ({len(back)} times, first: {{}})", given
         )

@@ -9,6 +9,7 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
 from coopoc.world.fleet import Fleet
 
 from . import mrclam_files as files
@@ -133,7 +134,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     """
     if not dt > 0:
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
-    folder = Path(folder)
+    folder = given_path(folder)
     numbers = files.robots(folder)
     truths = [files.truth(folder, n) for n in numbers]
     wheels = [files.odometry(folder, n) for n in numbers]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names, suggestion, unknown
 from coopoc.world.fleet import Fleet
@@ -252,7 +253,7 @@ def convert(
     Raises:
         InputError: as `load_fleet`, another ending of `out`, or ids that are no file names for TUM.
     """
-    path = Path(out)
+    path = given_path(out)
     if path.suffix not in (".csv", ".parquet", ""):
         raise InputError("out", path.name, "must end in .csv or .parquet, or be a folder for TUM files", "Rename it.")
     fleet = load_fleet(name_or_path, format=format, **options, **({} if dt is None else {"dt": dt}))

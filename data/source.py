@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
 
 
 def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
@@ -20,9 +21,10 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     >>> split("drive.csv?dt=0.1&columns=t:time,id:car")
     ('drive.csv', {'dt': 0.1, 'columns': {'t': 'time', 'id': 'car'}})
     """
-    text = str(name_or_path)
+    text = name_or_path if isinstance(name_or_path, str) else str(given_path(name_or_path))
     name, mark, query = text.partition("?")
-    if not mark or Path(text).exists():
+    given_path(name)
+    if not mark or _exists(text):
         return text, {}
     options: dict[str, Any] = {}
     for part in query.split("&"):
@@ -32,6 +34,13 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
             raise InputError("data", repr(text), "must give each option behind ? one value", hint)
         options[key] = _value(key, value)
     return name, options
+
+
+def _exists(text: str) -> bool:
+    try:
+        return given_path(text).exists()
+    except InputError:  # options may be longer than the name of a file
+        return False
 
 
 def _value(key: str, value: str) -> Any:

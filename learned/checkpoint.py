@@ -1,10 +1,11 @@
-"""Checkpoints: weights in safetensors with a card, written atomically, refused when they do not fit."""
+"""Checkpoints: weights in safetensors with a card and a checksum, written atomically, refused if they do not fit."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -13,17 +14,21 @@ from typing import Any
 
 import numpy as np
 import safetensors
-from safetensors.torch import save_file
+from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from coopoc.errors import InputError
+from coopoc.arrays import instance
+from coopoc.errors import InputError, shown
+from coopoc.file_names import given_path, replaceable
+from coopoc.methods.options import check_options
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
+from coopoc.seals import UNSEALED, holds, sealed
 
 from .nets.gain import Gain
 from .nets.stack import unflatten
 
-_HISTORY = "history"
+_HISTORY, CHECKSUM = "history", "checksum"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +41,9 @@ class Checkpoint:
     model: Gain
     card: Mapping[str, Any]
     history: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self, kinds={"model": Gain, "card": Mapping, "history": Tensor})
 
     def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""
@@ -58,10 +66,13 @@ class Checkpoint:
 def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     """Write weights, history and card to one safetensors file; a reader sees the old file or the new one whole.
 
+    The card's "checksum" is the SHA-256 of the whole file (`coopoc.seals`).
+
     Raises:
-        InputError: a net of a class that is no entry point in `coopoc.nets`: the file could not be read again.
+        InputError: a net of a class that is no entry point in `coopoc.nets`: the file could not be read again; a card
+            that holds what JSON cannot.
     """
-    path, model = Path(path), checkpoint.model
+    path, model = given_path(path), instance("checkpoint", checkpoint, Checkpoint).model
     card = dict(checkpoint.card) | {
         "environment": environment(),
         "kind": kind(model),
@@ -71,12 +82,22 @@ def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     tensors = {name: tensor.contiguous() for name, tensor in model.state_dict().items()}
     if checkpoint.history is not None:
         tensors[_HISTORY] = checkpoint.history
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file(tensors, partial, metadata={"card": json.dumps(card, sort_keys=True)})
-    partial.chmod(0o644)  # the writer of safetensors lets the owner alone read it
-    os.replace(partial, path)
+    write(path, tensors, card)
     return path
+
+
+def write(path: Path, tensors: Mapping[str, Tensor], card: Mapping[str, Any]) -> None:
+    """Write tensors and a card with the checksum of both; `read` checks it."""
+    last = {name: card[name] for name in sorted(card) if name != CHECKSUM} | {CHECKSUM: UNSEALED}
+    try:
+        text = json.dumps(last)
+    except (TypeError, ValueError, RecursionError) as error:
+        allowed = f"must hold what JSON can ({error})"
+        raise InputError("card", shown(card), allowed, "Convert its values to numbers, texts and lists.") from None
+    replaceable(path).parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}")
+    partial.write_bytes(sealed(to_bytes(dict(tensors), metadata={"card": text})))
+    os.replace(partial, path)
 
 
 def kind(model: Gain) -> str:
@@ -103,11 +124,14 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
         path: of the safetensors file.
         net: the net, "folder/mine.py:Net", if it is one of your own files; a card cannot name such a file.
 
+    A file without a checksum, which another program wrote, is read with a warning.
+
     Raises:
-        InputError: no such file, no card, a kind of net that is not installed, a file that `net` does not name, or
-            tensors of another shape than its net has.
+        InputError: no such file, a wrong checksum, no card, a kind of net that is not installed, a file that `net` does
+            not name, or tensors of another shape than its net has.
     """
-    tensors, card = _read(Path(path))
+    path, net = given_path(path), instance("net", net, str, 'Give "mine.py:Net".')
+    tensors, card = read(path)
     history = tensors.pop(_HISTORY, None)
     if not isinstance(card.get("kind"), str) or not isinstance(card.get("net"), dict):
         given = {name: card.get(name) for name in ("kind", "net")}
@@ -137,7 +161,7 @@ def load_into(model: Gain, tensors: Mapping[str, Tensor], path: Path | str = "ch
 
 def read_card(path: Path | str) -> Mapping[str, Any]:
     """The card alone, without its weights."""
-    with _opened(Path(path)) as file:
+    with _opened(given_path(path)) as file:
         return _card(file, path)
 
 
@@ -168,9 +192,24 @@ def _card(file: Any, path: Path | str) -> dict[str, Any]:
     return card
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and card of a file, its checksum checked.
+
+    Raises:
+        InputError: no such file, another format, a wrong checksum.
+    """
     with _opened(path) as file:
-        return {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
+        found = {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
+    right = holds(path.read_bytes())
+    if right is False or (right is None and CHECKSUM in found[1]):
+        hint = "Copy it again from where it came from, or delete it and train again."
+        raise InputError("checkpoint", path, "has another content than its checksum says: it is damaged", hint)
+    if right is None:
+        text = (
+            f"{path} has no checksum, so that no damage of its weights would be noticed; coopoc.learned.save adds one"
+        )
+        warnings.warn(text, RuntimeWarning, stacklevel=3)
+    return found
 
 
 def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], found: Mapping[str, Tensor]) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
+from coopoc.file_names import given_path, replaceable
 from coopoc.world.noise import stream
 
 from .checkpoint import Checkpoint
@@ -175,8 +176,8 @@ def _example(net: GainNet) -> tuple[Tensor, ...]:
 
 def _kept(path: Path | str, write: Callable[[Path], None], net: GainNet, load: Callable[[Path], Run]) -> Path:
     """Write beside `path`, check, and only then put it there."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = given_path(path)
+    replaceable(path).parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         write(part)

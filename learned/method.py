@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import Floats
-from coopoc.errors import InputError
+from coopoc.errors import InputError, shown
+from coopoc.methods.options import check_options
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording, check_recording
@@ -67,6 +68,11 @@ class LearnedGain:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if not callable(self.model) or not callable(getattr(self.model, "start", None)):
+            raise InputError("model", shown(self.model), "must be a net with start and step", "Give GainNet().")
 
     def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[GainState]:
         """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.

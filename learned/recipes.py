@@ -6,11 +6,13 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import torch
 
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
+from coopoc.methods.options import check_options
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find, one_of, unknown
@@ -18,10 +20,10 @@ from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import load
 from .nets.gain import Gain
-from .training.clients import Client, Noise, Start, clients
+from .training.clients import Client, Noise, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
-from .training.schedule import Epoch, Schedule
+from .training.schedule import STEPS, Epoch, Schedule
 
 REVISION = 6
 """Raised whenever the training code changes what it makes of the same recipe."""
@@ -71,6 +73,10 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("kind of recipe", self.kind, KINDS)
+        one_of("noise", self.noise, get_args(Noise))
+        one_of("local_epoch", self.local_epoch, get_args(Epoch))
+        check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, {"schedule": Schedule, "options": tuple})
+        check_pieces(self.piece, self.split)
 
 
 RECIPES: dict[str, Recipe] = {
@@ -119,6 +125,11 @@ class Setting:
     seed: int = 0
     start: Start = "gnss"
     reading: VelocityReading = "axis"
+
+    def __post_init__(self) -> None:
+        check_options(self, {"seed": (0, 2**63 - 1, "in 0..2^63 - 1")})
+        one_of("start", self.start, get_args(Start))
+        one_of("reading", self.reading, get_args(VelocityReading))
 
 
 @dataclass(frozen=True)
@@ -213,7 +224,8 @@ def load_method(name_or_path: Path | str, net: str = "") -> Method:
         InputError: neither a file nor a shipped name.
     """
     shipped = shipped_weights()
-    path = shipped.get(str(name_or_path), Path(name_or_path))
+    path = shipped.get(name_or_path) if isinstance(name_or_path, str) else None
+    path = path or given_path(name_or_path)
     if not path.is_file():
         raise unknown("learned method", str(name_or_path), shipped)
     checkpoint = load(path, net)

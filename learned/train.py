@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 
+from coopoc.arrays import listed, number
+from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
@@ -62,26 +64,28 @@ def train_all(
     Raises:
         InputError: an unknown recipe; a log without a truth.
     """
-    fleet = drives_of(data)
+    fleet, out = drives_of(data), given_path(out)
+    jobs = number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1")
+    given = {"seeds": seeds, "starts": starts, "readings": readings, "recipes": RECIPES if recipes is None else recipes}
+    seeds, starts, readings, recipes = (listed(name, v, f"Give {name}=[...].") for name, v in given.items())
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     wanted = {
-        name: [job for setting in settings for job in jobs_of(name, setting, fleet, aggregate)]
-        for name in (RECIPES if recipes is None else recipes)
+        name: [job for setting in settings for job in jobs_of(name, setting, fleet, aggregate)] for name in recipes
     }
-    paths = {job: Path(out) / f"{job.label}.safetensors" for group in wanted.values() for job in group}
+    paths = {job: out / f"{job.label}.safetensors" for group in wanted.values() for job in group}
     groups = ([job for job in group if not _made(paths[job], job.key(fleet))] for group in wanted.values())
     missing = [group for group in groups if group]
     if jobs > 1 and len(missing) > 1:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
             todo = [
-                pool.submit(_in_worker, group, fleet, Path(out), line if progress else None, os.getpid())
+                pool.submit(_in_worker, group, fleet, out, line if progress else None, os.getpid())
                 for line, group in enumerate(missing)
             ]
             for done in todo:
                 done.result()
     else:
         for group in missing:
-            _train(group, fleet, Path(out), progress)
+            _train(group, fleet, out, progress)
     return {job.label: _loaded(job, path) for job, path in paths.items()}
 
 

@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval
+from coopoc.file_names import given_path
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
@@ -42,7 +43,7 @@ def method(name: str, late: bool = False) -> Method:
     from coopoc.learned import CooperativeGain, load_method
     from coopoc.learned.recipes import shipped_weights
 
-    if name not in shipped_weights() and not Path(name).is_file():
+    if name not in shipped_weights() and not given_path(name).is_file():
         raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
     learned = load_method(name)
     return CooperativeGain(learned.model, not late, name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,11 +55,52 @@ def test_a_list_of_names_imports_no_library(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1] == "0 []"
 
 
-@pytest.mark.parametrize("name", ["run", "merge", "compare", "table", "report", "list", "reference", "survey", "greet"])
-def test_each_command_explains_itself_with_an_example(tmp_path: Path, name: str) -> None:
-    done = coopoc(name, "--help", cwd=tmp_path)
+NAMES = ("run", "merge", "compare", "table", "report", "list", "reference", "survey", "greet")
+MISTAKES = (
+    (["run", "smal"], "study = 'smal': must be one of"),
+    (["rn"], "command = 'rn': must be one of"),
+    (["run", "small", "--set", "max_neighbours=-1"], "max_neighbours = -1: must be >= 0. Use 0 for no neighbours."),
+    (["run", "small", "--set", "runs"], "--set = 'runs': must be key=value"),
+    (["run", "small", "--set", "rums=3"], "Did you mean runs?"),
+    (["run", "small", "--jobs", "0"], "jobs = 0: must be >= 1"),
+    (["run", "small", "--shard", "4/3"], "shard = '4/3': must be i/n with 1 <= i <= n"),
+    (["merge", "nowhere", "--out", "runs"], "folder = nowhere: holds no manifest.json"),
+    (["compare", "nowhere", "nowhere"], "folder = nowhere: holds no manifest.json"),
+    (["table", "nowhere"], "folder = nowhere: holds no views yet"),
+    (["report"], "folders = none"),
+)
+OF_OTHERS = (["greet", "--name", "x"], ["kin", "greet"], ["kin", "--help"], ["kin", "gret"])
+ONE_BY_ONE = """
+import contextlib, io, json, sys
+from coopoc.cli import main
+for words in json.loads(sys.argv[1]):
+    out, err, status = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(words)
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+    print(json.dumps([status, out.getvalue(), err.getvalue()]))
+"""
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], list[Any]]:
+    """Status, stdout and stderr of commands that do nothing, one after the other in one process: most is its start."""
+    lines = [*([name, "--help"] for name in NAMES), *(words for words, _ in MISTAKES), *OF_OTHERS]
+    command = [sys.executable, "-c", ONE_BY_ONE, json.dumps(lines)]
+    cwd = tmp_path_factory.mktemp("answers")
+    done = subprocess.run(command, cwd=cwd, env=ENV, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert f"Example: coopoc {name}" in done.stdout
+    assert not list(cwd.iterdir())
+    return {tuple(words): json.loads(line) for words, line in zip(lines, done.stdout.splitlines(), strict=True)}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_command_explains_itself_with_an_example(answers: dict[tuple[str, ...], list[Any]], name: str) -> None:
+    status, out, err = answers[name, "--help"]
+    assert status == 0, err
+    assert f"Example: coopoc {name}" in out
 
 
 def test_tables_on_stdout(folder: Path) -> None:
@@ -115,37 +157,30 @@ def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     assert groups == ["datasets", "methods", "studies", "backends", *open_sets]
 
 
-def test_commands_of_others(tmp_path: Path) -> None:
-    assert coopoc("greet", "--name", "x", cwd=tmp_path).stdout == "hello x\n"
-    assert coopoc("kin", "greet", cwd=tmp_path).stdout == "hello you\n"
-    assert "greet" in coopoc("kin", "--help", cwd=tmp_path).stdout
-    assert coopoc("kin", "gret", cwd=tmp_path).returncode == 2
+def test_commands_of_others(answers: dict[tuple[str, ...], list[Any]]) -> None:
+    assert answers["greet", "--name", "x"] == [0, "hello x\n", ""]
+    assert answers["kin", "greet"] == [0, "hello you\n", ""]
+    assert "greet" in answers["kin", "--help"][1]
+    assert answers["kin", "gret"][0] == 2
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["run", "smal"], "study = 'smal': must be one of"),
-        (["rn"], "command = 'rn': must be one of"),
-        (["run", "small", "--set", "max_neighbours=-1"], "max_neighbours = -1: must be >= 0. Use 0 for no neighbours."),
-        (["run", "small", "--set", "runs"], "--set = 'runs': must be key=value"),
-        (["run", "small", "--set", "rums=3"], "Did you mean runs?"),
-        (["run", "small", "--jobs", "0"], "jobs = 0: must be >= 1"),
-        (["run", "small", "--shard", "4/3"], "shard = '4/3': must be i/n with 1 <= i <= n"),
-        (["merge", "nowhere", "--out", "runs"], "folder = nowhere: holds no manifest.json"),
-        (["compare", "nowhere", "nowhere"], "folder = nowhere: holds no manifest.json"),
-        (["table", "nowhere"], "folder = nowhere: holds no views yet"),
-        (["report"], "folders = none"),
-    ],
-)
-def test_bad_usage_is_one_readable_line(tmp_path: Path, words: list[str], message: str) -> None:
-    done = coopoc(*words, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith("coopoc: ")
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
-    assert len(done.stderr.splitlines()) == 1
-    assert done.stdout == ""
+@pytest.mark.parametrize(("words", "message"), MISTAKES)
+def test_bad_usage_is_one_readable_line(
+    answers: dict[tuple[str, ...], list[Any]], words: list[str], message: str
+) -> None:
+    status, out, err = answers[tuple(words)]
+    assert status == 2
+    assert err.startswith("coopoc: ")
+    assert message in err
+    assert "Traceback" not in err
+    assert len(err.splitlines()) == 1
+    assert out == ""
+
+
+def test_a_mistake_in_a_process_of_its_own(tmp_path: Path) -> None:
+    done = coopoc("run", "smal", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("coopoc: study = 'smal': must be one of")
 
 
 def test_an_unknown_option_is_usage(tmp_path: Path) -> None:

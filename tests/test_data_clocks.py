@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,8 @@ import pytest
 
 from coopoc.data.log import read_log
 from coopoc.data.log_check import check
+from coopoc.data.log_poses import check_poses
+from coopoc.errors import InputError
 
 NAMES = ("tug", "barge", "pilot")
 
@@ -81,3 +84,54 @@ def test_a_truth_with_another_clock_is_named(tmp_path: Path, late: float) -> Non
         assert named is not None
         assert float(named[1]) == pytest.approx(abs(late), abs=0.1)
         assert (named[2] == "ahead of") == (late > 0)
+
+
+def bodily(folder: Path, late: float, truth_late: float = 0.0) -> tuple[str, ...]:
+    """What is said of the same log in body frames, with yaw rates, one clock and that of the truth moved."""
+    log, truth = tables(3)
+    t = np.unique(log.t)
+    rates = [
+        pd.DataFrame({"t": t, "vehicle": name, "kind": "yaw_rate", "value": 0.025 * np.cos(0.05 * t + k), "std": 2e-3})
+        for k, name in enumerate(NAMES)
+    ]
+    log = pd.concat([log, *rates], ignore_index=True)
+    log.assign(t=log.t + late * (log.vehicle == "barge")).to_csv(folder / "measurements.csv", index=False)
+    truth.assign(t=truth.t + truth_late).to_csv(folder / "truth.csv", index=False)
+    return tuple(check_poses(read_log(folder, frame="body")).warnings)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.5, -0.6])
+def test_the_clock_of_one_vehicle_is_found_in_body_frames(tmp_path: Path, late: float) -> None:
+    found = [text for text in bodily(tmp_path, late) if "its stamps are" in text]
+    assert len(found) == (late != 0)
+    for text in found:
+        (clock,) = re.findall(r"clock=\{'barge': (\S+)\}", text)
+        assert float(clock) == pytest.approx(late, rel=0.2)
+
+
+def test_other_clocks_of_the_truth_and_of_a_time_zone_are_named_in_body_frames(tmp_path: Path) -> None:
+    found = re.findall(r"its fixes are (\S+) s ahead of the truth", "\n".join(bodily(tmp_path, 0.0, 0.7)))
+    assert [float(late) for late in found] == pytest.approx([0.7] * 3, rel=0.1)
+    with pytest.raises(InputError, match=r"all vehicles are there\. barge: is there while no other .*'barge': 3600"):
+        bodily(tmp_path, 3600.0)
+
+
+def test_stamps_that_go_back_in_a_file_are_told(tmp_path: Path) -> None:
+    log, _ = tables(3)
+    log.loc[log.index[3000:3400], "t"] -= 30
+    log.to_csv(tmp_path / "log{0}.csv", index=False)
+    assert "stamps go back in a file (24 times, first: log{0}.csv: row 3001, by 29.8 s)" in str(
+        read_log(tmp_path).summary
+    )
+    log, _ = tables(3)
+    log.sort_values(["vehicle", "kind"], kind="stable").to_csv(tmp_path / "log{0}.csv", index=False)
+    assert "go back" not in str(read_log(tmp_path).summary)
+
+
+@pytest.mark.parametrize(
+    "option", [{"columns": 3}, {"kinds": [1]}, {"ignore": 3}, {"origin": (1, 2)}, {"any_scale": "x"}, {"dt": "x"}]
+)
+def test_options_of_the_wrong_kind_are_refused(tmp_path: Path, option: dict[str, Any]) -> None:
+    tables(3)[0].to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(InputError, match=next(iter(option))):
+        read_log(tmp_path, **option)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +15,7 @@ from logs import drive, long, seen, write
 from matplotlib.figure import Figure
 
 import coopoc as co
+from coopoc.cli import main
 from coopoc.data import log_picture
 from coopoc.data.log import read_log
 from coopoc.data.log_check import check
@@ -268,25 +267,28 @@ def test_velocities_clockwise_from_north_are_found(tmp_path: Path) -> None:
     assert any("anticlockwise of the odometry" in warning for warning in warnings)
 
 
-def shell(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-W", "error", "-m", "coopoc.cli", *words]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+def test_the_commands_take_a_log_and_options(
+    folders: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
 
+    def shell(*words: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as ended:
+            main(list(words))
+        return int(ended.value.code or 0), capsys.readouterr().out
 
-def test_the_commands_take_a_log_and_options(folders: Path, tmp_path: Path) -> None:
-    done = shell("data", "check", str(folders / "with"), "--picture", "a.png", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "not used: 621 relative measurements while one of the two is absent" in done.stdout
-    assert "nothing looks wrong" in done.stdout
+    status, out = shell("data", "check", str(folders / "with"), "--picture", "a.png")
+    assert status == 0
+    assert "not used: 621 relative measurements while one of the two is absent" in out
+    assert "nothing looks wrong" in out
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     word = f"{folders / 'with'}?dt=0.2&max_gap=10"
     options = ("method=kalman", "max_neighbours=0", "egos=car2")
-    done = shell("run", "side_by_side", "--data", word, "--set", *options, "--out", "runs", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert "1 ego of with" in done.stdout
-    shown = shell("data", "show", str(folders / "with"), cwd=tmp_path)
-    assert "speed" in shown.stdout
-    assert shell("data", "check", "nowhere", cwd=tmp_path).returncode == 2
+    status, out = shell("run", "side_by_side", "--data", word, "--set", *options, "--out", "runs")
+    assert status == 0
+    assert "1 ego of with" in out
+    assert "speed" in shell("data", "show", str(folders / "with"))[1]
+    assert shell("data", "check", "nowhere")[0] == 2
 
 
 def test_a_gap_of_a_csv_does_not_stop_a_study(tmp_path: Path) -> None:

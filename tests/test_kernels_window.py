@@ -145,7 +145,7 @@ def test_vehicles_in_one_place_are_solved_converted() -> None:
     recording = observe(fleet, replace(S2, min_range=0.0, range_std=0.3), V2X(max_neighbours=1), runs=20)
     for robust in (None, "truncated"):
         found = CooperativeMAP(window=2, robust=robust)(recording, [0])
-        assert "solved converted" in found.notes[0]
+        assert any("solved converted" in note for note in found.notes)
         looped = CooperativeMAP(backend="gtsam", window=2)(recording.of_runs(slice(0, 3)), [0])
         if robust is None:
             assert np.median(np.abs(found.x[:3] - looped.x)) < 1e-3

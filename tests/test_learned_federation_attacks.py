@@ -277,7 +277,7 @@ def test_a_failed_run_raises_and_leaves_its_last_round(tmp_path: Path, capsys: p
 @flower
 def test_a_progress_file_is_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A write that is interrupted leaves the previous file."""
-    import coopoc.learned.flower.progress as module
+    import coopoc.learned.checkpoint as module
     from coopoc.learned.flower.rows import Row
 
     job, path = job_of(TINY), tmp_path / "p"
@@ -293,7 +293,28 @@ def test_a_progress_file_is_whole_or_absent(tmp_path: Path, monkeypatch: pytest.
     back = read(path, job)
     assert back is not None
     assert (back.usual, back.rows[0].number, back.state[0].tolist()) == (2.5, 0, [1.0, 1.0, 1.0])
+    damaged = bytearray(path.read_bytes())
+    damaged[-1] ^= 1
+    path.write_bytes(damaged)
+    with pytest.raises(InputError, match=r"progress.*cannot be read"):
+        read(path, job)
 
 
 def replace_usual(progress: Progress) -> Progress:
     return progress._replace(usual=9.0, rows=tuple(replace(row, note="x") for row in progress.rows))
+
+
+@flower
+def test_what_a_client_says_went_wrong_is_one_line_of_text() -> None:
+    """The server prints it: no terminal may take it for a command, no reader for a round of its own."""
+    from coopoc.learned.flower.wire import Report, answer, reported
+
+    told = reported(answer(Report("a", 3, 1.0, failure="disk\x1b[2J\nround 9: validation 0.0" + 300 * "x")))
+    assert told.failure.startswith("disk [2J round 9: validation 0.0x")
+    assert len(told.failure) <= 200
+
+
+@pytest.mark.parametrize("given", [{"timeout": math.nan}, {"timeout": -1}, {"timeout": "x"}, {"patience": -1.0}])
+def test_a_wait_that_ends_at_once_or_never_is_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=next(iter(given))):
+        Wait(**given)

@@ -86,6 +86,7 @@ def test_every_kind_of_net_round_trips(net: RecursiveGain | SplitGain | GainNet,
     assert (again.settings, torch.equal(flatten([again]), flatten([net]))) == (net.settings, True)
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(5, 40), {}))
     tensors, card = load_file(path), read_card(path)
@@ -96,6 +97,7 @@ def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
         load(path)
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_a_history_of_another_net_and_another_kind_are_refused(tmp_path: Path) -> None:
     longer = torch.zeros(2, 19_939)
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(), {}, longer))
@@ -106,6 +108,7 @@ def test_a_history_of_another_net_and_another_kind_are_refused(tmp_path: Path) -
         load(path)
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.safetensors").write_text("not weights")
     save_file({"x": torch.zeros(1)}, tmp_path / "bare.safetensors")
@@ -222,3 +225,28 @@ def test_metrics_are_those_of_the_validation_fleet() -> None:
 def test_weights_that_are_not_shipped_cannot_be_made_again() -> None:
     with pytest.raises(InputError, match="weights = 'individual9'"):
         differences("individual9")
+
+
+def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:
+    """All bits of the weights, and a sample of those of the card and the header."""
+    path = save(tmp_path / "okf.safetensors", Checkpoint(NoiseParameters(), {"recipe": "okf", "seconds": 5.25}))
+    whole = path.read_bytes()
+    weights = range(8 * (len(whole) - 36), 8 * len(whole))
+    others = np.random.default_rng(0).choice(weights.start, 300, replace=False).tolist()
+    for bit in (*weights, *others):
+        damaged = bytearray(whole)
+        damaged[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match="checkpoint"):
+            load(path)
+    path.write_bytes(whole)
+    assert load(path).card["checksum"].startswith("sha256:")
+
+
+def test_a_checkpoint_without_a_checksum_is_read_with_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "okf.safetensors"
+    card = {"kind": "okf", "net": {"velocity_part": True}}
+    save_file(NoiseParameters().state_dict(), path, metadata={"card": json.dumps(card)})
+    with pytest.warns(RuntimeWarning, match=r"has no checksum.*coopoc\.learned\.save adds one"):
+        found = load(path)
+    assert load(save(path, found)).model.settings == dict(found.model.settings)

@@ -9,12 +9,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import coopoc as co
 from coopoc import optimize
+from coopoc.errors import shown
+from coopoc.evaluate.score import Path as Path_
+from coopoc.evaluate.score import scores
 from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg, write_g2o, write_graph, write_jrl, write_pyfg
 from coopoc.formats.graph import Graph
+from coopoc.study.merge import merge
+from coopoc.study.publish import views
+from coopoc.study.reference import Reference
+from coopoc.study.report import report
 
 WRONG: tuple[Any, ...] = (
     None,
@@ -78,7 +86,7 @@ def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, 
     for name in given:
         for value in wrong:
             call = lambda name=name, value=value: make(**{**given, name: value})  # noqa: E731
-            ours(call, f"{name}={value!r:.40}")
+            ours(call, f"{name}={shown(value, 40)}")
 
 
 def init(instance: Any) -> dict[str, Any]:
@@ -227,3 +235,113 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
             co.run_study(value, tmp_path, progress=False)  # type: ignore[arg-type]
         with pytest.raises(co.InputError, match="path"):
             co.run_study("backends", value, progress=False)  # type: ignore[arg-type]
+
+
+class Foreign:
+    """An object of a library of which nothing is known: it is no array, and has not even a text."""
+
+    def __array__(self, *_given: Any, **_options: Any) -> Any:
+        raise RuntimeError("no array")
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no text")
+
+
+HOSTILE: tuple[Any, ...] = (
+    np.array(3),
+    np.array("x"),
+    np.array(None),
+    pd.NA,
+    pd.NaT,
+    np.timedelta64(300, "ms"),
+    np.ma.masked_array([1.0, 2.0, 3.0], [True, False, False]),
+    [pd.NA],
+    pd.Series([1, pd.NA]),
+    Foreign(),
+    10**400,
+    "a" * 300,
+    "a\0b",
+    "\ud800",
+    b"ab",
+    {0, 1},
+)
+"""What pandas, masks, paths and libraries from elsewhere bring in."""
+
+
+@pytest.mark.parametrize("noun", [SENSORS, CHANNEL, FLEET, RECORDING, TRACK], ids=lambda n: type(n).__name__)
+def test_no_noun_takes_values_from_elsewhere(noun: Any) -> None:
+    swept(type(noun), init(noun), HOSTILE)
+
+
+def test_functions_refuse_values_from_elsewhere() -> None:
+    swept(co.observe, {"fleet": FLEET, "sensors": SENSORS, "runs": 1, "seed": 0, "observers": [0]}, HOSTILE)
+    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "velocity": None}, HOSTILE)
+    swept(co.RelativeMeasurement, {"id": "b", "relative": [9.0, 0.1, 1.57], "gnss": None, "age": 0.0}, HOSTILE)
+    swept(co.Message, {"name": "m", "numbers": 6}, HOSTILE)
+    given: dict[str, Any] = {"gnss": [0.0, 0.0, 0.0], "velocity": [1.0, 0.0, 0.0], "dt": 0.1, "fix_age": 0.0}
+    for method in (co.Kalman("identity"), co.JointFilter("identity")):
+        swept(lambda method=method, **step: method.start().step(**step), given, HOSTILE)
+        swept(method, {"recording": RECORDING, "egos": [0]}, HOSTILE)
+    with pytest.raises(co.InputError, match=r"dt = np\.timedelta64"):  # 300 ms are no 300 s
+        co.Kalman("identity").start().step([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], np.timedelta64(300, "ms"))  # type: ignore[arg-type]
+    with pytest.raises(co.InputError, match="a = dtype object"):  # numbers behind a mask are none
+        co.paired_difference(np.ma.masked_array([1.0, 2.0], [True, False]), np.ones(2))
+    path = {"t": np.arange(30.0), "position": np.zeros((30, 3)), "rotation": None, "covariance": None}
+    swept(lambda **one: scores({"a": Path_(**one)}, {"a": Path_(**path)}), path, HOSTILE)
+    both = {"estimates": {"a": Path_(**path)}, "truths": {"a": Path_(**path)}, "aligned": "none", "unit": "steps"}
+    swept(scores, {**both, "max_diff": 0.1, "offset": 0.0, "delta": 1.0, "blocks": 5}, HOSTILE)
+
+
+def test_solvers_refuse_values_from_elsewhere() -> None:
+    whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
+    solution = co.solve(whole)
+    marked = {"problem": whole, "candidates": [0], "groups": None, "threshold": 0.99}
+    swept(optimize.solve_gnc, marked, (*HOSTILE, [[1], [2, 3]], ["a", None]))
+    swept(optimize.solve_gnc_batch, {name: marked[name] for name in ("problem", "candidates", "groups")}, HOSTILE)
+    swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a"]}, HOSTILE)
+    swept(optimize.loop_closures, {"problem": whole}, HOSTILE)
+    swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3}, HOSTILE)
+    swept(PROBLEM.add, {"kind": "range", "nodes": ("a", "b"), "z": 9.0, "std": 1.0, "loss": None}, HOSTILE)
+    swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0}, HOSTILE)
+    swept(co.Loss, {"name": "huber", "scale": 1.0}, HOSTILE)
+    swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))}, (*HOSTILE, 1e308))
+    swept(lambda problem: solution.plot(problem=problem), {"problem": whole}, HOSTILE)
+    swept(solution.__getitem__, {"point": "a"}, HOSTILE)
+    with pytest.raises(co.InputError, match="loss"):
+        PROBLEM.add("range", ("a", "b"), 9.0, std=1.0, loss=3)  # type: ignore[arg-type]
+
+
+def test_training_refuses_values_from_elsewhere() -> None:
+    learned = pytest.importorskip("coopoc.learned")
+    drive = co.load_fleet("town10").between(0, 44).select([0])
+    (client,) = learned.clients(drive, piece=10)
+    schedule, wrong = learned.Schedule(epochs=1, checks=1), (*WRONG, *HOSTILE)
+    for made in (schedule, learned.Participation(), learned.Setting(), learned.Recipe("okf"), client):
+        swept(type(made), init(made), wrong)
+    swept(learned.Privacy, {"clip": 1.0, "noise_multiplier": 1.0, "keyed": True}, wrong)
+    swept(learned.SecureAggregation, init(learned.SecureAggregation()), wrong)
+    swept(learned.Segments, init(client.training), HOSTILE)
+    swept(learned.OptimisedKF, {"process_std": (1, 1, 1), "velocity_ratio": (1, 1, 1), "gnss_std": (1, 1, 1)}, wrong)
+    few = (None, -1, 1.5, "x", [], *HOSTILE)
+    net = learned.NoiseParameters()
+    fit = {"model": net, "training": client.training, "validation": client.validation, "schedule": schedule, "seed": 0}
+    swept(learned.fit, {**fit, "progress": None, "long": None}, few)
+    swept(learned.fit_okf, {"training": client.training, "validation": client.validation, "steps": 2}, few)
+    federation = {"model": "okf", "clients": [client], "rounds": 1, "local_epochs": 1, "schedule": schedule, "seed": 0}
+    more = dict.fromkeys(("progress", "participation", "compression", "privacy", "topology"))
+    swept(learned.federate, {**federation, **more, "aggregate": "mean", "epoch": "pass"}, few)
+    swept(learned.ledger, {"federation": learned.federate(**federation), "overhead": 0}, wrong)
+    swept(learned.LearnedGain, {"model": learned.GainNet(), "name": "n", "x0": None}, wrong)
+    with pytest.raises(co.InputError, match=r"epochs = 1\.5: must be a whole number"):
+        learned.Schedule(epochs=1.5)
+
+
+@pytest.mark.parametrize("path", [np.array(3), pd.NA, None, "", "a" * 300, "a/" * 3000, "a\0b", "\ud800", Foreign()])
+def test_paths_that_no_file_system_holds_are_refused(tmp_path: Path, path: Any) -> None:
+    learned = pytest.importorskip("coopoc.learned")
+    checkpoint = learned.Checkpoint(learned.NoiseParameters(), {})
+    reads = (co.read_graph, co.load_fleet, co.load_recording, co.read_log, co.Results.load, learned.load, views)
+    others = (lambda p: learned.save(p, checkpoint), lambda p: merge([p], tmp_path), lambda p: report([p], tmp_path))
+    for call in (*reads, learned.load_method, Reference.load, *others):
+        with pytest.raises(co.InputError):
+            call(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -100,6 +101,7 @@ def status(*words: str) -> int:
     return int(ended.value.code or 0)
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     from safetensors.torch import save_file
@@ -114,6 +116,7 @@ def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_
     assert not mark.exists()
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 @pytest.mark.parametrize("card", ["[]", "{", "3", "[" * 100_000, "{}", '{"kind": "gain_net", "net": {"<b>": 1}}'])
 def test_a_damaged_card_is_named(tmp_path: Path, card: str) -> None:
     torch = pytest.importorskip("torch")
@@ -126,6 +129,7 @@ def test_a_damaged_card_is_named(tmp_path: Path, card: str) -> None:
         load(tmp_path / "net.safetensors")
 
 
+@pytest.mark.filterwarnings("ignore:.*has no checksum")
 def test_a_net_of_ones_own_is_loaded_when_the_caller_names_its_file(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     from safetensors.torch import save_file
@@ -434,3 +438,18 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
         path.write_bytes(damaged)
         with pytest.warns(RuntimeWarning, match="is damaged and will be computed again"):
             assert store.load(tmp_path / "noise", path.stem) is None
+
+
+@pytest.mark.parametrize("kind", ["folder", "pipe"])
+def test_no_device_and_no_folder_is_replaced_by_a_file(folder: Path, tmp_path: Path, kind: str) -> None:
+    """As root, a report "written to" /dev/null took its place for every program of the machine."""
+    learned = pytest.importorskip("coopoc.learned")
+    out = tmp_path / "out.html"
+    os.mkfifo(out) if kind == "pipe" else out.mkdir()
+    before = os.stat(out).st_mode
+    weights = learned.Checkpoint(learned.NoiseParameters(), {})
+    results = Results.load(folder)
+    for write in (lambda: report([folder], out), lambda: results.to_csv(out), lambda: learned.save(out, weights)):
+        with pytest.raises(InputError, match=r"is a folder|must be a file, and is a device or a pipe"):
+            write()
+    assert os.stat(out).st_mode == before

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, checked
+from ..arrays import Floats, checked, instance
 from ..errors import InputError
 
 
@@ -49,6 +49,7 @@ def align(estimate: Floats, truth: Floats, *, scale: bool = False) -> Alignment:
     >>> align(x, x + 5.0).translation
     array([5., 5.])
     """
+    instance("scale", scale, bool, "Give True or False.")
     x, y = _pair(estimate, truth)
     mean_x, mean_y = x.mean(axis=-2, keepdims=True), y.mean(axis=-2, keepdims=True)
     cov = np.einsum("...ti,...tj->...ij", y - mean_y, x - mean_x) / x.shape[-2]

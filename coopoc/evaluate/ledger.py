@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, instance, refuse
+from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
 from ..methods.track import Track
 from ..plugins import one_of
@@ -122,6 +122,7 @@ def of_training(
     >>> ledger.per_vehicle("training"), ledger.per_vehicle("training", "on air")
     (120.0, 140.0)
     """
+    overhead = number("overhead", overhead, 0, 10**9, kind=int, allowed=">= 0 bytes")
     given = (("sent", sent), ("received", received))
     payload = np.array([checked(name, values, "(V,)", (len(names),)) for name, values in given])
     kinds = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]

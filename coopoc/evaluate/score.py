@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, Ints, number
+from ..arrays import Floats, Ints, checked, instance, named, number
 from ..errors import InputError
 from ..plugins import one_of, suggestion
 from .alignment import Alignment, align
@@ -35,6 +35,14 @@ class Path:
     position: Floats
     rotation: Floats | None = None
     covariance: Floats | None = None
+
+    def __post_init__(self) -> None:
+        count = len(checked("t", self.t, "(T,)", (-1,)))
+        shapes = {"t": (count,), "position": (count, 3), "rotation": (count, 3, 3), "covariance": (count, 3, 3)}
+        for name, shape in shapes.items():
+            if name in ("t", "position") or getattr(self, name) is not None:
+                axes = str(("T", *shape[1:])).replace("'", "")
+                object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
 
 
 @dataclass(frozen=True)
@@ -100,13 +108,20 @@ def scores(
     0.5
     """
     one_of("aligned", aligned, ("none", "each", "team"))
+    one_of("unit", unit, get_args(Unit))
+    hint = "Give vehicle -> Path."
+    for side, paths in (("estimates", estimates), ("truths", truths)):
+        if not named(side, paths, hint):
+            raise InputError(side, "none", "must be at least one", hint)
+        for name, path in paths.items():
+            instance(f"{side}[{name!r}]", path, Path)
     blocks = number("blocks", blocks, 2, kind=int, allowed=">= 2")
     alone = len(estimates) == len(truths) == 1
-    named = {name: _truth(name, truths, alone) for name in estimates}
+    true_of = {name: _truth(name, truths, alone) for name in estimates}
     pairs = {}
     for name, path in estimates.items():
-        i, j = associated(path.t, named[name].t, max_diff, offset)
-        pairs[name] = _at(path, i), _at(named[name], j)
+        i, j = associated(path.t, true_of[name].t, max_diff, offset)
+        pairs[name] = _at(path, i), _at(true_of[name], j)
     team = None
     if aligned == "team":
         team = align(*(np.concatenate([pair[k].position for pair in pairs.values()]) for k in (0, 1)))
@@ -117,7 +132,7 @@ def scores(
         raw = np.linalg.norm(estimate.position - truth.position, axis=1)
         error = np.linalg.norm(moved.position - truth.position, axis=1)
         relative = None
-        stamps = estimates[name].t + offset, named[name].t
+        stamps = estimates[name].t + offset, true_of[name].t
         found = remarks(stamps, (estimate.position, truth.position), max_diff)
         if len(ends(estimate.position, delta, unit)) < 2:
             found = (*found, f"no relative error: the drive is shorter than {delta:g} {unit}.")

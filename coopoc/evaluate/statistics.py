@@ -84,7 +84,10 @@ def paired_ratio(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: int =
     2.0
     """
     a, b = _pair(a, b)
-    ratios = _resampled(a, resamples, seed) / _resampled(b, resamples, seed)
+    below = _resampled(b, resamples, seed)
+    if not below.all():
+        raise InputError("b", float(b.mean()), "must have means that are not zero", "Compare by paired_difference.")
+    ratios = _resampled(a, resamples, seed) / below
     return _interval(ratios, float(a.mean() / b.mean()), a, level)
 
 
@@ -120,7 +123,7 @@ def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
 
 def _resampled(values: Floats, resamples: int, seed: int) -> Floats:
     """(resamples,) means; the same draws for any values of one shape, so pairs stay pairs."""
-    resamples = number("resamples", resamples, 1, kind=int, allowed=">= 1", hint="2000 is the default.")
+    resamples = number("resamples", resamples, 1, 10**7, kind=int, allowed="in 1..10^7", hint="2000 is the default.")
     seed = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
     flat, step = values.ravel(), max(1, _CHUNK // values.size)
     counts = _counts(*values.shape, resamples, seed)

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from ..arrays import Floats, Ints
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, check_recording
+from .contradiction import contradicted
 from .track import Method, Track
 
 
@@ -61,6 +62,7 @@ def follow_egos(
                 here = slice(None) if len(found.links) == len(box.link) else np.searchsorted(box.link, found.links)
                 neighbours[:, ends[e] : ends[e + 1]][:, here] = found.neighbours
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
+    notes = (*notes, *contradicted(x, recording, columns))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = time.perf_counter() - began

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, number
-from ..errors import InputError
+from ..arrays import Floats, number, plain
+from ..errors import InputError, shown
 from ..kernels.motion import ROUNDING, push, since
 
 
@@ -79,6 +78,10 @@ def check_age(age: float, seen: float) -> None:
     number("fix_age", age, -ROUNDING, seen + ROUNDING, allowed=kept, hint=hint)
 
 
+PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
+"""What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
+
+
 def check_step(
     gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float, history: MotionHistory
 ) -> None:
@@ -116,7 +119,7 @@ def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
     """
     if not isinstance(given, Sequence) or not all(isinstance(one, kind) for one in given):
         hint = f"Give a list of {kind.__name__}, empty for none."
-        raise InputError(field, repr(given)[:60], f"must hold {kind.__name__}s", hint)
+        raise InputError(field, shown(given), f"must hold {kind.__name__}s", hint)
     names: list[str] = [one.id for one in given]
     if len(set(names)) < len(names):
         raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
@@ -141,8 +144,5 @@ def numbers(value: npt.ArrayLike) -> Floats:
     >>> numbers("east").size
     0
     """
-    with suppress(ValueError):
-        given = np.asarray(value)
-        if given.dtype.kind in "fiu":
-            return given.astype(float)
-    return np.empty(0)
+    given = plain(value)
+    return given.astype(float) if given.dtype.kind in "fiu" else np.empty(0)

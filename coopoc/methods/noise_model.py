@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, instance
+from ..arrays import Floats, checked, instance
 from ..errors import InputError
 from ..plugins import suggestion
+from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
@@ -41,10 +42,18 @@ class NoiseModel:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        check_texts(self, "name")
+        object.__setattr__(self, "notes", texts("notes", self.notes))
+        if self.sensors is not None:
+            instance("sensors", self.sensors, Sensors)
+        if self.velocity is not None:
+            object.__setattr__(self, "velocity", checked("velocity", self.velocity, "(T, N, 3)", (-1, -1, 3)))
         for field in ("process_std", "gnss_std"):
-            value = getattr(self, field)
-            if value is not None and not all(np.isfinite(v) and v > 0 for v in value):
-                raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
+            if field == "gnss_std" or self.process_std is not None:
+                value = checked(field, getattr(self, field), "(3,)", (3,))
+                if not (np.isfinite(value) & (value > 0)).all():
+                    raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
+                object.__setattr__(self, field, _three(value))
 
     @classmethod
     def identity(cls) -> NoiseModel:
@@ -137,17 +146,18 @@ components: information that is large in one direction and small in another lose
 
 
 def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
-    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST.
+    """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST, and
+    no range finer than its angles bear (`_bent`).
 
     >>> resolve("identity", None).gnss_std
     (1.0, 1.0, 1.0)
     """
     if isinstance(noise_model, NoiseModel):
-        return _resolvable(noise_model)
+        return _resolvable(_bent(noise_model, recording))
     if noise_model == "identity":
         return NoiseModel.identity()
     if noise_model == "nominal":
-        return _resolvable(NoiseModel.nominal(check_recording(recording).sensors))
+        return _resolvable(_bent(NoiseModel.nominal(check_recording(recording).sensors), recording))
     raise InputError(
         "noise_model",
         repr(noise_model),
@@ -158,6 +168,41 @@ def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
             "For fitted noise pass NoiseModel.fitted(training_recording, training_fleet).",
         ),
     )
+
+
+def _bent(known: NoiseModel, recording: Recording | None) -> NoiseModel:
+    """With ranges no finer than the arc bends on which a vehicle lies whose direction is uncertain; a note says so.
+
+    A direction that is off by e shortens d to d cos e along the assumed one: by d e^2 / 2, whose standard deviation is
+    d std^2 / sqrt(2). Of measured angles std is theirs; where there are none, that of the line between two fixes,
+    sqrt(2) std of a fix / d. A finer range, taken for exact along a line, moves estimates by ten times what is claimed.
+
+    References:
+        Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
+    """
+    if known.sensors is None or not isinstance(recording, Recording) or not recording.relative.shape[1]:
+        return known
+    noise, seen = known.sensors, recording.relative[0][np.isfinite(recording.relative[0, :, 0])]
+    directed = seen[np.isfinite(seen[:, 1])]
+    if not len(seen):
+        return known
+    far, notes = float(np.median((directed if len(directed) else seen)[:, 0])), known.notes
+    if noise.range_std > far / 2:
+        given = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
+        return replace(known, notes=(*notes, f"{given}: none is negative, so that their errors have a mean"))
+    if len(directed):
+        arc = far * float(np.hypot(noise.azimuth_std**2, noise.inclination_std**2)) / np.sqrt(2.0)
+        why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad"
+    else:
+        fix = float(np.square(known.gnss_std[:2]).mean())
+        arc, why = np.sqrt(2.0) * fix / far, f"fixes of {np.sqrt(fix):.2g} m and no azimuth"
+    if arc <= noise.range_std:
+        return known
+    std = float(np.hypot(arc, noise.range_std))
+    text = (
+        f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why} put what is {far:.3g} m away on an arc"
+    )
+    return replace(known, sensors=replace(noise, range_std=std), notes=(*notes, text))
 
 
 def _resolvable(known: NoiseModel) -> NoiseModel:
@@ -173,7 +218,7 @@ def _resolvable(known: NoiseModel) -> NoiseModel:
     raised = {name: max(getattr(known.sensors, name), min(least, np.pi)) for name in names}
     beside = f"finer ones beside a fix of {max(known.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
-    return replace(known, sensors=replace(known.sensors, **raised), notes=(note,))
+    return replace(known, sensors=replace(known.sensors, **raised), notes=(*known.notes, note))
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

@@ -1,14 +1,15 @@
-"""Checks of a method's options, each against the type that its class declares."""
+"""Checks of the options of a method, a schedule or a rule, each against the type that its class declares."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from ..arrays import number
-from ..errors import InputError
+from ..arrays import checked, number
+from ..errors import InputError, shown
 from ..world.sensors import Sensors
 from ..world.v2x import Message
 from .noise_model import NoiseModel
@@ -23,8 +24,17 @@ TYPES: dict[str, Any] = {
 }
 
 
-def check_options(method: Any) -> None:
+Limits = Mapping[str, tuple[float, float, str]]
+"""Option -> least and largest value, and both in words."""
+
+
+def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, Any] | None = None) -> None:
     """InputError for an option of another type than its field of the dataclass has; NumPy's numbers become Python's.
+
+    Args:
+        made: instance of a dataclass, in its `__post_init__`.
+        limits: of numbers; default no NaN.
+        kinds: option -> its class, where that is none of TYPES.
 
     >>> from coopoc import JointFilter
     >>> JointFilter(exact="no")
@@ -32,17 +42,22 @@ def check_options(method: Any) -> None:
     ...
     coopoc.errors.InputError: exact = 'no': must be bool. Give JointFilter(exact=...).
     """
-    for field in fields(method):
-        name, text, value = field.name, str(field.type), getattr(method, field.name)
+    own = {str(f.type).removesuffix(" | None"): kinds[f.name] for f in fields(made) if kinds and f.name in kinds}
+    types = {**TYPES, **own}
+    for field in fields(made):
+        name, text, value = field.name, str(field.type), getattr(made, field.name)
         if not field.init or (value is None and text.endswith("None")):
             continue
         text = text.removesuffix(" | None")
-        if isinstance(field.default, str) and text not in TYPES:  # one of some words, which the method lists
+        if isinstance(field.default, str) and text not in types:  # one of some words, which the method lists
             text = "str"
-        hint = f"Give {type(method).__name__}({name}=...)."
+        hint = f"Give {type(made).__name__}({name}=...)."
         if text in NUMBERS:
-            least = -(2**62) if text == "int" else -np.inf
-            value = number(name, value, least, -least, kind=NUMBERS[text], allowed="no NaN", hint=hint)
-            object.__setattr__(method, name, value)
-        elif text in TYPES and not isinstance(value, TYPES[text]):
-            raise InputError(name, repr(value)[:60], f"must be {text}", hint)
+            most = 2**62 if text == "int" else np.inf
+            low, high, words = (limits or {}).get(name, (-most, most, "no NaN"))
+            value = number(name, value, low, high, kind=NUMBERS[text], allowed=words, hint=hint)
+            object.__setattr__(made, name, value)
+        elif text == "Floats":
+            object.__setattr__(made, name, checked(name, value))
+        elif text in types and not isinstance(value, types[text]):
+            raise InputError(name, shown(value), f"must be {text}", hint)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..arrays import Floats, Ints, checked
+from ..arrays import Floats, Ints, checked, listed
 from ..errors import InputError
 from ..world.body import Body
 from ..world.recording import Recording
@@ -15,6 +15,7 @@ from . import pose_unit
 
 def pose_egos(recording: Recording, egos: Sequence[int | str]) -> list[int]:
     """Columns of egos that are there throughout; InputError for one that is not, and for a landmark."""
+    egos = listed("egos", egos, "Give [0] for the first.")
     columns = recording.observing(egos)
     for ego, column in zip(egos, columns, strict=True):
         if column in recording.landmarks:

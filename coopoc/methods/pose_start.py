@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints, number
+from ..arrays import Floats, Ints, instance, number
 from ..errors import InputError
 from ..world.frames import turned
 from ..world.recording import Recording, check_recording
@@ -57,9 +57,9 @@ def pose_start(
     """
     check_recording(recording, body=True)
     headings = number("headings", headings, 4, 360, kind=int, allowed="4..360", hint="24 are 15 degrees apart.")
-    steps = min(int(number("seconds", seconds, hint="30 is the default.") / recording.dt) + 1, len(recording.t))
+    steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
     part = recording.between(0, max(steps, 2))
-    noise = assumed or recording.sensors
+    noise = recording.sensors if assumed is None else instance("assumed", assumed, Sensors)
     spread = (*_spread(noise), np.pi / headings)
     filter_ = PoseFilter("solo", gate=gate, spread=spread, assumed=noise)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)

@@ -25,7 +25,7 @@ from ..kernels.stars.star_stream import (
     resized,
     stream_step,
 )
-from .motion_history import MotionHistory, check_step, fix_or_none, names_of, numbers, seconds, three
+from .motion_history import PLAIN, MotionHistory, check_step, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import NoiseModel
 from .star import ACCELERATION_STD, FORGOTTEN, relative_noise
 from .stream import motion_noise
@@ -160,11 +160,13 @@ class StarStream:
             InputError: as `Stream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
         names, given = names_of("neighbours", neighbours, RelativeMeasurement), self._given
-        if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+        if not (isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN):
             check_step(gnss, velocity, dt, fix_age, self.history)
         try:
+            if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+                check_step(gnss, velocity, dt, fix_age, self.history)
             given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-        except (TypeError, ValueError):
+        except Exception:  # a class from elsewhere may raise anything
             check_step(gnss, velocity, dt, fix_age, self.history)
             raise
         k = len(names)

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
 from ..kernels.solo import ESTIMATE, GNSS, HISTORY_FULL, NO_FIX_YET, VELOCITY, FixNoise, packed, stream_step
 from ..world.recording import Recording, check_recording
-from .motion_history import MotionHistory, check_step, three
+from .motion_history import PLAIN, MotionHistory, check_step, three
 from .noise_model import NoiseModel, resolve
 from .track import Track
 
@@ -124,11 +124,13 @@ class FilterStream:
                 then as it was before.
         """
         given, answer = self._given, np.empty(12)
-        if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+        if not (isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN):
             check_step(gnss, velocity, dt, fix_age, self.history)
         try:
+            if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+                check_step(gnss, velocity, dt, fix_age, self.history)
             given[GNSS], given[VELOCITY], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-        except (TypeError, ValueError):
+        except Exception:  # a class from elsewhere may raise anything
             check_step(gnss, velocity, dt, fix_age, self.history)
             raise
         found = stream_step(given, self._state, self.history.rows, self._noise, answer)

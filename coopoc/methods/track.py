@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 
 from ..arrays import Floats, checked, instance, number
-from ..errors import InputError
+from ..errors import InputError, shown
 from ..world.axes import texts
 from ..world.fleet import Fleet
 from ..world.recording import Recording
@@ -77,9 +77,10 @@ class Track:
         for name, (axes, shape) in shapes.items():
             if name not in optional or getattr(self, name) is not None:
                 object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
+        object.__setattr__(self, "seconds", number("seconds", self.seconds))
         object.__setattr__(self, "notes", texts("notes", self.notes))
         if not isinstance(self.extras, Mapping):
-            raise InputError("extras", repr(self.extras)[:60], "must be name -> (R, T, E)", "Give {} for none.")
+            raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
         extras = {name: checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3]) for name, v in self.extras.items()}
         object.__setattr__(self, "extras", extras)
         if not np.isfinite(self.x).all():

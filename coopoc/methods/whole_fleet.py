@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..world.exchange import Exchange
 from ..world.recording import Recording, check_recording
+from .contradiction import contradicted
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
@@ -86,7 +87,16 @@ def fleet_track(
             x, cov = bring_forward(held, x, cov, own, assumed._replace(process=process, fix=fix))
     x, cov = x.reshape(*shape, 3), None if cov is None else cov.reshape(*shape, 3, 3)
     received, sent, seconds = met.received_bytes[:, columns], met.sent_bytes[:, columns], time.perf_counter() - began
-    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, notes=known.notes + found.notes)
+    return Track(
+        recording.t,
+        tuple(columns),
+        x,
+        cov,
+        received,
+        sent,
+        seconds,
+        notes=known.notes + found.notes + contradicted(x, recording, columns),
+    )
 
 
 def kernel_arguments(

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, frozen, instance
 from ..errors import InputError
 from ..formats import load_graph
 from ..formats.edges import ENDS
@@ -99,6 +99,7 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
     >>> loop_closures(problem.add("relative_pose", pairs, pose(np.zeros((3, 2))), std=[0.1, 0.1, 0.1]))
     [(0, [2])]
     """
+    instance("problem", problem, Problem)
     after, last = np.full(len(problem.names), -1), dict[str, int]()
     for node in problem.poses:
         robot = problem.names[node][0]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, instance, listed, named, number
 from ..errors import InputError
 from ..plugins import suggestion
 from .backend import require_backend
@@ -67,9 +67,10 @@ class FixedLag:
     """
 
     def __init__(self, lag: float, threshold: float = 0.01, passes: int = 1) -> None:
-        if not (lag >= 0 and threshold > 0 and passes >= 1):
-            given = f"lag {lag}, threshold {threshold}, passes {passes}"
-            raise InputError("FixedLag", given, "must be >= 0 s, > 0 m or rad, >= 1", "Such as FixedLag(lag=1.0).")
+        hint = "Such as FixedLag(lag=1.0)."
+        lag = number("lag", lag, 0.0, np.inf, allowed=">= 0 s", hint=hint)
+        threshold = number("threshold", threshold, 1e-300, np.inf, allowed="> 0 m or rad", hint=hint)
+        passes = number("passes", passes, 1, 10**6, kind=int, allowed=">= 1", hint=hint)
         require_backend("gtsam")
         import gtsam
 
@@ -106,6 +107,9 @@ class FixedLag:
             InputError: a piece with realisations, fixed nodes or constraints, a new node without a stamp or
                 older than the window, a node that changes its kind, nodes that the measurements leave free.
         """
+        instance("piece", piece, Problem)
+        given = named("stamps", stamps, 'Give a moment of each new node, as {"v0@0": 0.0}.')
+        stamps = {name: number("stamps", at, -np.inf, np.inf, allowed="seconds") for name, at in given.items()}
         before = self._stamps
         posed = which_turn(piece)
         fresh = self._check(piece, stamps, before, posed)
@@ -121,9 +125,8 @@ class FixedLag:
         for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
         entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
-        moments = {name: float(at) for name, at in stamps.items()}
-        self._advance(graph, entering, {self._keys[name]: at for name, at in moments.items()})
-        self._age(moments)
+        self._advance(graph, entering, {self._keys[name]: at for name, at in stamps.items()})
+        self._age(stamps)
         return self.estimate(wanted)
 
     def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
@@ -131,9 +134,9 @@ class FixedLag:
         stamps = self._stamps
         if wanted is None:
             wanted = [name for name, at in stamps.items() if at == self._newest]
-        names = tuple(wanted)
+        names = tuple(listed("wanted", wanted, "Give a list of names."))
         for name in names:
-            if name not in stamps:
+            if not isinstance(name, str) or name not in stamps:
                 hint = suggestion(name, stamps, "See stamps.")
                 raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", hint)
         return self._read(names, Space(self._dimension or 3, any(self._turns[name] for name in names)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
 from .algebra.cholesky import cholesky_of, with_still
 from .algebra.sparse import sparse
+from .model.nodes import several
 from .model.problem import Problem
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
     if problem.constraints or problem.batch is not None:
         what = "constraints" if problem.constraints else f"{problem.batch} realisations"
         raise InputError("problem", what, "must be a single one without constraints", "Pick one: problem.pick(0).")
-    places = [problem.index(node) for node in (nodes if isinstance(nodes, Iterable) else [nodes])]
+    places = [problem.index(node) for node in (nodes if isinstance(nodes, str) else several(nodes))]
     if len(places) > len(problem.names):
         allowed = f"must name each of {len(problem.names)} nodes once"
         raise InputError("nodes", f"{len(places)} nodes", allowed, "Leave out those that stand twice.")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import Floats
-from ..errors import InputError
+from ..arrays import Floats, instance
+from ..errors import InputError, shown
 from ..plugins import suggestion
 from .model.space import Space
 
@@ -90,10 +90,10 @@ class Solution:
 
     def __getitem__(self, point: str) -> Floats:
         """(ambient,) estimate of a node by name; InputError that lists the names if there is none."""
-        if point not in self.names:
+        if not isinstance(point, str) or point not in self.names:
             known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
             hint = suggestion(point, self.names, "See solution.names.")
-            raise InputError("point", repr(point), f"must be one of {known}", hint)
+            raise InputError("point", shown(point), f"must be one of {known}", hint)
         where: Floats = self.x[self.names.index(point)]
         return where
 
@@ -111,10 +111,11 @@ class Solution:
         """
         from ..escapes import picture
         from ..pictures import COLORS, INK, axes, ellipses, finish, pairs
+        from .model.problem import Problem
 
         ax, at, few = axes(ax), self.position[:, :2], len(self.names) <= NAMED
         if problem is not None:
-            if problem.names != self.names:
+            if instance("problem", problem, Problem).names != self.names:
                 raise InputError("problem", repr(problem), "must be the one that was solved", "Give it to both.")
             between = [factor for factor in problem.factors if factor.nodes.shape[1] == 2]
             for k, kind in enumerate(dict.fromkeys(factor.kind for factor in between)):

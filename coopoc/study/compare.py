@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from ..errors import InputError
 from ..evaluate.statistics import Interval, mean_interval, paired_difference
+from ..file_names import given_path
 from ..plugins import unknown
 from . import changes
 from .changes import NAN, Change, plain
@@ -72,7 +73,7 @@ def compare(
     References:
         Zou and Donner, Statistics in Medicine 27, 2008.
     """
-    folders = Path(a), Path(b)
+    folders = given_path(a), given_path(b)
     one, two = read(folders[0]), read(folders[1])
     if one.study != two.study:
         allowed = f"hold different studies, {one.study} and {two.study}"

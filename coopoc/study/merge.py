@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pyarrow as pa
 
+from ..arrays import listed
 from ..errors import InputError
-from ..file_names import inside
+from ..file_names import given_path, inside
 from . import store
 from .lock import locked
 from .manifest import NAME, different, environments, read
@@ -39,12 +40,13 @@ def merge(folders: Sequence[str | Path], out: str | Path) -> Merged:
     Raises:
         InputError: no folder, folders whose manifests differ (environments may), or a folder that a run holds.
     """
+    out, folders = given_path(out), listed("folders", folders, "Give a list of folders.")
     if not folders:
         raise InputError("folders", "none", "must be at least one", "Example: coopoc merge a/small b/small --out all.")
-    sources = [Path(folder) for folder in folders]
-    target = Path(out) / read(sources[0]).study
+    sources = [given_path(folder) for folder in folders]
+    target = out / read(sources[0]).study
     for path in (target, *(target / kind for kind in ("cells", "failed"))):
-        inside(Path(out), path)
+        inside(out, path)
     if (target / NAME).is_file():
         sources = [target, *(folder for folder in sources if folder != target)]
     first, *others = manifests = [read(folder) for folder in sources]

@@ -11,7 +11,7 @@ from typing import Any
 from tqdm import tqdm
 
 from ..errors import InputError
-from ..file_names import file_name
+from ..file_names import file_name, given_path
 from ..plugins import unknown
 from . import reference, store
 from .results import Results
@@ -42,7 +42,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         folder: of the study.
         progress: show a bar on stderr.
     """
-    folder = Path(folder)
+    folder = given_path(folder)
     results.to_parquet(folder / "results.parquet")
     missing: dict[str, str] = {}
     made: dict[str, list[dict[str, Any]]] = {"tables": [], "figures": []}
@@ -74,7 +74,7 @@ def views(folder: str | Path) -> Mapping[str, Any]:
     Raises:
         InputError: the study was not run to its end, the file is damaged, or a view's name is no file name.
     """
-    path = Path(folder) / VIEWS
+    path = given_path(folder) / VIEWS
     found = store.content(path, _FIELDS, "holds no views yet", "Run the study to its end: coopoc run NAME.")
     for view in (*found["tables"], *found["figures"]):
         if not isinstance(view, dict) or not isinstance(view.get("caption"), str):

@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ..arrays import instance, number
 from ..errors import InputError
 from ..evaluate.statistics import Interval
+from ..file_names import given_path
 from . import changes, store
 from .changes import Change, Direction, plain
 from .results import SEED, Results, ego_by_run
@@ -66,7 +68,7 @@ class Reference:
         """Write as JSON, one line per number."""
         lines = ",\n".join("  " + json.dumps(vars(number), default=float) for number in self.numbers)
         head = json.dumps({"study": self.study, "settings": dict(self.settings)}, indent=1, default=list)[:-2]
-        store.write(Path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
+        store.write(given_path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
 
     @classmethod
     def load(cls, path: str | Path) -> Reference:
@@ -75,15 +77,28 @@ class Reference:
         Raises:
             InputError: no such file, or a damaged one.
         """
-        path, hint = Path(path), "Write them with coopoc reference --write."
+        path, hint = given_path(path), "Write them with coopoc reference --write."
         given = store.content(
             path, {"study": str, "settings": dict, "numbers": list}, "holds no reference numbers", hint
         )
         try:
-            numbers = tuple(Number(**number) for number in given["numbers"])
-        except TypeError as error:
+            numbers = tuple(_sound(Number(**each)) for each in given["numbers"])
+        except (TypeError, InputError) as error:
             raise InputError("file", str(path), f"is damaged ({error})", hint) from None
         return cls(given["study"], given["settings"], numbers)
+
+
+def _sound(read: Number) -> Number:
+    """A number as `save` wrote it; InputError for a field of another kind."""
+    instance("where", read.where, dict)
+    instance("metric", read.metric, str)
+    if read.better not in ("lower", "higher"):
+        number("better", read.better, -np.inf, np.inf, allowed="lower, higher or a number")
+    number("value", read.value, -np.inf, np.inf, allowed="no NaN")
+    number("runs", read.runs, 1, 2**53, kind=int, allowed=">= 1")
+    for field in ("run_std", "tolerance"):
+        number(field, getattr(read, field), high=1e100)
+    return read
 
 
 def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:

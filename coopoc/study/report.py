@@ -10,9 +10,10 @@ from typing import Any
 import jinja2
 import markupsafe
 
+from ..arrays import listed
 from ..errors import InputError
 from ..escapes import uncontrolled
-from ..file_names import inside
+from ..file_names import given_path, inside
 from . import store
 from .inline_svg import inline
 from .marks import described
@@ -59,9 +60,10 @@ def report(
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
         MissingLibraryError: a PDF without Chromium.
     """
-    if Path(out).is_dir():
-        raise InputError("out", str(out), "is a folder", f"Name the file, such as {Path(out) / 'report.html'}.")
-    sections = [_section(Path(folder)) for folder in folders]
+    out = given_path(out)
+    if out.is_dir():
+        raise InputError("out", str(out), "is a folder", f"Name the file, such as {out / 'report.html'}.")
+    sections = [_section(given_path(folder)) for folder in listed("folders", folders, "Give a list of folders.")]
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
@@ -77,8 +79,8 @@ def report(
         css=markupsafe.Markup(_own("report.css")),
         script=markupsafe.Markup(_own("report.js")),
     )
-    store.write(Path(out), printed(page) if Path(out).suffix.lower() == ".pdf" else page)
-    return Path(out)
+    store.write(out, printed(page) if out.suffix.lower() == ".pdf" else page)
+    return out
 
 
 def _section(folder: Path) -> dict[str, Any]:

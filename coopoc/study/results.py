@@ -15,6 +15,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..escapes import spreadsheet
 from ..evaluate.statistics import Interval, mean_interval
+from ..file_names import given_path
 from ..plugins import unknown
 from . import store
 from .manifest import read
@@ -60,7 +61,7 @@ class Results:
         Raises:
             InputError: as `coopoc.study.manifest.read`.
         """
-        folder = Path(folder)
+        folder = given_path(folder)
         manifest = read(folder)
         done, failed, pending = [], [], 0
         for name in manifest.cells if names is None else [name for name in manifest.cells if name in names]:
@@ -142,7 +143,7 @@ class Results:
 
     def to_parquet(self, path: str | Path) -> None:
         """Write all rows as Parquet."""
-        store.write(Path(path), lambda file: self.frame.to_parquet(file, index=False))
+        store.write(given_path(path), lambda file: self.frame.to_parquet(file, index=False))
 
     def to_csv(self, path: str | Path) -> None:
         """Write all rows as CSV with full precision; columns of lists are left to Parquet, no text is a formula."""
@@ -150,7 +151,7 @@ class Results:
         texts = [str(c) for c in flat if not pd.api.types.is_numeric_dtype(self.frame[c])]
         safe = self.frame[flat].copy()
         safe[texts] = safe[texts].map(lambda v: spreadsheet(v) if isinstance(v, str) else v)
-        store.write(Path(path), safe.to_csv(index=False))
+        store.write(given_path(path), safe.to_csv(index=False))
 
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
         check_metric(frame, value)

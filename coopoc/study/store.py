@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import re
 import tempfile
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -17,11 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from ..errors import InputError
+from ..file_names import replaceable
+from ..seals import UNSEALED, holds, sealed
 from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
-UNSEALED = b"sha256:" + 64 * b"0"
-"""Place of the checksum in the metadata of a Parquet file while the checksum is computed over the whole file."""
 
 
 def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
@@ -31,8 +29,10 @@ def write(path: Path, content: str | bytes | Callable[[Any], object]) -> None:
     replaced, not followed.
 
     Raises:
+        InputError: a folder or a device at `path`.
         OSError: a full or read-only disk, with the path.
     """
+    replaceable(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _write(path, content)
@@ -139,19 +139,12 @@ def to_table(rows: Sequence[Row]) -> pa.Table:
 def _save(path: Path, table: pa.Table) -> None:
     buffer = BytesIO()
     pq.write_table(table.replace_schema_metadata({"checksum": UNSEALED}), buffer)
-    before, seal, after = buffer.getvalue().rpartition(UNSEALED)
-    write(path, before + _seal(before + seal + after) + after)
-
-
-def _seal(content: bytes) -> bytes:
-    return b"sha256:" + hashlib.sha256(content).hexdigest().encode()
+    write(path, sealed(buffer.getvalue()))
 
 
 def _checked(content: bytes) -> pa.Table:
     """The table of a file whose checksum is right; pa.ArrowInvalid otherwise."""
-    seals = re.findall(rb"sha256:[0-9a-f]{64}", content)
-    before, seal, after = content.rpartition(seals[-1]) if seals else (b"", b"", b"")
-    if not seal or _seal(before + UNSEALED + after) != seal:
+    if not holds(content):
         raise pa.ArrowInvalid("its checksum is wrong")
     return pq.read_table(BytesIO(content))
 

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked
-from ..errors import InputError
+from ..arrays import Floats, checked, listed
+from ..errors import InputError, shown
 from ..plugins import unknown
 
 
@@ -19,9 +19,24 @@ def texts(field: str, values: object) -> tuple[str, ...]:
     >>> texts("notes", ["a reconstruction"])
     ('a reconstruction',)
     """
-    if isinstance(values, str) or not isinstance(values, Iterable) or not all(isinstance(v, str) for v in values):
-        raise InputError(field, repr(values)[:60], "must be a sequence of texts", 'Give a tuple such as ("a note",).')
-    return tuple(values)
+    hint = 'Give a tuple such as ("a note",).'
+    found = listed(field, values, hint)
+    if not all(isinstance(value, str) for value in found):
+        raise InputError(field, shown(values), "must be a sequence of texts", hint)
+    return tuple(found)
+
+
+def check_texts(owner: object, *fields: str) -> None:
+    """InputError for the first of these attributes that is no text.
+
+    >>> from types import SimpleNamespace
+    >>> check_texts(SimpleNamespace(name=3), "name")
+    Traceback (most recent call last):
+    coopoc.errors.InputError: name = 3: must be text. Leave it out, or give a word.
+    """
+    for field in fields:
+        if not isinstance(value := getattr(owner, field), str):
+            raise InputError(field, shown(value), "must be text", "Leave it out, or give a word.")
 
 
 def names(ids: Iterable[object]) -> tuple[str, ...]:
@@ -30,9 +45,11 @@ def names(ids: Iterable[object]) -> tuple[str, ...]:
     >>> names([7, "b"])
     ('7', 'b')
     """
-    if isinstance(ids, str) or not isinstance(ids, Iterable):
-        raise InputError("ids", repr(ids), "must be a sequence of names", 'Give a tuple such as ("a", "b").')
-    found = tuple(str(i) for i in ids)
+    hint = 'Give a tuple such as ("a", "b").'
+    given = listed("ids", ids, hint)
+    if isinstance(ids, set) or not all(isinstance(i, str | int | np.integer) for i in given):
+        raise InputError("ids", shown(ids), "must be a sequence of names or whole numbers", hint)
+    found = tuple(str(i) for i in given)
     if not found:
         raise InputError("ids", "no vehicle", "must be at least one", "Check that the file holds a drive.")
     if len(set(found)) != len(found):
@@ -51,9 +68,11 @@ def column(field: str, vehicle: object, ids: Sequence[str]) -> int:
         if vehicle in ids:
             return ids.index(vehicle)
         raise unknown(field, vehicle, ids)
-    if isinstance(vehicle, int | np.integer) and not isinstance(vehicle, bool) and 0 <= vehicle < len(ids):
-        return int(vehicle)
-    raise InputError(field, repr(vehicle), f"must be an index in 0..{len(ids) - 1} or an id", "List them with .ids.")
+    if isinstance(vehicle, int | np.integer) and not isinstance(vehicle, bool | np.timedelta64):
+        place = int(vehicle)
+        if 0 <= place < len(ids):
+            return place
+    raise InputError(field, shown(vehicle), f"must be an index in 0..{len(ids) - 1} or an id", "List them with .ids.")
 
 
 def columns(field: str, vehicles: Iterable[object], ids: Sequence[str]) -> list[int]:
@@ -62,9 +81,8 @@ def columns(field: str, vehicles: Iterable[object], ids: Sequence[str]) -> list[
     >>> columns("egos", ["b", 0], ("a", "b"))
     [1, 0]
     """
-    if isinstance(vehicles, str) or not isinstance(vehicles, Iterable):
-        raise InputError(field, repr(vehicles), "must be a sequence of indices or ids", f"Give [{vehicles!r}].")
-    return [column(field, vehicle, ids) for vehicle in vehicles]
+    given = listed(field, vehicles, "Give a list of indices or ids.")
+    return [column(field, vehicle, ids) for vehicle in given]
 
 
 def clock(t: npt.ArrayLike) -> Floats:

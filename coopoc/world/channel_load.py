@@ -56,7 +56,10 @@ def channel_load(
     for name, value in given.items():
         if not (value >= 0).all() or value.shape not in ((), (vehicles,)):
             raise InputError(name, value.tolist(), f"must be a number >= 0, or {vehicles} of them", "One per vehicle.")
-    busy = np.broadcast_to(8.0 * given["size"] * given["rate"] / bit_rate, vehicles)
+    with np.errstate(over="ignore", invalid="ignore"):
+        busy = np.broadcast_to(8.0 * given["size"] * given["rate"] / bit_rate, vehicles)
+    if not np.isfinite(busy).all():
+        raise InputError("size, rate", (size, rate), "must have a finite product", "Give bytes and Hz.")
     flat = places.reshape(places.size // max(3 * vehicles, 1), vehicles, 3)
     loads = [_load_within(step, busy, carrier_sense) for step in flat]
     return np.array(loads, dtype=float).reshape(places.shape[:-1])

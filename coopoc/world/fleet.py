@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, checked, number, refuse
 from ..errors import InputError
-from .axes import clock, column, columns, interval, names
+from .axes import check_texts, clock, column, columns, interval, names
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +48,7 @@ class Fleet:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ids", names(self.ids))
+        check_texts(self, "name", "source", "licence")
         object.__setattr__(self, "t", clock(self.t))
         for field in ("position", "velocity"):
             values = checked(field, getattr(self, field), "(T, N, 3)", (len(self.t), len(self.ids), 3))

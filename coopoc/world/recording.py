@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, instance, number, refuse
-from ..errors import InputError
+from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse
+from ..errors import InputError, shown
 from .axes import clock, columns, interval, names, texts
 from .body import Body
 from .consistency import check_landmarks, check_links, check_measurements
@@ -66,7 +66,7 @@ class Recording:
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
             if not isinstance(getattr(self, name), kind):
-                given, allowed = repr(getattr(self, name))[:60], f"must be {kind.__name__}"
+                given, allowed = shown(getattr(self, name)), f"must be {kind.__name__}"
                 raise InputError(name, given, allowed, f"Give {kind.__name__}(...).")
         ids, t, links = names(self.ids), clock(self.t), len(self.links)
         gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
@@ -189,6 +189,7 @@ class Recording:
 
     def observing(self, egos: Sequence[int | str]) -> list[int]:
         """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""
+        egos = listed("egos", egos, "Give [0] for the first.")
         cols = columns("egos", egos, self.ids)
         if not cols:
             raise InputError("egos", egos, "must name at least one vehicle", "Give [0] for the first.")

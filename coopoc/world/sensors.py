@@ -7,8 +7,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, number
-from ..errors import InputError
+from ..arrays import Floats, listed, number
+from ..errors import InputError, shown
 from ..plugins import one_of
 
 BiasMode = Literal["run", "sample"]
@@ -76,12 +76,13 @@ class Sensors:
                 one_of(name, value, words[name])
             elif isinstance(field.default, bool):
                 if not isinstance(value, bool):
-                    raise InputError(name, repr(value), "must be True or False", "Say whether there is one.")
+                    raise InputError(name, shown(value), "must be True or False", "Say whether there is one.")
             elif isinstance(field.default, tuple):
                 size = len(field.default)
-                if not isinstance(value, tuple | list | np.ndarray) or len(value) != size:
+                given = listed(name, value, "Give metres in a tuple.", f"must be {size} numbers")
+                if len(given) != size:
                     raise InputError(name, value, f"must be {size} numbers", "Give metres in a tuple.")
-                object.__setattr__(self, name, tuple(number(name, v, hint=hint) for v in value))
+                object.__setattr__(self, name, tuple(number(name, v, hint=hint) for v in given))
             else:
                 object.__setattr__(self, name, number(name, value, hint=hint))
         if self.gnss_bias[0] > self.gnss_bias[1]:

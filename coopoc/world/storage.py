@@ -16,6 +16,7 @@ import numpy as np
 
 from ..arrays import AnyArray
 from ..errors import InputError
+from ..file_names import given_path
 from .body import Body
 from .fleet import Fleet
 from .links import Links
@@ -113,7 +114,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     Raises:
         InputError: a file that is damaged, too large, or no recording.
     """
-    path = Path(path)
+    path = given_path(path)
     try:
         arrays = unpacked(path)
         return _recording(json.loads(str(arrays.pop("coopoc_recording"))), arrays)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Bools, Floats, number
 from ..plugins import one_of
+from ..world.axes import check_texts
 
 Schedule = Literal["nearest", "round robin", "most informative"]
 
@@ -118,6 +119,7 @@ class Message:
     cumulative: bool = False
 
     def __post_init__(self) -> None:
+        check_texts(self, "name")
         for field in ("numbers", "rounds", "opening", "per_neighbour"):
             value = number(field, getattr(self, field), kind=int, allowed=">= 0", hint=f"Give Message({field}=...).")
             object.__setattr__(self, field, value)

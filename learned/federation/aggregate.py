@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, shown
 from coopoc.plugins import find
 
 from .means import FedProx, Function, inverse_variance, mean, uniform
@@ -44,4 +44,4 @@ def rule(given: str | Rule | Combine) -> Rule:
     if callable(made):
         return Function(made)
     hint = "Give a function of (weights, sizes, uncertainty), or a Rule."
-    raise InputError("aggregate", repr(given), f"is a {type(made).__name__}, no aggregation rule", hint)
+    raise InputError("aggregate", shown(given), f"is a {type(made).__name__}, no aggregation rule", hint)

@@ -6,18 +6,21 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import torch
 from torch import Tensor
 
-from coopoc.errors import InputError
-from coopoc.plugins import find
+from coopoc.arrays import instance, listed
+from coopoc.errors import InputError, shown
+from coopoc.methods.options import check_options
+from coopoc.plugins import find, one_of
 
 from ..nets.gain import Gain
 from ..nets.stack import flatten
 from ..training.clients import Client
 from ..training.machine import one_core, watched
-from ..training.schedule import Epoch, Schedule
+from ..training.schedule import STEPS, Epoch, Schedule
 from .aggregate import rule
 from .compression import Compression
 from .history import Federation, Round
@@ -26,6 +29,14 @@ from .participation import Participation, Turn
 from .rule import Combine, Rule
 from .server import SERVER, Exchange, Group, Protection, Server, Standing
 from .topology import Mesh, Topology, connected, disagreement
+
+KINDS = {
+    "aggregate": object,  # `rule` says what is none
+    "schedule": Schedule,
+    "participation": Participation,
+    "compression": Compression,
+    "topology": Topology,
+}
 
 
 @dataclass(frozen=True)
@@ -50,9 +61,8 @@ class Plan:
     topology: Topology | None = None
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "local_epochs"):
-            if (value := getattr(self, name)) < 1:
-                raise InputError(name, value, "must be >= 1", "The paper has 20 rounds.")
+        check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, KINDS)
+        one_of("epoch", self.epoch, get_args(Epoch))
         if self.topology is None:
             return
         if self.aggregate != "mean":
@@ -85,6 +95,8 @@ class Plan:
             given, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
             raise InputError("aggregate", given, allowed, "Ask more clients, or take the median.")
         if self.privacy is not None:
+            if not callable(getattr(self.privacy, "check", None)):
+                raise InputError("privacy", shown(self.privacy), "must be a Privacy", "Give Privacy(...), or None.")
             self.privacy.check(chosen)
         return Server(chosen, self.participation, self.compression, self.privacy)
 
@@ -142,8 +154,9 @@ def federate(
     79756
     """
     found = find("coopoc.nets", model) if isinstance(model, str) else model
-    start = found() if isinstance(found, type) else found
-    optimiser, presence = schedule or Schedule(), participation or Participation()
+    start = instance("model", found() if isinstance(found, type) else found, Gain, "Give GainNet(), or its name.")
+    optimiser = Schedule() if schedule is None else schedule
+    presence = Participation() if participation is None else participation
     protection = compression, privacy, topology
     plan = Plan(rounds, aggregate, local_epochs, optimiser, epoch, presence, *protection)
     return federate_many([start], [clients], [seed], plan, progress)[0]
@@ -184,7 +197,10 @@ def federate_many(
 
 
 def _group(clients: Sequence[Client], seed: int) -> Group:
-    names = tuple(client.name for client in clients)
+    hint = "Give what learned.clients(...) returns."
+    names = tuple(instance("clients", client, Client, hint).name for client in listed("clients", clients, hint))
+    if not names:
+        raise InputError("clients", "none", "must be at least one", hint)
     if len(set(names)) < len(names) or SERVER in names:
         raise InputError("clients", names, f"must have distinct names, none of them {SERVER!r}", "Rename the vehicles.")
     return Group(names, tuple(len(client.training) for client in clients), seed)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from coopoc.arrays import instance
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import Ledger, of_training
 from coopoc.world.fleet import Fleet
@@ -135,6 +136,7 @@ def ledger(federation: Federation, overhead: int = 0) -> Ledger:
         federation: with its traffic.
         overhead: bytes per message on air beyond the payload, as in `V2X`.
     """
+    instance("federation", federation, Federation, "Give what federate(...) returns.")
     ends = {name for row in federation.history for pair in row.traffic for name in pair}
     names = [*federation.names, *sorted(ends - set(federation.names))]
     moved, messages = np.zeros((2, 2, len(names)))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from coopoc.errors import InputError
+from coopoc.methods.options import check_options
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensors import Sensors
@@ -52,6 +53,7 @@ class Participation:
     straggle: float = 0.0
 
     def __post_init__(self) -> None:
+        check_options(self)
         within("share", self.share, 0 < self.share <= 1, "in (0, 1]", "1 asks all clients.")
         for field in ("dropout", "straggle"):
             within(field, getattr(self, field), 0 <= getattr(self, field) <= 1, "in [0, 1]", "0 for never.")

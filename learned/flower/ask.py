@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from torch import Tensor
 
+from coopoc.methods.options import check_options
+
 from ..federation.server import SERVER
-from .wire import LONGEST, MalformedAnswerError, Report, question, reported, size
+from .wire import MalformedAnswerError, Report, question, reason, reported, size
 
 if TYPE_CHECKING:
     from flwr.app import Message, RecordDict
@@ -33,6 +35,10 @@ class Wait:
     timeout: float = 600.0
     patience: float = 10.0
     pause: Callable[[float], object] = time.sleep
+
+    def __post_init__(self) -> None:
+        longest = 1e9
+        check_options(self, {"timeout": (0.0, longest, ">= 0 s"), "patience": (1.0, longest, ">= 1")})
 
     def until(self, arrived: Sequence[float], needed: int) -> float:
         """Seconds after the question at which the round ends, given those at which answers arrived.
@@ -68,7 +74,7 @@ def collect(
     names |= {node.node_id: node.name for node in grid.get_nodes() if node.name}
     content = question(theta, number)
     replies, lasted = ask(grid, kind, content, number, nodes, silent, wait)
-    failed = {node: str(reply.error.reason)[:LONGEST] for node, reply in replies.items() if reply.has_error()}
+    failed = {node: reason(reply.error.reason) for node, reply in replies.items() if reply.has_error()}
     answers = {node: reply.content for node, reply in sorted(replies.items()) if node not in failed}
     reports, rejected, received = read(answers, names)
     missing = frozenset(nodes) - replies.keys()

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import safetensors
 import torch
-from safetensors.torch import save_file
 
 from coopoc.errors import InputError
 
+from .. import checkpoint
 from ..federation.rule import State
 from ..recipes import REVISION, Job
 from .rows import Row
@@ -40,10 +38,7 @@ def write(path: Path, job: Job, progress: Progress) -> None:
         for row in progress.rows
     ]
     card = {"job": _facts(job), "rows": rows, "usual": progress.usual}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file(tensors, partial, metadata={"card": json.dumps(card)})
-    os.replace(partial, path)
+    checkpoint.write(path, tensors, card)
 
 
 def read(path: Path, job: Job) -> Progress | None:
@@ -56,15 +51,13 @@ def read(path: Path, job: Job) -> Progress | None:
         return None
     hint = "Delete it to start anew, or name another `out`."
     try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            card: dict[str, Any] = json.loads((file.metadata() or {})["card"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors, card = checkpoint.read(path)
         given, weights = card["job"], tensors.pop("weights")
         ways = [{(sender, receiver): n for sender, receiver, n in row.pop("traffic")} for row in card["rows"]]
         rows = [Row(weights=w, traffic=t, **r) for w, t, r in zip(weights, ways, card["rows"], strict=True)]
         state = tuple(tensors[f"state{i}"] for i in range(len(tensors)))
         progress = Progress(tuple(rows), state, card["usual"])
-    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError("progress", path, f"cannot be read ({type(error).__name__})", hint) from error
     if given != _facts(job):
         raise InputError("progress", path, "must be of the same recipe and setting", hint)

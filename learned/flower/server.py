@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from coopoc import arrays
 from coopoc.errors import InputError
+from coopoc.file_names import given_path
 
 from ..checkpoint import save
 from ..federation.aggregate import rule
@@ -55,13 +56,15 @@ def configured(grid: Grid, context: Context) -> None:
             job.
     """
     config, began, rows = context.run_config, time.perf_counter(), list[Row]()
-    job, wait = job_of(config), Wait(float(config["timeout"]), float(config["patience"]))
-    out = Path(str(config["out"]))
+    given: Any = config
+    job, wait = job_of(config), Wait(given["timeout"], given["patience"])
+    nodes = arrays.number("nodes", given["nodes"], 1, 10**6, kind=int, allowed=">= 1", hint="Of clients, to wait for.")
+    out = given_path(given["out"])
     path = out.with_name(f"{out.name}.progress")
     if type(untrained(job)).calibrate is not Gain.calibrate:
         allowed = "must be a net that needs no calibration on the clients' segments"
         raise InputError("recipe", job.name, allowed, "Train it in one process, or with coopoc train --flower.")
-    for row in rounds(grid, job, int(config["nodes"]), wait, read(path, job), partial(write, path, job)):
+    for row in rounds(grid, job, nodes, wait, read(path, job), partial(write, path, job)):
         rows.append(row)
         save(out, checkpoint(rows, job, time.perf_counter() - began))
         print(line(row), flush=True)

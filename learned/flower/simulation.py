@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coopoc.errors import MissingLibraryError
+from coopoc.file_names import given_path
 
 from ..checkpoint import Checkpoint, load, read_card, save
 from ..recipes import Job, job_clients
@@ -58,7 +59,7 @@ def train(job: Job, fleet: Drives, out: Path | str, progress: bool = True) -> di
     Raises:
         MissingLibraryError: Flower or its simulation engine is not installed.
     """
-    path = Path(out) / f"{job.label}.safetensors"
+    path = given_path(out) / f"{job.label}.safetensors"
     card = read_card(path) if path.is_file() else {}
     if card.get("key") != job.key(fleet) or not str(card.get("engine")).startswith("flower"):
         save(path, simulate(job, fleet, f"train {job.name}" if progress else None))

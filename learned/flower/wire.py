@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from coopoc.errors import MissingLibraryError
+from coopoc.escapes import visible
 
 if TYPE_CHECKING:
     from flwr.app import RecordDict
@@ -100,7 +101,7 @@ def reported(content: RecordDict) -> Report:
     """
     metrics: Any = content["metrics"]
     client: Any = content["client"]
-    name, failure, pieces = client["name"], str(client.get("failure", ""))[:LONGEST], metrics["num-examples"]
+    name, failure, pieces = client["name"], reason(client.get("failure", "")), metrics["num-examples"]
     if not (isinstance(name, str) and 0 < len(name) <= LONGEST and name.isprintable()):
         raise MalformedAnswerError(f"a name that is not 1 to {LONGEST} printable characters")
     if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
@@ -111,6 +112,15 @@ def reported(content: RecordDict) -> Report:
     weights = _theta(content) if "arrays" in content and not failure else None
     training = math.nan if weights is None else _loss(metrics, "training-loss")
     return Report(name, pieces, _loss(metrics, "validation-loss"), training, weights, failure)
+
+
+def reason(given: object) -> str:
+    """What a client says went wrong, in one line that no terminal takes for a command.
+
+    >>> reason("disk\\x1b[2J\\nround 9: done")
+    'disk [2J round 9: done'
+    """
+    return visible(str(given)[:LONGEST])
 
 
 def size(content: RecordDict) -> int:

@@ -12,6 +12,7 @@ from coopoc.errors import InputError
 from coopoc.kernels.motion import NO_MOTION_NOISE
 from coopoc.methods.egos import Estimate, follow_egos
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.options import check_options
 from coopoc.methods.star import assumptions, measurements, relative_noise
 from coopoc.methods.stream import alone
 from coopoc.methods.track import Track
@@ -100,6 +101,9 @@ class CooperativeGain:
     sums: bool = True
     name: str = "cooperative"
     cooperative: bool = True
+
+    def __post_init__(self) -> None:
+        check_options(self, kinds={"noise": (NoiseNet, NoiseModel)})
 
     @property
     def message(self) -> Message:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, Ints, instance
+from coopoc.arrays import Floats, Ints, instance, number
 
 from ..engine import rollout as engine
 from ..engine.places import CELLS, LOG_FLOOR, SHORTEST, SIZE
@@ -67,6 +68,8 @@ class GainNet(Recurrent):
         super().__init__()
         self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
         self.magnitudes = instance("magnitudes", magnitudes, bool, "Give True or False.")
+        if start_gain is not None:
+            start_gain = number("start_gain", start_gain, -np.inf, hint="KalmanNet's own start is None, ours 0.1.")
         wide, both, seen = SIZE * in_mult, 2 * CELLS, SIZE + magnitudes
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_of(seed))

@@ -11,11 +11,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, instance
+from coopoc.arrays import Floats, checked, instance
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import drive_of, filtered
+from coopoc.methods.options import check_options
 from coopoc.methods.stream import FilterStream, check_interval
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording, check_recording
@@ -23,7 +24,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core
-from .gain import Gain, error, known, over_time
+from .gain import Gain, error, known, over_time, seed_of
 from .stack import flatten
 
 
@@ -55,9 +56,10 @@ class OptimisedKF:
 
     def __post_init__(self) -> None:
         for field in ("process_std", "velocity_ratio", "gnss_std"):
-            value = np.array(getattr(self, field), dtype=float)
-            if value.shape != (3,) or not (np.isfinite(value) & (value >= 0)).all():
+            value = checked(field, getattr(self, field), "(3,)", (3,))
+            if not (np.isfinite(value) & (value >= 0)).all():
                 raise InputError(field, getattr(self, field), "must be three numbers >= 0", "Train it with fit_okf.")
+        check_options(self)
         if min(self.gnss_std) == 0:
             raise InputError("gnss_std", self.gnss_std, "must be > 0", "Assumed noise may not be zero.")
 
@@ -108,6 +110,7 @@ class NoiseParameters(Gain):
 
     def __init__(self, velocity_part: bool = True, seed: int = 0) -> None:
         super().__init__()
+        seed_of(seed)
         self.velocity_part = instance("velocity_part", velocity_part, bool, "Give True or False.")
         self.logs = nn.Parameter(torch.tensor([0.1, 0.1, 1.0]).log()[:, None].repeat(1, 3))
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from coopoc.arrays import Floats
+from coopoc.methods.options import check_options
 from coopoc.methods.stream import Stream, solo_track
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
@@ -188,6 +189,9 @@ class RecursiveFilter:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    def __post_init__(self) -> None:
+        check_options(self, kinds={"model": RecursiveGain})
 
     def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[RecursiveState]:
         """The filter as a stream, one step at a time (docs/streaming.md).

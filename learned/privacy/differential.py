@@ -15,6 +15,7 @@ from torch import Tensor
 
 from coopoc.arrays import number
 from coopoc.errors import InputError, MissingLibraryError
+from coopoc.methods.options import check_options
 from coopoc.world.noise import stream
 
 from ..federation.aggregate import rule
@@ -60,6 +61,7 @@ class Privacy:
     keyed: bool = True
 
     def __post_init__(self) -> None:
+        check_options(self)
         clip = number("clip", self.clip)
         within("clip", self.clip, 0 < clip < math.inf, "> 0 and finite", "Try the median norm of an update.")
         finite = 0 <= number("noise_multiplier", self.noise_multiplier) < math.inf

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.methods.options import check_options
 
 from ..federation.aggregate import rule
 from ..federation.rule import Rule, State
@@ -200,6 +201,7 @@ class SecureAggregation(Rule):
     resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
+        check_options(self, {"threshold": (1, 2**31, ">= 1"), "resolution": (1e-30, 1e30, "> 0")}, {"then": object})
         if self.server.mean_by is None:
             allowed = "must depend on nothing but the clients' mean under masks"
             raise InputError("aggregate", repr(self.then), allowed, "Take mean, uniform, fedprox, fedavgm or fedadam.")

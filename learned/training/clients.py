@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import AnyArray, Floats, instance, number
-from coopoc.errors import InputError
+from coopoc.errors import InputError, shown
+from coopoc.methods.options import check_options
 from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
@@ -69,6 +70,19 @@ class Segments:
     true_start: Tensor
     dt: float
     noise: Noise = "static"
+
+    def __post_init__(self) -> None:
+        check_options(self, {"dt": (1e-9, 1e9, "> 0 s")})
+        one_of("noise", self.noise, get_args(Noise))
+        for field in fields(self):
+            value, shape = getattr(self, field.name), getattr(self.truth, "shape", ())
+            if field.type == "Tensor":
+                wanted = shape[:1] if field.name == "true_start" else shape
+                fits = isinstance(value, Tensor) and value.shape == wanted and len(shape) == 3 and shape[2] == 3
+                if not fits:
+                    allowed = "must be a tensor (n, T + 1, 3) as the others are, true_start (n,)"
+                    given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else shown(value)
+                    raise InputError(field.name, given, allowed, "Make segments with learned.clients(...).")
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -165,6 +179,9 @@ class Client:
     training: Segments
     validation: Segments
     long: Segments
+
+    def __post_init__(self) -> None:
+        check_options(self, kinds={"training": Segments})
 
 
 def clients(

@@ -10,8 +10,8 @@ from typing import Protocol, TypeAlias, cast
 
 import numpy as np
 
-from coopoc.arrays import instance
-from coopoc.errors import InputError
+from coopoc.arrays import instance, listed
+from coopoc.errors import InputError, shown
 from coopoc.world.axes import columns
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording, check_recording
@@ -50,7 +50,7 @@ class MeasuredDrives:
             hint = "Give the truth on the steps of the recording, as read_log does."
             raise InputError("truth", repr(truth), "must hold the members and steps of the recording", hint)
         moving = np.flatnonzero(np.abs(np.nan_to_num(seen.velocity)).max(axis=(0, 1, 3)))
-        wanted = self.ids or moving.tolist()
+        wanted = listed("ids", self.ids, "Give a tuple of ids, () for all that move.") or moving.tolist()
         cols = columns("vehicles", wanted, seen.ids)
         if not cols:
             raise InputError("recording", repr(seen), "has no vehicle that moves", "Give one with odometry.")
@@ -102,4 +102,4 @@ def drives_of(data: Drives | Logged) -> Drives:
     if hasattr(data, "recording") and hasattr(data, "truth"):
         return MeasuredDrives(data.recording, cast(Fleet, data.truth))
     hint = "Take coopoc.load_fleet(...), or coopoc.read_log(...) of a log with a truth."
-    raise InputError("data", repr(data)[:60], "must be a Fleet, or a log with its truth", hint)
+    raise InputError("data", shown(data), "must be a Fleet, or a log with its truth", hint)

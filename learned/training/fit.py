@@ -12,8 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, instance
 from coopoc.errors import InputError
+from coopoc.methods.options import check_options
 from coopoc.world.noise import stream
 
 from ..nets.gain import Gain
@@ -33,6 +34,9 @@ class Task:
     seed: int = 0
     name: str = ""
     long: Segments | None = None
+
+    def __post_init__(self) -> None:
+        check_options(self, kinds={"model": Gain, "training": Segments, "validation": Segments, "long": Segments})
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +105,8 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     Raises:
         InputError: some of the tasks have long pieces and some have none.
     """
-    schedule, began = schedule or Schedule(), time.perf_counter()
+    schedule = Schedule() if schedule is None else instance("schedule", schedule, Schedule)
+    began = time.perf_counter()
     like, theta = tasks[0].model, flatten([t.model for t in tasks])
     pool, members = pooled([t.training for t in tasks])
     streams = [stream(t.seed, "batches", 0, t.name) for t in tasks]

@@ -12,6 +12,8 @@ from typing import TypeVar
 import torch
 from tqdm import tqdm
 
+from coopoc.errors import InputError, shown
+
 Item = TypeVar("Item")
 _line: ContextVar[int] = ContextVar("line", default=0)
 _threads: ContextVar[int | None] = ContextVar("threads", default=None)
@@ -74,4 +76,6 @@ def reporting_on(line: int) -> Iterator[None]:
 
 def watched(items: Iterable[Item], name: str | None, unit: str, total: int | None = None) -> Iterator[Item]:
     """The items, with a bar of that name on stderr; None: without."""
+    if not isinstance(name, str | None):
+        raise InputError("progress", shown(name), "must be the name of a stage", "Give None for no bar.")
     return iter(tqdm(items, desc=name, unit=unit, total=total, disable=name is None, position=_line.get()))

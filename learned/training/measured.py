@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, instance
 from coopoc.errors import InputError
 from coopoc.plugins import one_of
 from coopoc.world.axes import columns
@@ -54,6 +54,7 @@ def measured_clients(
     [(2, 1)]
     """
     one_of("start", start, get_args(Start))
+    instance("drives", drives, MeasuredDrives)
     check_pieces(piece, split)
     cols = columns("vehicles", drives.ids, drives.recording.ids)
     piece = _steps(drives.recording, cols, piece)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc.arrays import instance, number
 from coopoc.world.noise import stream
 
 from ..nets.gain import error, known, over_time
@@ -51,6 +52,9 @@ def fit_okf(training: Segments, validation: Segments, steps: int = 300, velocity
     >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
     (0.0, 0.0, 0.0)
     """
+    for name, part in (("training", training), ("validation", validation)):
+        instance(name, part, Segments, "Give the pieces of a Client.")
+    steps = number("steps", steps, 1, 10**7, kind=int, allowed="in 1..10^7", hint="300 is the default.")
     return fit_okf_many([(training, validation)], steps, velocity_part)[0]
 
 

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from coopoc.arrays import Floats, Ints
-from coopoc.errors import InputError
 from coopoc.learned.engine.arguments import Found, Moments, Update
+from coopoc.methods.options import Limits, check_options
+from coopoc.plugins import one_of
 
 from ..engine import optimiser
 
 Epoch = Literal["step", "pass"]
+STEPS, SIZE = (1, 10**7, "> 0 and at most 10^7"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
+LIMITS: Limits = {
+    **dict.fromkeys(("epochs", "batch", "checks"), STEPS),
+    **dict.fromkeys(("learning_rate", "clip"), SIZE),
+    **dict.fromkeys(("weight_decay", "l2", "proximal"), (0.0, sys.float_info.max, ">= 0, and 0 for none")),
+}
+"""Of a Schedule's numbers."""
 
 
 @dataclass(frozen=True)
@@ -45,14 +54,8 @@ class Schedule:
     kept."""
 
     def __post_init__(self) -> None:
-        for field in ("epochs", "batch", "learning_rate", "clip", "checks"):
-            if not getattr(self, field) > 0:
-                raise InputError(field, getattr(self, field), "must be > 0", f"Give Schedule({field}=...).")
-        for field in ("weight_decay", "l2", "proximal"):
-            if not getattr(self, field) >= 0:
-                raise InputError(field, getattr(self, field), "must be >= 0", "Use 0 for none.")
-        if self.epoch not in ("step", "pass"):
-            raise InputError("epoch", repr(self.epoch), 'must be "step" or "pass"', "Pick one.")
+        check_options(self, LIMITS)
+        one_of("epoch", self.epoch, get_args(Epoch))
 
     def plan(self, pieces: int, draw: np.random.Generator) -> Ints:
         """(steps, batch) indices of the pieces that each optimiser step sees, without repetition within a pass."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pandas as pd
-from safetensors.torch import save_file
+from safetensors.torch import save as to_bytes
 
 from coopoc import read_graph
 from coopoc.data.log import read_log
@@ -17,6 +17,7 @@ from coopoc.formats.kitti import read_kitti
 from coopoc.formats.tum import read_tum
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
+from coopoc.seals import UNSEALED, sealed
 from coopoc.study import publish, reference
 from coopoc.study.merge import merge
 from coopoc.study.results import Results
@@ -54,7 +55,8 @@ def _reference(folder: Path) -> None:
 def _card(folder: Path) -> None:
     """A checkpoint with this card and the weights of the smallest net."""
     text = (folder / "card.json").read_bytes().decode("utf-8", "replace")
-    save_file(NoiseParameters().state_dict(), folder / "net.safetensors", metadata={"card": text})
+    content = to_bytes(NoiseParameters().state_dict(), metadata={"card": text, "checksum": UNSEALED})
+    (folder / "net.safetensors").write_bytes(sealed(content))
     load(folder / "net.safetensors")
 
 

@@ -47,15 +47,20 @@ class Constraint:
         object.__setattr__(self, "kind", known.name)
         object.__setattr__(self, "nodes", check_nodes(known, self.nodes))
         object.__setattr__(self, "constants", check_constants(known, self.constants, len(self.nodes)))
-        lower, upper = np.broadcast_arrays(numbers("lower", self.lower), numbers("upper", self.upper))
-        size = lower.shape[-1] if lower.ndim else known.size()
+        given = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
+        sizes = [side.shape[-1] for side in given.values() if side.ndim]
+        size = max(sizes, default=known.size())
         fitting(known, size)
-        for name, side in (("lower", lower), ("upper", upper)):
-            object.__setattr__(self, name, frozen(np.broadcast_to(side, (len(self.nodes), size))))
+        for name, side in given.items():
+            try:
+                object.__setattr__(self, name, frozen(np.broadcast_to(side, (len(self.nodes), size))))
+            except ValueError:
+                allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
+                raise InputError(name, side.shape, allowed, "Give one bound per component.") from None
         if np.isnan(self.lower).any() or np.isnan(self.upper).any() or (self.lower > self.upper).any():
             bad = np.argwhere(~(self.lower <= self.upper))[0]
-            given = f"[{self.lower[tuple(bad)]}, {self.upper[tuple(bad)]}] in row {bad[0]}"
-            raise InputError(f"bounds of {self.kind}", given, "must have lower <= upper", "No point can satisfy it.")
+            bad_row = f"[{self.lower[tuple(bad)]}, {self.upper[tuple(bad)]}] in row {bad[0]}"
+            raise InputError(f"bounds of {self.kind}", bad_row, "must have lower <= upper", "No point can satisfy it.")
         if np.isinf(self.lower).all() and np.isinf(self.upper).all():
             raise InputError(f"bounds of {self.kind}", "none", "must bound something", "Leave the constraint out.")
 

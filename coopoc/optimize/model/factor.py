@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints
+from ...arrays import Bools, Floats, Ints, instance
 from ...errors import InputError
 from .inputs import check_constants, check_nodes, check_root, check_std, check_values, fitting, whitening
 from .losses import Loss
@@ -70,6 +70,8 @@ class Factor:
             root = whitening(known.name, cov) if cov is not None else self.sqrt_information
             assert root is not None
             object.__setattr__(self, "sqrt_information", check_root(known, root, shape))
+        if self.loss is not None:
+            instance("loss", self.loss, Loss, 'Give Loss("huber", 2.0), or None.')
         _ = self.batch  # refuses numbers of realisations that differ
 
     @property

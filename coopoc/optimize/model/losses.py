@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...arrays import Floats
-from ...errors import InputError
+from ...arrays import Floats, number
 from ...plugins import one_of
 
 Curve = Callable[[Floats, float], Floats]
@@ -60,8 +59,8 @@ class Loss:
 
     def __post_init__(self) -> None:
         one_of("loss", self.name, LOSSES)
-        if not 0 < self.scale < np.inf:
-            raise InputError("scale", self.scale, "must be > 0 and finite", "It counts standard deviations: 1.5 to 3.")
+        hint, tiny = "It counts standard deviations: 1.5 to 3.", np.finfo(float).tiny
+        object.__setattr__(self, "scale", number("scale", self.scale, tiny, allowed="> 0 and finite", hint=hint))
 
     def cost(self, square: Floats) -> Floats:
         """rho(s)."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, Ints
-from ...errors import InputError
+from ...errors import InputError, shown
 from ...plugins import suggestion
 from .constraint import Constraint
 from .factor import Factor
@@ -21,11 +21,21 @@ from .space import Space
 def indices(index: Callable[[Any], int], kind: str, nodes: Any) -> Ints:
     """Nodes (M, arity) of a kind from one node, a tuple or rows of them, each found by `index`."""
     arity = lookup(kind).arity
-    flat = [nodes] if isinstance(nodes, str) or not isinstance(nodes, Iterable) else list(nodes)
-    flat = [p for row in flat for p in (row if isinstance(row, list | tuple | np.ndarray) else [row])]
+    places = several(nodes)
+    flat = [p for row in places for p in (several(row) if isinstance(row, list | tuple | np.ndarray) else [row])]
     if len(flat) % arity or not flat:
         raise InputError("nodes", nodes, f"must name {arity} points per {kind}", "Give points by name or index.")
     return np.array([index(p) for p in flat]).reshape(-1, arity)
+
+
+def several(nodes: Any) -> list[Any]:
+    """What an iterable holds; a name, a number and an array without an axis are one node.
+
+    >>> several("car"), several(np.array(3)), several(("a", 1))
+    (['car'], [array(3)], ['a', 1])
+    """
+    scalar = isinstance(nodes, np.ndarray) and not nodes.ndim
+    return [nodes] if scalar or isinstance(nodes, str) or not isinstance(nodes, Iterable) else list(nodes)
 
 
 def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
@@ -38,7 +48,7 @@ def check_item(item: object, names: Sequence[str], poses: Collection[int], dimen
     """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
     if not isinstance(item, Factor | Constraint):
         hint = "Add measurements with Problem.add, constraints with Problem.constrain."
-        raise InputError("factors, constraints", repr(item)[:60], "must be Factors and Constraints", hint)
+        raise InputError("factors, constraints", shown(item), "must be Factors and Constraints", hint)
     known, nodes = item.measurement, item.nodes
     if len(beyond := nodes[(nodes < 0) | (nodes >= len(names))]):
         raise no_such_node(int(beyond[0]), names)
@@ -56,7 +66,7 @@ def no_such_node(node: Any, names: Sequence[str]) -> InputError:
     """The error for a node that is neither a name nor an index."""
     known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
     allowed = f"must be an index < {len(names)} or one of {known}"
-    return InputError("node", repr(node), allowed, suggestion(node, names, "Name the point when the Problem is made."))
+    return InputError("node", shown(node), allowed, suggestion(node, names, "Name the point when the Problem is made."))
 
 
 def points(space: Space, n: int, field: str, x: npt.ArrayLike, ranks: tuple[int, ...] = (2, 3)) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, frozen, instance
-from ...errors import InputError
+from ...arrays import Bools, Floats, Ints, frozen, instance, listed
+from ...errors import InputError, shown
 from ...world.sensors import Sensors
 from .constraint import Constraint
 from .factor import Factor
@@ -73,8 +73,8 @@ class Problem:
 
     def __post_init__(self) -> None:
         for field in ("names", "factors", "separator", "poses", "fixed", "constraints"):
-            if not isinstance(value := getattr(self, field), Iterable):
-                raise InputError(field, repr(value)[:60], "must be a sequence", "Give a tuple, () for none.")
+            if not isinstance(value := getattr(self, field), str | Sequence):
+                object.__setattr__(self, field, tuple(listed(field, value, "Give a tuple, () for none.")))
         object.__setattr__(self, "names", tuple(str(name) for name in self.names))
         if len(self._place) != len(self.names):
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
@@ -90,7 +90,7 @@ class Problem:
         for item in items:
             if not isinstance(item, Factor | Constraint):
                 hint = "Add measurements with Problem.add, constraints with Problem.constrain."
-                raise InputError("factors, constraints", repr(item)[:60], "must be Factors and Constraints", hint)
+                raise InputError("factors, constraints", shown(item), "must be Factors and Constraints", hint)
             check_item(item, self.names, self.poses, self.dimension)
         if self.x0 is not None:
             object.__setattr__(self, "x0", frozen(points(self.space, len(self.names), "x0", self.x0)))
@@ -308,7 +308,7 @@ class Problem:
             names: of the points, step by step; default their numbers.
         """
         if not isinstance(steps, Sequence) or not steps:
-            raise InputError("steps", repr(steps)[:60], "must be one or more", "Give WindowSteps, oldest first.")
+            raise InputError("steps", shown(steps), "must be one or more", "Give WindowSteps, oldest first.")
         for step in steps:
             instance("steps", step, WindowStep)
         if sensors is not None:

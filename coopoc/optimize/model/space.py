@@ -126,6 +126,10 @@ def cross(w: Floats) -> Floats:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+FARTHEST = 1e6
+"""rad, beyond which the sine of an angle keeps too few digits to be one of a heading."""
+
+
 def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     """Poses (..., d + d^2) from positions (..., d) m and headings (...) rad in 2-D or rotation vectors (..., 3) in 3-D.
 
@@ -133,7 +137,7 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     array([ 1.,  2.,  0., -1.,  1.,  0.])
     """
     at, w = checked("position", position), checked("turn", turn)
-    refuse("turn", w, ~np.isfinite(w), "must be finite", "Give rad.")
+    refuse("turn", w, ~(np.abs(w) <= FARTHEST), "must be finite, at most 10^6 rad", "Give rad.")
     if not at.ndim or at.shape[-1] not in (2, 3):
         allowed = "must have shape (..., 2) or (..., 3)"
         raise InputError("position", f"shape {at.shape}", allowed, "Give x, y or x, y, z of each.")

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, Ints, number
-from ...errors import InputError
+from ...errors import InputError, shown
 from ...world.recording import Recording, check_recording
 from ...world.sensors import Sensors
 from ...world.spherical import to_vector
@@ -141,7 +141,7 @@ def recorded_steps(
     check_recording(recording)
     (column,) = recording.observing([ego])
     if noise is not None and not isinstance(noise, Noise):
-        raise InputError("noise", repr(noise)[:60], "must be a noise model", "Give NoiseModel.nominal(sensors).")
+        raise InputError("noise", shown(noise), "must be a noise model", "Give NoiseModel.nominal(sensors).")
     _check(recording, step, length, run)
     steps, names, before = [], [], np.empty(0, np.int64)
     for s in range(step - length + 1, step + 1):

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, Ints, checked, instance
-from ...errors import InputError
+from ...arrays import Floats, Ints, checked, instance, plain
+from ...errors import InputError, shown
 from ..model.factor import unchecked
 from ..model.local import local
 from ..model.problem import Problem
@@ -53,7 +53,7 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
         k, rows = item if isinstance(item, tuple | list) and len(item) == 2 else (item, None)
         if isinstance(k, bool) or not isinstance(k, int | np.integer) or not 0 <= k < len(problem.factors):
             allowed = f"must be a factor in 0..{len(problem.factors) - 1} or (factor, rows)"
-            raise InputError("candidates", repr(item), allowed, "See problem.factors.")
+            raise InputError("candidates", shown(item), allowed, "See problem.factors.")
         factor = problem.factors[k]
         if factor.loss is not None:
             raise InputError(
@@ -66,10 +66,11 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
     if not places or len(set(places)) < len(places):
         hint = "Name the factors that may hold outliers."
         raise InputError("candidates", list(candidates)[:3], "must name measurements, each once", hint)
-    labels = np.arange(len(places)) if groups is None else np.asarray(groups)
-    if labels.shape != (len(places),):
-        allowed = f"must have shape ({len(places)},), one label per candidate measurement"
-        raise InputError("groups", labels.shape, allowed, "Leave it out to judge each alone.")
+    labels = np.arange(len(places)) if groups is None else plain(groups)
+    if labels.shape != (len(places),) or labels.dtype.kind not in "iuSU":
+        allowed = f"must have shape ({len(places)},), one whole number or word per candidate measurement"
+        given = f"shape {labels.shape} of {labels.dtype}"
+        raise InputError("groups", given, allowed, "Leave it out to judge each alone.")
     factor_of, row = np.array(places).T
     return Marked(factor_of, row, np.unique(labels, return_inverse=True)[1])
 
