@@ -12,6 +12,7 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.plugins import one_of
+from coopoc.short_repr import short_repr
 from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
@@ -51,6 +52,8 @@ class Log:
     summary: Summary
     messages: bool
     origin: tuple[float, float, float] | None = None
+
+    __repr__ = short_repr
 
     def part(self, since: float | None = None, until: float | None = None) -> Log:
         """The same log from `since` to `until` s after its first step, such as a part to train on and the rest.

@@ -19,6 +19,7 @@ from torch import Tensor
 from coopoc.errors import InputError
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
+from coopoc.short_repr import short_repr
 
 from .nets.gain import Gain
 from .nets.stack import unflatten
@@ -36,6 +37,8 @@ class Checkpoint:
     model: Gain
     card: Mapping[str, Any]
     history: Tensor | None = None
+
+    __repr__ = short_repr
 
     def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""

@@ -15,6 +15,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -40,6 +41,8 @@ class Diagnostics:
     prior: Floats
     innovation: Floats
     posterior: Floats
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,8 @@ class LearnedGain:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[GainState]:
         """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.

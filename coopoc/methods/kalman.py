@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.solo import FixNoise, drive
+from ..short_repr import short_repr
 from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel, resolve
@@ -39,6 +40,8 @@ class Kalman:
     name: str = "kalman"
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -10,6 +10,7 @@ import numpy as np
 from ..arrays import Floats, instance
 from ..errors import InputError
 from ..plugins import suggestion
+from ..short_repr import short_repr
 from ..world.fleet import Fleet
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
@@ -40,6 +41,8 @@ class NoiseModel:
     gnss_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     velocity: Floats | None = None
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for field in ("process_std", "gnss_std"):

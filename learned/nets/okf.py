@@ -18,6 +18,7 @@ from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.stream import FilterStream, check_interval
 from coopoc.methods.track import Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -52,6 +53,8 @@ class OptimisedKF:
     name: str = "okf"
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for field in ("process_std", "velocity_ratio", "gnss_std"):

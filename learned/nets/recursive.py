@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats
 from coopoc.methods.stream import Stream, solo_track
 from coopoc.methods.track import Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -188,6 +189,8 @@ class RecursiveFilter:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def start(self, x0: npt.ArrayLike | None = None, *, history: float = 10.0) -> Stream[RecursiveState]:
         """The filter as a stream, one step at a time (docs/streaming.md).

@@ -14,6 +14,7 @@ from torch import Tensor
 from coopoc.arrays import AnyArray, Floats, instance, number
 from coopoc.errors import InputError
 from coopoc.plugins import one_of
+from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensing import observe
@@ -69,6 +70,8 @@ class Segments:
     true_start: Tensor
     dt: float
     noise: Noise = "static"
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -165,6 +168,8 @@ class Client:
     training: Segments
     validation: Segments
     long: Segments
+
+    __repr__ = short_repr
 
 
 def clients(

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
+from coopoc.short_repr import short_repr
 from coopoc.world.noise import stream
 
 from ..nets.gain import Gain
@@ -45,6 +46,8 @@ class Progress:
     training_loss: float
     validation_loss: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -54,6 +57,8 @@ class Fit:
     history: tuple[Progress, ...]
     stopped: str | None
     seconds: float
+
+    __repr__ = short_repr
 
     @property
     def best(self) -> Progress:

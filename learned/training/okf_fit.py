@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc.short_repr import short_repr
 from coopoc.world.noise import stream
 
 from ..nets.gain import error, known, over_time
@@ -26,6 +27,8 @@ class OkfFit:
     model: NoiseParameters
     validation_loss: tuple[float, ...]
     seconds: float
+
+    __repr__ = short_repr
 
     @property
     def method(self) -> OptimisedKF:
