@@ -20,7 +20,7 @@ _LIBRARIES = (
     "torch",
     "gtsam",
     "casadi",
-    "cvxpy",
+    "cvxpy-base",
     "osqp",
     "pandas",
     "pyarrow",
