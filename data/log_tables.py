@@ -26,6 +26,7 @@ LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 LOST = ("lost", "-1")
 USUAL = {
     "t": ("time", "timestamp", "stamp", "time_s", "seconds", "sec", "datetime", "utc", "rostime"),
+    "partner": ("target", "to", "other", "peer", "neighbour", "neighbor", "anchor"),
     "value": ("measurement", "val", "data"),
     "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
 }
@@ -81,7 +82,10 @@ def read_rows(
         rows = _wide(frame, path, tally, {}, ignore)
         return _checked(replace(rows, t=np.full(len(rows), np.nan)))
     read = _long if {"kind", "value"} <= set(frame.columns) or "kind" in frame.columns else _wide
-    return _checked(read(frame, path, tally, dict(kinds or {}), ignore))
+    rows = read(frame, path, tally, dict(kinds or {}), ignore)
+    if "partner" not in frame.columns and (rows.group == "relative").any():
+        raise _no_column(file, "partner", frame)
+    return _checked(rows)
 
 
 def named(header: str) -> list[str]:
