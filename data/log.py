@@ -13,6 +13,7 @@ from coopoc.arrays import Floats, checked, instance, named, number
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.plugins import one_of
+from coopoc.short_repr import short_repr
 from coopoc.world.axes import texts
 from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
@@ -53,6 +54,8 @@ class Log:
     summary: Summary
     messages: bool
     origin: tuple[float, float, float] | None = None
+
+    __repr__ = short_repr
 
     def part(self, since: float | None = None, until: float | None = None) -> Log:
         """The same log from `since` to `until` s after its first step, such as a part to train on and the rest.

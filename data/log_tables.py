@@ -26,7 +26,7 @@ LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 LOST = ("lost", "-1")
 USUAL = {
     "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "car_id", "agent_id"),
-    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
+    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "peer", "anchor", "receiver", "landmark"),
     "t": ("time", "timestamp", "stamp", "time_s", "seconds", "sec", "datetime", "utc", "rostime"),
     "value": ("measurement", "val", "data"),
     "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
@@ -83,7 +83,10 @@ def read_rows(
         rows = _wide(frame, path, tally, {}, ignore)
         return _checked(replace(rows, t=np.full(len(rows), np.nan)))
     read = _long if {"kind", "value"} <= set(frame.columns) or "kind" in frame.columns else _wide
-    return _checked(read(frame, path, tally, dict(kinds or {}), ignore))
+    rows = read(frame, path, tally, dict(kinds or {}), ignore)
+    if "partner" not in frame.columns and (rows.group == "relative").any():
+        raise _no_column(file, "partner", frame)
+    return _checked(rows)
 
 
 def named(header: str) -> list[str]:
@@ -119,8 +122,6 @@ def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
             raise InputError(
                 f"{file}: row {row[k]}, column kind", repr(one), f"must be one of {', '.join(KINDS)}", hint.lstrip()
             )
-    if any(KINDS[one].group == "relative" for one in set(kind.tolist())):
-        _need_members(frame, file)
     message = kind == "message"
     value = np.full(len(frame), np.nan)
     if not message.all():
@@ -151,8 +152,6 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
         raise _no_column(file, "kind", frame)
     frame = _own_std(frame, used, tally, file)
     groups = {KINDS[kind].group for kind in used}
-    if "relative" in groups:
-        _need_members(frame, file)
     known = {"t", "vehicle", *used, *(f"{kind}_std" for kind in used)}
     known |= {"partner"} if groups & {"relative", "message"} else set()
     known |= {"arrival"} if "message" in used else set()
@@ -301,12 +300,6 @@ def _partners(frame: pd.DataFrame) -> AnyArray:
     if "partner" not in frame.columns:
         return np.full(len(frame), "", dtype=object)
     return np.array(["" if p != p or p is None else str(p).strip() for p in frame["partner"].tolist()], dtype=object)
-
-
-def _need_members(frame: pd.DataFrame, file: str) -> None:
-    """InputError for a table of relative measurements without a column partner."""
-    if "partner" not in frame.columns:
-        raise _no_column(file, "partner", frame)
 
 
 def _no_column(file: str, column: str, frame: pd.DataFrame) -> InputError:

@@ -10,6 +10,7 @@ import numpy as np
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
+from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 
 from . import mrclam_files as files
@@ -64,6 +65,8 @@ class MrclamLog:
     sightings: Floats
     unknown: int
     absent: int = 0
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,7 @@ from coopoc.methods.options import check_options
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
 from coopoc.seals import UNSEALED, holds, sealed
+from coopoc.short_repr import short_repr
 
 from .nets.gain import Gain
 from .nets.stack import unflatten
@@ -41,6 +42,8 @@ class Checkpoint:
     model: Gain
     card: Mapping[str, Any]
     history: Tensor | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self, kinds={"model": Gain, "card": Mapping, "history": Tensor})

@@ -16,6 +16,7 @@ from coopoc.errors import InputError, shown
 from coopoc.methods.options import check_options
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -41,6 +42,8 @@ class Diagnostics:
     prior: Floats
     innovation: Floats
     posterior: Floats
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,8 @@ class LearnedGain:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -7,4 +7,4 @@ try:
 except ModuleNotFoundError as error:
     if error.name != "torch":
         raise
-    raise MissingLibraryError("torch", "learned gains and their training", "'coopoc[learned]'") from None
+    raise MissingLibraryError("torch", "a learned gain", "'coopoc[learned]'") from None

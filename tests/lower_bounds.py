@@ -12,10 +12,10 @@ PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
 def lower(requirement: str) -> str:
     """The constraint of a requirement.
 
-    >>> lower("scipy>=1.13"), lower("numpy>=2")
-    ('scipy==1.13.*', 'numpy==2.0.*')
+    >>> lower("scipy>=1.13"), lower("numba>=0.68,<0.69"), lower("numpy>=2")
+    ('scipy==1.13.*', 'numba==0.68.*', 'numpy==2.0.*')
     """
-    found = re.fullmatch(r"([\w.-]+)>=([\d.]+)", requirement)
+    found = re.fullmatch(r"([\w.-]+)>=([\d.]+)(?:,<[\d.]+)?", requirement)
     assert found, f"{requirement} names no least version"
     name, version = found.groups()
     return f"{name}=={version}.*" if "." in version else f"{name}=={version}.0.*"

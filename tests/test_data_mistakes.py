@@ -57,6 +57,7 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "a compass in radians' column": (swap(",0.0\n", ",270\n", WIDE), {}, "row 1, heading"),
     "a negative range": (swap("range,blue,12.0", "range,blue,-3.2"), {}, "row 5, range"),
     "a range without a partner": (swap("range,blue", "range,"), {}, "row 5, column partner"),
+    "no column of partners": (swap("kind,partner", "kind,target"), {}, "log.csv: column partner"),
     "a vehicle that measures itself": (swap("range,blue", "range,red"), {}, "row 5, column partner"),
     "a standard deviation of zero": (swap("x,,0.0,1.5", "x,,0.0,0"), {}, "row 1, standard deviation of x"),
     "a message that arrives before it is sent": (swap("red,,,0.1", "red,,,-0.5"), {}, "row 10, column arrival"),

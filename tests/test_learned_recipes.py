@@ -57,7 +57,7 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
     assert torch.equal(flatten([again.model]), flatten([net]))
     assert torch.equal(flatten([again.after(1)]), history[1:])
     assert (again.card["recipe"], again.card["best"], again.card["parameters"]) == ("mine", 3, 19_938)
-    assert again.card["environment"]["torch"] == torch.__version__
+    assert torch.__version__.startswith(again.card["environment"]["torch"])  # of some builds it ends with "+cu130"
     assert [p.name for p in tmp_path.iterdir()] == ["net.safetensors"]
     with pytest.raises(InputError, match="row"):
         again.after(2)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, checked, instance
 from ..errors import InputError
+from ..short_repr import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,8 @@ class Alignment:
     rotation: Floats
     translation: Floats
     scale: Floats
+
+    __repr__ = short_repr
 
     def apply(self, position: Floats) -> Floats:
         """(..., T, d) positions in the other frame, m."""
@@ -70,6 +73,8 @@ class AbsoluteError:
     """Absolute position error (APE, also ATE) of a trajectory: (..., T) m, and its rmse, mean and max, (...,) m."""
 
     error: Floats
+
+    __repr__ = short_repr
 
     @property
     def rmse(self) -> Floats:

@@ -14,6 +14,7 @@ from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
 from ..methods.track import Track
 from ..plugins import one_of
+from ..short_repr import short_repr
 from ..world.recording import Recording
 from ..world.v2x import Message
 
@@ -47,6 +48,8 @@ class Ledger:
     sent: Floats
     received: Floats
     servers: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for name in ("seconds", "sent", "received"):

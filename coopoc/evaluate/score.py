@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Floats, Ints, checked, instance, named, number
 from ..errors import InputError
 from ..plugins import one_of, suggestion
+from ..short_repr import short_repr
 from .alignment import Alignment, align
 from .association import associated
 from .relative_error import Unit, ends, relative_error
@@ -35,6 +36,8 @@ class Path:
     position: Floats
     rotation: Floats | None = None
     covariance: Floats | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         count = len(checked("t", self.t, "(T,)", (-1,)))

@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from ..arrays import Floats, Ints, frozen
+from ..short_repr import short_repr
 from .rotations import to_rotation
 
 ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be
@@ -66,6 +67,8 @@ class PoseEdges(Edges):
     covariance: Floats = ()  # type: ignore[assignment]
     stamps: Floats = ()  # type: ignore[assignment]
 
+    __repr__ = short_repr
+
     @cached_property
     def rotation(self) -> Floats:
         """(M, d, d)."""
@@ -91,6 +94,8 @@ class PointEdges(Edges):
     covariance: Floats = ()  # type: ignore[assignment]
     stamps: Floats = ()  # type: ignore[assignment]
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class RangeEdges(Edges):
@@ -110,3 +115,5 @@ class RangeEdges(Edges):
     distance: Floats = ()  # type: ignore[assignment]
     variance: Floats = ()  # type: ignore[assignment]
     stamps: Floats = ()  # type: ignore[assignment]
+
+    __repr__ = short_repr

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, frozen
 from ..errors import InputError
+from ..short_repr import short_repr
 
 ORTHONORMAL = 1e-3  # largest entry of |R R^T - I| of a matrix that was merely rounded
 
@@ -39,6 +40,8 @@ class Trajectory:
     position: Floats
     rotation: Floats
     place: InitVar[Callable[[int], str] | None] = None
+
+    __repr__ = short_repr
 
     def __post_init__(self, place: Callable[[int], str] | None) -> None:
         for field in ("position", "rotation", *(() if self.stamps is None else ("stamps",))):

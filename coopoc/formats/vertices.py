@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from ..arrays import Bools, Floats
+from ..short_repr import short_repr
 from .rotations import to_rotation
 
 
@@ -19,6 +20,8 @@ class Vertices:
     position: Floats
     orientation: Floats
     stamps: Floats = ()  # type: ignore[assignment]
+
+    __repr__ = short_repr
 
     @cached_property
     def rotation(self) -> Floats:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.solo import FixNoise
+from ..short_repr import short_repr
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
@@ -103,6 +104,8 @@ class AdaptiveKalman(NoiseAdaptive):
 
     window: float = 100.0
     name: str = "kalman-adaptive"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         super().__post_init__()

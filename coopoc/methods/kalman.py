@@ -13,6 +13,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import Drive, FixNoise, drive
+from ..short_repr import short_repr
 from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel, resolve
@@ -40,6 +41,8 @@ class Kalman:
     name: str = "kalman"
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -9,6 +9,7 @@ import numpy as np
 from ..arrays import Floats, checked, instance
 from ..errors import InputError
 from ..plugins import suggestion
+from ..short_repr import short_repr
 from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet
 from ..world.recording import Recording, check_recording
@@ -40,6 +41,8 @@ class NoiseModel:
     gnss_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     velocity: Floats | None = None
     notes: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_texts(self, "name")

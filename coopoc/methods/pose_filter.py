@@ -12,6 +12,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, checked, number
 from ..errors import InputError
 from ..plugins import one_of
+from ..short_repr import short_repr
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.spherical import wrap
@@ -80,6 +81,8 @@ class PoseFilter:
     spread: tuple[float, ...] = SPREAD
     assumed: Sensors | None = None
     name: str = ""
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..optimize.backend import require_backend
 from ..optimize.incremental import Estimates, FixedLag
 from ..optimize.model.space import log
+from ..short_repr import short_repr
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import Message
@@ -64,6 +65,8 @@ class PoseSmoother:
     name: str = "pose-smoother"
     cooperative: bool = True
     message: Message = pose_unit.UPLOAD
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import Floats, checked, instance, number
 from ..errors import InputError, shown
+from ..short_repr import short_repr
 from ..world.axes import texts
 from ..world.fleet import Fleet
 from ..world.recording import Recording
@@ -57,6 +58,8 @@ class Track:
     heading: Floats | None = None
     heading_covariance: Floats | None = None
     extras: Mapping[str, Floats] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..kernels.solo import FixNoise
+from ..short_repr import short_repr
 from .adaptive import NoiseAdaptive
 from .noise_model import NoiseModel
 
@@ -38,6 +39,8 @@ class VariationalKalman(NoiseAdaptive):
     rho: float = 0.99
     iterations: int = 3
     name: str = "kalman-variational"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
+from ..short_repr import short_repr
 from .algebra.arrowhead import Arrow, marginals, structure
 from .algebra.normal import normal_equations
 from .assessment.assess import bounded
@@ -37,6 +38,8 @@ class Batch:
     iterations: Ints
     converged: Bools
     again: Bools
+
+    __repr__ = short_repr
 
 
 def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **options: Any) -> Batch:

@@ -12,6 +12,7 @@ import numpy as np
 from ..arrays import Floats, Ints, instance, listed, named, number
 from ..errors import InputError
 from ..plugins import suggestion
+from ..short_repr import short_repr
 from .backend import require_backend
 from .backends.gauss_newton import linear_step
 from .backends.gtsam_forms import forms
@@ -36,6 +37,8 @@ class Estimates:
     names: tuple[str, ...]
     x: Floats
     covariance: Floats
+
+    __repr__ = short_repr
 
 
 class FixedLag:

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Floats, instance
 from ..errors import InputError, shown
 from ..plugins import suggestion
+from ..short_repr import short_repr
 from .model.space import Space
 
 if TYPE_CHECKING:
@@ -77,6 +78,8 @@ class Solution:
     space: Space = field(default_factory=Space)
     violation: float = 0.0
     extras: dict[str, Any] = field(default_factory=dict)
+
+    __repr__ = short_repr
 
     @property
     def position(self) -> Floats:

@@ -17,6 +17,7 @@ from ..escapes import spreadsheet
 from ..evaluate.statistics import Interval, mean_interval
 from ..file_names import given_path
 from ..plugins import unknown
+from ..short_repr import short_repr
 from . import store
 from .manifest import read
 from .parse import assignments, parse
@@ -49,6 +50,8 @@ class Results:
     failures: pd.DataFrame
     pending: int
     environment: Mapping[str, str]
+
+    __repr__ = short_repr
 
     @classmethod
     def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats, checked, refuse
+from ..short_repr import short_repr
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +27,8 @@ class Body:
 
     yaw_rate: Floats
     heading: Floats
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         shape: tuple[int, ...] = (-1, -1, -1)

@@ -13,6 +13,7 @@ from torch import Tensor
 from coopoc.arrays import instance
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import Ledger, of_training
+from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 
 from ..nets.gain import Gain
@@ -52,6 +53,8 @@ class Round:
     note: str = ""
     disagreement: float = 0.0
 
+    __repr__ = short_repr
+
     @property
     def sent_bytes(self) -> int:
         """Bytes that all clients sent."""
@@ -88,6 +91,8 @@ class Federation:
     seconds: float
     names: tuple[str, ...] = ()
     own: Tensor | None = None
+
+    __repr__ = short_repr
 
     @property
     def best(self) -> Round:

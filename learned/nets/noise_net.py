@@ -15,6 +15,7 @@ from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.methods.star import FORGOTTEN
 from coopoc.methods.track import Method, Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -144,6 +145,8 @@ class NoiseFilter:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     @one_core()
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:

@@ -19,6 +19,7 @@ from coopoc.methods.kalman import drive_of, filtered
 from coopoc.methods.options import check_options
 from coopoc.methods.stream import FilterStream, check_interval
 from coopoc.methods.track import Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -53,6 +54,8 @@ class OptimisedKF:
     name: str = "okf"
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         for field in ("process_std", "velocity_ratio", "gnss_std"):

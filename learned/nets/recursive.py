@@ -16,6 +16,7 @@ from coopoc.arrays import Floats
 from coopoc.methods.options import check_options
 from coopoc.methods.stream import Stream, solo_track
 from coopoc.methods.track import Track
+from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
@@ -189,6 +190,8 @@ class RecursiveFilter:
     x0: Floats | None = None
     cooperative: bool = False
     message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self, kinds={"model": RecursiveGain})

@@ -15,6 +15,7 @@ from coopoc.arrays import AnyArray, Floats, instance, number
 from coopoc.errors import InputError, shown
 from coopoc.methods.options import check_options
 from coopoc.plugins import one_of
+from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.noise import stream
 from coopoc.world.sensing import observe
@@ -70,6 +71,8 @@ class Segments:
     true_start: Tensor
     dt: float
     noise: Noise = "static"
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self, {"dt": (1e-9, 1e9, "> 0 s")})
@@ -179,6 +182,8 @@ class Client:
     training: Segments
     validation: Segments
     long: Segments
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self, kinds={"training": Segments})

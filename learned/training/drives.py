@@ -12,6 +12,7 @@ import numpy as np
 
 from coopoc.arrays import instance, listed
 from coopoc.errors import InputError, shown
+from coopoc.short_repr import short_repr
 from coopoc.world.axes import columns
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording, check_recording
@@ -42,6 +43,8 @@ class MeasuredDrives:
     recording: Recording
     truth: Fleet
     ids: tuple[str, ...] = ()
+
+    __repr__ = short_repr
 
     def __post_init__(self) -> None:
         hint = "Add a table named truth to the folder of the log, or name one: read_log(..., truth=)."

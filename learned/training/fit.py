@@ -15,6 +15,7 @@ from torch import Tensor
 from coopoc.arrays import Floats, Ints, instance
 from coopoc.errors import InputError
 from coopoc.methods.options import check_options
+from coopoc.short_repr import short_repr
 from coopoc.world.noise import stream
 
 from ..nets.gain import Gain
@@ -49,6 +50,8 @@ class Progress:
     training_loss: float
     validation_loss: float
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -58,6 +61,8 @@ class Fit:
     history: tuple[Progress, ...]
     stopped: str | None
     seconds: float
+
+    __repr__ = short_repr
 
     @property
     def best(self) -> Progress:

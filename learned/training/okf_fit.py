@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import instance, number
+from coopoc.short_repr import short_repr
 from coopoc.world.noise import stream
 
 from ..nets.gain import error, known, over_time
@@ -27,6 +28,8 @@ class OkfFit:
     model: NoiseParameters
     validation_loss: tuple[float, ...]
     seconds: float
+
+    __repr__ = short_repr
 
     @property
     def method(self) -> OptimisedKF:

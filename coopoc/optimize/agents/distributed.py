@@ -9,6 +9,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints, instance, number
 from ...errors import InputError
+from ...short_repr import short_repr
 from ..algebra.sparse import sparse
 from ..model.problem import Problem
 from .agent import Agent, agents_of
@@ -37,6 +38,8 @@ class Distributed:
     messages: Ints
     sent_bytes: Ints
     robots: tuple[str, ...]
+
+    __repr__ = short_repr
 
 
 def solve_distributed(

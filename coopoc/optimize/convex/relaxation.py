@@ -14,6 +14,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
+from ...short_repr import short_repr
 from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve
@@ -48,6 +49,8 @@ class Relaxation:
     cost: float
     solution: Solution | None
     seconds: float
+
+    __repr__ = short_repr
 
     @property
     def gap(self) -> float:

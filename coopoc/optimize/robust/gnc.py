@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ...arrays import Bools, Floats, Ints, instance
 from ...errors import InputError
 from ...plugins import one_of
+from ...short_repr import short_repr
 from ..backend import Backend
 from ..batch import Batch, solve_batch
 from ..model.problem import Problem
@@ -38,6 +39,8 @@ class GNCBatch(Batch):
     rounds: Ints
     mu: Floats
     problem: Problem
+
+    __repr__ = short_repr
 
 
 def solve_gnc(
