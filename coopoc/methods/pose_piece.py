@@ -138,7 +138,7 @@ def _moves(drive: Drive, step: int, columns: Sequence[int], moved: Floats) -> li
     speed = noise.assumed_velocity_std(drive.recording.velocity[drive.run, step, columns])[:, :2]
     turn = np.full((count, 1), max(noise.yaw_rate_std, LEAST_YAW_RATE_STD))
     pairs = np.arange(2 * count).reshape(2, count).T
-    return [of_recorded("relative_pose", pairs, moved, dt * np.hstack([speed, turn]))]
+    return [of_recorded("relative_pose_log", pairs, moved, dt * np.hstack([speed, turn]))]
 
 
 def _own(drive: Drive, step: int, columns: Sequence[int], place: Mapping[int, int]) -> list[Factor]:
