@@ -77,7 +77,7 @@ def joined(parts: list[Problem]) -> Problem:
 def test_an_endless_lag_is_one_solve_of_all_that_was_measured() -> None:
     """Gauss-Newton on all factors at once, with ranges, bearings, both, fixes, compasses and landmarks among them."""
     seen, _ = recording()
-    smoother = PoseSmoother(np.inf, threshold=1e-9, passes=12)
+    smoother = PoseSmoother(np.inf, threshold=1e-9, passes=8)
     parts = list(pieces(seen, smoother))
     assert {f.kind for part in parts for f in part.factors} == {
         "relative_pose_log",
@@ -91,7 +91,7 @@ def test_an_endless_lag_is_one_solve_of_all_that_was_measured() -> None:
     *_, newest = smoother.follow(seen)
     place = [whole.names.index(name) for name in newest.names]
     assert newest.names == ("a@29", "b@29", "c@29")
-    assert newest.x == pytest.approx(whole.x[place], abs=1e-6)
+    assert newest.x == pytest.approx(whole.x[place], abs=1e-5)  # Cholesky of odometry to 1e-3 m
     assert newest.covariance == pytest.approx(whole.covariance[place], rel=1e-4)
 
 
