@@ -67,6 +67,11 @@ class Drive:
         return moved, std
 
     @cached_property
+    def fix_std(self) -> Floats:
+        """(1, 2) m."""
+        return check_std(lookup("position"), np.array(self.noise.fix_std[:2]), (1, 2))
+
+    @cached_property
     def compass(self) -> tuple[Floats, Floats]:
         """(T, N, 6) poses that have the headings of the compasses, NaN where there is none, and (1, 3) their std."""
         noise, seen = self.noise, body_of(self.recording).heading[self.run]
@@ -186,11 +191,10 @@ def _moves(drive: Drive, step: int, columns: Sequence[int]) -> list[Factor]:
 def _own(drive: Drive, step: int, columns: Sequence[int], place: Mapping[int, int]) -> list[Factor]:
     """Fixes, compasses and, at the first step, the poses that are given."""
     found, fix, (compass, turn) = [], drive.recording.gnss[drive.run, step, :, :2], drive.compass
-    fixed: Bools = np.isfinite(fix).all(axis=1)
+    fixed = np.isfinite(fix[:, 0] + fix[:, 1])
     on = [c for c in columns if fixed[c]]
     if on:
-        std = check_std(lookup("position"), np.array(drive.noise.fix_std[:2]), (1, 2))
-        found.append(of_checked("position", _column([place[c] for c in on]), fix[on], std))
+        found.append(of_checked("position", _column([place[c] for c in on]), fix[on], drive.fix_std))
     headed = np.isfinite(compass[step, :, 0])
     on = [c for c in columns if headed[c]]
     if on:
