@@ -114,7 +114,7 @@ class Problem:
     @cached_property
     def space(self) -> Space:
         """Where the nodes live."""
-        return Space(self.dimension, bool(self.poses))
+        return _space(self.dimension, bool(self.poses))
 
     @cached_property
     def movable(self) -> Bools | None:
@@ -334,6 +334,10 @@ class Problem:
         plane = " in the plane" if self.dimension == 2 else ""
         bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
         return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
+
+
+_space = cache(Space)
+"""The one space of its kind."""
 
 
 @cache
