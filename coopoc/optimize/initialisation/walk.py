@@ -32,9 +32,9 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
     position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
     known = np.zeros(n, dtype=bool)
     which = np.argsort(moves.length, kind="stable")
-    ends = np.concatenate([moves.nodes, moves.nodes[:, ::-1]])[np.concatenate([which, which + len(which)])]
+    ends = np.stack([moves.nodes[which], moves.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
     key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
-    edge, forward = which[first % max(len(which), 1)], first < len(which)
+    edge, forward = which[first // 2], first % 2 == 0
     ways = csr_array((moves.length[edge], (key // n, key % n)), shape=(n, n))
     for root, at, turned in roots:
         if known[root]:
