@@ -17,6 +17,7 @@ from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import random_graph
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
+from scipy.sparse.csgraph import dijkstra
 
 from coopoc import InputError
 from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
@@ -35,10 +36,12 @@ from coopoc.optimize.initialisation.linear_start import linear_start, project
 from coopoc.optimize.initialisation.race import expected
 from coopoc.optimize.initialisation.starts import chained, separated
 from coopoc.optimize.initialisation.trilateration import located
+from coopoc.optimize.initialisation.walk import Moves, walk
 from coopoc.optimize.model.dual import Dual
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.model.fuse import fused
 from coopoc.optimize.model.search import Search
+from coopoc.optimize.model.space import exp
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
@@ -367,6 +370,59 @@ def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed: int) ->
     grown = solve(from_graph(graph, start="incremental"))
     assert grown.cost == pytest.approx(best, rel=1e-6)
     assert solve(from_graph(graph, start="odometry"), throw=False).cost > 1.2 * best
+
+
+def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ranges ten times as noisy as stated: a start that grows would end at the same minimum, and is not tried."""
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
+    from unseen_graphs import world
+
+    drive = world(31, 2, 1, 300, 3)
+    ranges = drive.ranged(drive.to_points(300), 1.0)
+    stated = replace(ranges, variance=ranges.variance / 100.0)
+    graph = drive.graph(relative_pose=drive.relative(drive.chain(), 0.02, 0.005), ranges=stated)
+    problem = from_graph(graph)
+    found, free = solve(problem), 3 * 299 + 2 * 3
+    mean, variance = expected(problem, free)
+    assert found.cost > mean + 5 * np.sqrt(variance)
+    assert found.extras["start"] == "odometry"
+    assert found.extras["start_iterations"] <= 12
+    assert found.cost == pytest.approx(solve(from_graph(graph, start="incremental")).cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_poses_are_composed_along_the_shortest_paths(dimension: int) -> None:
+    """Against SciPy's dijkstra and products one after the other; parallel edges both ways, two parts, an odd pose."""
+    rng = np.random.default_rng(5)
+    n, space = 60, Space(dimension, has_rotation=True)
+    pairs = np.array([(rng.integers(max(30 * (k > 30), k - 4), k), k) for k in range(1, n - 1) if k != 30])
+    pairs = np.concatenate([pairs, pairs[::3], pairs[::5, ::-1], rng.permutation(pairs)[:10, ::-1]])
+    turn, moved = space.angles, rng.normal(size=(len(pairs), dimension))
+    moves = Moves(pairs, moved, exp(rng.normal(size=(len(pairs), turn))), rng.uniform(1, 2, len(pairs)))
+    roots = [(k, rng.normal(size=dimension), exp(rng.normal(size=turn))) for k in (0, 5, 30)]
+    position, rotation, known = walk(n, dimension, moves, roots)
+    least = np.full((n, n), np.inf)
+    for (i, j), length in zip(pairs.tolist(), moves.length, strict=True):
+        least[i, j] = least[j, i] = min(least[i, j], length)
+    assert known.tolist() == [k < n - 1 for k in range(n)]
+    for root, at, turned in (roots[0], roots[2]):
+        far, before = dijkstra(np.where(np.isfinite(least), least, 0.0), indices=root, return_predecessors=True)
+        own = {root: (at, turned)}
+        for j in np.argsort(far)[1 : np.isfinite(far).sum()].tolist():
+            i = int(before[j])
+            k = min(
+                (k for k, pair in enumerate(pairs.tolist()) if sorted(pair) == sorted((i, j))),
+                key=lambda k: moves.length[k],
+            )
+            T, R = (moves.position[k], moves.rotation[k])
+            if pairs[k, 0] != i:
+                T, R = -R.T @ T, R.T
+            own[j] = own[i][0] + own[i][1] @ T, own[i][1] @ R
+        for j, (where, facing) in own.items():
+            assert position[j] == pytest.approx(where, abs=1e-12)
+            assert rotation[j] == pytest.approx(facing, abs=1e-12)
 
 
 def test_a_point_is_located_as_scipy_finds_it() -> None:

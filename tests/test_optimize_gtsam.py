@@ -75,6 +75,7 @@ def natives(d: int) -> dict[str, tuple]:
         "speed": ("speed", PAIRS, {"std": 0.3}, True),
         "relative position": ("relative_position", BETWEEN, {"std": 0.3}, True),
         "relative pose": ("relative_pose", BETWEEN, {"cov": apart(0.09 * np.eye(d), turn)}, False),
+        "relative pose log": ("relative_pose_log", BETWEEN, {"cov": spd(3 * d - 3, 0.01)}, True),
         "relative pose chordal": ("relative_pose_chordal", BETWEEN, {"std": even}, True),
         "pose": ("pose", [("a",), ("c",)], {"cov": apart(spd(d), turn)}, False),
         "pose chordal": ("pose_chordal", [("a",), ("c",)], {"cov": spd(d + d * d)}, True),

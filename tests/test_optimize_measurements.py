@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
 from coopoc import InputError
@@ -25,7 +26,7 @@ CONSTANTS = [0.1]
 class Symbolic:
     """CasADi as the namespace of a formula."""
 
-    sqrt, atan2, where = ca.sqrt, ca.atan2, ca.if_else
+    sqrt, sin, cos, atan2, where = ca.sqrt, ca.sin, ca.cos, ca.atan2, ca.if_else
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -49,7 +50,7 @@ def test_derivative_equals_casadis(kind: str, dimension: int) -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("kind", ["relative_pose", "relative_pose_chordal"])
+@pytest.mark.parametrize("kind", ["relative_pose", "relative_pose_log", "relative_pose_chordal"])
 def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
     """By the position and by a right turn R Exp(w), w = 0, for a small and for any error of the rotation."""
     known, space = MEASUREMENTS[kind], Space(dimension, has_rotation=True)
@@ -84,6 +85,21 @@ def test_a_relative_pose_is_scipys_logarithm() -> None:
     back = Rotation.from_matrix(ROTATIONS[::-1]).inv()
     assert found[:, :3] == pytest.approx(back.apply(VECTORS - VECTORS[::-1]), abs=1e-12)
     assert found[:, 3:] == pytest.approx((back * Rotation.from_matrix(ROTATIONS)).as_rotvec(), abs=1e-9)
+
+
+@pytest.mark.parametrize("far", [1.0, 1e-2, 1e-6])
+def test_the_logarithm_of_a_relative_pose_is_scipys(far: float) -> None:
+    """scipy.linalg.logm of the homogeneous matrix Tz^-1 T, near the measured pose and far from it."""
+    known, space = MEASUREMENTS["relative_pose_log"], Space(3, has_rotation=True)
+    near = ROTATIONS @ exp(far * VECTORS / np.linalg.norm(VECTORS, axis=1, keepdims=True))
+    found = known.difference(VECTORS, near, space.join(VECTORS[::-1], ROTATIONS), np.empty((50, 0)))
+    for k in range(50):
+        pair = np.tile(np.eye(4), (2, 1, 1))
+        pair[0, :3, :3], pair[0, :3, 3] = ROTATIONS[k], VECTORS[::-1][k]
+        pair[1, :3, :3], pair[1, :3, 3] = near[k], VECTORS[k]
+        twist = logm(np.linalg.inv(pair[0]) @ pair[1]).real
+        assert found[k, :3] == pytest.approx(twist[:3, 3], abs=1e-7)
+        assert found[k, 3:] == pytest.approx([twist[2, 1], twist[0, 2], twist[1, 0]], abs=1e-7)
 
 
 @pytest.mark.parametrize("kind", sorted(MEASUREMENTS))

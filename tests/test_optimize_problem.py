@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
-from coopoc.optimize import MEASUREMENTS, Factor, Problem, SolveError, Status, pose, solve, solve_batch
+from coopoc.optimize import MEASUREMENTS, Factor, Loss, Problem, SolveError, Status, pose, solve, solve_batch
 from coopoc.optimize.initialisation.initial import converted, initial_guess
 from coopoc.optimize.model.window import relative_std
 from coopoc.world.recording import Recording
@@ -239,6 +239,34 @@ def test_converted_measurement_has_the_rotated_covariance(recording: Recording) 
     measured = problem.factors[1].z
     assert (measured[:, 0] > 1).all()
     assert cov == pytest.approx(vector_cov(measured, S2.relative_std), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("most", [0, 200], ids=["kernel", "casadi"])
+def test_a_start_is_the_least_squares_of_the_converted_vectors(
+    recording: Recording, monkeypatch: pytest.MonkeyPatch, most: int
+) -> None:
+    """Against NumPy's least squares with vectors d u and vector_cov; ranges and losses have no part in it."""
+    monkeypatch.setattr("coopoc.optimize.algebra.layout.DENSE", most)
+    star = Problem.from_snapshot(recording, 20, 0)
+    fixes, edges = star.factors
+    problem = Problem(star.names, star.factors).add("range", (1, 2), 5.0, std=0.1)
+    problem = problem.add("position", 0, fixes.z[0] + 2.0, std=1.0, loss=Loss("cauchy", 1.0))
+    rows, goals = [], []
+    for factor, z, cov in (
+        (fixes, fixes.z, np.diag(np.square(fixes.std[0]))),
+        (edges, to_vector(edges.z), vector_cov(edges.z, S2.relative_std)),
+        (problem.factors[-1], problem.factors[-1].z, np.eye(3)),
+    ):
+        for nodes, value, own in zip(factor.nodes, z, np.broadcast_to(cov, (len(z), 3, 3)), strict=True):
+            wide = np.zeros((3, len(star.names), 3))
+            wide[:, nodes[-1]] = np.eye(3)
+            if len(nodes) == 2:
+                wide[:, nodes[0]] = -np.eye(3)
+            root = np.linalg.cholesky(np.linalg.inv(own)).T
+            rows.append(root @ wide.reshape(3, -1))
+            goals.append(root @ value)
+    wanted = np.linalg.lstsq(np.concatenate(rows), np.concatenate(goals), rcond=None)[0]
+    assert initial_guess(problem)[0].ravel() == pytest.approx(wanted, abs=1e-5)
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])

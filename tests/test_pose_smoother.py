@@ -80,7 +80,7 @@ def test_an_endless_lag_is_one_solve_of_all_that_was_measured() -> None:
     smoother = PoseSmoother(np.inf, threshold=1e-9, passes=8)
     parts = list(pieces(seen, smoother))
     assert {f.kind for part in parts for f in part.factors} == {
-        "relative_pose",
+        "relative_pose_log",
         "position",
         "pose",
         "range",
@@ -91,17 +91,17 @@ def test_an_endless_lag_is_one_solve_of_all_that_was_measured() -> None:
     *_, newest = smoother.follow(seen)
     place = [whole.names.index(name) for name in newest.names]
     assert newest.names == ("a@29", "b@29", "c@29")
-    assert newest.x == pytest.approx(whole.x[place], abs=1e-6)
-    assert newest.covariance == pytest.approx(whole.covariance[place], rel=0.05)  # their chord's J^T J, not ours
+    assert newest.x == pytest.approx(whole.x[place], abs=1e-5)  # Cholesky of odometry to 1e-3 m
+    assert newest.covariance == pytest.approx(whole.covariance[place], rel=1e-4)
 
 
 def test_a_lag_gives_what_gtsams_smoother_gives() -> None:
-    """GTSAM's own incremental fixed-lag smoother and factors; its odometry is the logarithm of the whole pose."""
+    """GTSAM's own incremental fixed-lag smoother and factors, by a plain loop."""
     seen, _ = recording(60)
     smoother = PoseSmoother(1.55)
     ours = np.array([found.x[:, :2] for found in smoother.follow(seen)])
     theirs = by_hand(list(pieces(seen, smoother)), 1.55, seen.dt)
-    assert np.abs(ours - theirs).max() < 0.01
+    assert np.abs(ours - theirs).max() < 1e-9
 
 
 def flat_error(track: co.Track, fleet: co.Fleet) -> np.ndarray:

@@ -73,9 +73,11 @@ class Capabilities:
         >>> Capabilities().lacking(problem), Capabilities(constraints="linear").lacking(problem)
         (['a constraint on position'], [])
         """
-        kinds = {f.kind for f in problem.factors} - set(self.kinds or [f.kind for f in problem.factors])
-        losses = {f.loss.name for f in problem.factors if f.loss is not None}
-        losses -= set(losses if self.losses is None else self.losses)
+        kinds, losses = set[str](), set[str]()
+        if self.kinds is not None:
+            kinds = {f.kind for f in problem.factors} - {*self.kinds}
+        if self.losses is not None:
+            losses = {f.loss.name for f in problem.factors if f.loss is not None} - {*self.losses}
         barred = [c for c in problem.constraints if not self._can_hold(c.measurement.linear, bool(c.equality.all()))]
         return [
             *(f"kind {kind}" for kind in sorted(kinds)),

@@ -158,9 +158,14 @@ class FixedLag:
         keys, posed = [self._keys[name] for name in names], [self._turns[name] for name in names]
         x = estimate(space, posed, self._smoother.calculateEstimate(keys), keys)
         cov = [self._smoother.marginalCovariance(key) for key in keys]
-        if space.has_rotation:
-            cov = [t @ each @ t.T for t, each in zip(tangent(space, posed, x), cov, strict=True)]
-        return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
+        if not space.has_rotation:
+            return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
+        turn, whole = tangent(space, posed, x), np.zeros((len(x), space.dof, space.dof))
+        for kind in {*posed}:  # theirs have one size each
+            rows = [k for k, turns in enumerate(posed) if turns == kind]
+            T, own = (np.array([each[k] for k in rows]) for each in (turn, cov))
+            whole[rows] = T @ own @ T.swapaxes(1, 2)
+        return Estimates(names, x, whole)
 
     def _check(
         self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float], posed: Sequence[bool]

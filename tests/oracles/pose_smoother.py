@@ -1,7 +1,4 @@
-"""gtsam.IncrementalFixedLagSmoother by a plain loop, with the factors that a user of GTSAM would write.
-
-Odometry is BetweenFactorPose2, whose error is the logarithm of the whole pose.
-"""
+"""gtsam.IncrementalFixedLagSmoother by a plain loop, with the factors that a user of GTSAM would write."""
 
 from __future__ import annotations
 
@@ -39,7 +36,7 @@ def by_hand(parts: Sequence[Problem], lag: float, dt: float) -> Floats:
             for nodes, z, s in zip(factor.nodes.tolist(), factor.z, std, strict=True):
                 on, model = [keys[part.names[i]] for i in nodes], gtsam.noiseModel.Diagonal.Sigmas
                 posed = nodes[-1] in part.poses
-                if factor.kind == "relative_pose":
+                if factor.kind == "relative_pose_log":
                     graph.add(gtsam.BetweenFactorPose2(*on, gtsam.Pose2(*z[:2], np.arctan2(z[4], z[2])), model(s)))
                 elif factor.kind == "pose":
                     graph.add(gtsam.PoseRotationPrior2D(on[0], gtsam.Rot2(np.arctan2(z[4], z[2])), model(s[2:])))

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ...arrays import Floats, Ints
+from ..model.converted import is_converted
 from ..model.factor import Factor
 from ..model.losses import Loss
 from ..model.measurements import Measurement
@@ -20,7 +21,8 @@ from ..model.space import Space
 if TYPE_CHECKING:
     from ...kernels.graphs.graph_tape import Tape
 
-Model = Literal["cost", "gauss-newton", "newton"]
+Model = Literal["cost", "gauss-newton", "newton", "converted"]
+"""What a tape gives: the cost alone, with J^T J, with the exact Hessian; or J^T J of the converted measurement."""
 
 
 class NoTape(Exception):
@@ -83,7 +85,9 @@ def write(kind: Kind, model: Model) -> Written:
     """
     import casadi as ca
 
-    nodes, number, steps, parts = _cost(kind)
+    if model == "converted":
+        kind = kind._replace(loss=None)
+    nodes, number, steps, parts = _cost(kind, model == "converted")
     cost, white, square, rho = parts
     zero = ca.SX.zeros(steps.size1())
     outputs, entries = [cost], [(-1, -1)]
@@ -103,15 +107,18 @@ def write(kind: Kind, model: Model) -> Written:
                 entries.append((i, j))
     here = ca.substitute(ca.vertcat(*outputs), steps, zero)
     here = ca.cse(here)
-    kept = [k for k in range(here.size1()) if not here[k].is_zero()]
+    kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
     found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
     tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found))
     function = ca.Function("tape", [nodes, number], found)
     return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
 
 
-def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
-    """Symbols of the nodes, the numbers and the steps; the cost, the whitened residual, and rho of its square."""
+def _cost(kind: Kind, converted: bool) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
+    """Symbols of the nodes, the numbers and the steps; the cost, the whitened residual, and rho of its square.
+
+    Of converted measurements those without a linear form have no residual.
+    """
     import casadi as ca
 
     from ..model import symbolic
@@ -124,7 +131,10 @@ def _cost(kind: Kind) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
     number, square = ca.SX.sym("number", sum(widths)), ca.SX.sym("square")
     given = [number[sum(widths[:k]) : sum(widths[: k + 1])] for k in range(3)]
     try:
-        white = symbolic.white(known, space, nodes, steps, given, kind.full)
+        vectors = converted and is_converted(known)
+        white = symbolic.white(known, space, nodes, steps, given, kind.full, vectors)
+        if converted and not (vectors or known.linear):
+            white = ca.SX(size, 1)
         rho = symbolic.robust(square, kind.loss)
     except Exception as problem:  # the formula is the user's: whatever it raises, the plain way takes it
         raise NoTape(f"{known.name} does not run on CasADi's numbers: {problem}") from problem

@@ -101,9 +101,9 @@ def _as_graph(problem: Problem, system: Sparse, x: Floats) -> Assessment:
         return failed()
     dx = -cholesky.solve(gradient)
     free, rows, columns = system.entries.own
-    cov = np.zeros(free.shape)
-    cov[free] = cholesky.inverse(rows, columns)
-    inflation = np.einsum("nii->ni", cov)[system.entries.number >= 0] * values[system.entries.diagonal]
+    found, cov = cholesky.inverse(rows, columns), np.zeros(free.shape)
+    cov[free] = found
+    inflation = found[rows == columns] * values[system.entries.diagonal]
     remaining, promised = float(np.abs(dx).max(initial=0.0)), -0.5 * float(gradient @ dx)
     if not (inflation < INFLATION).all() and (without := failed()).unobservable:
         return without

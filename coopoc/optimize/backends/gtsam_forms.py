@@ -1,9 +1,8 @@
 """Which factors GTSAM has with exactly our objective, by kind.
 
 The error e of a GTSAM class below gives our whitened residual, or one of the same length, as S e; S goes into its noise
-model and the loss into a robust one. What is not here GTSAM weighs in another way: its BetweenFactorPose2/3 takes the
-logarithm of the whole pose where ours is (Rz^T (t - tz), Log(Rz^T R)), its bearing in space lives in the tangent plane
-of a direction, and range, azimuth and inclination in the world frame it does not have.
+model and the loss into a robust one. What is not here GTSAM weighs in another way: its bearing in space lives in the
+tangent plane of a direction, and range, azimuth and inclination in the world frame it does not have.
 """
 
 from __future__ import annotations
@@ -156,6 +155,12 @@ def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     return [*chord, Part({(POSE, POSE): f"BetweenFactorPose{d}"}, given, root)]
 
 
+def relative_log(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's errors in space are those of the rotation first."""
+    root = W if d == 2 else np.roll(W, -d, axis=2)
+    return [Part({(POSE, POSE): f"BetweenFactorPose{d}"}, lambda g: [(pose_of(g, d, z),) for z in factor.z], root)]
+
+
 def _relative_chordal(factor: Factor, W: Floats, d: int) -> Form:
     columns = {0: np.arange(d), **{1 + k: d + k + d * np.arange(d) for k in range(d)}}
     return _turned(W, columns, lambda gtsam: [(pose_of(gtsam, d, z),) for z in factor.z], d)
@@ -229,6 +234,7 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     "body_spherical": _body_spherical,
     "relative_position": _relative_position,
     "relative_pose": _relative_pose,
+    "relative_pose_log": relative_log,
     "relative_pose_chordal": _relative_chordal,
     "pose": _pose_prior,
     "pose_chordal": _chordal_prior,

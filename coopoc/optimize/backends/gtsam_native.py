@@ -16,7 +16,7 @@ from ..model.factor import Factor
 from ..model.linear import linearise
 from ..model.losses import Loss
 from ..model.problem import Problem
-from ..model.space import Space
+from ..model.space import Space, exp
 from .gtsam_forms import Form, pose_of
 
 ESTIMATORS = {
@@ -106,21 +106,22 @@ def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) 
     return found
 
 
-def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Iterable[int]) -> Floats:
-    """x (n, ambient) of the nodes in gtsam.Values."""
-    d, x = space.dimension, np.empty((len(posed), space.ambient))
-    if not space.has_rotation:
-        at = found.atPoint3 if d == 3 else found.atPoint2
-        return np.array([at(key) for key in keys]).reshape(x.shape)
-    position, rotation = x[:, :d], np.tile(np.eye(d), (len(x), 1, 1))
-    pose, point = getattr(found, f"atPose{d}"), getattr(found, f"atPoint{d}")
-    for i, (turns, key) in enumerate(zip(posed, keys, strict=True)):
-        if turns:
-            at = pose(key)
-            position[i], rotation[i] = at.translation(), at.rotation().matrix()
-        else:
-            position[i] = point(key)
-    return space.join(position, rotation)
+def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Sequence[int]) -> Floats:
+    """x (n, ambient) of the nodes in gtsam.Values, which holds no others."""
+    from gtsam import utilities
+
+    d, x, rank = space.dimension, np.empty((len(posed), space.ambient)), np.argsort(keys)
+    turns = np.array(posed, dtype=bool)[rank]
+    points, poses = rank[~turns], rank[turns]
+    if len(points):
+        x[points] = space.join(getattr(utilities, f"extractPoint{d}")(found))
+    if len(poses) and d == 2:
+        rows = utilities.extractPose2(found)
+        x[poses] = space.join(rows[:, :2], exp(rows[:, 2:]))
+    elif len(poses):
+        rows = utilities.extractPose3(found)
+        x[poses] = space.join(rows[:, 9:], rows[:, :9].reshape(-1, 3, 3))
+    return x
 
 
 def which_turn(problem: Problem) -> list[bool]:

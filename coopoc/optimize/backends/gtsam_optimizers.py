@@ -11,7 +11,7 @@ from ...arrays import Floats
 from ...errors import InputError
 from ..model.factor import Factor
 from ..model.problem import Problem
-from .gtsam_forms import Form, Part, pose_of
+from .gtsam_forms import Form, relative_log
 from .gtsam_native import fix_nodes, native_graph
 
 STEEP = 1e12
@@ -110,8 +110,7 @@ def copied(factor: Factor, form: Form, d: int) -> Form:
     if factor.kind != "relative_pose":
         hint = 'Use optimizer="lm", or coopoc.optimize.solve_gnc.'
         raise InputError("optimizer", "'gnc'", f"cannot copy {bad[0]}, GTSAM's {factor.kind}", hint)
-    root = factor.root if d == 2 else np.roll(factor.root, -d, axis=2)
-    return [Part({(True, True): f"BetweenFactorPose{d}"}, lambda g: [(pose_of(g, d, z),) for z in factor.z], root)]
+    return relative_log(factor, factor.root, d)
 
 
 def _patient(params: Any, limit: int) -> Any:

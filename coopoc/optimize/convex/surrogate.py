@@ -62,7 +62,7 @@ def _quadratic(problem: Problem, factor: Factor) -> tuple[Factor, list[str]]:
         if factor.kind == "spherical":
             return vector, ["its vector d u", "covariance rotated"]
         return replace(vector, kind="relative_position"), ["its vector d u"]
-    if factor.kind in ("pose", "relative_pose"):
+    if factor.kind in ("pose", "relative_pose", "relative_pose_log"):
         return _chordal(factor, problem.dimension), ["chords in place of angles"]
     hint = "Measure angles together with a distance, as spherical or body_spherical."
     raise InputError("kind", repr(factor.kind), "has no quadratic surrogate", hint)
@@ -72,7 +72,7 @@ def _chordal(factor: Factor, d: int) -> Factor:
     cov = _covariance(factor)
     turn = np.einsum("mii->m", cov[:, d:, d:]) * (1.0 if d == 2 else 2.0 / 3.0)
     std = np.sqrt(np.column_stack([_mean(cov[:, :d, :d])[:, None].repeat(d, 1), turn[:, None].repeat(d * d, 1)]))
-    return Factor(f"{factor.kind}_chordal", factor.nodes, factor.z, std=std)
+    return Factor(f"{factor.kind.removesuffix('_log')}_chordal", factor.nodes, factor.z, std=std)
 
 
 def _isotropic(factor: Factor) -> Factor:

@@ -90,7 +90,9 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             dx = -cholesky.solve(gradient)
             promised = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx)
             there = system.retract(x, dx)
-            trial, used = system.quadratic(there, model), model
+            near = promised <= NEAR * cost and doubt >= 0
+            used: Model = "newton" if near else model
+            trial = system.quadratic(there, used)
             after = trial[0]
             hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
             share = 1.0 if hidden else (cost - after) / promised
@@ -109,7 +111,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             if model == "gauss-newton":
                 off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
                 doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
-                doubt = DOUBT if promised <= NEAR * cost and doubt >= 0 else doubt
+                doubt = DOUBT if near else doubt
                 model = "newton" if doubt >= DOUBT else model
             last = promised
             if not converged:

@@ -18,8 +18,12 @@ from .trilateration import located
 STAGE = 25
 """Poses of the longest robot that are added at a time, at least."""
 STAGES = 60
-"""At most."""
-STEPS = 10
+"""At most, unless odometry turns by more than DRIFT in one."""
+MOST = 200
+"""Whatever the odometry."""
+DRIFT = 0.5
+"""rad, standard deviation by which odometry may turn in a stage: beyond it a stage begins in no basin."""
+STEPS = 5
 """Of each stage."""
 TOLERANCE = 1e-2
 """m or rad, a step at which a stage has arrived for the purpose."""
@@ -47,13 +51,20 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
         Kaess et al., iSAM, T-RO 2008: an estimate that follows the measurements in time.
     """
     assert problem.x0 is not None
-    longest = max(len(places) for places in graph.robots.values())
-    count = int(np.clip(longest // STAGE, 1, STAGES))
-    n = len(graph.names)
+    count, n = _stages(graph), len(graph.names)
     now = Growth(problem.x0.copy(), np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64), 0)
     for stage in range(count):
         now = _extended(graph, problem, now, (stage + 1) / count)
     return now.x, now.iterations
+
+
+def _stages(graph: Graph) -> int:
+    """How many stages: STAGES, or as many as odometry needs to turn by no more than DRIFT in each."""
+    longest = max(len(places) for places in graph.robots.values())
+    turns = graph.relative_pose.covariance[:, graph.dimension :, graph.dimension :]
+    variance = np.median(np.einsum("mii->m", turns) / turns.shape[-1]) if len(turns) else 0.0
+    drifting = min(longest * variance / DRIFT**2, MOST)
+    return max(min(longest // STAGE, max(STAGES, int(drifting))), 1)
 
 
 def _extended(graph: Graph, problem: Problem, now: Growth, share: float) -> Growth:

@@ -7,14 +7,13 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.dense import damped_step
-from ..algebra.sparse import sparse
+from ..algebra.sparse import Sparse, sparse
+from ..algebra.tape import Model
+from ..model.converted import converted_rows, is_converted
 from ..model.factor import Factor, unchecked
+from ..model.measurements import columns
 from ..model.problem import Problem
 
-LEAST_RANGE = 1.0
-"""m; a noisy range near zero would make the converted angles seem exact."""
-LEAST_SINE = 0.05
-"""Of the inclination: near the vertical the azimuth carries no information."""
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
 
@@ -25,7 +24,7 @@ def converted(problem: Problem) -> Problem:
     d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
     that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
     """
-    factors = [_vector(f) if f.kind == "spherical" else unchecked(f, loss=None) for f in problem.factors]
+    factors = [_vector(f) if is_converted(f.measurement) else unchecked(f, loss=None) for f in problem.factors]
     return problem.replace_unchecked(factors=tuple(f for f in factors if f.measurement.linear), x0=None, fixed=())
 
 
@@ -40,20 +39,24 @@ def initial_guess(problem: Problem) -> Floats:
         return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.ambient)))
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
+    if (system := sparse(problem)) is not None:
+        x, touched = _solution(system, "converted")
+        return x if touched else _apart(problem, x)
     linear = converted(problem)
-    x: Floats = np.zeros((batch, len(problem.names), problem.dimension))
-    if linear.factors and (system := sparse(linear)) is not None:
-        _, gradient, values = system.quadratic(x[0], "gauss-newton")
-        own = system.entries.diagonal
-        every = bool((values[own] > 0.0).all())
-        values[own] += RIDGE
-        system.cholesky.factor(values)
-        x = system.retract(x[0], -system.cholesky.solve(gradient))[None]
-        if every:  # a linear factor touches each
-            return x
-    elif linear.factors:
-        x = damped_step(linear, linear.linearise(x), np.full_like(x, RIDGE))
-    return _apart(problem, linear, x)
+    if (system := sparse(linear)) is not None:
+        return _apart(problem, _solution(system, "gauss-newton")[0])
+    x = np.zeros((batch, len(problem.names), problem.dimension))
+    return _apart(problem, damped_step(linear, linear.linearise(x), np.full_like(x, RIDGE)) if linear.factors else x)
+
+
+def _solution(system: Sparse, model: Model) -> tuple[Floats, bool]:
+    """(1, n, d) where a quadratic cost of points is least, and whether every point has a part in it."""
+    zero = np.zeros(system.entries.number.shape)
+    _, gradient, values = system.quadratic(zero, model)
+    own = values[system.entries.diagonal]
+    values[system.entries.diagonal] = own + RIDGE
+    system.cholesky.factor(values)
+    return system.retract(zero, -system.cholesky.solve(gradient))[None], bool(own.min(initial=np.inf) > 0.0)
 
 
 def somewhere(problem: Problem) -> Floats:
@@ -73,10 +76,12 @@ def somewhere(problem: Problem) -> Floats:
     return x
 
 
-def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:
+def _apart(problem: Problem, x: Floats) -> Floats:
     """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
     touched = np.zeros(x.shape[:2], dtype=bool)
-    for f in linear.factors:
+    for f in problem.factors:
+        if not (f.measurement.linear or is_converted(f.measurement)):
+            continue
         informative = f.informative
         if informative.all():
             touched[:, f.nodes] = True
@@ -95,18 +100,8 @@ def _apart(problem: Problem, linear: Problem, x: Floats) -> Floats:
 
 
 def _vector(factor: Factor) -> Factor:
-    d, az = np.maximum(factor.z[..., 0], LEAST_RANGE), factor.z[..., 1]
-    sa, ca = np.sin(az), np.cos(az)
-    inverse = np.zeros((*d.shape, factor.size, factor.size))
-    if factor.size == 2:
-        inverse[..., 0, 0], inverse[..., 0, 1] = ca, sa
-        inverse[..., 1, 0], inverse[..., 1, 1] = -sa / d, ca / d
-    else:
-        si, ci = np.sin(factor.z[..., 2]), np.cos(factor.z[..., 2])
-        across = d * np.where(si < 0, -1.0, 1.0) * np.maximum(np.abs(si), LEAST_SINE)
-        inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 0, 2] = si * ca, si * sa, ci
-        inverse[..., 1, 0], inverse[..., 1, 1] = -sa / across, ca / across
-        inverse[..., 2, 0], inverse[..., 2, 1], inverse[..., 2, 2] = ci * ca / d, ci * sa / d, -si / d
-    z, nothing = factor.z[..., :1] * inverse[..., 0, :], np.empty((len(factor.nodes), 0))
+    d, rows = converted_rows(columns(factor.z), np)
+    inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    z, nothing = d[..., None] * inverse[..., 0, :], np.empty((len(factor.nodes), 0))
     root = factor.whiten_jacobian(inverse)
     return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)

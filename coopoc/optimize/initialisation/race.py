@@ -38,9 +38,9 @@ def race(
 
     A start from which no step was refused and no promise failed by half, and that leads to a cost which the assumed
     noise explains, ends the search. Others are tried where the first had trouble, and all whose costs are near
-    the least go on (ROUNDS). Where the noise does not explain the end and no second start led there, the growing start
-    is tried, too: stated noise that is ten times too small costs a few more starts and not that. A problem that is not
-    large takes the first.
+    the least go on (ROUNDS). Where the noise does not explain the end, the steps to it had trouble and no second start
+    led there, the growing start is tried, too: stated noise that is ten times too small costs a few more starts and not
+    that. A problem that is not large takes the first.
 
     Args:
         problem: at any start.
@@ -48,7 +48,7 @@ def race(
         growing: problem -> x0 and iterations of a start that is tried last, "incremental".
     """
     system, tried, taken = sparse(problem), {}, 0
-    limit = np.inf
+    limit, straight = np.inf, set[str]()
     if system is not None:
         mean, variance = expected(problem, system.size)
         limit = mean + EXCESS * np.sqrt(variance)
@@ -58,8 +58,10 @@ def race(
             return problem.replace_unchecked(x0=frozen(x)), Search(name)
         end = arrive(system, x, STEPS, TOLERANCE)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
-        if smooth(end) and tried[name][0] <= limit:
-            return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
+        if smooth(end):
+            if tried[name][0] <= limit:
+                return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
+            straight |= {name} if end.converged else set()
     assert system is not None
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
@@ -76,7 +78,7 @@ def race(
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
     alone = sum(cost <= (1.0 + SAME) * least for cost in reached.values()) == 1
-    if growing is not None and alone and system.cost(x) > limit:
+    if growing is not None and alone and name not in straight and system.cost(x) > limit:
         end = arrive(system, x, MORE, TOLERANCE)
         x, taken = end.x, taken + end.iterations
         if system.cost(x) > limit:

@@ -31,28 +31,37 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
 
     position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
     known = np.zeros(n, dtype=bool)
-    which = np.argsort(-moves.length, kind="stable")  # of parallel edges the last, and shortest, is kept
-    best = {}
-    for k, (i, j) in zip(which.tolist(), moves.nodes[which].tolist(), strict=True):
-        best[i, j], best[j, i] = (k, True), (k, False)
-    pairs = np.array(list(best), dtype=np.int64).reshape(-1, 2)
-    weight = moves.length[[k for k, _ in best.values()]]
-    ways = csr_array((weight, (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    which = np.argsort(moves.length, kind="stable")
+    ends = np.stack([moves.nodes[which], moves.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
+    key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
+    edge, forward = which[first // 2], first % 2 == 0
+    ways = csr_array((moves.length[edge], (key // n, key % n)), shape=(n, n))
     for root, at, turned in roots:
         if known[root]:
             continue
         distance, before = dijkstra(ways, indices=root, return_predecessors=True)
+        reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
+        used = np.searchsorted(key, before[reached] * n + reached)
+        moved, turn = moves.position[edge[used]], moves.rotation[edge[used]]
+        back = np.swapaxes(turn, 1, 2)
+        turn = np.where(forward[used, None, None], turn, back)
+        moved = np.where(forward[used, None], moved, -(back @ moved[..., None])[..., 0])
+        place = np.full(n, -1)
+        place[reached] = np.arange(len(reached))
+        moved, turn = _from_root(place[before[reached]], moved, turn)
         position[root], rotation[root], known[root] = at, turned, True
-        reached = np.flatnonzero(np.isfinite(distance) & ~known)
-        for j in reached[np.argsort(distance[reached], kind="stable")].tolist():
-            i = int(before[j])
-            k, forward = best[i, j]
-            moved, step = moves.position[k], moves.rotation[k]
-            if not forward:
-                moved, step = -step.T @ moved, step.T
-            position[j], rotation[j] = position[i] + rotation[i] @ moved, rotation[i] @ step
-        known[reached] = True
+        position[reached], rotation[reached], known[reached] = at + moved @ turned.T, turned @ turn, True
     return position, rotation, known
+
+
+def _from_root(before: Ints, position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
+    """Poses of a tree as its root sees them, from each as the one before sees it (-1: the root): pointers jump."""
+    while (on := np.flatnonzero(before >= 0)).size:
+        by = before[on]
+        position[on] = position[by] + (rotation[by] @ position[on, :, None])[..., 0]
+        rotation[on] = rotation[by] @ rotation[on]
+        before[on] = before[by]
+    return position, rotation
 
 
 def along_poses(problem: Problem) -> Floats:

@@ -156,10 +156,16 @@ def of_recorded(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
     >>> of_recorded("range", np.array([[0, 1]]), np.array([[5.0]]), np.array([0.1]))
     Factor(range x 1)
     """
-    known, made = lookup(kind), object.__new__(Factor)
-    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=check_constants(known, None, len(nodes)))
-    made.__dict__.update(std=None, sqrt_information=None, loss=None)
-    made.__dict__["std"] = check_std(known, std, (len(nodes), made.size))
+    known = lookup(kind)
+    size = known.size(fitting(known, z.shape[-1]) or 3)
+    return of_checked(kind, nodes, z, check_std(known, std, (len(nodes), size)))
+
+
+def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
+    """A factor of nodes (M, arity), z (M, k) and std (M or 1, size) that come from checked arrays."""
+    made = object.__new__(Factor)
+    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=check_constants(lookup(kind), None, len(nodes)))
+    made.__dict__.update(std=std, sqrt_information=None, loss=None)
     return made
 
 

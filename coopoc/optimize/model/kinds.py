@@ -92,6 +92,36 @@ def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequ
     return *moved, *(ratio * h for h in half)
 
 
+def logarithm(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
+    """Log(Tz^-1 T), the twist that takes a measured pose Tz to the relative pose T: GTSAM's BetweenFactor, m and rad.
+
+    Its rotation vector w is that of `geodesic`, its translation u - w x u / 2 + c w x (w x u) with
+    c = (1 - (|w| / 2) cot(|w| / 2)) / |w|^2 and u = Rz^T (t - tz).
+
+    References:
+        Sola et al., A micro Lie theory, arXiv 1812.01537, equations 146 and 174.
+    """
+    *u, a, b, c = geodesic(x, y, z, R, measured, m)
+    w = (a, b, c)
+    once = _cross(w, u)
+    twice = _cross(w, once)
+    share = _half_cotangent(a * a + b * b + c * c, m)
+    return *(u[k] - 0.5 * once[k] + share * twice[k] for k in range(3)), *w
+
+
+def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _half_cotangent(square: Any, m: Any) -> Any:
+    """(1 - (w / 2) cot(w / 2)) / w^2 of w^2; near zero by its series, whose terms beyond are below rounding."""
+    large = square > 1e-2
+    w = m.sqrt(m.where(large, square, 1.0))
+    exact = (1.0 - 0.5 * w * m.cos(0.5 * w) / m.sin(0.5 * w)) / (w * w)
+    series = 1 / 12 + square * (1 / 720 + square * (1 / 30240 + square * (1 / 1209600 + square / 47900160)))
+    return m.where(large, exact, series)
+
+
 def chordal(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
     """t - tz and the nine entries of R - Rz: PyFG's objective, quadratic in positions and rotation matrices: m, 1."""
     *at, turned = measured
@@ -103,4 +133,6 @@ _CHORD = ("coordinate",) * 12
 for _name, _arity in (("pose", 1), ("relative_pose", 2)):
     _options = {"arity": _arity, "frame": "relative", "compares_poses": True}
     measurement(_name, components=_TURN, plane=(0, 1, 5), **_options)(geodesic)  # type: ignore[arg-type]
+    if _arity == 2:
+        measurement(f"{_name}_log", components=_TURN, plane=(0, 1, 5), **_options)(logarithm)  # type: ignore[arg-type]
     measurement(f"{_name}_chordal", components=_CHORD, plane=(0, 1, 3, 4, 6, 7), **_options)(chordal)  # type: ignore[arg-type]

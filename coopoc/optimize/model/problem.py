@@ -29,6 +29,14 @@ if TYPE_CHECKING:
     from ...world.recording import Recording
     from .losses import Loss
 
+DERIVED = (
+    ("_place", {"names"}),
+    ("_turning", {"poses"}),
+    ("space", {"dimension", "poses"}),
+    ("movable", {"names", "dimension", "poses", "fixed"}),
+)
+"""What is found of a problem once, and the fields that it follows from: others may change and it still holds."""
+
 Nodes = str | int | Sequence[str | int] | Sequence[Sequence[str | int]]
 
 
@@ -106,7 +114,7 @@ class Problem:
     @cached_property
     def space(self) -> Space:
         """Where the nodes live."""
-        return Space(self.dimension, bool(self.poses))
+        return _space(self.dimension, bool(self.poses))
 
     @cached_property
     def movable(self) -> Bools | None:
@@ -191,11 +199,8 @@ class Problem:
             raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
         before = self.factors if isinstance(self.factors, Growing) else Growing(self.factors)
         grown = self.replace_unchecked(factors=before.plus(factor))
-        kept: dict[str, Any] = {
-            name: self.__dict__[name] for name in ("_place", "_turning", "space", "movable") if name in self.__dict__
-        }
         batches = [b for b in (self.batch, factor.batch) if b is not None]
-        grown.__dict__.update(kept, batch=max(batches) if batches else None)
+        grown.__dict__["batch"] = max(batches) if batches else None
         return grown
 
     def constrain(
@@ -230,6 +235,9 @@ class Problem:
         changed = object.__new__(Problem)
         kept = self.__dict__
         changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
+        for name, inputs in DERIVED:
+            if name in kept and inputs.isdisjoint(changes):
+                changed.__dict__[name] = kept[name]
         return changed
 
     def linearise(self, x: Floats) -> Linear:
@@ -326,6 +334,10 @@ class Problem:
         plane = " in the plane" if self.dimension == 2 else ""
         bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
         return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
+
+
+_space = cache(Space)
+"""The one space of its kind."""
 
 
 @cache

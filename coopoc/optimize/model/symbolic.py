@@ -11,6 +11,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from .constraint import steerable
+from .converted import converted_rows
 from .losses import Loss
 from .measurements import Measurement
 from .problem import Problem
@@ -135,12 +136,15 @@ def _factor(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tup
     return numbers, 0.5 * ca.sum1(square if term.loss is None else LOSSES[term.loss.name](square, term.loss.scale, m))
 
 
-def white(known: Measurement, space: Space, nodes: Any, steps: Any, given: list[Any], full: bool) -> Any:
+def white(
+    known: Measurement, space: Space, nodes: Any, steps: Any, given: list[Any], full: bool, converted: bool = False
+) -> Any:
     """Whitened residual (size,) of one measurement after steps of its nodes (arity dof,).
 
     Args:
         nodes: (arity ambient,).
         given: z, constants and weights.
+        converted: take the residual of `converted_rows`.
     """
     import casadi as ca
 
@@ -148,7 +152,14 @@ def white(known: Measurement, space: Space, nodes: Any, steps: Any, given: list[
     at, turned = _moved(space, place, step)
     z, constants, weight = ([v[k] for k in range(v.numel())] for v in given)
     seen = _seen(known, at, turned, np.arange(known.arity)[None])
-    return ca.vertcat(*_whitened(_residual(known, seen, z, constants, _namespace()), weight, full))
+    gap = _converted(seen, z) if converted else _residual(known, seen, z, constants, _namespace())
+    return ca.vertcat(*_whitened(gap, weight, full))
+
+
+def _converted(vector: Columns, z: Columns) -> Columns:
+    d, rows = converted_rows(z, _namespace())
+    along, *across = (sum(a * v for a, v in zip(row, vector, strict=True)) for row in rows)
+    return [along - d, *across]
 
 
 def robust(square: Any, loss: Loss | None) -> Any:
@@ -183,6 +194,7 @@ def _namespace() -> Any:
         cos=ca.cos,
         atan2=ca.atan2,
         log1p=ca.log1p,
+        fabs=ca.fabs,
         fmax=ca.fmax,
         where=ca.if_else,
         remainder=ca.remainder,
