@@ -40,8 +40,7 @@ class PoseSmoother:
         passes: Gauss-Newton steps per step of the drive.
         begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
         spread: (4,) standard deviations of these.
-        assumed: noise, default that of the recording. Where it is the same along both axes of a body, odometry is one
-            of GTSAM's own factors and is linearised afresh; else it is linearised once.
+        assumed: noise, default that of the recording.
 
     Raises:
         InputError: a lag < 0, a threshold <= 0, passes < 1. MissingLibraryError: no gtsam.
