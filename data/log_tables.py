@@ -148,6 +148,8 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
     used = [kind for kind in KINDS if kind in frame.columns and kind not in ignore]
     if "arrival" in frame.columns and "message" not in used:
         used.append("message")
+    if "message" in used and "arrival" not in frame.columns:
+        raise _no_column(file, "arrival", frame)
     if not used:
         raise _no_column(file, "kind", frame)
     frame = _own_std(frame, used, tally, file)

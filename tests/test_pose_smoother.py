@@ -160,8 +160,8 @@ def test_a_vehicle_may_join_and_leave() -> None:
     ("options", "words"),
     [
         ({"lag": -1.0}, "lag = -1"),
-        ({"threshold": 0.0}, "threshold 0"),
-        ({"passes": 0}, "passes 0"),
+        ({"threshold": 0.0}, "threshold = 0"),
+        ({"passes": 0}, "passes = 0"),
         ({"spread": (1.0, 1.0, 1.0, 0.0)}, "spread"),
     ],
 )

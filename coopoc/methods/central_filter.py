@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..world.exchange import Exchange, exchange
-from ..world.recording import Recording
+from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel
 from .options import check_options
@@ -28,6 +28,10 @@ CALL = 20
 """Steps of one call of compiled code."""
 CENTRE = (
     "needs a centre that every vehicle reaches; loss and delay act on relative measurements only, a byte cap on neither"
+)
+BEARINGS = (
+    "most ranges are missing: bearings alone are taken at believed distances, whose errors they share, and covariances "
+    "are too small; joint and the batch smoother hold"
 )
 
 
@@ -71,8 +75,9 @@ class CentralFilter:
                         span = t, min(t + CALL, steps)
                         follow(measured, pairs, assumed, memory, (run, together), span, (x, cov))
                         bar.update(together * (span[1] - t))
-            return Answer(x, cov, None, (CENTRE,))
+            return Answer(x, cov, None, (CENTRE, BEARINGS) if np.isnan(ranges).mean() > 0.5 else (CENTRE,))
 
+        ranges = np.append(check_recording(recording).relative[0, :, 0], 0.0)
         met = lambda: centre(recording, self.message)  # noqa: E731
         return fleet_track(self, self.noise_model, recording, egos, met, solve, both_ways=False)
 

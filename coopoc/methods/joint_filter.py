@@ -67,6 +67,9 @@ class JointFilter:
     ) -> StarStream:
         """Start the filter for one step at a time: `step(gnss, velocity, dt, fix_age, neighbours=[...])`.
 
+        For a recording the std of ranges that are finer than their angles bear is raised (`noise_model.resolve`); a
+        stream does not know the ranges to come, and takes what the noise model says.
+
         Args:
             x0: (3,) m, known before the first step; None starts at the first fix.
             interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times

@@ -146,7 +146,7 @@ def federate(
     References:
         arXiv 2411.05847, algorithm 1; McMahan et al., AISTATS 2017.
 
-    >>> from coopoc.learned import clients
+    >>> from coopoc.learned import clients, federate
     >>> from coopoc.world.fleet import Fleet
     >>> t = torch.arange(33) / 10
     >>> line = Fleet(("a",), t, torch.zeros(33, 1, 3), torch.zeros(33, 1, 3))

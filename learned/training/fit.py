@@ -94,7 +94,7 @@ def fit(
         arXiv 2411.05847, equation 7; KalmanNet_TSP for "epoch".
 
     >>> from coopoc.world.fleet import Fleet
-    >>> from coopoc.learned import GainNet, clients
+    >>> from coopoc.learned import GainNet, Schedule, clients, fit
     >>> line = Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3)))
     >>> (only,) = clients(line, piece=10)
     >>> fit(GainNet(), only.training, only.validation, Schedule(epochs=2)).history[-1].step

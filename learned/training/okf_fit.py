@@ -49,7 +49,7 @@ def fit_okf(training: Segments, validation: Segments, steps: int = 300, velocity
         steps: of Adam on all training segments.
         velocity_part: train b too, else b = 0.
 
-    >>> from coopoc.learned.training.clients import clients
+    >>> from coopoc.learned import clients, fit_okf
     >>> from coopoc.world.fleet import Fleet
     >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
     >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
