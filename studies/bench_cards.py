@@ -147,7 +147,7 @@ def _logs(cards: Sequence[Mapping[str, Any]]) -> str:
             rows.append((row["task"], np.inf, {"task": row["task"], "method": one, "RT-LE [m]": "failed"}))
             continue
         mean, low, high = row["rt_le_m"]
-        shown = {"task": row["task"], "method": one, "RT-LE [m]": f"{mean:.3g} [{low:.3g}, {high:.3g}]"}
+        shown = {"task": row["task"], "method": one, "RT-LE [m]": f"{three(mean)} [{three(low)}, {three(high)}]"}
         shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
         shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append((row["task"], mean, shown))
@@ -191,14 +191,23 @@ def _simulated(cards: Sequence[Mapping[str, Any]]) -> str:
             "us/step": paper.get("microseconds_per_step", ""),
         }
         rows.append(
-            (mean, {"method": one["method"], "mean": f"{mean:.3g}" if np.isfinite(mean) else "-", **shown, **extra})
+            (mean, {"method": one["method"], "mean": three(mean) if np.isfinite(mean) else "-", **shown, **extra})
         )
     rows.sort(key=lambda row: row[0])
     return _table([row for _, row in rows])
+
+
+def three(value: float) -> str:
+    """A number with three digits, zeros included.
+
+    >>> three(1.0), three(10.14), three(121.3)
+    ('1.00', '10.1', '121')
+    """
+    return f"{value:#.3g}".removesuffix(".")
 
 
 def _cell(row: Mapping[str, Any]) -> str:
     if "failed" in row:
         return "failed"
     ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else ""
-    return f"{row['rt_le_m'][0]:.3g}{ratio}"
+    return f"{three(row['rt_le_m'][0])}{ratio}"
