@@ -51,7 +51,7 @@ class Kalman:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos, missing=True)
-        known = resolve(self.noise_model, recording)
+        known = resolve(self.noise_model, recording, relative=False)
         x, p, _ = filtered(drive_of(recording, known, columns), FixNoise(known.gnss_variance), self.x0)
         return axis_track(recording, columns, x, p, began)
 

@@ -143,24 +143,31 @@ FINEST = 1e-5
 beside 1 leaves the fixes six of double precision's sixteen digits."""
 FAR = 30.0
 """m, distance at which an angle is coarse."""
+SAMPLED = 2000
+"""Measurements whose median distance counts for a recording's."""
 UNEVEN = 3e-7
 """Least variance that is assumed of a relative measurement, over the product of the largest std of a fix and of its own
 components: information that is large in one direction and small in another loses the small one's digits, too."""
 
 
-def resolve(noise_model: NoiseModel | str, recording: Recording) -> NoiseModel:
+def resolve(noise_model: NoiseModel | str, recording: Recording, relative: bool = True) -> NoiseModel:
     """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST, and
     no range finer than its angles bear (`_bent`).
+
+    Args:
+        noise_model: or its name.
+        recording: that is filtered.
+        relative: whether relative measurements are used; a solo filter takes the model as it is.
 
     >>> resolve("identity", None).gnss_std
     (1.0, 1.0, 1.0)
     """
     if isinstance(noise_model, NoiseModel):
-        return _resolvable(_bent(noise_model, recording))
+        return _resolvable(_bent(noise_model, recording)) if relative else noise_model
     if noise_model == "identity":
         return NoiseModel.identity()
     if noise_model == "nominal":
-        return _resolvable(_bent(NoiseModel.nominal(check_recording(recording).sensors), recording))
+        return resolve(NoiseModel.nominal(check_recording(recording).sensors), recording, relative)
     raise InputError(
         "noise_model",
         repr(noise_model),
@@ -183,9 +190,10 @@ def _bent(known: NoiseModel, recording: Recording | None) -> NoiseModel:
     References:
         Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
     """
-    if known.sensors is None or not isinstance(recording, Recording) or not recording.relative.shape[1]:
+    if known.sensors is None or not isinstance(recording, Recording) or not (links := recording.relative.shape[1]):
         return known
-    noise, seen = known.sensors, recording.relative[0][np.isfinite(recording.relative[0, :, 0])]
+    sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(np.int64)]
+    noise, seen = known.sensors, sample[np.isfinite(sample[:, 0])]
     directed = seen[np.isfinite(seen[:, 1])]
     if not len(seen):
         return known
