@@ -678,12 +678,12 @@ FREE = Problem(("b", "c")).add("displacement", ("b", "c"), [1, 0, 0], std=1.0)
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda s: FixedLag(-1.0), "lag -1.0"),
-        (lambda s: FixedLag(1.0, passes=0), "passes 0"),
+        (lambda s: FixedLag(-1.0), "lag = -1.0"),
+        (lambda s: FixedLag(1.0, passes=0), "passes = 0"),
         (lambda s: s.update(TWO, {}), "none of 'b'"),
         (lambda s: s.update(TWO, {"b": 5.0, "c": 5.0}), "'c': 5.0"),
         (lambda s: s.update(TWO, {"b": -5.0}), "within the lag"),
-        (lambda s: s.update(TWO, {"b": np.nan}), "within the lag"),
+        (lambda s: s.update(TWO, {"b": np.nan}), "stamps = nan"),
         (lambda s: s.update(FLAT, {"b": 0.0}), "dimension 2"),
         (lambda s: s.update(TURNED, {}), "point or pose"),
         (lambda s: s.update(MANY, {"b": 0.0}), "batch 2"),

@@ -93,7 +93,7 @@ class Problem:
             raise InputError(
                 "separator", self.separator, "must not name a point twice", "Name each point of the separator once."
             )
-        Space(self.dimension)  # refuses any other than 2 and 3
+        object.__setattr__(self, "dimension", int(Space(self.dimension).dimension))  # 2 or 3
         items: tuple[object, ...] = (*self.factors, *self.constraints)
         for item in items:
             if not isinstance(item, Factor | Constraint):
