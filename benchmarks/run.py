@@ -30,6 +30,7 @@ BENCHMARKS = (
     "online_methods",
     "learned_gain",
     "backends",
+    "building",
     "peers",
     "poses",
     "fleet",

@@ -137,12 +137,14 @@ def check_std(known: Measurement, std: npt.ArrayLike | float, shape: tuple[int, 
     """std as (M or 1, size) or (B, M or 1, size): > 0, angles at most pi."""
     if isinstance(std, float):
         return _one_std(known, std, shape[-1])
+    if isinstance(std, tuple) and all(isinstance(one, float) for one in std):
+        return _one_std(known, std, shape[-1])
     return _checked_std(known, std, shape)
 
 
 @lru_cache(maxsize=256)
-def _one_std(known: Measurement, std: float, size: int) -> Floats:
-    """Of all components: measurements that are added one by one share the array."""
+def _one_std(known: Measurement, std: float | tuple[float, ...], size: int) -> Floats:
+    """Of all components, or one each: measurements that are added one by one share the array."""
     return _checked_std(known, std, (1, size))
 
 
