@@ -11,8 +11,9 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.data.log import Log
+from coopoc.data.log_body_clocks import GATE
 from coopoc.data.log_links import under
-from coopoc.data.log_poses import GATE, begin_of, together
+from coopoc.data.log_poses import begin_of, together
 from coopoc.data.mrclam import MrclamLog, read_mrclam
 from coopoc.data.mrclam_calibration import Calibration, calibrate
 from coopoc.data.mrclam_poses import pose_recording, surveyed

@@ -154,7 +154,9 @@ def federate(
     79756
     """
     found = find("coopoc.nets", model) if isinstance(model, str) else model
-    start = instance("model", found() if isinstance(found, type) else found, Gain, "Give GainNet(), or its name.")
+    start = found() if isinstance(found, type) else found
+    if not isinstance(start, Gain):
+        raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
     optimiser = Schedule() if schedule is None else schedule
     presence = Participation() if participation is None else participation
     protection = compression, privacy, topology

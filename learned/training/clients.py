@@ -78,7 +78,8 @@ class Segments:
         check_options(self, {"dt": (1e-9, 1e9, "> 0 s")})
         one_of("noise", self.noise, get_args(Noise))
         for field in fields(self):
-            value, shape = getattr(self, field.name), getattr(self.truth, "shape", ())
+            value = getattr(self, field.name)
+            shape: tuple[int, ...] = tuple(getattr(self.truth, "shape", ()))
             if field.type == "Tensor":
                 wanted = shape[:1] if field.name == "true_start" else shape
                 fits = isinstance(value, Tensor) and value.shape == wanted and len(shape) == 3 and shape[2] == 3
