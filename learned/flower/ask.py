@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +29,8 @@ class Wait:
 
     Args:
         timeout: s, at most.
-        patience: once most clients have answered, the round ends after this many times the latest answer's time.
+        patience: once most clients have answered, the round ends after this many times the latest answer's time;
+            infinite for no end before the timeout.
         pause: function that waits some seconds; an exception from it ends the rounds.
     """
 
@@ -37,8 +39,7 @@ class Wait:
     pause: Callable[[float], object] = time.sleep
 
     def __post_init__(self) -> None:
-        longest = 1e9
-        check_options(self, {"timeout": (0.0, longest, ">= 0 s"), "patience": (1.0, longest, ">= 1")})
+        check_options(self, {"timeout": (0.0, 1e9, ">= 0 s"), "patience": (1.0, math.inf, ">= 1")})
 
     def until(self, arrived: Sequence[float], needed: int) -> float:
         """Seconds after the question at which the round ends, given those at which answers arrived.
