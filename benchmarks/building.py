@@ -71,23 +71,28 @@ def cost(problem: co.Problem) -> float:
     return float(np.sum(problem.cost(problem.x0)))
 
 
-def measured(rounds: int = ROUNDS, count: int = COUNT) -> list[dict[str, Any]]:
-    """Rows: microseconds per factor, and the ratio to GTSAM's."""
-    graph, values = by_gtsam(count)
-    wanted = graph.error(values)
-    made: dict[str, tuple[Callable[[int], Any], int]] = {
-        "GTSAM, a factor at a time": (by_gtsam, count),
+GTSAM = "GTSAM, a factor at a time"
+
+
+def ways(count: int) -> dict[str, tuple[Callable[[int], Any], int]]:
+    """Row -> what builds, and how many factors."""
+    return {
+        GTSAM: (by_gtsam, count),
         "ours, a factor at a time": (one_by_one, count),
         "ours, a factor at a time, twice as many": (one_by_one, 2 * count),
         "ours, in one array": (at_once, count),
     }
-    spent = medians({name: (lambda of=of, n=n: timed(lambda: of(n)) / n) for name, (of, n) in made.items()}, rounds)
-    right = {
-        name: abs(cost(of(count)) - wanted) < 1e-6 * wanted for name, (of, _) in made.items() if of is not by_gtsam
-    }
-    first = spent["GTSAM, a factor at a time"]
+
+
+def measured(rounds: int = ROUNDS, count: int = COUNT) -> list[dict[str, Any]]:
+    """Rows: microseconds per factor, and the ratio to GTSAM's."""
+    made = ways(count)
+    graph, values = by_gtsam(count)
+    wanted = graph.error(values)
+    right = {way: way is by_gtsam or abs(cost(way(count)) - wanted) < 1e-6 * wanted for way, _ in made.values()}
+    spent = medians({name: (lambda way=way, n=n: timed(lambda: way(n)) / n) for name, (way, n) in made.items()}, rounds)
     return [
-        {"name": name, "us": 1e6 * spent[name], "ratio": spent[name] / first, "right": right.get(name, True)}
+        {"name": name, "us": 1e6 * spent[name], "ratio": spent[name] / spent[GTSAM], "right": right[made[name][0]]}
         for name in made
     ]
 

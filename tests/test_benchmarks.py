@@ -156,6 +156,7 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     found |= {f"fleet: {job}: {each.words}" for job, _, rows in fleet.parts() for each in rows}
     found |= {f"fleet: neighbours, {vehicles} vehicles" for vehicles, _ in fleet.SEARCHED}
     found |= {f"poses: poses, K = {neighbours}: compiled" for neighbours in load("poses").NEIGHBOURS}
+    found |= {f"building: {row['name']}" for row in load("building").measured(rounds=1, count=20) if row["right"]}
     cliffs = load("cliffs")
     monkeypatch.setattr(cliffs, "STEPS", 4)
     monkeypatch.setattr(cliffs, "RUNS", 1)
