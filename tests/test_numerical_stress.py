@@ -200,7 +200,7 @@ def test_ranges_that_noise_reflects_at_zero_are_noted() -> None:
 
 
 def test_an_estimate_that_its_fixes_contradict_is_noted() -> None:
-    """Ranges fifty times as long as stated pull the ego away from its fixes."""
+    """Ranges fifty times as long as stated move the estimate away from the ego's fixes, which a note reports."""
     seen = observed(in_line(4, 10.0), co.Sensors())
     wrong = replace(seen, relative=seen.relative * [50.0, 1.0, 1.0])
     for name in ("joint", "central-filter"):

@@ -152,7 +152,7 @@ components: information that is large in one direction and small in another lose
 
 def resolve(noise_model: NoiseModel | str, recording: Recording, relative: bool = True) -> NoiseModel:
     """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST, and
-    no range finer than its angles bear (`_bent`).
+    no range finer than its direction allows (`_with_range_floor`).
 
     Args:
         noise_model: or its name.
@@ -163,7 +163,7 @@ def resolve(noise_model: NoiseModel | str, recording: Recording, relative: bool 
     (1.0, 1.0, 1.0)
     """
     if isinstance(noise_model, NoiseModel):
-        return _resolvable(_bent(noise_model, recording)) if relative else noise_model
+        return _resolvable(_with_range_floor(noise_model, recording)) if relative else noise_model
     if noise_model == "identity":
         return NoiseModel.identity()
     if noise_model == "nominal":
@@ -180,8 +180,8 @@ def resolve(noise_model: NoiseModel | str, recording: Recording, relative: bool 
     )
 
 
-def _bent(known: NoiseModel, recording: Recording | None) -> NoiseModel:
-    """With ranges no finer than the arc bends on which a vehicle lies whose direction is uncertain; a note says so.
+def _with_range_floor(known: NoiseModel, recording: Recording | None) -> NoiseModel:
+    """The model with a floor for the range's std where the direction of a range is uncertain; a note reports it.
 
     A direction that is off by e shortens d to d cos e along the assumed one: by d e^2 / 2, whose standard deviation is
     d std^2 / sqrt(2). Of measured angles std is theirs; where there are none, that of the line between two fixes,

@@ -1,1 +1,1 @@
-"""What a point is worth, whoever found it: cost, covariance, curvature, what constraints hold."""
+"""Assessment of a point independently of its solver: cost, covariance, curvature, active constraints."""
