@@ -213,4 +213,6 @@ def test_the_central_filter_notes_that_bearings_alone_make_it_too_sure() -> None
     seen = observed(in_line(4, 10.0), co.Sensors())
     blind = replace(seen, relative=np.where([True, False, False], np.nan, seen.relative))
     assert any("most ranges are missing" in note for note in co.CentralFilter()(blind, [0]).notes)
+    nothing = replace(seen, relative=np.full_like(seen.relative, np.nan))
+    assert not any("most ranges are missing" in note for note in co.CentralFilter()(nothing, [0]).notes)
     assert not any("most ranges are missing" in note for note in co.CentralFilter()(seen, [0]).notes)

@@ -75,9 +75,11 @@ class CentralFilter:
                         span = t, min(t + CALL, steps)
                         follow(measured, pairs, assumed, memory, (run, together), span, (x, cov))
                         bar.update(together * (span[1] - t))
-            return Answer(x, cov, None, (CENTRE, BEARINGS) if np.isnan(ranges).mean() > 0.5 else (CENTRE,))
+            return Answer(x, cov, None, notes)
 
-        ranges = np.append(check_recording(recording).relative[0, :, 0], 0.0)
+        relative = check_recording(recording).relative[0]
+        alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
+        notes = (CENTRE, BEARINGS) if 2 * alone.sum() > len(alone) else (CENTRE,)
         met = lambda: centre(recording, self.message)  # noqa: E731
         return fleet_track(self, self.noise_model, recording, egos, met, solve, both_ways=False)
 
