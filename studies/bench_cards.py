@@ -18,6 +18,7 @@ from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find, names, unknown
 from coopoc.study.environment import environment
+from coopoc.study.numbers import three
 
 from .bench_tasks import VERSION, Task, bound, recording
 
@@ -195,15 +196,6 @@ def _simulated(cards: Sequence[Mapping[str, Any]]) -> str:
         )
     rows.sort(key=lambda row: row[0])
     return _table([row for _, row in rows])
-
-
-def three(value: float) -> str:
-    """A number with three digits, zeros included.
-
-    >>> three(1.0), three(10.14), three(121.3)
-    ('1.00', '10.1', '121')
-    """
-    return f"{value:#.3g}".removesuffix(".")
 
 
 def _cell(row: Mapping[str, Any]) -> str:

@@ -85,7 +85,7 @@ def _findings(results: Results) -> dict[str, str]:
 def _finding(results: Results, at: dict[str, Any]) -> str:
     """RT-LE of each method in a case, and the verdict on the federated net; nothing where nothing was run."""
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
-    names |= {f"net of client {client}": name for client, name in enumerate(weights.INDIVIDUAL, start=1)}
+    names |= {f"client {client}'s net": name for client, name in enumerate(weights.INDIVIDUAL, start=1)}
     found = {words: mean(results, {**at, "method": name}) for words, name in names.items()}
     filters = {f"{known} KF": of("kalman", known, **at) for known in ("fitted", "oracle")}
     found |= {words: mean(results, where) for words, where in filters.items()}

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.study.numbers import difference, listed, mean, present, ran
+from coopoc.study.numbers import difference, listed, mean, present, ran, three
 
 from . import lineup, scene, weights
 from .lineup import of
@@ -75,7 +75,7 @@ def _fitted(results: Results) -> str:
         "fitted LKF-SA": ("lkf-sa", "fitted"),
     }
     found = ran({words: mean(results, _at(*which, steps[-1])) for words, which in names.items()})
-    order = " < ".join(f"{words} {value:.3g} m" for value, words in sorted((v, w) for w, v in found.items()))
+    order = " < ".join(f"{words} {three(value)} m" for value, words in sorted((v, w) for w, v in found.items()))
     return f"Fitted covariances, K = {steps[-1]}: {order}."
 
 

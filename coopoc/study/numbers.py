@@ -79,13 +79,22 @@ def ran(numbers: Mapping[Any, float | None]) -> dict[Any, float]:
     return {name: value for name, value in numbers.items() if value is not None}
 
 
+def three(value: float) -> str:
+    """A number with three digits, zeros included.
+
+    >>> three(1.0), three(10.14), three(121.3)
+    ('1.00', '10.1', '121')
+    """
+    return f"{value:#.3g}".removesuffix(".")
+
+
 def listed(numbers: Mapping[str, float | None]) -> str:
     """Lengths in metres as words: those that were run, in their order.
 
     >>> listed({"OKF": 0.8, "KF": None, "GNSS": 3.0})
-    'OKF 0.8 m, GNSS 3 m'
+    'OKF 0.800 m, GNSS 3.00 m'
     """
-    return ", ".join(f"{name} {value:.3g} m" for name, value in ran(numbers).items())
+    return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
 def sentence(template: str, **numbers: Any) -> str:
