@@ -129,13 +129,14 @@ def _innovations(results: Results) -> Plot | None:
     if not scene.is_real(data):
         return None
     from coopoc.data.mrclam import innovations, read_mrclam
+    from coopoc.data.planar import robust_std
     from coopoc.study import figures
 
-    found = innovations(read_mrclam(data))
+    ranges, bearings = innovations(read_mrclam(data))
     return figures.innovations(
-        {"Range": (found.range, 0.095, "m"), "Bearing": (found.bearing, 0.007, "rad")},
+        {"Range": (ranges, 0.095, "m"), "Bearing": (bearings, 0.007, "rad")},
         caption=f"Innovations of the real robot-to-robot measurements against Vicon, and the Gaussian of 0.095 m and "
-        f"0.007 rad; robust standard deviations {found.range_std:.4f} m and {found.bearing_std:.5f} rad.",
+        f"0.007 rad; robust standard deviations {robust_std(ranges):.4f} m and {robust_std(bearings):.5f} rad.",
     )
 
 

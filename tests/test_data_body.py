@@ -13,8 +13,8 @@ import pandas as pd
 import pytest
 
 import coopoc as co
-from coopoc.data.log_poses import check_poses
-from coopoc.data.recordings import load_log
+from coopoc.data.log.check import check as check_poses
+from coopoc.data.registry import load_log
 from coopoc.evaluate.innovations import innovation_columns, normalised_innovations
 from coopoc.study.run import find_study
 

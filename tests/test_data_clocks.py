@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
+from coopoc.data.log.read import read_log
+from coopoc.data.log.check import check
 from coopoc.data.log_poses import check_poses
 from coopoc.errors import InputError
 

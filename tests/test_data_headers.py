@@ -9,7 +9,7 @@ import pytest
 from test_data_mistakes import GOOD, WIDE
 
 import coopoc as co
-from coopoc.data.recordings import load_log
+from coopoc.data.registry import load_log
 
 
 def same(a: co.Recording, b: co.Recording) -> bool:

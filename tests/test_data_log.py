@@ -11,8 +11,8 @@ import pytest
 from logs import NOISE, drive, long, seen, write
 
 import coopoc as co
-from coopoc.data.geodetic import to_enu
-from coopoc.data.log import read_log
+from coopoc.data.log.frames import to_enu
+from coopoc.data.log.read import read_log
 from coopoc.evaluate.metrics import nees
 from coopoc.methods.catalogue import METHODS
 

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 import coopoc as co
 from coopoc.cli import main
-from coopoc.data import log_picture
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
+from coopoc.data.log import picture as log_picture
+from coopoc.data.log.read import read_log
+from coopoc.data.log.check import check
 from coopoc.data.registry import kind_of, load_fleet, load_log
 from coopoc.evaluate.innovations import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.world.storage import digest, read_recording, save_recording
@@ -195,7 +195,7 @@ def test_a_picture_without_innovations_says_so(tmp_path: Path) -> None:
     first = frame["t"] == frame["t"].min()
     log = read_log(write(frame[first | ~frame["kind"].isin(["x", "y", "z"])], tmp_path / "log.csv"))
     axes = Figure().add_subplot()
-    log_picture._fixes(axes, log.recording, check(log))
+    log_picture.innovations(axes, check(log))
     assert [text.get_text() for text in axes.texts] == ["no vehicle has a fix after its first"]
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import coopoc as co
-from coopoc.data.log import read_log
-from coopoc.data.recordings import load_log
+from coopoc.data.log.read import read_log
+from coopoc.data.registry import load_log
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
 GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(

@@ -12,7 +12,7 @@ import pytest
 
 from coopoc import InputError
 from coopoc.data.registry import load_fleet
-from coopoc.data.rows import interpolate
+from coopoc.data.assemble import interpolate
 
 
 def drive(t: np.ndarray, **more: object) -> pd.DataFrame:

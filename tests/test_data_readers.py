@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from coopoc.data.registry import convert, detect, load_fleet
-from coopoc.data.rows import assemble
-from coopoc.data.table import write_table
-from coopoc.data.tum import read_tum
+from coopoc.data.assemble import assemble
+from coopoc.data.fleet_files import write_table
+from coopoc.data.fleet_files import read_tum
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 

@@ -14,7 +14,7 @@ import coopoc as co
 from coopoc.data.commands import check as data_check
 from coopoc.data.pyfg_recording import graph_recording
 from coopoc.data.recording_graph import recording_graph, write_log_graph
-from coopoc.data.recordings import load_log
+from coopoc.data.registry import load_log
 from coopoc.formats import write_graph
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.frames import body_motion

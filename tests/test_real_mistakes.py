@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
-from coopoc.data.recordings import load_log
+from coopoc.data.log.read import read_log
+from coopoc.data.log.check import check
+from coopoc.data.registry import load_log
 from coopoc.formats.g2o import write_g2o
 from coopoc.formats.pyfg import read_pyfg
 

@@ -10,8 +10,8 @@ import pandas as pd
 from safetensors.torch import save as to_bytes
 
 from coopoc import read_graph
-from coopoc.data.log import read_log
-from coopoc.data.recordings import load_log
+from coopoc.data.log.read import read_log
+from coopoc.data.registry import load_log
 from coopoc.data.registry import load_fleet
 from coopoc.formats.kitti import read_kitti
 from coopoc.formats.tum import read_tum
