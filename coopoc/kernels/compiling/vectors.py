@@ -62,8 +62,9 @@ class Number:
 
     def apply(self, make: Callable[..., Any], *others: Number | float, kind: Any = None) -> Number:
         """What an LLVM instruction makes of this number and others, a vector if one of them is."""
-        given = (self, *others)
-        numbers = [n if isinstance(n, Number) else Number(types.float64, self.build, _constant(n)) for n in given]
+        numbers = [
+            n if isinstance(n, Number) else Number(types.float64, self.build, _constant(n)) for n in (self, *others)
+        ]
         batched = any(n.kind is BATCHED for n in numbers)
         own = kind or (BATCHED if batched else types.float64)
         if self.build is None:
@@ -223,13 +224,12 @@ def unrolled(write: Callable[..., Any]) -> Any:
 def _operator(function: Any, write: Callable[..., Number], *patterns: tuple[Any, ...]) -> None:
     """Give vectors an operator or a function of Python; a float beside a vector stands in all lanes."""
 
+    def result(*kinds: Any) -> Any:
+        return _typed(write, kinds) if any(all(map(isinstance, kinds, pattern)) for pattern in patterns) else None
+
     @type_callable(function)
     def typed(context: Any) -> Any:
-        def typer(*kinds: Any) -> Any:
-            fits = any(all(map(isinstance, kinds, pattern)) for pattern in patterns if len(pattern) == len(kinds))
-            return _typed(write, kinds) if fits else None
-
-        return typer
+        return (lambda a: result(a)) if len(patterns[0]) == 1 else lambda a, b: result(a, b)
 
     def lowered(context: Any, build: Any, signature: Any, args: Any) -> Any:
         return _instructions(write, context, build, signature.args, args)

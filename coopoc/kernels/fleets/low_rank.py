@@ -16,9 +16,8 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray
-from ..compiling.batched import less, pack, put, take
 from ..compiling.compile import part
-from ..compiling.lanes import LANES, subtract
+from ..compiling.vectors import LANES, less, pack, put, subtract, take
 from .components import BASE, BEGIN, MEMBER, STRIDE, TILE
 
 DEPTH = 24
@@ -185,6 +184,18 @@ def lessen(f: AnyArray, out: int, one: int, other: int, stride: int) -> None:
         for s in range(3):
             at = other + s * stride
             f[out + r * stride + s] -= x * f[at] + y * f[at + 1] + z * f[at + 2]
+
+
+@part
+def subtract(
+    out: AnyArray, to: int, left: AnyArray, by: int, right: AnyArray, of: int, stride: int, tiles: int
+) -> None:
+    """Three rows less the transposed (3, 3) of `left` times three rows of `right`."""
+    for a in range(3):
+        for c in range(3):
+            factor = left[by + c * stride + a]
+            for j in range(tiles * LANES):
+                out[to + a * stride + j] -= factor * right[of + c * stride + j]
 
 
 @part
