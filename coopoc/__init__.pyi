@@ -24,7 +24,6 @@ from .methods.batch_smoother import BatchSmoother as BatchSmoother
 from .methods.central_filter import CentralFilter as CentralFilter
 from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
-from .methods.diffusion import Diffusion as Diffusion
 from .methods.fixed_lag import FixedLagSmoother as FixedLagSmoother
 from .methods.gbp import GaussianBeliefPropagation as GaussianBeliefPropagation
 from .methods.gnss import GNSS as GNSS
