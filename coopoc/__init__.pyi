@@ -19,13 +19,13 @@ from .fleets import load_fleet as load_fleet
 from .fleets import load_recording as load_recording
 from .fleets import read_log as read_log
 from .methods.adaptive import AdaptiveKalman as AdaptiveKalman
-from .methods.admm import ConsensusADMM as ConsensusADMM
-from .methods.batch_smoother import BatchSmoother as BatchSmoother
-from .methods.central_filter import CentralFilter as CentralFilter
+from .methods.centralised import BatchSmoother as BatchSmoother
+from .methods.centralised import CentralFilter as CentralFilter
 from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
+from .methods.decentralised import ConsensusADMM as ConsensusADMM
+from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation
 from .methods.fixed_lag import FixedLagSmoother as FixedLagSmoother
-from .methods.gbp import GaussianBeliefPropagation as GaussianBeliefPropagation
 from .methods.gnss import GNSS as GNSS
 from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import Kalman as Kalman

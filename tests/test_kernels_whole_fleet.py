@@ -13,8 +13,7 @@ from oracles.gbp import gbp
 from oracles.whole_fleet import Drive
 
 from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, NoiseModel, Recording, Sensors, observe
-from coopoc.methods.admm import ConsensusADMM
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.methods.noise_model import resolve
 from coopoc.world.exchange import exchange
 

@@ -14,7 +14,7 @@ from coopoc.evaluate.ledger import of_drive, of_track, of_training
 from coopoc.learned import load as load_weights
 from coopoc.learned.federation.history import card_ledger
 from coopoc.learned.recipes import WEIGHTS
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.v2x import FIX_AND_VELOCITY, NO_MESSAGE, Message
 
 S2 = Sensors.paper_scenario2()

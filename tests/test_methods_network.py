@@ -14,13 +14,11 @@ from scipy import optimize, stats
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe, posterior_bound
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
-from coopoc.kernels.fleets.fleet_graph import measurement
+from coopoc.kernels.fleets.graph import measurement
 from coopoc.kernels.stars.relative import components
-from coopoc.methods.admm import ConsensusADMM
-from coopoc.methods.batch_smoother import BatchSmoother
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.central_filter import CentralFilter
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.centralised import BatchSmoother, CentralFilter
+from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
 from coopoc.world.sensing import find_links

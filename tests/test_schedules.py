@@ -12,7 +12,7 @@ from scipy.linalg import solve_discrete_are
 
 from coopoc import V2X, CentralFilter, Fleet, InputError, JointFilter, MovingHorizon, Recording, Sensors, observe
 from coopoc.arrays import Floats
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
 from coopoc.world.informative import UNKNOWN, MostInformative

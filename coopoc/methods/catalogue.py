@@ -7,14 +7,12 @@ from collections.abc import Callable, Mapping
 from ..one_file import in_file
 from ..plugins import find, names
 from .adaptive import AdaptiveKalman
-from .admm import ConsensusADMM
-from .batch_smoother import BatchSmoother
-from .central_filter import CentralFilter
+from .centralised import BatchSmoother, CentralFilter
 from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
+from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
 from .fixed_lag import FixedLagSmoother
-from .gbp import GaussianBeliefPropagation
 from .gnss import GNSS
 from .joint_filter import JointFilter
 from .kalman import Kalman
