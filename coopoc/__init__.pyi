@@ -58,9 +58,7 @@ from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body import Body as Body
-from .world.cam_recording import cam_received as cam_received
 from .world.channel_load import channel_load as channel_load
-from .world.cpm_recording import cpm_received as cpm_received
 from .world.fleet import Fleet as Fleet
 from .world.frames import in_world as in_world
 from .world.links import Links as Links
