@@ -1,79 +1,59 @@
-"""Private hooks of numba that halve compile times: a part is optimised once, in the machine code of its callers.
+"""Private hooks of numba that halve compile times: a part is optimised in its callers only."""
 
-numba would optimise each part alone, and once more at each level of calls above it, and make machine code of it that
-nothing runs. Where a name is missing `compile` uses plain `njit`.
-"""
-
-from functools import partial
 from typing import Any
 
-from numba import config
 from numba._dynfunc import make_function
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import PassManager, register_pass
-from numba.core.typed_passes import NativeLowering
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 
 
 class KernelLibrary(JITCodeLibrary):
-    """Instructions that are optimised once, when everything that they call stands beside them."""
+    """Instructions, optimised when all that they call stands beside them; those of a part wait for a caller."""
+
+    is_part: bool
 
     def _optimize_functions(self, ll_module: Any) -> None:
         ll_module.data_layout = self._codegen._data_layout
 
     def _optimize_final_module(self) -> None:
-        passes, builder = self._codegen._module_pass_manager()
-        passes.run(self._final_module, builder)
-
-
-class PartLibrary(KernelLibrary):
-    """Instructions that wait for a caller: neither optimised nor made machine code."""
-
-    def _optimize_final_module(self) -> None:
-        pass
+        if not self.is_part:
+            passes, builder = self._codegen._module_pass_manager()
+            passes.run(self._final_module, builder)
 
     def _finalize_final_module(self) -> None:
-        self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]
+        finalise: Any = self._finalize_dynamic_globals if self.is_part else super()._finalize_final_module
+        finalise()
         self._finalized = True
 
 
-@register_pass(mutates_CFG=True, analysis_only=False)
-class PartLowering(NativeLowering):
-    """Translate a part and make it known to its callers, without the branch for an exception: it raises none."""
+class KernelFlags(Flags):  # numba looks options up for every operation that it types
+    """Options that are compared by what was set of them."""
 
-    _name = "part_lowering"
-
-    def run_pass(self, state: Any) -> bool:
-        """Leave the result in `state.cr`."""
-        state.flags.no_compile = True
-        super().run_pass(state)  # type: ignore[no-untyped-call]
-        desc, libraries = state.cr.fndesc, (state.library,)
-        key = make_function(desc.lookup_module(), desc.qualname, "", 0, state.cr.env, libraries)
-        state.targetctx.insert_user_function(key, desc, libraries)
-        state.cr = state.cr._replace(cfunc=key)
-        return True
+    __hash__ = lambda self: hash(tuple(self._values))  # noqa: E731
+    __eq__ = lambda self, other: self._values == other._values  # noqa: E731
 
 
 class Kernel(CompilerBase):
-    """The pipeline of a function that Python calls."""
+    """The pipeline of a function that Python calls; `Part` is that of one that only compiled functions call."""
 
-    library: type[KernelLibrary] = KernelLibrary
+    is_part = False
 
-    def define_pipelines(self) -> list[PassManager]:
-        """numba's passes, into a library of ours."""
-        self.state.library = self.library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-        self.state.library.enable_object_caching()
+    def define_pipelines(self) -> Any:
+        """numba's own, into a library of ours."""
+        library: Any = KernelLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)  # type: ignore[no-untyped-call]
+        self.state.library, library.is_part = library, self.is_part
+        library.enable_object_caching()
         return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
 
+    def _compile_core(self) -> Any:
+        self.state.flags, self.state.flags.no_compile = KernelFlags(self.state.flags), self.is_part  # type: ignore[no-untyped-call]
+        made = super()._compile_core()  # type: ignore[no-untyped-call]
+        if self.is_part:
+            desc, libraries = made.fndesc, (made.library,)
+            key = make_function(desc.lookup_module(), desc.qualname, "", 0, made.environment, libraries)
+            made.target_context.insert_user_function(key, desc, libraries)
+            made = made._replace(entry_point=key)
+        return made
 
-class Part(Kernel):
-    """The pipeline of a function that only compiled ones call."""
 
-    library = PartLibrary
-
-    def define_pipelines(self) -> list[PassManager]:
-        """The same passes, with `PartLowering`."""
-        (passes,) = super().define_pipelines()
-        passes.passes[:] = [(PartLowering if each is NativeLowering else each, why) for each, why in passes.passes]
-        passes.finalize()
-        return [passes]
+Part: Any = type("Part", (Kernel,), {"is_part": True})

@@ -249,8 +249,9 @@ for _function, _write in (
     _operator(_function, _write, *_PAIRS)
 _operator(operator.le, Number.at_most, (Batched, Batched))
 _operator(operator.neg, Number.__neg__, (Batched,))
-for _function, _name in ((math.sqrt, "sqrt"), (math.floor, "floor"), (abs, "fabs")):
-    _operator(_function, lambda a, name=_name: a.call(name), (Batched,))
+_operator(math.sqrt, lambda a: a.call("sqrt"), (Batched,))
+_operator(math.floor, lambda a: a.call("floor"), (Batched,))
+_operator(abs, lambda a: a.call("fabs"), (Batched,))
 
 
 @unrolled
