@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from coopoc.data.score_files import read_paths, score
 from coopoc.errors import InputError
-from coopoc.evaluate.association import associated
-from coopoc.evaluate.relative_error import relative_error
-from coopoc.evaluate.score import Path as Track
-from coopoc.evaluate.score import rms_interval, scores
+from coopoc.evaluate.alignment import relative_error
+from coopoc.evaluate.trajectories import Path as Track
+from coopoc.evaluate.trajectories import associated, rms_interval, scores
 from coopoc.formats.kitti import read_kitti
 from coopoc.formats.tum import write_tum
 
