@@ -13,10 +13,8 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from coopoc.errors import InputError
-from coopoc.formats.kitti import read_kitti
-from coopoc.formats.lines import read_words
-from coopoc.formats.rotations import to_rotation
-from coopoc.formats.tum import read_tum
+from coopoc.formats.trajectories import read_kitti, read_tum
+from coopoc.formats.values import read_words, to_rotation
 
 from .cells import numeric, read_frame, seconds, words
 from .source import split

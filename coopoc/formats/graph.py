@@ -1,26 +1,128 @@
-"""Graph: the vertices and measurements of a PyFG or g2o file."""
+"""Graph: the vertices and measurements of a PyFG, g2o or JRL file."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import InitVar, dataclass, replace
+from dataclasses import InitVar, dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Ints, frozen
-from .check import check, no_edges
-from .edges import ENDS, PointEdges, PoseEdges, RangeEdges
-from .vertices import Vertices
+from ..arrays import Bools, Floats, Ints, frozen
+from ..short_repr import short_repr
+from .check import ENDS, check, shapes
+from .values import to_rotation
 
 
-def _row(field: str, row: int) -> str:
-    return f"{field}[{row}]"
+class Edges:
+    """Base of the three kinds: read-only arrays with one row per measurement, NaN for a stamp that is not given."""
+
+    nodes: Ints
+    stamps: Floats
+
+    __repr__ = short_repr
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            dtype: Any = np.int64 if field.name == "nodes" else np.float64
+            object.__setattr__(self, field.name, frozen(getattr(self, field.name), dtype))
+        if not len(self.stamps):
+            object.__setattr__(self, "stamps", frozen(np.full(len(self.nodes), np.nan)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseEdges(Edges):
+    """M measured poses: of the second vertex in the frame of the first, or of a single vertex in the world (priors).
+
+    Args:
+        nodes: (M, 2), or (M, 1) for priors: places in Graph.names.
+        position: (M, d) m.
+        orientation: (M, 1) rad in 2-D, (M, 4) qx qy qz qw in 3-D, as in the file; of matrices by `to_orientation`.
+        covariance: (M, D, D) of x, y, theta (D = 3), or of x, y, z and the rotation vector (D = 6), m and rad.
+        stamps: (M,) s.
+
+    >>> PoseEdges([[0, 1]], [[1, 0]], [[0.0]], [np.eye(3)]).rotation.shape
+    (1, 2, 2)
+    """
+
+    nodes: Ints = ()  # type: ignore[assignment]
+    position: Floats = ()  # type: ignore[assignment]
+    orientation: Floats = ()  # type: ignore[assignment]
+    covariance: Floats = ()  # type: ignore[assignment]
+    stamps: Floats = ()  # type: ignore[assignment]
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(M, d, d)."""
+        return to_rotation(self.orientation)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointEdges(Edges):
+    """M measured points: of the second vertex in the frame of the first, or of a single vertex in the world (priors).
+
+    Args:
+        nodes: (M, 2), or (M, 1) for priors.
+        position: (M, d) m.
+        covariance: (M, d, d) m^2.
+        stamps: (M,) s.
+
+    >>> len(PointEdges([[0, 1]], [[1, 0]], [np.eye(2)]))
+    1
+    """
+
+    nodes: Ints = ()  # type: ignore[assignment]
+    position: Floats = ()  # type: ignore[assignment]
+    covariance: Floats = ()  # type: ignore[assignment]
+    stamps: Floats = ()  # type: ignore[assignment]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RangeEdges(Edges):
+    """M measured distances between any two vertices.
+
+    Args:
+        nodes: (M, 2).
+        distance: (M,) m.
+        variance: (M,) m^2.
+        stamps: (M,) s.
+
+    >>> len(RangeEdges([[0, 1]], [5.0], [0.01]))
+    1
+    """
+
+    nodes: Ints = ()  # type: ignore[assignment]
+    distance: Floats = ()  # type: ignore[assignment]
+    variance: Floats = ()  # type: ignore[assignment]
+    stamps: Floats = ()  # type: ignore[assignment]
+
+
+def edges_of(kind: str, nodes: npt.ArrayLike, values: Floats, covariance: Floats, stamps: npt.ArrayLike) -> Edges:
+    """Edges of a kind from the rows of a file.
+
+    Args:
+        kind: as in `ENDS`.
+        nodes: (M, 1 or 2).
+        values: (M, C) a distance, a position, or a position and an orientation.
+        covariance: (M, D, D).
+        stamps: (M,) s.
+    """
+    if kind == "ranges":
+        arrays = (values[:, 0], covariance[:, 0, 0])
+        return RangeEdges(nodes, *arrays, stamps)  # type: ignore[arg-type]
+    if "point" in kind:
+        return PointEdges(nodes, values, covariance, stamps)  # type: ignore[arg-type]
+    d = 2 if values.shape[1] == 3 else 3
+    return PoseEdges(nodes, values[:, :d], values[:, d:], covariance, stamps)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
-class Graph(Vertices):
+class Graph:
     """A factor graph as a file holds it: n poses and points, and what was measured between them.
 
     Orientations are kept as the file writes them (an angle or a quaternion), so that writing what was read changes no
@@ -50,6 +152,12 @@ class Graph(Vertices):
     Graph(2-D: 1 poses of 1 robots, 1 points; 1 ranges)
     """
 
+    dimension: int
+    names: tuple[str, ...]
+    is_pose: Bools
+    position: Floats
+    orientation: Floats
+    stamps: Floats = ()  # type: ignore[assignment]
     relative_pose: PoseEdges = PoseEdges()
     relative_point: PointEdges = PointEdges()
     ranges: RangeEdges = RangeEdges()
@@ -67,16 +175,22 @@ class Graph(Vertices):
         if not len(self.stamps):
             object.__setattr__(self, "stamps", frozen(np.full(len(self.names), np.nan)))
         for field in ENDS:
-            if not len(getattr(self, field)):
-                object.__setattr__(self, field, no_edges(field, self.dimension))
-        check(self, {field: getattr(self, field) for field in ENDS}, self.fixed, place or _row)
+            if not len(edges := getattr(self, field)):
+                empty = {name: np.zeros(shape) for name, shape in shapes(field, self.dimension, 0).items()}
+                object.__setattr__(self, field, type(edges)(**empty))
+        check(self, place or (lambda field, row: f"{field}[{row}]"))
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(n, d, d), the identity for points."""
+        return to_rotation(self.orientation)
 
     @cached_property
     def robots(self) -> Mapping[str, Ints]:
         """Letter -> places in names of that robot's poses, in the order of the file."""
         letter = np.array([name[0] for name in self.names])
         first = dict.fromkeys(letter[self.is_pose].tolist())
-        return {one: np.flatnonzero(self.is_pose & (letter == one)) for one in first}
+        return {robot: np.flatnonzero(self.is_pose & (letter == robot)) for robot in first}
 
     def stamped(self, stamps: npt.ArrayLike) -> Graph:
         """The same graph with other stamps, an edge that of its first pose, else point; NaN takes them away.
