@@ -61,7 +61,6 @@ METHODS: tuple[Any, ...] = (
     co.BatchSmoother,
     co.CentralFilter,
     co.CovarianceIntersection,
-    co.Diffusion,
     co.GaussianBeliefPropagation,
     co.ConsensusADMM,
 )
