@@ -9,8 +9,7 @@ import numpy as np
 from ..arrays import instance
 from ..errors import InputError
 from ..file_names import given_path
-from .check import NAME
-from .graph import Graph
+from .graph import NAME, Graph
 from .records import Grammar, Record
 from .values import read_words, to_numbers
 

@@ -14,8 +14,7 @@ from ..arrays import Floats
 from ..errors import InputError
 from ..file_names import given_path
 from ..plugins import suggestion
-from .check import ENDS, NAME
-from .graph import Graph, edges_of
+from .graph import ENDS, NAME, Graph, edges_of
 from .values import LARGEST
 
 VALUES = ("groundtruth", "initialization")

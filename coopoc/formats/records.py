@@ -11,8 +11,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..errors import InputError
 from ..plugins import suggestion
-from .check import ENDS
-from .graph import Edges, Graph, edges_of
+from .graph import ENDS, Edges, Graph, edges_of
 from .values import inverse, malformed, symmetric, to_numbers, to_text, upper_triangle
 
 VALUES = {"pose2": "x y theta", "pose3": "x y z qx qy qz qw", "point2": "x y", "point3": "x y z"}

@@ -12,8 +12,7 @@ import numpy as np
 from ..arrays import Floats, frozen, instance
 from ..errors import InputError
 from ..formats import load_graph
-from ..formats.check import ENDS
-from ..formats.graph import Graph
+from ..formats.graph import ENDS, Graph
 from ..plugins import one_of
 from .algebra.sparse import keep
 from .initialisation.incremental_start import incremental_start
