@@ -107,7 +107,7 @@ def linear_step(problem: Problem) -> Step:
     def step(linear: Linear, damping: Floats) -> Floats:
         dx, rows = np.full_like(damping, np.nan), _rows(problem, linear)
         for b, added in enumerate(np.sqrt(damping + still)):
-            graph = gtsam.GaussianFactorGraph()
+            graph: Any = gtsam.GaussianFactorGraph()
             for nodes, jacobians, goal in rows:
                 model = unit[goal.shape[-1]]
                 for at, rhs, *by in zip(nodes, goal[b], *(jacobian[b] for jacobian in jacobians), strict=True):

@@ -23,6 +23,8 @@ from ..model.problem import Problem
 from ..model.space import Space, exp, log
 
 POINT, POSE = False, True
+Names: TypeAlias = Mapping[tuple[bool, ...], str]
+"""GTSAM's class by which of the nodes are poses."""
 SAME = 1e-12
 """Share by which two weights may differ and count as equal."""
 ESTIMATORS = {
@@ -43,7 +45,7 @@ class Part(NamedTuple):
         root: (M or 1, k, k) S, square root of the information of its k errors.
     """
 
-    names: Mapping[tuple[bool, ...], str]
+    names: Names
     arguments: Callable[[], Iterable[tuple[Any, ...]]]
     root: Floats
 
@@ -90,7 +92,7 @@ def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
 
 
 def _position(factor: Factor, W: Floats, d: int) -> Form:
-    names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
+    names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
     return [Part(names, lambda: zip(factor.z, strict=True), W)]
 
 
@@ -110,7 +112,7 @@ def _range(factor: Factor, W: Floats, d: int) -> Form:
     """A speed is a range over dt."""
     dt = factor.constants if factor.kind == "speed" else np.ones((len(W), 1))
     assert dt is not None
-    names = {
+    names: Names = {
         (POINT, POINT): f"RangeFactor{d}",
         (POSE, POINT): f"RangeFactor{d}D",
         (POSE, POSE): f"RangeFactorPose{d}",
@@ -131,7 +133,7 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
         return ((gtsam.Rot2(angle), *far) for *far, angle in factor.z)
 
-    names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
+    names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
     return [Part(names, arguments, W[:, ::-1, ::-1])]
 
 

@@ -28,7 +28,7 @@ class Marked:
 
     def sums(self, values: Floats) -> Floats:
         """(G,) sums over each group of values (M,)."""
-        return np.bincount(self.group, values, int(self.group.max(initial=-1)) + 1)
+        return np.asarray(np.bincount(self.group, values, int(self.group.max(initial=-1)) + 1), np.float64)
 
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:

@@ -83,7 +83,7 @@ def _rows(graph: Graph, at: Ints) -> tuple[Any, Floats, Floats]:
     numbers each node's columns of R^T and its position."""
     from scipy.sparse import csr_array, vstack
 
-    d, matrices, goals, weights = graph.dimension, [csr_array((0, at.size))], [np.empty((0, graph.dimension))], []
+    d, matrices, goals, weights = graph.dimension, [csr_array((0, at.size))], list[Floats](), list[Floats]()
 
     def add(columns: Ints, values: Floats, goal: Floats, variance: Floats) -> None:
         ends = np.arange(len(columns) + 1) * columns.shape[1]
@@ -111,7 +111,11 @@ def _rows(graph: Graph, at: Ints) -> tuple[Any, Floats, Floats]:
         if len(fixes):
             columns = at[fixes.nodes[:, 0], d:]
             add(columns, np.ones(columns.shape), fixes.position, _variance(fixes.covariance, d))
-    return vstack(matrices, format="csr"), np.concatenate(goals), np.concatenate([np.empty(0), *weights])
+    return (
+        vstack(matrices, format="csr"),
+        np.concatenate([np.empty((0, d)), *goals]),
+        np.concatenate([np.empty(0), *weights]),
+    )
 
 
 def _least_squares(A: Any, weight: Floats, width: int) -> Callable[[Floats, Floats], Floats]:
