@@ -61,7 +61,6 @@ METHODS: tuple[Any, ...] = (
     co.BatchSmoother,
     co.CentralFilter,
     co.CovarianceIntersection,
-    co.Diffusion,
     co.GaussianBeliefPropagation,
     co.ConsensusADMM,
 )
@@ -154,8 +153,6 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     swept(co.bound_rt_le, {"cov": np.eye(3)[None]})
     swept(co.paired_difference, {"a": [1.0, 2.0], "b": [2.0, 4.0], "level": 0.95, "resamples": 100, "seed": 0})
     swept(co.break_even, {"training": None, "online": None, "kind": "payload", "way": "per receiver"})
-    for received in (co.cam_received, co.cpm_received):
-        swept(received, {"recording": RECORDING, "ego": 0, "origin": (47.0, 8.0, 400.0)})
     swept(RECORDING.between, {"start": 0, "stop": 3})
     swept(RECORDING.neighbours, {"ego": 0})
     swept(RECORDING.links.of, {"observer": 0})
