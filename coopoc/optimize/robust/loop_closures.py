@@ -316,5 +316,5 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         squared = np.einsum("mk,mk->m", r, np.linalg.solve(S, r[..., None])[..., 0])
         distance[here] = np.where(lost, np.inf, squared)
         volume[here] = np.linalg.slogdet(S)[1]
-    distance, volume = (np.bincount(marked.group, each, len(weight)) + 0.0 for each in (distance, volume))
-    return distance, volume
+    sums = [np.asarray(np.bincount(marked.group, each, len(weight)), np.float64) for each in (distance, volume)]
+    return sums[0], sums[1]
