@@ -168,7 +168,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(co.solve, {"problem": whole, "backend": "gauss-newton", "throw": True})
     swept(optimize.solve_batch, {"problem": whole, "backend": "gauss-newton"})
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
-    swept(optimize.solve_gnc_batch, {"problem": whole, "candidates": [0], "groups": None, "backend": "gauss-newton"})
     swept(optimize.solve_distributed, {"problem": whole, "owner": "ab", "rounds": 1, "rho": 0.3, "loss": 0.0})
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))})
@@ -294,7 +293,6 @@ def test_solvers_refuse_values_from_elsewhere() -> None:
     solution = co.solve(whole)
     marked = {"problem": whole, "candidates": [0], "groups": None, "threshold": 0.99}
     swept(optimize.solve_gnc, marked, (*HOSTILE, [[1], [2, 3]], ["a", None]))
-    swept(optimize.solve_gnc_batch, {name: marked[name] for name in ("problem", "candidates", "groups")}, HOSTILE)
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a"]}, HOSTILE)
     swept(optimize.loop_closures, {"problem": whole}, HOSTILE)
     swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3}, HOSTILE)

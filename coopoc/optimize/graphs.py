@@ -15,14 +15,13 @@ from ..formats import load_graph
 from ..formats.graph import ENDS, Graph
 from ..plugins import one_of
 from .algebra.sparse import keep
-from .initialisation.incremental_start import incremental_start
-from .initialisation.linear_start import parts
-from .initialisation.race import race
-from .initialisation.starts import STARTS, contenders, separated
 from .model.factor import Factor
 from .model.problem import Problem
 from .model.search import Search
 from .model.space import Space
+from .starts.graph_starts import STARTS, contenders, incremental_start, separated
+from .starts.race import race
+from .starts.walk import parts
 
 Objective = Literal["chordal", "geodesic"]
 Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
