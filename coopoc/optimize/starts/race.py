@@ -21,8 +21,6 @@ SAME = 1e-3
 """Share by which costs may differ and count as the same minimum: the cheaper start then stays."""
 TOLERANCE = 1e-3
 """m or rad, a step at which a start has arrived for the purpose."""
-
-
 EXCESS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
 MORE = 50

@@ -1,4 +1,4 @@
-"""Poses along measured relative poses, from some that are known."""
+"""Poses along measured relative poses (shortest paths from known ones), and points by trilateration."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
     ends = np.stack([moves.nodes[which], moves.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
     key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
     edge, forward = which[first // 2], first % 2 == 0
-    ways = csr_array((moves.length[edge], (key // n, key % n)), shape=(n, n))
+    graph = csr_array((moves.length[edge], (key // n, key % n)), shape=(n, n))
     for root, at, turned in roots:
         if known[root]:
             continue
-        distance, before = dijkstra(ways, indices=root, return_predecessors=True)
+        distance, before = dijkstra(graph, indices=root, return_predecessors=True)
         reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
         used = np.searchsorted(key, before[reached] * n + reached)
         moved, turn = moves.position[edge[used]], moves.rotation[edge[used]]
@@ -65,8 +65,8 @@ def _from_root(before: Ints, position: Floats, rotation: Floats) -> tuple[Floats
 
 
 def along_poses(problem: Problem) -> Floats:
-    """x0 (1, n, ambient) with poses where relative poses lead, from fixed poses, then from others, and points without
-    a fix where a pose sees them.
+    """x0 (n, ambient) with poses where relative poses lead, from fixed poses, then from others, and points without a
+    fix where a pose sees them.
 
     The start of a graph may follow measurements that have no weight here.
     """
@@ -85,7 +85,45 @@ def along_poses(problem: Problem) -> Floats:
     still = np.concatenate([problem.fixed, *(f.nodes[on, 0] for f, on in used if f.kind == "position")])
     for f, on in used:
         if f.kind == "relative_position":
-            i, j = f.nodes[on & ~np.isin(f.nodes[:, 1], still)][::-1].T  # the first that sees a point places it
-            z = f.z[on & ~np.isin(f.nodes[:, 1], still)][::-1]
-            x[j, :d] = x[i, :d] + np.einsum("mab,mb->ma", space.rotation(x[i]), z)
-    return np.asarray(x[None])
+            rows = np.flatnonzero(on & ~np.isin(f.nodes[:, 1], still))[::-1]  # the first that sees a point places it
+            i, j = f.nodes[rows].T
+            x[j, :d] = x[i, :d] + np.einsum("mab,mb->ma", space.rotation(x[i]), f.z[rows])
+    return np.asarray(x)
+
+
+def parts(n: int, pairs: Ints) -> Ints:
+    """(n,) number of the connected component that each node is in, by pairs (M, 2) that are joined."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(joined, directed=False)[1])
+
+
+def trilaterate(places: Floats, ranges: Floats) -> Floats:
+    """(d,) minimum of sum (|l - p_k| - r_k)^2, the lowest of those that three guesses lead to.
+
+    2 p_k . l - |l|^2 = |p_k|^2 - r_k^2 is linear in l and |l|^2. Where the places nearly lie in a plane (on a line),
+    how far l is from it follows from the ranges, and on which side from the descents.
+
+    Args:
+        places: (K, d) m; with K <= d one of the points that the ranges allow is returned.
+        ranges: (K,) m.
+
+    >>> trilaterate(np.array([[0.0, 0], [8, 0], [4, 1]]), np.array([5.0, 5, 2])).round(6)
+    array([4., 3.])
+    """
+    from scipy.optimize import least_squares
+
+    d, middle = places.shape[1], places.mean(axis=0)
+    p = places - middle
+    if len(p) <= d:
+        return np.asarray(places[0] + ranges[0] * np.eye(d)[0])
+    matrix = np.concatenate([2.0 * p, np.ones((len(p), 1))], axis=1)
+    guess = np.linalg.lstsq(matrix, np.square(p).sum(axis=1) - ranges**2, rcond=None)[0][:d]
+    normal = np.linalg.eigh(p.T @ p)[1][:, 0]
+    flat = guess - normal * (guess @ normal)
+    height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
+    guesses = (guess, flat + height * normal, flat - height * normal)
+    ends = [least_squares(lambda at: np.linalg.norm(at - p, axis=1) - ranges, at, method="lm") for at in guesses]
+    return np.asarray(min(ends, key=lambda end: float(end.cost)).x + middle)

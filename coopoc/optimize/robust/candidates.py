@@ -1,14 +1,14 @@
-"""Candidates: measurements that may be outliers, in groups that share a weight, and the problem with those weights."""
+"""Candidates of GNC: measurements that may be outliers, in groups that share a weight, and the problem reweighed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, Ints, checked, instance, plain
+from ...arrays import Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
 from ..model.factor import unchecked
 from ..model.local import local
@@ -20,29 +20,15 @@ Candidates = Sequence[int | tuple[int, Sequence[int]]]
 
 @dataclass(frozen=True, eq=False)
 class Marked:
-    """Where the M candidates stand: factor, row and group (M,), groups numbered from 0."""
+    """The M candidate measurements: factor, row and group (M,), groups numbered from 0."""
 
     factor: Ints
     row: Ints
     group: Ints
 
-    def sums(self, values: Sequence[Floats]) -> Floats:
-        """(B, G) sums over each group of one array (B, rows) or (rows,) per factor."""
-        parts = {int(k): np.atleast_2d(values[k]) for k in np.unique(self.factor)}
-        total = np.zeros((int(self.group.max()) + 1, max(map(len, parts.values()))))
-        for k, part in parts.items():
-            here = self.factor == k
-            np.add.at(total, self.group[here], part[:, self.row[here]].T)
-        return total.T
-
-    def among(self, rows: Sequence[Ints]) -> Marked:
-        """Those of some rows of each factor, of a problem that has these alone; groups keep their numbers."""
-        number = np.cumsum([len(own) > 0 for own in rows]) - 1
-        kept = np.concatenate(
-            [np.flatnonzero((self.factor == k) & np.isin(self.row, own)) for k, own in enumerate(rows)]
-        )
-        row = [np.searchsorted(rows[k], r) for k, r in zip(self.factor[kept], self.row[kept], strict=True)]
-        return Marked(number[self.factor[kept]], np.array(row, dtype=np.int64), self.group[kept])
+    def sums(self, values: Floats) -> Floats:
+        """(G,) sums over each group of values (M,)."""
+        return np.asarray(np.bincount(self.group, values, int(self.group.max(initial=-1)) + 1), np.float64)
 
 
 def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None = None) -> Marked:
@@ -56,9 +42,8 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
             raise InputError("candidates", shown(item), allowed, "See problem.factors.")
         factor = problem.factors[k]
         if factor.loss is not None:
-            raise InputError(
-                "candidates", repr(factor), f"has a {factor.loss.name} loss already", "Leave its loss out."
-            )
+            allowed = f"has a {factor.loss.name} loss already"
+            raise InputError("candidates", repr(factor), allowed, "Leave its loss out.")
         chosen = range(len(factor.nodes)) if rows is None else checked("candidates", rows, "(M,)", (-1,), int).tolist()
         if bad := [r for r in chosen if not 0 <= r < len(factor.nodes)]:
             raise InputError("candidates", bad[:3], f"must be rows of {factor!r}", "Rows count from 0.")
@@ -76,35 +61,39 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
 
 
 def reweigh(problem: Problem, marked: Marked, weight: Floats, x0: Floats) -> Problem:
-    """The problem of B realisations from x0 (B, n, ambient), with W of the candidates times sqrt(weight) (B, G)."""
+    """The problem from x0 (n, ambient), with W of the candidates times sqrt(weight) (G,)."""
     factors = list(problem.factors)
     for k in np.unique(marked.factor):
         factor, here = factors[k], marked.factor == k
-        root = np.ones((len(weight), len(factor.nodes), 1))
-        root[:, marked.row[here], 0] = np.sqrt(weight[:, marked.group[here]])
+        root = np.ones((len(factor.nodes), 1))
+        root[marked.row[here], 0] = np.sqrt(weight[marked.group[here]])
         if factor.std is None:
             factors[k] = unchecked(factor, sqrt_information=factor.sqrt_information * root[..., None])
         else:
             with np.errstate(divide="ignore"):  # no weight is an infinite std
                 factors[k] = unchecked(factor, std=factor.std / root)
-    return replace(problem, factors=tuple(factors), x0=x0)
+    return problem.replace_unchecked(factors=tuple(factors), x0=frozen(x0))
 
 
 def squares(problem: Problem, marked: Marked, x: Floats) -> Floats:
-    """(B, G) r^2 of each group at x (B, n, ambient)."""
-    found: list[Floats] = [np.empty(0)] * len(problem.factors)
+    """(G,) r^2 of each group at x (n, ambient)."""
+    found = np.empty(len(marked.row))
     for k in np.unique(marked.factor):
-        factor = problem.factors[k]
-        seen = local(problem.space, factor.measurement, x, factor.nodes)
+        factor, here = problem.factors[k], marked.factor == k
         assert factor.constants is not None
-        residual = factor.whiten(factor.measurement.difference(*seen, factor.z, factor.constants))
-        found[k] = np.square(residual).sum(axis=-1)
+        measured = local(problem.space, factor.measurement, x[None], factor.nodes)
+        residual = factor.whiten(factor.measurement.difference(*measured, factor.z, factor.constants))
+        found[here] = np.square(residual[0]).sum(axis=-1)[marked.row[here]]
     return marked.sums(found)
 
 
 def bounds(problem: Problem, marked: Marked, threshold: float) -> Floats:
-    """(B or 1, G) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
+    """(G,) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
     from scipy.special import gammaincinv
 
-    freedom = marked.sums([(f.root != 0).any(axis=-1).sum(axis=-1).astype(np.float64) for f in problem.factors])
-    return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
+    freedom = np.empty(len(marked.row))
+    for k in np.unique(marked.factor):
+        here, factor = marked.factor == k, problem.factors[k]
+        numbers = (factor.root != 0).any(axis=-1).sum(axis=-1)
+        freedom[here] = np.broadcast_to(numbers, len(factor.nodes))[marked.row[here]]
+    return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(marked.sums(freedom), 1.0), threshold))
