@@ -15,9 +15,9 @@ import pytest
 import coopoc as co
 from coopoc import optimize
 from coopoc.errors import shown
-from coopoc.evaluate.score import Path as Path_
-from coopoc.evaluate.score import scores
-from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg, write_g2o, write_graph, write_jrl, write_pyfg
+from coopoc.evaluate.trajectory_scores import Path as Path_
+from coopoc.evaluate.trajectory_scores import scores
+from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg, write_g2o, write_graph, write_pyfg
 from coopoc.formats.graph import Graph
 from coopoc.study.merge import merge
 from coopoc.study.publish import views
@@ -221,7 +221,7 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
     ):
         swept(lambda path, read=read: read(path), {"path": "nowhere.pyfg"})
     graph = Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]])
-    for write, name in ((write_graph, "a.pyfg"), (write_g2o, "b.g2o"), (write_jrl, "c.jrl"), (write_pyfg, "d.pyfg")):
+    for write, name in ((write_graph, "a.pyfg"), (write_g2o, "b.g2o"), (write_pyfg, "d.pyfg")):
         swept(lambda graph, write=write, name=name: write(graph, tmp_path / name), {"graph": graph})
         for value in (None, 1.5, object(), ["a"]):
             with pytest.raises(co.InputError, match=r"path|stamp|fixed"):

@@ -20,8 +20,7 @@ from scipy.sparse import csc_array
 from scipy.sparse.csgraph import dijkstra
 
 from coopoc import InputError
-from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.arrowhead import structure
 from coopoc.optimize.algebra.sparse import Sparse, _made, sparse

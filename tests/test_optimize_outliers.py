@@ -12,8 +12,7 @@ import pytest
 import coopoc as co
 from coopoc.arrays import Bools, Ints
 from coopoc.formats import write_graph
-from coopoc.formats.edges import PoseEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graphs import from_graph, loop_closures
 from coopoc.optimize.model.space import exp

@@ -12,8 +12,7 @@ import numpy as np
 from ..arrays import Floats, frozen, instance
 from ..errors import InputError
 from ..formats import load_graph
-from ..formats.edges import ENDS
-from ..formats.graph import Graph
+from ..formats.graph import ENDS, Graph
 from ..plugins import one_of
 from .algebra.sparse import keep
 from .model.factor import Factor
@@ -57,7 +56,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
 
-    >>> from coopoc.formats.edges import RangeEdges
+    >>> from coopoc.formats.graph import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
     >>> from_graph(Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges))
     Problem(2 nodes in the plane; 1 range)
