@@ -18,7 +18,7 @@ import numpy as np
 
 from coopoc.arrays import Bools, Floats
 from coopoc.errors import InputError, MissingLibraryError
-from coopoc.formats.lines import LARGEST
+from coopoc.formats.values import LARGEST
 from coopoc.plugins import suggestion, unknown
 
 if TYPE_CHECKING:

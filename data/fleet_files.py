@@ -12,9 +12,8 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.file_names import file_name, inside
-from coopoc.formats import tum
-from coopoc.formats.lines import LARGEST
-from coopoc.formats.trajectory import Trajectory
+from coopoc.formats import trajectories as tum
+from coopoc.formats.values import LARGEST
 from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 
@@ -146,7 +145,7 @@ def write_tum(fleet: Fleet, folder: Path) -> None:
     for column, path in enumerate(inside(folder, path) for path in paths):
         present = fleet.present[:, column]
         position = fleet.position[present, column]
-        poses = Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
+        poses = tum.Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
         tum.write_tum(poses, path)
 
 

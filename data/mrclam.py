@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
-from coopoc.formats.lines import LARGEST, read_table, read_words
+from coopoc.formats.values import LARGEST, read_table, read_words
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.frames import midway, turned
@@ -23,7 +23,7 @@ from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
 from .assemble import backward_difference, check_size, check_time, interpolate
-from .planar import PLANE_STD, first_of_each, nearest, robust_std, steps_of
+from .planar import PLANE_STD, first_of_each, nearest, steps_of
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""

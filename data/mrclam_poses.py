@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
@@ -16,7 +16,7 @@ from coopoc.world.v2x import V2X
 
 from .assemble import interpolate
 from .mrclam import MrclamLog, kept
-from .planar import PLANE_STD, nearest, planar_recording, robust_std, steps_of
+from .planar import PLANE_STD, nearest, planar_recording, steps_of
 
 LAGS = np.arange(0.0, 0.525, 0.025)
 """s, that are tried."""

@@ -114,12 +114,3 @@ def planar_recording(
         body=Body(turning, np.full(turning.shape, np.nan)),
         landmarks=tuple(range(n, len(ids))),
     )
-
-
-def robust_std(residual: Floats) -> float:
-    """1.4826 median(|r - median(r)|), the standard deviation of a Gaussian without its outliers.
-
-    >>> round(robust_std(np.array([-1.0, 0, 1, 100])), 4)
-    1.4826
-    """
-    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from coopoc.arrays import robust_std
 from coopoc.study.numbers import present
 from coopoc.study.pivot import pivot
 from coopoc.study.study import Params
@@ -129,7 +130,6 @@ def _innovations(results: Results) -> Plot | None:
     if not scene.is_real(data):
         return None
     from coopoc.data.mrclam import innovations, read_mrclam
-    from coopoc.data.planar import robust_std
     from coopoc.study import figures
 
     ranges, bearings = innovations(read_mrclam(data))

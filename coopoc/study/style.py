@@ -48,8 +48,6 @@ METHODS = {
     "qcqp-relaxation": Look("QCQP-SDR", "#4D4D4D", "2"),
     "gbp": Look("Belief propagation", "#0096A0", "d"),
     "admm": Look("ADMM", "#3F51B5", "H"),
-    "diffusion": Look("Diffusion", "#B0A8B9", "3"),
-    "diffusion-anchored": Look("Diffusion, anchored", "#845EC2", "4"),
     "fixed-lag": Look("Fixed-lag smoother", "#2E7D32", "8"),
     "mhe": Look("Moving horizon", "#7CB342", "h"),
     "central-filter": Look("Whole-fleet filter", "#444E86", "s"),

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats
+from coopoc.arrays import Bools, Floats, robust_std
 from coopoc.errors import InputError
 from coopoc.evaluate.innovations import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
@@ -20,7 +20,6 @@ from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import spherical, wrap
 
-from ..planar import robust_std
 from .read import Log
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
