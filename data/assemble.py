@@ -256,7 +256,7 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     grid = instants.copy() if sparse else np.round(np.linspace(instants[0], instants[-1], place[-1] + 1), 6)
     if sparse or np.abs(grid[place] - instants).max() > 1e-3 * gaps.min() + 1e-6:
         given = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
-        hint = "Resample: load_fleet(..., dt=0.1), --data 'FILE?dt=0.1' or coopoc data convert --dt 0.1."
+        hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
         raise InputError(f"{file}: t", given, "must be equally spaced", hint)
     grid[place] = instants
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)

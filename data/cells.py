@@ -175,7 +175,7 @@ def named_columns(
             allowed = f"is not the only column {key} then: the file has one of that name"
             raise InputError(f"{file}: columns[{key!r}]", repr(columns[key]), allowed, "Rename or remove one of them.")
     for key in needed:
-        if key not in frame.columns:
+        if columns.get(key, key) not in given:
             raise missing_column(file, columns.get(key, key), given, f"columns {', '.join(needed)} are needed", key)
     return frame
 
@@ -185,7 +185,7 @@ def missing_column(file: str, column: str, given: Sequence[str], allowed: str, k
     key = key or column
     usual = [header for header in given if header.lower() in USUAL.get(key, ())]
     header = usual[0] if usual else "..."
-    hint = f'Add it, or pass columns={{"{key}": "{header}"}} (--columns {key}={header}).'
+    hint = f'Add it, or pass columns={{"{key}": "{header}"}}.'
     if usual:
         hint = f"Did you mean {header}? {hint}"
     allowed = f"{allowed}; the file has {', '.join(given)}"

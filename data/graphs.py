@@ -123,12 +123,12 @@ def _others(graph: Graph) -> Floats:
 
 def _vectors(graph: Graph) -> PointEdges:
     """Points that were measured, and poses of other robots as points."""
-    points, poses = graph.relative_point, graph.relative_pose.rows(np.flatnonzero(_others(graph)))
+    points, poses, other = graph.relative_point, graph.relative_pose, _others(graph)
     return PointEdges(
-        np.concatenate([points.nodes, poses.nodes]),
-        np.concatenate([points.position, poses.position]),
-        np.concatenate([points.covariance, poses.covariance[:, :2, :2]]),
-        np.append(points.stamps, poses.stamps),
+        np.concatenate([points.nodes, poses.nodes[other]]),
+        np.concatenate([points.position, poses.position[other]]),
+        np.concatenate([points.covariance, poses.covariance[other, :2, :2]]),
+        np.append(points.stamps, poses.stamps[other]),
     )
 
 

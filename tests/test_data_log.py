@@ -242,18 +242,6 @@ def test_methods_run_while_others_come_and_go(tmp_path: Path, name: str) -> None
     assert float(co.rt_le(track, drive(4)).mean()) < 2.2
 
 
-def test_ranges_alone_run_through_the_cooperative_methods(tmp_path: Path) -> None:
-    """A UWB log: fixes at 1 Hz, odometry and ranges; no angle, no message. Ranges help each kind of method."""
-    fleet = drive(4, gap=24.0)
-    frame = thinned(long(seen(fleet), messages=False))
-    frame = frame[~frame["kind"].isin(["azimuth", "inclination"])]
-    rec = read_log(write(frame, tmp_path / "log.csv")).recording
-    alone = replace(rec, relative=np.full_like(rec.relative, np.nan))
-    for method in (co.JointFilter(), co.CooperativeMAP(window=5), co.MovingHorizon(), METHODS["drift"]("nominal")):
-        with_ranges, without = (float(co.rt_le(method(one, [1]), fleet).mean()) for one in (rec, alone))
-        assert with_ranges < without, method.name
-
-
 def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path: Path) -> None:
     """Closed form: eight cars at 10 m/s on bends, headings of 0.05 rad every 0.4 s; NEES is 2 in a plane if consistent,
     and was 43 with the noise of the speeds alone."""

@@ -33,7 +33,7 @@ ENOUGH = 20
 """Measurements from which a statistic is worth a word."""
 COARSE = 0.5
 """rad: no sensor's angles scatter as much about positions that are better known."""
-INCONSISTENT = 5.0
+INCONSISTENT = 10.0
 """Errors over the standard deviations of the filter."""
 MISTAKEN = (
     (0.0, 3e-3, "Is t in ms, or finer? Divide it: stamps are in s."),
@@ -313,32 +313,28 @@ def _unit(ratio: float) -> str:
 
 
 def _truth(rec: Recording, truth: Fleet, column: int) -> list[str]:
-    """A sentence where the fixes of a vehicle lie beside its truth by more than their noise explains, as they do where
-    the truth has another origin, or behind it along its way, by the same time at any speed."""
+    """A sentence where the fixes of a vehicle lie behind its truth along its way, by the same time at any speed, or
+    beside it by more than their noise explains, as they do where the truth has another origin."""
     gap = (rec.gnss[0, :, column] - truth.position[:, column])[:, :2]
     moves = rec.velocity[0, :, column, :2]
     known = np.isfinite(gap).all(axis=1)
-    if known.sum() < FEW:
+    both, name = known & np.isfinite(moves).all(axis=1), rec.ids[column]
+    if both.sum() >= ENOUGH:
+        off, along = gap[both] - np.median(gap[both], axis=0), moves[both] - moves[both].mean(axis=0)
+        power = max(float((along**2).sum()), 1e-12)
+        late = float((off * along).sum()) / power
+        std = float(np.sqrt(((off - late * along) ** 2).mean() / power))
+        if abs(late) >= max(SIGMAS * std, 0.5 * rec.dt):
+            return [
+                f"{name}: its fixes are {abs(late):.2f} s {'ahead of' if late > 0 else 'behind'} the truth along its "
+                "way: the clock of the truth differs, or fixes carry the time at which they arrived."
+            ]
+    east, north = np.median(gap[known], axis=0) if known.sum() >= FEW else (0.0, 0.0)
+    if np.hypot(east, north) < APART * np.hypot(*rec.sensors.fix_std[:2]):
         return []
-    east, north = np.median(gap[known], axis=0)
-    if np.hypot(east, north) >= APART * np.hypot(*rec.sensors.fix_std[:2]):
-        return [
-            f"{rec.ids[column]}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. Fixes "
-            "in degrees are local at the first one: give origin= of the frame of the truth, or the truth in degrees."
-        ]
-    known &= np.isfinite(moves).all(axis=1)
-    if known.sum() < ENOUGH:
-        return []
-    gap, moves = gap[known] - np.median(gap[known], axis=0), moves[known] - moves[known].mean(axis=0)
-    power = float((moves**2).sum())
-    late = float((gap * moves).sum()) / power if power > 0 else 0.0
-    std = float(np.sqrt(((gap - late * moves) ** 2).mean() / power)) if power > 0 else np.inf
-    if abs(late) < max(SIGMAS * std, 0.5 * rec.dt):
-        return []
-    word = "ahead of" if late > 0 else "behind"
     return [
-        f"{rec.ids[column]}: its fixes are {abs(late):.2f} s {word} the truth along its way: the clock of the "
-        "truth differs, or fixes carry the time at which they arrived."
+        f"{name}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. Fixes in degrees are "
+        "local at the first one: give origin= of the frame of the truth, or the truth in degrees."
     ]
 
 

@@ -97,7 +97,7 @@ def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
     if len(strange):
         one, *others = dict.fromkeys(strange.tolist())
         more = f" Unknown too: {', '.join(map(repr, others))}." if others else ""
-        hint = f'Map it with kinds={{"{one}": ...}} (--kinds), or leave it out: ignore=["{one}"] (--ignore).{more}'
+        hint = f'Map it with kinds={{"{one}": ...}}, or leave it out: ignore=["{one}"].{more}'
         hint = f"{suggestion(one, KINDS, '')} {hint}".lstrip()
         where, allowed = f"{file}: row {strange.index[0]}, column kind", f"must be one of {', '.join(KINDS)}"
         raise InputError(where, repr(one), allowed, hint)
@@ -111,7 +111,7 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
     used += ["message"] if {"message", "arrival"} & set(frame.columns) else []
     if not used:
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
-        wanted = 'name the columns: kinds={"...": "speed_kmh"} (--kinds ...=speed_kmh)'
+        wanted = 'name the columns: kinds={"...": "speed_kmh"}'
         error = missing_column(file, "kind", list(frame.columns), allowed)
         raise InputError(error.field, error.value, error.allowed, f"{error.hint} Or {wanted}.")
     if "std" in frame.columns:
