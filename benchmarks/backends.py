@@ -24,7 +24,7 @@ from backends_star import Job, star
 from tabulate import tabulate
 from timing import timed
 
-from coopoc.optimize.initialisation.initial import converted
+from coopoc.optimize.starts.initial import converted
 
 ROUNDS, RUNS, STEPS = 7, 200, 60
 

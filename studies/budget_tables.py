@@ -34,7 +34,7 @@ SHARED = (
 SCHEDULED = (("joint", "nominal"), ("split-ci", "nominal"))
 """Which of them run under every schedule."""
 CAPS = (100.0, 200.0, 400.0, 800.0)
-SCHEDULES = ("nearest", "round robin", "most informative")
+SCHEDULES = ("nearest", "round robin")
 FREE = {"rate_hz": 0.0, "cap_bytes_per_second": 0.0, "schedule": SCHEDULES[0]}
 AXES = ("channel", "max_neighbours", *FREE)
 """Parameters of a channel."""

@@ -140,7 +140,7 @@ def packed(motion: MotionNoise, rule: FixNoise) -> Floats:
 def dead_reckon(
     given: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
 ) -> int:
-    """Add a step to the history, which has room for it: its motion and the variance of that; what a fix of some age has missed since.
+    """Add a step to the history: its motion and the variance of that; what a fix of some age has missed since.
 
     Nothing is changed where the input is bad. NO_FIX_YET: there is no fix.
     """

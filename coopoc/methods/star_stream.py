@@ -11,11 +11,9 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
-from ..kernels.compiling.lanes import LANES
 from ..kernels.motion import NO_MOTION_NOISE
 from ..kernels.solo import ESTIMATE, NO_FIX_YET
-from ..kernels.stars.joint import joint_rows, new_joint
-from ..kernels.stars.messages import ROW, Assumptions
+from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.star_stream import (
     FIX,
     LAST_AGE,
@@ -27,6 +25,7 @@ from ..kernels.stars.star_stream import (
     WIDTH,
     Noise,
     packed,
+    resized,
     stream_step,
 )
 from .noise_model import NoiseModel, motion_noise
@@ -114,17 +113,8 @@ class StarStream:
 
     def _reserve(self, most: int) -> None:
         """Room for `most` members of the star, with the state and the information of the last one."""
-        n, before = self._size, len(self._columns) // 3
-        memory = np.zeros((30 * most + joint_rows(most, ROW)) * LANES)
-        if n:
-            old, new = (
-                new_joint(before, ROW, self._memory[30 * before * LANES :]),
-                new_joint(most, ROW, memory[30 * most * LANES :]),
-            )
-            new.state[: 3 * n] = old.state[: 3 * n]
-            blocks, more = (j.information.reshape(j.stride, j.stride, 9, LANES) for j in (old, new))
-            more[:n, :n] = blocks[:n, :n]
-        self._memory, self._columns, self._rows = memory, np.zeros(3 * most, np.int64), np.zeros((most, WIDTH))
+        self._memory = resized(self._memory, self._size, len(self._columns) // 3, most)
+        self._columns, self._rows = np.zeros(3 * most, np.int64), np.zeros((most, WIDTH))
 
     @property
     def neighbours(self) -> dict[str, Floats]:

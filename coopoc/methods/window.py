@@ -11,6 +11,7 @@ from ..arrays import Bools, Floats, Ints
 from ..optimize.model.window import WindowStep
 from ..world.inbox import Inbox
 from ..world.recording import Recording
+from . import star
 from .noise_model import NoiseModel
 
 Span = tuple[int, int]
@@ -35,11 +36,7 @@ def dead_reckoned(recording: Recording, known: NoiseModel) -> Positions:
     variance = np.ascontiguousarray(known.fix_variance(recording))
     if recording.complete:
         return Positions(recording.gnss, variance, new)
-    from ..kernels.motion import bridge
-
-    x = recording.gnss.copy()
-    variance, process = np.broadcast_to(variance, x.shape).copy(), known.process_variance(recording)
-    bridge(x, variance, new, recording.velocity, np.broadcast_to(process, x.shape), recording.dt)
+    x, variance = star.dead_reckoned(recording, known)
     x.flags.writeable = False  # as the fixes are, for the same compiled code
     return Positions(x, variance, new)
 

@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import add, add_diagonal, first3, load, square, store, subtract, times, zeros
-from ..compiling.symbolic import unrolled
+from ..compiling.vectors import LANES, unrolled
 from .elimination import predict, rescale
 from .joint import Joint, block_of, joint_within, place_on_broadcast, predict_state, rearrange
 from .joint_filter import Estimates, update, write
@@ -49,7 +48,7 @@ class Drift(NamedTuple):
 
 
 @as_written
-def run_filter(seen: Measurements, known: Assumptions, drift: Drift) -> Estimates:
+def run_filter(seen: Measurements, known: Assumptions, refine: bool, drift: Drift) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
     runs, steps = seen.gnss.shape[:2]
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
@@ -59,14 +58,14 @@ def run_filter(seen: Measurements, known: Assumptions, drift: Drift) -> Estimate
         star, joint = star_within(most), joint_within(most, STATE)
         for t in range(steps):
             n = gather(star, seen, known, first, last, t, old)
-            step(star, joint, known, drift, n, old)
+            step(star, joint, known, refine, drift, n, old)
             write(out, joint, first, last, t, seen.start[t], n, STATE)
             old = n
     return out
 
 
 @inner
-def step(star: Star, joint: Joint, known: Assumptions, drift: Drift, members: int, old: int) -> None:
+def step(star: Star, joint: Joint, known: Assumptions, refine: bool, drift: Drift, members: int, old: int) -> None:
     """Predict and update; the common error is one more member, which does not move and is never measured."""
     o, flat, fades = 0.0 * load(star.motion, 0, ROW)[0], 1.0 / known.flat, 1.0 - drift.keep * drift.keep
     n, before = members + 1, old + 1 if old > 0 else 0
@@ -96,7 +95,7 @@ def step(star: Star, joint: Joint, known: Assumptions, drift: Drift, members: in
     place_on_broadcast(star, joint, members, STATE)
     clear(joint.eta)
     add_fixes(star, joint, members, n)
-    update(star, joint, known, True, members, n, STATE)
+    update(star, joint, known, refine, members, n, STATE)
 
 
 @inner

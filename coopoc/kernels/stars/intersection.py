@@ -16,9 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Floats
-from ..compiling.batched import choose
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -36,6 +34,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
+from ..compiling.vectors import LANES, choose
 from .joint_filter import Estimates
 from .messages import (
     HELD,

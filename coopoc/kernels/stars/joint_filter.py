@@ -11,8 +11,8 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import as_written, inner
-from ..compiling.lanes import LANES
 from ..compiling.small import load, negate, square, store, subtract
+from ..compiling.vectors import LANES
 from .elimination import predict
 from .joint import (
     Joint,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiling.batched import choose
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import add, add_diagonal, load, negate, scale, square, store, subtract
+from ..compiling.vectors import LANES, choose
 from .elimination import predict
 from .joint import Joint, joint_within, move, predict_state, rearrange, solve
 from .joint_filter import Estimates, add_fixes, write

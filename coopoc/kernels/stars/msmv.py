@@ -6,7 +6,6 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import as_written, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -21,6 +20,7 @@ from ..compiling.small import (
     times,
     zeros,
 )
+from ..compiling.vectors import LANES
 from .joint_filter import Estimates
 from .messages import (
     MOVED,

@@ -13,11 +13,11 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, inner, inside, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import store
+from ..compiling.vectors import LANES
 from ..motion import ROUNDING, MotionNoise, process_variance
 from ..solo import ESTIMATE, NO_FIX_YET, dead_reckon
-from .joint import Joint, joint_in
+from .joint import Joint, joint_in, joint_rows, new_joint
 from .joint_filter import step
 from .messages import (
     MOVED,
@@ -68,6 +68,20 @@ def unpacked(values: Floats) -> Noise:
     std, still = values[12 : 12 if values[20] > 0.0 else 15], MotionNoise(values[21:24], values[21:24], 0.0, 0.0, 0.0)
     known = Assumptions(fixes, fixes, fixes, FIX_GROWTH, std, values[15], values[16], values[17], still)
     return Noise(motion, known, values[18], values[19] > 0.0)
+
+
+def resized(memory: Floats, n: int, before: int, most: int) -> Floats:
+    """Memory for a star of up to `most` members, with the state and the information of the n of the last one."""
+    larger = np.zeros((30 * most + joint_rows(most, ROW)) * LANES)
+    if n:
+        old, new = (
+            new_joint(before, ROW, memory[30 * before * LANES :]),
+            new_joint(most, ROW, larger[30 * most * LANES :]),
+        )
+        new.state[: 3 * n] = old.state[: 3 * n]
+        blocks, more = (joint.information.reshape(joint.stride, joint.stride, 9, LANES) for joint in (old, new))
+        more[:n, :n] = blocks[:n, :n]
+    return larger
 
 
 @as_written
@@ -192,8 +206,14 @@ def set_neighbour(star: Star, noise: Noise, row: Floats, k: int, dt: float) -> N
     for c in range(3):
         position = row[8 + c] if there else 0.0
         set_axis(star, k, c, row[11 + c], variance[c] * share * share, position, noise.known.broadcast[0, 0, 0, c])
+    measure(star, row, noise.known.relative_std, k)
+
+
+@inner
+def measure(star: Star, row: Floats, std: Floats, k: int) -> None:
+    """Range m, azimuth and inclination rad of member k, with which a row begins; NaN is what was not measured."""
     sa, ca = sine_and_cosine(row[1])
     si, ci = sine_and_cosine(row[2])
     seen = or_else(row[0], -1.0), or_else(sa, 0.0), or_else(ca, 0.0), or_else(si, 0.0), or_else(ci, 0.0)
     for lane in range(LANES):
-        measured(star.relative, seen, noise.known.relative_std, k, lane)
+        measured(star.relative, seen, std, k, lane)

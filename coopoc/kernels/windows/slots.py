@@ -8,10 +8,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
-from ..compiling.batched import put, take
 from ..compiling.compile import inner, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import load, store, subtract, times
+from ..compiling.vectors import LANES, put, take
 from ..stars.edges import edge
 from ..stars.messages import MOVED, POSITION, PROCESS, RELATIVE, Assumptions, Measurements, Star, gather
 
@@ -140,7 +139,7 @@ def linearise(window: Window, span: Any, assumed: Any, how: int) -> None:
         origin = load(window.point, ego, ROW)
         for place in range(ego + 1, ego + count_of(window.sizes, step)):
             gap = subtract(load(window.point, place, ROW), origin)
-            information, eta = edge(gap, load(window.relative, place, RELATIVE), assumed, how)
+            information, eta = edge(gap, load(window.relative, place, RELATIVE), assumed[0], assumed[1], how)
             store(window.edge, place, information)
             store(window.eta, place, eta)
 

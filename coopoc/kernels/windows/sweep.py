@@ -12,7 +12,6 @@ from typing import Any
 from numpy import uint64
 
 from ...arrays import AnyArray
-from ..compiling.batched import choose, put, take
 from ..compiling.compile import inner, inside
 from ..compiling.small import (
     add,
@@ -31,6 +30,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
+from ..compiling.vectors import choose, put, take
 from ..stars.edges import AT_GAP, EXACT, edge
 from ..stars.elimination import predict
 from ..stars.joint import Joint, add_relative, block_of, copy, rearrange, solve
@@ -109,7 +109,7 @@ def locate_before(window: Window, place: int, t: int, mask: Any, at: Any) -> Non
 def put_edge(window: Window, past: Past, known: Assumptions, place: int, gap: Any, how: Any, mask: Any) -> None:
     """The relative measurement of a place, linear at the vector `gap`, where the mask is positive: E and E v + eta."""
     z = load(window.relative, place, RELATIVE)
-    information, eta = edge(gap, z, (known.relative_std, known.min_range), how)
+    information, eta = edge(gap, z, known.relative_std, known.min_range, how)
     o, used = 0.0 * gap[0], max(take(window.located, uint64(place)), whole_of(window, place)) - 0.5
     information, eta = choose_each(used, information, zeros(o, ONE)), choose_each(used, eta, zeros(o, ROW))
     eta = plus_applied(eta, information, gap)
@@ -169,8 +169,8 @@ def add_edges(window: Window, a: AnyArray, eta: AnyArray, stride: int, step: int
     for k in range(1, n):
         gap = subtract(load(window.point, ego + k, ROW), load(window.point, ego, ROW))
         information = load(window.edge, ego + k, ONE)
-        edge = information, less_applied(load(window.eta, ego + k, ROW), information, gap)
-        add_relative(a, eta, stride, (k, n), edge, ROW)
+        vector = less_applied(load(window.eta, ego + k, ROW), information, gap)
+        add_relative(a, eta, stride, k, n, information, vector, ROW)
 
 
 @inner

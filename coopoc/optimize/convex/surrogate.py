@@ -8,9 +8,9 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..initialisation.initial import converted
 from ..model.factor import Factor
 from ..model.problem import Problem
+from ..starts.initial import converted
 from .quadratic import TERMS, one_weight
 
 
