@@ -6,7 +6,7 @@ behind the members'; its drift is zero. Both errors are Gauss-Markov: e_t = keep
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -138,18 +138,18 @@ def add_at(joint: Joint, i: int, j: int, information: Numbers) -> None:
 
 
 @unrolled
-def joined(a: Numbers, b: Numbers) -> Numbers:
+def joined(a: Any, b: Any) -> Any:
     """Both tuples in one."""
-    return (*a, *b)
+    return [*a, *b]
 
 
 @unrolled
-def both(w: Numbers) -> Numbers:
+def both(w: Any) -> Any:
     """H^T diag(w) H with H = [I I], as a fix sees position and drift."""
-    return tuple(w[i % 3] if i % 3 == j % 3 else w[0] * 0.0 for i in range(6) for j in range(6))
+    return [w[i % 3] if i % 3 == j % 3 else w[0] * 0.0 for i in range(6) for j in range(6)]
 
 
 @unrolled
-def last3(v: Numbers) -> Numbers:
+def last3(v: Any) -> Any:
     """The last three numbers."""
     return v[3:]

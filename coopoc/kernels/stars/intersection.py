@@ -74,6 +74,7 @@ class Fusion(NamedTuple):
         used: (most, LANES) 1, or 0 for one without a message.
         weight: (1, LANES) w.
         cov: (9, LANES) m^2 of the fused estimate.
+        split: keep independent errors apart.
     """
 
     x: Floats
@@ -83,6 +84,7 @@ class Fusion(NamedTuple):
     used: Floats
     weight: Floats
     cov: Floats
+    split: bool
 
 
 @as_written
@@ -105,33 +107,34 @@ def run_filter(seen: Measurements, known: Assumptions, split: bool) -> Estimates
         np.ones((most, LANES)),
         np.zeros((1, LANES)),
         np.zeros((9, LANES)),
+        split,
     )
     for first in range(0, runs, LANES):
         star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
             n = gather(star, seen, known, first, last, t, old)
-            step(star, known, fusion, split, n, old)
+            step(star, known, fusion, n, old)
             write_ego(out, star, fusion.x, fusion.cov, first, last, t, seen.start[t], n)
             old = n
     return out
 
 
 @inner
-def step(star: Star, known: Assumptions, fusion: Fusion, split: bool, n: int, old: int) -> None:
+def step(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) -> None:
     """Predict and fuse."""
     fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
     o = 0.0 * fix[0]
     nothing = zeros(o, square(ROW))
     if old == 0:
         x, fixed, w = fix, nothing, o + 0.5
-        add_source(fusion, 0, nothing, add_diagonal(nothing, variance), split)
+        add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
     else:
         new = load(star.status, NEW, (0.0,))[0]
         x, w = add(load(fusion.x, 0, ROW), load(star.motion, MOVED, ROW)), load(fusion.weight, 0, (0.0,))[0]
         fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
         independent = add_diagonal(load(fusion.independent, 0, square(ROW)), load(star.motion, PROCESS, ROW))
-        add_source(fusion, 0, load(fusion.dependent, 0, square(ROW)), independent, split)
-    add_neighbours(star, known, fusion, x, split, n)
+        add_source(fusion, 0, load(fusion.dependent, 0, square(ROW)), independent)
+    add_neighbours(star, known, fusion, x, n)
     w = best_weight(fusion, fixed, n, w)
     total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
     for k in range(n):
@@ -149,7 +152,7 @@ def step(star: Star, known: Assumptions, fusion: Fusion, split: bool, n: int, ol
 
 
 @inner
-def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, split: bool, n: int) -> None:
+def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
     """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
     o = 0.0 * x[0]
     one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
@@ -163,13 +166,13 @@ def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, s
         held = load(star.status, 5 * k + HELD, (0.0,))[0]
         store(fusion.used, k, (choose(o + NOWHERE - variance[0], held, o),))
         store(fusion.gap, k, subtract(gap, vector(completed(relative, gap))))
-        add_source(fusion, k, add_diagonal(zeros(o, square(ROW)), variance), noise, split)
+        add_source(fusion, k, add_diagonal(zeros(o, square(ROW)), variance), noise)
 
 
 @inside
-def add_source(fusion: Fusion, k: int, dependent: Numbers, independent: Numbers, split: bool) -> None:
+def add_source(fusion: Fusion, k: int, dependent: Numbers, independent: Numbers) -> None:
     """Set a source; plain covariance intersection takes all of its error as dependent."""
-    if not split:
+    if not fusion.split:
         dependent, independent = add(dependent, independent), scale(independent, 0.0)
     store(fusion.dependent, k, dependent)
     store(fusion.independent, k, independent)
@@ -177,15 +180,18 @@ def add_source(fusion: Fusion, k: int, dependent: Numbers, independent: Numbers,
 
 @inner
 def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]:
-    """L, L' and K I L' of a source at its s; 0 for one that is not used."""
-    d, i, used = (
-        load(fusion.dependent, k, square(ROW)),
-        load(fusion.independent, k, square(ROW)),
-        load(fusion.used, k, (0.0,))[0],
-    )
-    root = scale(inverse(add(d, scale(i, s))), used)
-    derivative = product(product(root, d), root)
-    return scale(root, s), derivative, product(product(root, i), derivative)
+    """L, L' and K I L' of a source at its s; 0 for one that is not used.
+
+    K I is (1 - K D) / s, which keeps its digits beside an I of 1e8 m^2; if not split it is 0.
+    """
+    d, i = load(fusion.dependent, k, square(ROW)), load(fusion.independent, k, square(ROW))
+    root = scale(inverse(add(d, scale(i, s))), load(fusion.used, k, (0.0,))[0])
+    share = product(root, d)
+    derivative = product(share, root)
+    bend = scale(derivative, 0.0)
+    if fusion.split:
+        bend = scale(subtract(derivative, product(share, derivative)), 1.0 / max(s, 0.0 * s + 1e-12))
+    return scale(root, s), derivative, bend
 
 
 @inner

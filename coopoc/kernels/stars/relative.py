@@ -221,7 +221,7 @@ def completed(seen: Numbers, gap: Numbers) -> Numbers:
 def direction(x: float, y: float, z: float) -> Numbers:
     """Length of a vector, sine and cosine of its azimuth and of its inclination."""
     flat2 = plus(x * x, y, y)
-    flat, d = math.sqrt(flat2), math.sqrt(plus(flat2, z, z))
+    flat, d = math.sqrt(flat2), math.sqrt(plus(x * x + y * y, z, z))
     o, one = 0.0 * d, 0.0 * d + 1.0
     sine, cosine = choose(flat, y / flat, o), choose(flat, x / flat, one)
     return d, sine, cosine, choose(d, flat / d, o), choose(d, z / d, one)

@@ -179,7 +179,7 @@ def gather_arrived(
         if changed:
             for lane in range(uint64(LANES)):
                 run = min(runs[0] + int(lane), runs[1])
-                receive(star, seen, known, (run, step, link), (k, place, lane))
+                receive(star, seen, known, run, step, link, k, lane)
                 used_since = max(seen.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, known, k, seen.dt)
