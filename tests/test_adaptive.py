@@ -88,7 +88,8 @@ def test_on_traffic_it_comes_near_the_filter_that_knows() -> None:
     fleet = load_fleet("town10-validation").select([0, 12])
     recording = observe(fleet, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=20)
     score = [
-        rt_le(m(recording, [0, 1]), fleet).mean() for m in (Kalman("nominal"), Kalman(NoiseModel.nominal(Sensors())))
+        rt_le(m(recording, [0, 1]), fleet).mean()
+        for m in (DEFAULT, Kalman("nominal"), Kalman(NoiseModel.nominal(Sensors())))
     ]
     assert score[0] < 1.01 * score[1]
     assert score[0] < 0.97 * score[2]
