@@ -82,7 +82,8 @@ def _by_tapes(problem: Problem, system: Sparse, x: Floats) -> Assessment:
     unknown = Assessment(cost, size, np.full((len(x), *(problem.space.dof,) * 2), np.nan), np.nan)
     if not np.isfinite(values).all():
         return unknown
-    dx, inflation = np.zeros(0), np.full(1, np.inf)
+    dx: Floats = np.zeros(0)
+    inflation: Floats = np.full(1, np.inf)
     if cholesky.factor(values):
         dx = -cholesky.solve(gradient)
         free, rows, columns = system.entries.own

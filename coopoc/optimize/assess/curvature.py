@@ -163,7 +163,7 @@ def _second(problem: Problem, kind: Measurement, constants: Floats, z: Floats, a
             with np.errstate(all="ignore"):
                 columns.append((gradient(step) - gradient(-step)) / (2.0 * reach[c][:, None]))
     whole = np.stack(columns, axis=2)
-    return 0.5 * (whole + np.swapaxes(whole, 1, 2))
+    return np.asarray(0.5 * (whole + np.swapaxes(whole, 1, 2)))
 
 
 def _assembled(problem: Problem, nodes: Ints, blocks: Floats) -> Any:
