@@ -11,9 +11,8 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.metrics import errors
-from coopoc.evaluate.pose_bounds import fleet_pose_bound
-from coopoc.evaluate.pose_metrics import heading_error, pose_nees
+from coopoc.evaluate.bounds import fleet_pose_bound
+from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start

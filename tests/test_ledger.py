@@ -15,7 +15,7 @@ from coopoc.learned import load as load_weights
 from coopoc.learned.federation.history import card_ledger
 from coopoc.learned.recipes import WEIGHTS
 from coopoc.methods.decentralised import GaussianBeliefPropagation
-from coopoc.world.v2x import FIX_AND_VELOCITY, NO_MESSAGE, Message
+from coopoc.world.v2x import NO_MESSAGE, Message
 
 S2 = Sensors.paper_scenario2()
 ROOT = Path(__file__).parent.parent
@@ -83,29 +83,10 @@ def test_the_page_of_the_budget_runs() -> None:
     assert rate == pytest.approx(2.2 * 382, rel=0.02)  # what the ego itself broadcasts
 
 
-def test_ledgers_add_up_by_name() -> None:
-    rng = np.random.default_rng(0)
-    once = of_training(["a", "b"], [10.0, 20.0], [30.0, 40.0])
-    drives = [
-        of_drive(names, 5.0, *rng.uniform(1, 9, (2, 3, 2)), FIX_AND_VELOCITY, 96) for names in (("a", "b"), ("b", "c"))
-    ]
-    both = once + drives[0] + drives[1]
-    assert both.names == ("a", "b", "c")
-    assert both.seconds.tolist() == [5.0, 10.0, 5.0]
-    assert both.of("training").tolist() == [[30.0, 40.0, 0.0]] * 3
-    for kind in ("payload", "on air"):
-        first, second = (drive.of("online", kind) for drive in drives)  # type: ignore[arg-type]
-        wanted = np.column_stack([first[:, 0], first[:, 1] + second[:, 0], second[:, 1]])
-        np.testing.assert_array_equal(both.of("online", kind), wanted)  # type: ignore[arg-type]
-    assert break_even(both, both) == pytest.approx(both.per_vehicle("training") / both.rate())
-    with pytest.raises(InputError, match="runs"):
-        drives[0] + Ledger.empty(["a"], runs=2)
-
-
 def test_a_ledger_refuses_what_does_not_fit() -> None:
     with pytest.raises(InputError, match="seconds"):
         Ledger(("a",), np.zeros(2), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)))
     with pytest.raises(InputError, match="names"):
         Ledger(("a",), np.zeros(1), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)), servers=("server",))
     with pytest.raises(InputError, match="kind"):
-        Ledger.empty(["a"]).of("training", "wire")  # type: ignore[arg-type]
+        of_training(["a"], [1.0], [1.0]).of("training", "wire")  # type: ignore[arg-type]

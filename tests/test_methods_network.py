@@ -438,20 +438,15 @@ def test_the_fleets_bounds_equal_gtsam_marginals(crossing: Fleet) -> None:
         expected = whole.marginalCovariance(gtsam.symbol(chr(97 + i), t))
         assert smoothing[t, i] == pytest.approx(expected, rel=1e-6, abs=1e-9)
     assert np.isnan(filtering[5, 1]).all()
-    assert posterior_bound(fleet, SPEED, 3, v2x, information="fleet") == pytest.approx(filtering[:, 3])
 
 
 def test_the_fleet_knows_more_than_a_star(crossing: Fleet) -> None:
     v2x = V2X(max_neighbours=4)
-    solo, star, whole = (
-        posterior_bound(crossing, SPEED, 0, v, information=i)  # type: ignore[arg-type]
-        for v, i in ((None, "star"), (v2x, "star"), (v2x, "fleet"))
-    )
+    solo, star = (posterior_bound(crossing, SPEED, 0, v) for v in (None, v2x))
+    whole = fleet_bound(crossing, SPEED, v2x)[:, 0]
     assert np.linalg.eigvalsh(solo - star).min() > -1e-9
     assert np.linalg.eigvalsh(star - whole).min() > -1e-9
     assert bound_rt_le(whole) < 0.95 * bound_rt_le(star)
-    with pytest.raises(InputError, match="information"):
-        posterior_bound(crossing, SPEED, 0, v2x, information="town")  # type: ignore[arg-type]
 
 
 def test_bad_settings_are_named() -> None:

@@ -15,8 +15,8 @@ import pytest
 import coopoc as co
 from coopoc import optimize
 from coopoc.errors import shown
-from coopoc.evaluate.score import Path as Path_
-from coopoc.evaluate.score import scores
+from coopoc.evaluate.trajectory_scores import Path as Path_
+from coopoc.evaluate.trajectory_scores import scores
 from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg, write_g2o, write_graph, write_pyfg
 from coopoc.formats.graph import Graph
 from coopoc.study.merge import merge

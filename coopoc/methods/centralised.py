@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tqdm import tqdm
 
+from ..arrays import Floats
 from ..errors import InputError
 from ..world.recording import Recording, check_recording
 from ..world.v2x import Message
@@ -127,14 +128,14 @@ class BatchSmoother:
             from ..kernels.fleets.smoother import run_factors, smooth
 
             steps = self.exact_steps if len(assumed.std) else 0
-            x, cov, lost = own_filters(measured, assumed).reshape(measured.gnss.shape), [], 0
-            with tqdm(total=x.shape[0] * (1 + steps) * x.shape[1], desc=self.name, unit="step", delay=2.0) as bar:
+            x, lost = own_filters(measured, assumed).reshape(measured.gnss.shape), 0
+            cov: Floats = np.empty((*x.shape, 3))
+            with tqdm(total=len(x) * (1 + steps) * len(x[0]), desc=self.name, unit="step", delay=2.0) as bar:
                 for run in range(len(x)):
                     factors = run_factors(*of_runs(measured, pairs, assumed, slice(run, run + 1)))
-                    x[run], one, small = smooth(x[run], factors, steps, self.settle, bar.update)
-                    cov.append(one)
+                    x[run], cov[run], small = smooth(x[run], factors, steps, self.settle, bar.update)
                     lost += not small
             note = (f"{lost} of {len(x)} runs did not settle within {self.settle:g} m",) if lost else ()
-            return Answer(x, np.stack(cov), 0, (NOT_CAUSAL, CENTRE, *note))
+            return Answer(x, cov, 0, (NOT_CAUSAL, CENTRE, *note))
 
         return fleet_track(self, self.noise_model, recording, egos, solve, central=True)

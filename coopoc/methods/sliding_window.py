@@ -364,7 +364,7 @@ class Windows:
 
     def problems(self, solved: Solutions) -> Iterator[tuple[int, int, Problem, Ints]]:
         """Run, step, problem and the vehicle of each point, of all windows that are not solved."""
-        from ..kernels.compiling.lanes import LANES
+        from ..kernels.compiling.vectors import LANES
         from ..kernels.windows.batch_window import LOST, gather_window, new_windows
 
         for first in range(0, len(solved.ended), LANES):

@@ -86,7 +86,9 @@ def fleet_track(
         rounds = vehicles if answer.rounds is None else answer.rounds
         latest = latest_available(pairs, np.where(pairs.alive, arrival, -1), vehicles, rounds).take(columns, axis=2)
         own = measured._replace(gnss=measured.gnss.take(columns, 2), velocity=measured.velocity.take(columns, 2))
-        process, fix = (values.take(columns, 2) if values.shape[2] > 1 else values for values in assumed[:2])
+        process, fix = (
+            values.take(columns, 2) if values.shape[2] > 1 else values for values in (assumed.process, assumed.fix)
+        )
         assumed = assumed._replace(process=process, fix=fix)
         x, cov = fuse_delayed(latest, x.reshape(*shape[:2], -1), cov.reshape(*shape[:2], -1), own, assumed)
     x = x.reshape(*shape, 3)
@@ -123,8 +125,8 @@ def kernel_arguments(
     active = located(recording)
     both = active[:, met.step, met.first] & active[:, met.step, met.second]
     columns = (met.first, met.second, met.link, met.link_back, met.start)
-    alive = np.ascontiguousarray(both & (arrival >= 0))
-    pairs = Pairs(*(np.ascontiguousarray(column, dtype=np.int64) for column in columns), alive)
+    first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
+    pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
     relative = components(recording.relative, np.arange(len(recording.links)))
     variances = model.process_variance(recording), model.fix_variance(recording)
     process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in variances)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ...arrays import Floats, Ints
+from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from ..compiling.small import add, from_upper, load, store, subtract
 from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, pair_at_agreement
@@ -60,7 +60,7 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
 
 
 @part
-def predict(measured: Measured, assumed: Assumed, t: int, before: Floats, x: Floats, P: Floats) -> None:
+def predict(measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floats, P: Floats) -> None:
     """x += dt u and P += Q; a vehicle that joins stands at its fix, and nothing is known of it."""
     for n in range(x.shape[2]):
         if measured.active[0, t, n]:
@@ -82,19 +82,21 @@ def difference(P: Floats, i: int, j: int) -> Matrix:
     """Covariance of x_j - x_i."""
     xx, xy, xz = entry(P, i, j, 0, 0), entry(P, i, j, 0, 1), entry(P, i, j, 0, 2)
     yy, yz, zz = entry(P, i, j, 1, 1), entry(P, i, j, 1, 2), entry(P, i, j, 2, 2)
-    return from_upper((xx, xy, xz, yy, yz, zz))
+    covariance: Matrix = from_upper((xx, xy, xz, yy, yz, zz))
+    return covariance
 
 
 @part
 def entry(P: Floats, i: int, j: int, c: int, d: int) -> float:
     """Entry of `difference`."""
     a, b = 3 * i, 3 * j
-    return P[a + c, a + d] + P[b + c, b + d] - P[a + c, b + d] - P[b + c, a + d]
+    value: float = P[a + c, a + d] + P[b + c, b + d] - P[a + c, b + d] - P[b + c, a + d]
+    return value
 
 
 @part
 def add_fixes(
-    measured: Measured, assumed: Assumed, t: int, before: Floats, x: Floats, P: Floats, B: Floats, total: Floats
+    measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floats, P: Floats, B: Floats, total: Floats
 ) -> None:
     """B += F P and the information vectors of the fixes; a vehicle that joins has the covariance of its own."""
     for n in range(x.shape[2]):

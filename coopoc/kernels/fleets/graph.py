@@ -98,10 +98,10 @@ class Edges(NamedTuple):
 
 def of_runs(measured: Measured, pairs: Pairs, assumed: Assumed, runs: slice) -> tuple[Measured, Pairs, Assumed]:
     """The arguments of some runs."""
-    gnss, velocity, relative, active = (values[runs] for values in measured[:4])
-    process, fix = (values[runs] if len(values) > 1 else values for values in assumed[:2])
+    gnss, velocity, relative = (values[runs] for values in (measured.gnss, measured.velocity, measured.relative))
+    process, fix = (values[runs] if len(values) > 1 else values for values in (assumed.process, assumed.fix))
     return (
-        Measured(gnss, velocity, relative, active, measured.dt),
+        Measured(gnss, velocity, relative, measured.active[runs], measured.dt),
         pairs._replace(alive=pairs.alive[runs]),
         assumed._replace(process=process, fix=fix),
     )
@@ -110,7 +110,8 @@ def of_runs(measured: Measured, pairs: Pairs, assumed: Assumed, runs: slice) -> 
 @storage
 def at(values: Floats, run: int, t: int, n: int) -> Floats:
     """Row (3,) of an array that is broadcastable to (R, T, N, 3)."""
-    return values[min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(n, values.shape[2] - 1)]
+    row: Floats = values[min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(n, values.shape[2] - 1)]
+    return row
 
 
 @compiled

@@ -203,7 +203,7 @@ def substitute(
     x: Floats, active: Bools, motions: list[Motion], inverses: list[Floats], vectors: list[Floats]
 ) -> Floats:
     """Positions (T, N, 3) m."""
-    x, error = x.copy(), np.zeros(0)
+    x, error = x.copy(), vectors[-1][:0]
     for t in range(len(x) - 1, -1, -1):
         motion, eta = motions[t], vectors[t]
         eta[motion.old] += motion.weight * (error[motion.new] - motion.gap)
@@ -217,7 +217,8 @@ def marginals(x: Floats, active: Bools, motions: list[Motion], inverses: list[Fl
 
     Sigma_t = S^-1 + (S^-1 D C) (S^-1 D C)^T with C C^T = Sigma_{t+1}.
     """
-    cov, ahead = np.full((*x.shape, 3), np.nan), np.zeros((0, 0))
+    cov: Floats = np.full((*x.shape, 3), np.nan)
+    ahead: Floats = np.zeros((0, 0))
     for t in range(len(x) - 1, -1, -1):
         sigma, motion = inverses[t], motions[t]
         if len(motion.new):

@@ -15,9 +15,7 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
-from ..compiling.batched import take
 from ..compiling.compile import inner
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -39,6 +37,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
+from ..compiling.vectors import LANES, take
 from ..stars.elimination import eliminate, substitute
 from .window_layout import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, row_of
 

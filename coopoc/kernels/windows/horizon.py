@@ -12,9 +12,7 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Bools, Floats, Ints
-from ..compiling.batched import choose, put, take
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -26,6 +24,7 @@ from ..compiling.small import (
     times,
     zeros,
 )
+from ..compiling.vectors import LANES, choose, put, take
 from ..stars.edges import AT_GAP, EXACT, edge
 from ..stars.elimination import predict
 from ..stars.joint import Joint, add_relative, block_of, new_joint, rearrange, solve

@@ -14,10 +14,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import Bools, Floats
-from ..compiling.batched import choose, put, take
 from ..compiling.compile import inner
-from ..compiling.lanes import LANES
 from ..compiling.small import load, scale, store, times
+from ..compiling.vectors import LANES, choose, put, take
 from .window_layout import ROW, Window, count_of, fix_gap, row_of
 
 TINY = 1e-30

@@ -8,10 +8,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
-from ..compiling.batched import put, take
 from ..compiling.compile import inner, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import load, subtract, times
+from ..compiling.vectors import LANES, put, take
 from ..stars.joint import LEAST_PROCESS
 from ..stars.messages import MOVED, POSITION, PROCESS, Assumptions, Measurements, Star, gather
 

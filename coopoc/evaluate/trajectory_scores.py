@@ -1,4 +1,4 @@
-"""Scores of trajectories that anyone estimated, against a truth: APE, RPE, RT-LE, NEES and intervals."""
+"""Scores of trajectories that anyone estimated, against a truth: APE, RPE, RT-LE, NEES, intervals and remarks."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ from ..arrays import Floats, Ints, checked, instance, named, number
 from ..errors import InputError
 from ..plugins import one_of, suggestion
 from ..short_repr import short_repr
-from .alignment import Alignment, align
-from .association import associated
-from .relative_error import Unit, ends, relative_error
-from .score_remarks import remarks
+from .alignment import Alignment, Unit, absolute_error, align, ends, relative_error
 from .statistics import Interval, mean_interval
 
 Aligned = Literal["none", "each", "team"]
+UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
+LENGTHS = {1e-3: "km", 1e2: "cm", 1e3: "mm", 1 / 0.3048: "feet"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,3 +190,89 @@ def _nees(estimate: Path, truth: Path) -> float | None:
     size = 2 if flat else 3
     solved = np.linalg.solve(estimate.covariance[:, :size, :size], gap[:, :size, None])[..., 0]
     return float((gap[:, :size] * solved).sum(axis=1).mean())
+
+
+def associated(estimate: Floats, truth: Floats, max_diff: float = 0.01, offset: float = 0.0) -> tuple[Ints, Ints]:
+    """Indices (n,), (n,) of stamps that belong together: for each of the shorter list the nearest of the longer.
+
+    Args:
+        estimate: (M,) s, increasing.
+        truth: (K,) s, increasing.
+        max_diff: s, stamps further apart than this belong to nothing.
+        offset: s, added to the estimate's stamps.
+
+    Raises:
+        InputError: no stamps belong together.
+
+    Source: the association of evo (`sync.associate_trajectories`), which gives the same pairs.
+
+    >>> associated(np.array([0.0, 0.1, 0.2]), np.array([0.101, 0.2]))
+    (array([1, 2]), array([0, 1]))
+    """
+    x, y = checked("estimate", estimate, "(M,)", (-1,)), checked("truth", truth, "(K,)", (-1,))
+    max_diff, x = number("max_diff", max_diff), x + number("offset", offset, -np.inf)
+    swap = len(x) > len(y)
+    short, long = (y, x) if swap else (x, y)
+    after = np.searchsorted(long, short).clip(max=len(long) - 1)
+    nearest = np.where(np.abs(long[after - 1] - short) <= np.abs(long[after] - short), after - 1, after) % len(long)
+    kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff)
+    if not len(kept):
+        spans = f"{span(x)} and {span(y)}"
+        hint = "Check the unit of the stamps, the clocks (offset) and the rates (max_diff)."
+        raise InputError("stamps", spans, f"must agree within {max_diff:g} s somewhere", hint)
+    pair = (kept.astype(np.int64), nearest[kept].astype(np.int64))
+    return (pair[1], pair[0]) if swap else pair
+
+
+def span(t: Floats) -> str:
+    """First and last stamp with all their digits.
+
+    >>> span(np.array([0.1, 1311868230.5]))
+    '0.1..1311868230.5 s'
+    """
+    return f"{t[0].item()!r}..{t[-1].item()!r} s" if len(t) else "no stamps"
+
+
+def remarks(stamps: tuple[Floats, Floats], positions: tuple[Floats, Floats], max_diff: float) -> tuple[str, ...]:
+    """What a reader should know before believing the scores, a sentence each.
+
+    Args:
+        stamps: (M,), (K,) s of the whole estimate and the whole truth.
+        positions: (n, 3), (n, 3) m of both where they are compared.
+        max_diff: s, how far stamps that belong together were allowed to be apart.
+
+    >>> import numpy as np
+    >>> t = np.arange(9.0)
+    >>> remarks((1000 * t, t), (np.zeros((1, 3)), np.zeros((1, 3))), 0.01)[0]
+    '1 of 9 stamps meet within 0.01 s: 0.0..8000.0 s and 0.0..8.0 s; the estimate looks like ms.'
+    """
+    return tuple(text for text in (_stamps(stamps, len(positions[0]), max_diff), _scale(*positions)) if text)
+
+
+def _stamps(stamps: tuple[Floats, Floats], met: int, max_diff: float) -> str:
+    count = min(map(len, stamps))
+    if 2 * met >= count:
+        return ""
+    long, true = (float(t[-1] - t[0]) for t in stamps)
+    looks = "another clock (offset), or rates that do not meet (max_diff)?"
+    for factor, unit in UNITS.items():
+        if 0.5 * factor < long / max(true, 1e-12) < 2 * factor:
+            looks = f"the estimate looks like {unit}."
+        if 0.5 * factor < true / max(long, 1e-12) < 2 * factor:
+            looks = f"the truth looks like {unit}."
+    return f"{met} of {count} stamps meet within {max_diff:g} s: {span(stamps[0])} and {span(stamps[1])}; {looks}"
+
+
+def _scale(estimate: Floats, truth: Floats) -> str:
+    """A scale that takes most of the error of the best rigid motion away, as a monocular camera or another unit has."""
+    try:
+        factor = float(align(estimate, truth, scale=True).scale)
+    except InputError:  # a straight drive, or a standing one: its frame is open, and so is its scale
+        return ""
+    rigid, free = (float(absolute_error(estimate, truth, scale=scale).rmse) for scale in (False, True))
+    if not factor or abs(factor - 1) < 0.05 or free > rigid / 2:
+        return ""
+    unit = next((f", as if it were in {unit}" for size, unit in LENGTHS.items() if abs(factor * size - 1) < 0.1), "")
+    return (
+        f"divided by {1 / factor:.3g}, its aligned error falls from {rigid:.3g} to {free:.3g} m: another scale{unit}."
+    )
