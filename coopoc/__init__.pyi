@@ -22,17 +22,14 @@ from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV
 from .methods.centralised import BatchSmoother as BatchSmoother
 from .methods.centralised import CentralFilter as CentralFilter
-from .methods.cooperative_map import CooperativeMAP as CooperativeMAP
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
 from .methods.decentralised import ConsensusADMM as ConsensusADMM
 from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation
-from .methods.fixed_lag import FixedLagSmoother as FixedLagSmoother
 from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
 from .methods.kalman import AdaptiveKalman as AdaptiveKalman
 from .methods.kalman import Kalman as Kalman
 from .methods.mds import MDS as MDS
-from .methods.moving_horizon import MovingHorizon as MovingHorizon
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.pose_filter import PoseFilter as PoseFilter
 from .methods.pose_measurement import BodyMeasurement as BodyMeasurement
@@ -40,6 +37,9 @@ from .methods.pose_measurement import OwnMeasurement as OwnMeasurement
 from .methods.pose_smoother import PoseSmoother as PoseSmoother
 from .methods.pose_start import pose_start as pose_start
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
+from .methods.sliding_window import CooperativeMAP as CooperativeMAP
+from .methods.sliding_window import FixedLagSmoother as FixedLagSmoother
+from .methods.sliding_window import MovingHorizon as MovingHorizon
 from .methods.star import stars as stars
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
 from .methods.track import Method as Method

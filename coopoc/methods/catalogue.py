@@ -8,17 +8,15 @@ from ..one_file import in_file
 from ..plugins import find, names
 from .baselines import LKFSA, MSMV
 from .centralised import BatchSmoother, CentralFilter
-from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
 from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
-from .fixed_lag import FixedLagSmoother
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
 from .mds import MDS
-from .moving_horizon import MovingHorizon
 from .noise_model import NoiseModel
 from .qcqp_relaxation import QCQPRelaxation
+from .sliding_window import CooperativeMAP, FixedLagSmoother, MovingHorizon
 from .track import Method
 
 Factory = Callable[[NoiseModel | str], Method]

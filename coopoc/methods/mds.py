@@ -14,7 +14,7 @@ from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
 from .options import check_options
-from .star import StarStep, dead_reckoned, stars
+from .star import StarStep, bridged, stars
 from .track import Track
 
 LISTED = 10
@@ -84,14 +84,15 @@ def bridged_stars(
 
     Where a fix is missing the last one counts, moved by the vehicle's own odometry; without one yet, no position does.
     """
-    x, variance = dead_reckoned(recording, known)
+    x, variance = bridged(recording, known)
+    variance = np.broadcast_to(variance, x.shape)
     for star in stars(recording, ego, known, message, sent=(x, variance)):
         star.position[:, 0], star.variance[:, 0] = x[:, star.step, ego], variance[:, star.step, ego]
         yield star, box.newest[:, box.start[star.step] : box.start[star.step + 1]]
 
 
 def bridging_note(recording: Recording) -> tuple[str, ...]:
-    """A note on `dead_reckoned`, where it has replaced fixes."""
+    """A note on `bridged`, where it has replaced fixes."""
     driving = np.isfinite(recording.velocity)
     share = 100 * (np.isnan(recording.gnss) & driving).sum() / driving.sum()
     note = f"{share:.0f} % of the fixes are missing: the last one is brought forward with the velocity"
