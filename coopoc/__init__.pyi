@@ -34,11 +34,11 @@ from .methods.mds import MDS as MDS
 from .methods.moving_horizon import MovingHorizon as MovingHorizon
 from .methods.msmv import MSMV as MSMV
 from .methods.noise_model import NoiseModel as NoiseModel
-from .methods.pose_filter import PoseFilter as PoseFilter
-from .methods.pose_measurement import BodyMeasurement as BodyMeasurement
-from .methods.pose_measurement import OwnMeasurement as OwnMeasurement
-from .methods.pose_smoother import PoseSmoother as PoseSmoother
-from .methods.pose_start import pose_start as pose_start
+from .methods.poses.pose_filter import PoseFilter as PoseFilter
+from .methods.poses.pose_smoother import PoseSmoother as PoseSmoother
+from .methods.poses.pose_start import pose_start as pose_start
+from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
+from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
 from .methods.track import Method as Method

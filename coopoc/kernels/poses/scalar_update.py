@@ -1,0 +1,173 @@
+"""Sequential scalar EKF update of the joint pose state, and the rows of compasses, fixes, ranges and angles.
+
+The state of a member is d = 4 or 6 numbers: position m, heading rad and, of six, the odometer's scale error and the
+yaw rate's bias rad/s. A row is linear in the pose of one member, (a, b, c, h), and at most in the position of another,
+(-a, -b, -c): every measurement here is one of the vector between the two and of the first one's heading.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Floats
+from ..compiling.compile import part
+
+HEADING = 3
+"""Index of the heading in a member's state."""
+NEAREST = 1e-3
+"""m, least distance at which an angle is linearised."""
+Ends = tuple[int, int]
+"""First number of the member and of the other, -1 for none."""
+Row = tuple[float, float, float, float]
+Three = tuple[float, float, float]
+
+
+class Poses(NamedTuple):
+    """State of n members of d numbers each, and memory of an update.
+
+    Attributes:
+        x: (n d,).
+        cov: (n d, n d).
+        linear: (n d,) state at which relative measurements are linearised.
+        prior_x: (n d,) before the relative measurements.
+        prior_cov: (n d, n d).
+        column: (n d,) P h of a row.
+        cost: (2,) sum of r^2 / s + log s, and number of rows that were used.
+    """
+
+    x: Floats
+    cov: Floats
+    linear: Floats
+    prior_x: Floats
+    prior_cov: Floats
+    column: Floats
+    cost: Floats
+
+
+def new_poses(size: int) -> Poses:
+    """Room for `size` numbers."""
+    linear, prior, column = np.zeros((3, size))
+    return Poses(np.zeros(size), np.zeros((size, size)), linear, prior, np.zeros((size, size)), column, np.zeros(2))
+
+
+@part
+def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: float, gate: float) -> bool:
+    """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance; nothing where r^2 > gate^2 s.
+
+    Args:
+        poses: the state.
+        ends: of the row.
+        row: (a, b, c, h).
+        residual: r, at the state.
+        variance: of the measurement.
+        gate: in standard deviations.
+
+    Returns:
+        Whether the measurement is used.
+    """
+    x, cov, column, (k, o), (a, b, c, h) = poses.x, poses.cov, poses.column, ends, row
+    if o >= 0:
+        for i in range(len(x)):
+            east, north, up = cov[k, i] - cov[o, i], cov[k + 1, i] - cov[o + 1, i], cov[k + 2, i] - cov[o + 2, i]
+            column[i] = a * east + b * north + c * up + h * cov[k + HEADING, i]
+    else:
+        for i in range(len(x)):
+            column[i] = a * cov[k, i] + b * cov[k + 1, i] + c * cov[k + 2, i] + h * cov[k + HEADING, i]
+    s = variance + a * column[k] + b * column[k + 1] + c * column[k + 2] + h * column[k + HEADING]
+    if o >= 0:
+        s -= a * column[o] + b * column[o + 1] + c * column[o + 2]
+    square = residual * residual / s
+    poses.cost[0] += min(square, gate * gate) + math.log(s)
+    if square > gate * gate:
+        return False
+    poses.cost[1] += 1.0
+    for i in range(len(x)):
+        gain = column[i] / s
+        if gain != 0.0:
+            x[i] += gain * residual
+            for j in range(len(x)):
+                cov[i, j] -= gain * column[j]
+    return True
+
+
+@part
+def wrapped(angle: float) -> float:
+    """The same angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@part
+def update_heading(poses: Poses, member: int, heading: float, variance: float, gate: float) -> None:
+    """A compass heading rad."""
+    residual = wrapped(heading - poses.x[member + HEADING])
+    update_row(poses, (member, np.int64(-1)), (0.0, 0.0, 0.0, 1.0), residual, variance, gate)
+
+
+@part
+def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: float) -> None:
+    """A position m."""
+    for axis in range(3):
+        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0)
+        update_row(poses, (member, np.int64(-1)), row, fix[axis] - poses.x[member + axis], variance[axis], gate)
+
+
+@part
+def relative_row(linear: Floats, component: int, ends: Ends, place: Three, measured: float) -> tuple[float, Row]:
+    """Residual and row of a range (0), a bearing from the observer's heading (1) or an inclination (2).
+
+    Args:
+        linear: the state at which they are taken.
+        component: which of the three.
+        ends: observer, and the other or -1 for a landmark.
+        place: of the landmark, m.
+        measured: m or rad.
+    """
+    (k, o), (px, py, pz) = ends, place
+    if o >= 0:
+        px, py, pz = linear[o], linear[o + 1], linear[o + 2]
+    x, y, z = px - linear[k], py - linear[k + 1], pz - linear[k + 2]
+    flat2 = max(x * x + y * y, NEAREST * NEAREST)
+    flat, r2 = math.sqrt(flat2), flat2 + z * z
+    if component == 0:
+        r = math.sqrt(r2)
+        return measured - r, (-x / r, -y / r, -z / r, 0.0)
+    if component == 1:
+        return wrapped(measured - math.atan2(y, x) + linear[k + HEADING]), (y / flat2, -x / flat2, 0.0, -1.0)
+    row = (-x * z / (flat * r2), -y * z / (flat * r2), flat / r2, 0.0)
+    return wrapped(measured - math.atan2(flat, z)), row
+
+
+@part
+def update_relative(
+    poses: Poses, ends: Ends, place: Three, measured: Three, variances: Three, gate: float, left_out: int
+) -> int:
+    """The components of one relative measurement, linear at `poses.linear`.
+
+    Args:
+        poses: the state.
+        ends: observer, and the other or -1 for a landmark.
+        place: of the landmark, m.
+        measured: m, rad, rad, NaN where missing.
+        variances: of the three.
+        gate: in standard deviations.
+        left_out: a bit for each component that is left out.
+
+    Returns:
+        The bits, and those of the components beyond the gate.
+    """
+    (k, o), x, linear = ends, poses.x, poses.linear
+    for component in range(3):
+        if math.isnan(measured[component]) or left_out & (1 << component):
+            continue
+        residual, row = relative_row(linear, component, ends, place, measured[component])
+        residual -= row[HEADING] * (x[k + HEADING] - linear[k + HEADING])
+        for axis in range(3):
+            residual -= row[axis] * (x[k + axis] - linear[k + axis])
+            if o >= 0:
+                residual += row[axis] * (x[o + axis] - linear[o + axis])
+        if not update_row(poses, ends, row, residual, variances[component], gate):
+            left_out |= 1 << component
+    return left_out
