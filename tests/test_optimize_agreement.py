@@ -116,7 +116,7 @@ UNSUPPORTED = {
     ("cvxpy", "active bound"): "cannot be solved by cvxpy",
 }
 """Pairs that are refused, and what the refusal names."""
-RELAXED = {("cvxpy", "range-only"), ("cvxpy", "SE(2) chordal")}
+RELAXED = {("cvxpy", "linear"), ("cvxpy", "range-only"), ("cvxpy", "SE(2) chordal")}
 """Where the backend's own answer is a rounded relaxation; only with its refinement does it agree to the last digits."""
 
 

@@ -210,7 +210,7 @@ class Windows:
 
     def problems(self, ended: Ints) -> Iterator[tuple[int, int, Problem, Ints]]:
         """Run, step, problem and the vehicle of each point, of all windows that are not solved."""
-        from ..kernels.compiling.lanes import LANES
+        from ..kernels.compiling.vectors import LANES
         from ..kernels.windows.window import LOST, gather_window, new_windows
 
         for first in range(0, len(ended), LANES):

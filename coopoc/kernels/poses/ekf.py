@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from .odometry import PoseNoise, join, predict
-from .scalar_update import Poses, update_fix, update_heading, update_relative
+from .scalar_update import COST, USED, Poses, settle, update_fix, update_heading, update_relative
 
 UNPLACED = 7
 """Bits of all components: nothing is known of the position of one of the two."""
@@ -90,7 +90,7 @@ def run_filter(
                         x[run, t, k, i] = poses.x[d * k + i]
                         for j in range(d):
                             cov[run, t, k, i, j] = poses.cov[d * k + i, d * k + j]
-        cost[run] = poses.cost
+        cost[run, 0], cost[run, 1] = poses.count[COST], poses.count[USED]
     return x, cov, cost
 
 
@@ -109,7 +109,7 @@ def step(
     """One step of all members: prediction, then each one's compass and fix, then the relative measurements."""
     d = options.d
     if t == 0:
-        poses.cost[0] = poses.cost[1] = 0.0
+        poses.count[COST] = poses.count[USED] = 0.0
     for k in range(measured.own.shape[2]):
         own, member = measured.own[run, t, k], d * k
         if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
@@ -126,6 +126,7 @@ def step(
             update_heading(poses, d * k, own[3], noise.heading, noise.gate)
         if measured.active[t, k] and not math.isnan(own[0]):
             update_fix(poses, d * k, (own[0], own[1], own[2]), noise.fix, noise.gate)
+    settle(poses)
     if measured.first[t] == measured.first[t + 1]:
         return
     if options.fusion == JOINT:
@@ -156,6 +157,7 @@ def update_jointly(
         for k in range(begin, end):
             ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
             left_out[k - begin] = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])
+        settle(poses)
 
 
 @part
@@ -206,6 +208,7 @@ def fuse_pair(
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
         add_relative(measured, noise, pair, ends, run, k, np.int64(0))
+        settle(pair)
         total = 0.0
         for i in range(d):
             before = poses.cov[observer + i, observer + i]

@@ -11,12 +11,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy import uint64
 
 from ...arrays import Floats
 from ..compiling.compile import part
+from ..compiling.vectors import LANES, less, put, take
 
 HEADING = 3
 """Index of the heading in a member's state."""
+ROWS = 4
+"""Rows that may be pending, so that one pass over the covariance serves them all."""
 NEAREST = 1e-3
 """m, least distance at which an angle is linearised."""
 Ends = tuple[int, int]
@@ -26,16 +30,18 @@ Three = tuple[float, float, float]
 
 
 class Poses(NamedTuple):
-    """State of n members of d numbers each, and memory of an update.
+    """State of n members of d numbers each, filled up with zeros to a multiple of LANES, and memory of an update.
 
     Attributes:
-        x: (n d,).
-        cov: (n d, n d).
-        linear: (n d,) state at which relative measurements are linearised.
-        prior_x: (n d,) before the relative measurements.
-        prior_cov: (n d, n d).
-        column: (n d,) P h of a row.
-        cost: (2,) sum of r^2 / s + log s, and number of rows that were used.
+        x: (size,).
+        cov: (size, size), to which pending rows have not been applied.
+        linear: (size,) state at which relative measurements are linearised.
+        prior_x: (size,) before the relative measurements.
+        prior_cov: (size, size).
+        columns: (ROWS, size) P h of pending rows.
+        gains: (ROWS, size) P h / s of these.
+        weights: (ROWS,) 1 / s of these.
+        count: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
     x: Floats
@@ -43,19 +49,28 @@ class Poses(NamedTuple):
     linear: Floats
     prior_x: Floats
     prior_cov: Floats
-    column: Floats
-    cost: Floats
+    columns: Floats
+    gains: Floats
+    weights: Floats
+    count: Floats
 
 
-def new_poses(size: int) -> Poses:
-    """Room for `size` numbers."""
-    linear, prior, column = np.zeros((3, size))
-    return Poses(np.zeros(size), np.zeros((size, size)), linear, prior, np.zeros((size, size)), column, np.zeros(2))
+COST, USED, PENDING = range(3)
+
+
+def new_poses(numbers: int) -> Poses:
+    """Room for so many numbers."""
+    size = -(-numbers // LANES) * LANES
+    (x, linear, prior_x), (cov, prior_cov) = np.zeros((3, size)), np.zeros((2, size, size))
+    columns, gains = np.zeros((2, ROWS, size))
+    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, np.zeros(ROWS), np.zeros(3))
 
 
 @part
 def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: float, gate: float) -> bool:
     """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance; nothing where r^2 > gate^2 s.
+
+    The covariance follows when ROWS rows are pending, or with `settle`; a row sees those that are pending.
 
     Args:
         poses: the state.
@@ -68,29 +83,61 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     Returns:
         Whether the measurement is used.
     """
-    x, cov, column, (k, o), (a, b, c, h) = poses.x, poses.cov, poses.column, ends, row
+    if poses.count[PENDING] == ROWS:
+        settle(poses)
+    cov, columns, pending, (k, o), (a, b, c, h) = poses.cov, poses.columns, int(poses.count[PENDING]), ends, row
+    size = len(poses.x)
     if o >= 0:
-        for i in range(len(x)):
+        for i in range(size):
             east, north, up = cov[k, i] - cov[o, i], cov[k + 1, i] - cov[o + 1, i], cov[k + 2, i] - cov[o + 2, i]
-            column[i] = a * east + b * north + c * up + h * cov[k + HEADING, i]
+            columns[pending, i] = a * east + b * north + c * up + h * cov[k + HEADING, i]
     else:
-        for i in range(len(x)):
-            column[i] = a * cov[k, i] + b * cov[k + 1, i] + c * cov[k + 2, i] + h * cov[k + HEADING, i]
-    s = variance + a * column[k] + b * column[k + 1] + c * column[k + 2] + h * column[k + HEADING]
-    if o >= 0:
-        s -= a * column[o] + b * column[o + 1] + c * column[o + 2]
+        for i in range(size):
+            columns[pending, i] = a * cov[k, i] + b * cov[k + 1, i] + c * cov[k + 2, i] + h * cov[k + HEADING, i]
+    for q in range(pending):
+        share = along(columns, q, ends, row) * poses.weights[q]
+        for i in range(size):
+            columns[pending, i] -= share * columns[q, i]
+    s = variance + along(columns, pending, ends, row)
     square = residual * residual / s
-    poses.cost[0] += min(square, gate * gate) + math.log(s)
+    poses.count[COST] += min(square, gate * gate) + math.log(s)
     if square > gate * gate:
         return False
-    poses.cost[1] += 1.0
-    for i in range(len(x)):
-        gain = column[i] / s
-        if gain != 0.0:
-            x[i] += gain * residual
-            for j in range(len(x)):
-                cov[i, j] -= gain * column[j]
+    poses.weights[pending] = 1.0 / s
+    for i in range(size):
+        poses.gains[pending, i] = columns[pending, i] / s
+        poses.x[i] += columns[pending, i] * (residual / s)
+    poses.count[USED] += 1.0
+    poses.count[PENDING] += 1.0
     return True
+
+
+@part
+def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
+    """h^T v of a row and a column."""
+    (k, o), (a, b, c, h) = ends, row
+    total = a * columns[q, k] + b * columns[q, k + 1] + c * columns[q, k + 2] + h * columns[q, k + HEADING]
+    if o >= 0:
+        total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
+    return float(total)
+
+
+@part
+def settle(poses: Poses) -> None:
+    """Apply the pending rows to the covariance, which is read once for all of them."""
+    size, tiles, gains = len(poses.x), len(poses.x) // LANES, poses.gains
+    pending = int(poses.count[PENDING])
+    for q in range(pending, ROWS if pending > 0 else 0):
+        for i in range(size):
+            gains[q, i] = 0.0
+    for i in range(size if pending > 0 else 0):
+        if gains[0, i] != 0.0 or gains[1, i] != 0.0 or gains[2, i] != 0.0 or gains[3, i] != 0.0:
+            for tile in range(tiles):
+                left = take(poses.cov, uint64(i * tiles + tile))
+                for q in range(ROWS):
+                    left = less(left, gains[q, i], take(poses.columns, uint64(q * tiles + tile)))
+                put(poses.cov, uint64(i * tiles + tile), left)
+    poses.count[PENDING] = 0.0
 
 
 @part

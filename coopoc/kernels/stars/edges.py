@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..compiling.batched import choose, plus
 from ..compiling.compile import inner
 from ..compiling.small import apply, choose_each, from_upper, scale, subtract
+from ..compiling.vectors import choose, plus
 from .relative import completed, converted, exact, vector
 
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05

@@ -126,6 +126,7 @@ class PoseStream:
         active = np.ones((2, 1), dtype=bool)
         measured = PoseMeasurements(both, active, ends, first, place, relative, self._dt)
         step(measured, self._noise, self._begin, self._spread, self._options, self._poses, self._pair, 0, t)
-        self._later, x = True, self._poses.x.copy()
+        self._later, d = True, self._options.d
+        x = self._poses.x[:d].copy()
         x[3] = wrap(x[3])
-        return PoseEstimate(x, self._poses.cov.copy())
+        return PoseEstimate(x, self._poses.cov[:d, :d].copy())
