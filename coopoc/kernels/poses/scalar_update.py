@@ -8,14 +8,14 @@ yaw rate's bias rad/s. A row is linear in the pose of one member, (a, b, c, h), 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import uint64
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..compiling.vectors import LANES, less, put, take
+from ..compiling.vectors import LANES, less, plus, put, take
 
 HEADING = 3
 """Index of the heading in a member's state."""
@@ -86,30 +86,39 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     if poses.count[PENDING] == ROWS:
         settle(poses)
     cov, columns, pending, (k, o), (a, b, c, h) = poses.cov, poses.columns, int(poses.count[PENDING]), ends, row
-    size = len(poses.x)
-    if o >= 0:
-        for i in range(size):
-            east, north, up = cov[k, i] - cov[o, i], cov[k + 1, i] - cov[o + 1, i], cov[k + 2, i] - cov[o + 2, i]
-            columns[pending, i] = a * east + b * north + c * up + h * cov[k + HEADING, i]
-    else:
-        for i in range(size):
-            columns[pending, i] = a * cov[k, i] + b * cov[k + 1, i] + c * cov[k + 2, i] + h * cov[k + HEADING, i]
+    tiles = len(poses.x) // LANES
+    for tile in range(tiles):
+        x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
+        if o >= 0:
+            x, y = x - entries(cov, o, tile, tiles), y - entries(cov, o + 1, tile, tiles)
+            z = z - entries(cov, o + 2, tile, tiles)
+        total = plus(plus(plus(h * entries(cov, k + HEADING, tile, tiles), a, x), b, y), c, z)
+        put(columns, uint64(pending * tiles + tile), total)
     for q in range(pending):
         share = along(columns, q, ends, row) * poses.weights[q]
-        for i in range(size):
-            columns[pending, i] -= share * columns[q, i]
+        for tile in range(tiles):
+            left = less(entries(columns, pending, tile, tiles), share, entries(columns, q, tile, tiles))
+            put(columns, uint64(pending * tiles + tile), left)
     s = variance + along(columns, pending, ends, row)
-    square = residual * residual / s
+    weight = 1.0 / s
+    square = residual * residual * weight
     poses.count[COST] += min(square, gate * gate) + math.log(s)
     if square > gate * gate:
         return False
-    poses.weights[pending] = 1.0 / s
-    for i in range(size):
-        poses.gains[pending, i] = columns[pending, i] / s
-        poses.x[i] += columns[pending, i] * (residual / s)
+    for tile in range(tiles):
+        column = entries(columns, pending, tile, tiles)
+        put(poses.x, uint64(tile), plus(take(poses.x, uint64(tile)), residual * weight, column))
+        put(poses.gains, uint64(pending * tiles + tile), weight * column)
+    poses.weights[pending] = weight
     poses.count[USED] += 1.0
     poses.count[PENDING] += 1.0
     return True
+
+
+@part
+def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
+    """LANES numbers of a row of `tiles` times as many."""
+    return take(rows, uint64(row * tiles + tile))
 
 
 @part
@@ -131,11 +140,13 @@ def settle(poses: Poses) -> None:
         for i in range(size):
             gains[q, i] = 0.0
     for i in range(size if pending > 0 else 0):
-        if gains[0, i] != 0.0 or gains[1, i] != 0.0 or gains[2, i] != 0.0 or gains[3, i] != 0.0:
+        p, q, r, s = gains[0, i], gains[1, i], gains[2, i], gains[3, i]
+        if p != 0.0 or q != 0.0 or r != 0.0 or s != 0.0:
             for tile in range(tiles):
-                left = take(poses.cov, uint64(i * tiles + tile))
-                for q in range(ROWS):
-                    left = less(left, gains[q, i], take(poses.columns, uint64(q * tiles + tile)))
+                left = less(entries(poses.cov, i, tile, tiles), p, entries(poses.columns, 0, tile, tiles))
+                left = less(left, q, entries(poses.columns, 1, tile, tiles))
+                left = less(left, r, entries(poses.columns, 2, tile, tiles))
+                left = less(left, s, entries(poses.columns, 3, tile, tiles))
                 put(poses.cov, uint64(i * tiles + tile), left)
     poses.count[PENDING] = 0.0
 

@@ -142,7 +142,7 @@ def pose_measurements(
     own = [recording.gnss, body.heading[..., None], recording.velocity, body.yaw_rate[..., None]]
     relative = recording.relative[:, links]
     return PoseMeasurements(
-        np.concatenate([values[:, :, members] for values in own], axis=3),
+        np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], axis=3)),
         np.ascontiguousarray(present(recording)[:, members]),
         np.stack([number[table.observer[links]], number[table.neighbour[links]]], axis=1),
         np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),
