@@ -31,11 +31,11 @@ from .methods.kalman import AdaptiveKalman as AdaptiveKalman
 from .methods.kalman import Kalman as Kalman
 from .methods.mds import MDS as MDS
 from .methods.noise_model import NoiseModel as NoiseModel
-from .methods.pose_filter import PoseFilter as PoseFilter
-from .methods.pose_measurement import BodyMeasurement as BodyMeasurement
-from .methods.pose_measurement import OwnMeasurement as OwnMeasurement
-from .methods.pose_smoother import PoseSmoother as PoseSmoother
-from .methods.pose_start import pose_start as pose_start
+from .methods.poses.pose_filter import PoseFilter as PoseFilter
+from .methods.poses.pose_smoother import PoseSmoother as PoseSmoother
+from .methods.poses.pose_start import pose_start as pose_start
+from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
+from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
 from .methods.sliding_window import CooperativeMAP as CooperativeMAP
 from .methods.sliding_window import FixedLagSmoother as FixedLagSmoother

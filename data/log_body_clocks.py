@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.methods.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import wrap

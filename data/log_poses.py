@@ -11,8 +11,8 @@ import numpy as np
 from coopoc.arrays import Floats, robust_std
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
-from coopoc.methods.pose_filter import PoseFilter
-from coopoc.methods.pose_start import pose_start
+from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import wrap
