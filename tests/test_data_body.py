@@ -111,12 +111,11 @@ def test_what_was_measured_is_what_the_recording_holds(tmp_path: Path) -> None:
 def test_pose_filters_run_on_a_log_and_cooperation_helps(tmp_path: Path) -> None:
     log = co.read_log(written(tmp_path / "log", noise=1.0), frame="body")
     assert log.truth is not None
-    filters = (co.PoseFilter("solo"), co.PoseFilter("star"), co.PoseFilter("fleet"))
+    filters = (co.PoseFilter("solo"), co.PoseFilter("fleet"))
     tracks = [one(log.recording, list(CARS)) for one in filters]
     errors = [co.rt_le(track, log.truth).mean() for track in tracks]
     assert errors[1] < 0.9 * errors[0]
-    assert errors[2] < 0.9 * errors[0]
-    assert 1.5 < np.nanmean(co.pose_nees(tracks[2], log.truth)) < 5
+    assert 1.5 < np.nanmean(co.pose_nees(tracks[1], log.truth)) < 5
 
 
 def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Path) -> None:
@@ -230,9 +229,8 @@ def test_innovations_of_poses_are_consistent_where_all_is_white() -> None:
     fleet = co.load_fleet("town10").between(0, 300)
     noise = co.Sensors(gnss_std=(1.0, 1.0, 1.0), heading_std=0.1, yaw_rate_std=0.05)
     rec = co.observe(fleet, noise, co.V2X(max_neighbours=2), runs=20, seed=1, observers=["town10-24"], frame="body")
-    for unit in ("solo", "star"):
-        track = co.PoseFilter(unit)(rec, ["town10-24"])  # type: ignore[arg-type]
-        assert float(np.nanmean(innovation_columns(track, rec)["nis"])) == pytest.approx(1.0, abs=0.03)
+    track = co.PoseFilter("solo")(rec, ["town10-24"])
+    assert float(np.nanmean(innovation_columns(track, rec)["nis"])) == pytest.approx(1.0, abs=0.03)
     alone = replace(track, covariance=track.covariance, heading_covariance=None)
     sure = normalised_innovations(alone, rec)
     whole = normalised_innovations(track, rec)

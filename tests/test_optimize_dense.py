@@ -7,7 +7,7 @@ import pytest
 
 from coopoc.optimize import Loss, Problem, pose, solve, solve_batch
 from coopoc.optimize.algebra.dense import NUMBERS, damped_step, diagonal_blocks, is_small, normal_matrix
-from coopoc.optimize.assessment.assess import assess
+from coopoc.optimize.assess.assess import assess
 from coopoc.optimize.descent.descend import _damping
 
 

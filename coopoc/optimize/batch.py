@@ -11,8 +11,8 @@ from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
 from ..short_repr import short_repr
 from .algebra.arrowhead import Arrow, marginals, structure
-from .algebra.normal import normal_equations
-from .assessment.assess import bounded
+from .algebra.normal import Pattern, normal_equations
+from .assess.assess import INFLATION
 from .backend import Backend, Options, require_backend
 from .model.problem import Problem
 from .solve import POSITION_TOLERANCE
@@ -81,7 +81,7 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
         linear = part.linearise(end.x)
         blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in part.factors])
         cov, left = _marginals(frame, blocks, gradient)
-        sound = bounded(scheme, blocks, cov)
+        sound = _bounded(scheme, blocks, cov)
         if part.movable is not None:
             cov *= part.movable[:, :, None] & part.movable[:, None, :]
         cov[~sound] = np.nan
@@ -100,6 +100,15 @@ def _repeated(found: Batch, problem: Problem, backend: Backend, options: Options
         getattr(found, field.name)[which] = getattr(better, field.name)
     found.again[which] = True
     return found
+
+
+def _bounded(scheme: Pattern, blocks: Floats, cov: Floats) -> Bools:
+    """(B,) True where no variance of cov (B, n, dof, dof) exceeds INFLATION times its value with all else known."""
+    own = np.zeros(cov.shape[:3])
+    diagonal = scheme.pairs[:, 0] == scheme.pairs[:, 1]
+    own[:, scheme.pairs[diagonal, 0]] = np.einsum("bpii->bpi", blocks[:, diagonal])
+    inflation = own * np.einsum("bnii->bni", cov)
+    return np.asarray(((inflation > 0) & (inflation < INFLATION)).all(axis=(1, 2)))
 
 
 def _marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:

@@ -12,8 +12,8 @@ from coopoc.arrays import Bools, Floats, robust_std
 from coopoc.errors import InputError
 from coopoc.evaluate.innovations import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
-from coopoc.methods.pose_filter import PoseFilter
-from coopoc.methods.pose_start import pose_start
+from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
 from coopoc.world.fleet import Fleet
 from coopoc.world.frames import midway, turned

@@ -9,16 +9,13 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.cholesky import cholesky_of, with_still
 from ..algebra.dense import damped_step
-from ..algebra.sparse import Sparse, sparse
-from ..assessment.curvature import newton_step
+from ..assess.curvature import tapes
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
 from ..descent.trust_region import arrive
 from ..model.linear import Linear
 from ..model.problem import Problem
 
-PATIENCE = 40
-"""Gauss-Newton steps before the exact Hessian takes over: with large residuals J^T J alone creeps or overshoots."""
 DENSE_POINTS = 60
 """Up to this many points a problem without a separator is solved densely."""
 
@@ -35,24 +32,14 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     step = linear_step(structure)
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        if max_iterations and (system := sparse(problem)) is not None:
-            return _by_tapes(system, x, 1 if problem.linear else max_iterations, tolerance)
-        patience = max_iterations if problem.batch is not None else min(max_iterations, PATIENCE)
-        end = descend(problem, step, x, patience, tolerance)
-        if end.converged.all() or patience == max_iterations:
-            return SolverResult(end.x, end.iterations, extras={"record": end.record})
-        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - patience, tolerance, exact=True)
-        extras = {"newton_steps": int(more.iterations.sum()), "record": np.concatenate([end.record, more.record])}
-        return SolverResult(more.x, end.iterations + more.iterations, extras=extras)
+        if max_iterations and problem.batch is None and (system := tapes(problem)) is not None:
+            found = arrive(system, x[0], 1 if problem.linear else max_iterations, tolerance)
+            extras = {"newton_steps": found.newton_steps, "record": found.record}
+            return SolverResult(found.x[None], np.array([found.iterations]), extras=extras)
+        end = descend(problem, step, x, max_iterations, tolerance)
+        return SolverResult(end.x, end.iterations, extras={"record": end.record})
 
     return solver
-
-
-def _by_tapes(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
-    """The result of a single problem from x (1, n, ambient)."""
-    end = arrive(system, x[0], max_iterations, tolerance)
-    extras = {"newton_steps": end.newton_steps, "record": end.record}
-    return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
 
 
 def linear_step(problem: Problem) -> Step:

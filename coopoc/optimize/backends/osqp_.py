@@ -15,7 +15,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.arrowhead import structure
 from ..algebra.normal import Pattern, normal_equations
-from ..assessment.active import constraint_rows
+from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..model.constraint import bounded

@@ -8,29 +8,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Floats, checked, number
-from ..errors import InputError
-from ..optimize.backend import require_backend
-from ..optimize.incremental import Estimates, FixedLag
-from ..optimize.model.space import log
-from ..short_repr import short_repr
-from ..world.recording import Recording, check_recording
-from ..world.sensors import Sensors
-from ..world.v2x import Message
-from . import pose_unit
-from .options import check_options
-from .pose_begin import first_poses, pose_egos
-from .pose_filter import SPREAD
-from .pose_piece import PLANE, Drive, node, pose_piece, vehicles
-from .track import Track
-from .whole_fleet import CENTRE, centre
+from ...arrays import Floats, number
+from ...optimize.backend import require_backend
+from ...optimize.incremental import Estimates, FixedLag
+from ...optimize.model.space import log
+from ...short_repr import short_repr
+from ...world.recording import Recording, check_recording
+from ...world.sensors import Sensors
+from ...world.v2x import Message
+from ..options import check_options
+from ..track import Track
+from ..whole_fleet import CENTRE, centre
+from .pose_factors import PLANE, PoseRun, node, pose_subgraph
+from .pose_inputs import SPREAD, UPLOAD, check_spread, first_poses, fleet_members, pose_egos
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSmoother:
     """Most probable poses (x, y, heading) of all vehicles in the last `lag` seconds, given all that was ever measured.
 
-    Each step of a recording in body frames is a piece of a problem (`pose_piece`) for FixedLag, which adds it to
+    Each step of a recording in body frames is a part of a problem (`pose_subgraph`) for FixedLag, which adds it to
     GTSAM's Bayes tree; the newest poses are the estimate. All is in the plane: heights stay those of the start. It
     loops over the runs.
 
@@ -63,15 +60,14 @@ class PoseSmoother:
     assumed: Sensors | None = None
     name: str = "pose-smoother"
     cooperative: bool = True
-    message: Message = pose_unit.UPLOAD
+    message: Message = UPLOAD
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
         check_options(self)
         number("lag", self.lag, 0.0, np.inf, allowed=">= 0 s", hint="5 is the default.")
-        if not (checked("spread", self.spread, "(4,)", (4,)) > 0).all():
-            raise InputError("spread", self.spread, "must be > 0", "Give m, m, m and rad.")
+        check_spread(self.spread)
         require_backend("gtsam")
         FixedLag(self.lag, self.threshold, self.passes)  # refuses the others
 
@@ -83,13 +79,14 @@ class PoseSmoother:
                 vehicle whose first pose is not known.
         """
         began, recording = time.perf_counter(), check_recording(recording, body=True)
-        columns, first = pose_egos(recording, egos), first_poses(recording, self.begin, None)
+        columns = pose_egos(recording, egos)
+        first = first_poses(recording, self.begin, fleet_members(recording))
         shape = (recording.runs, len(recording.t), len(columns))
         x, cov, heading, of_heading = (np.zeros((*shape, *more)) for more in ((3,), (3, 3), (), (4,)))
         height = np.where(np.isnan(first[..., 2]), recording.gnss[:, 0, :, 2], first[..., 2])
         x[..., 2], cov[..., 2, 2] = height[:, None, columns], self.spread[2] ** 2
         for run in range(recording.runs):
-            for t, found in enumerate(self.follow(recording, run, first)):
+            for t, found in enumerate(self.estimates(recording, run, first)):
                 place = [found.names.index(node(recording, column, t)) for column in columns]
                 at, full = found.x[place], found.covariance[place]
                 x[run, t, :, :2], cov[run, t, :, :2, :2] = at[:, :2], full[:, :2, :2]
@@ -110,7 +107,7 @@ class PoseSmoother:
             heading_covariance=of_heading,
         )
 
-    def follow(self, recording: Recording, run: int = 0, begin: Floats | None = None) -> Iterator[Estimates]:
+    def estimates(self, recording: Recording, run: int = 0, begin: Floats | None = None) -> Iterator[Estimates]:
         """Step by step the poses of all vehicles that are there, as nodes "id@step".
 
         Args:
@@ -118,13 +115,16 @@ class PoseSmoother:
             run: of it.
             begin: (R, N, 4) first poses; None: those of the smoother.
         """
-        first = first_poses(recording, self.begin, None) if begin is None else begin
-        drive = Drive(recording, run, self.assumed or recording.sensors, first[run], np.array(self.spread, dtype=float))
+        if begin is None:
+            begin = first_poses(recording, self.begin, fleet_members(recording))
+        drive = PoseRun(
+            recording, run, self.assumed or recording.sensors, begin[run], np.array(self.spread, dtype=float)
+        )
         smoother, landmarks = FixedLag(self.lag, self.threshold, self.passes), dict[str, Floats]()
         known = dict[str, Floats]()
         for step, t in enumerate(recording.t.tolist()):
-            piece = pose_piece(drive, step, known | landmarks)
-            poses = [node(recording, column, step) for column in vehicles(drive, step)]
+            piece = pose_subgraph(drive, step, known | landmarks)
+            poses = [node(recording, column, step) for column in np.flatnonzero(drive.present[step])]
             assert piece.x0 is not None
             landmarks |= dict(zip(piece.names[len(piece.poses) :], piece.x0[len(piece.poses) :], strict=True))
             found = smoother.update(piece, dict.fromkeys([*poses, *landmarks], t), poses)

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints, instance, number
-from ..errors import InputError
-from ..world.frames import turned
-from ..world.recording import Recording, check_recording
-from ..world.sensors import Sensors
-from ..world.spherical import to_vector, wrap
-from . import pose_unit
-from .pose_begin import body_of
+from ...arrays import Floats, Ints, instance, number
+from ...errors import InputError
+from ...world.frames import turned
+from ...world.recording import Recording, check_recording
+from ...world.sensors import Sensors
+from ...world.spherical import to_vector, wrap
 from .pose_filter import PoseFilter
+from .pose_inputs import body_of, fleet_members, to_landmarks
 
 
 def pose_start(
@@ -66,7 +65,7 @@ def pose_start(
     for run in range(recording.runs):
         known = np.full((len(part.t), len(part.ids), 3), np.nan)
         known[:, list(part.landmarks)] = part.gnss[run][:, list(part.landmarks)]
-        waiting = np.unique(pose_unit.fleet(part).column).tolist()
+        waiting = fleet_members(part)
         while waiting:
             column, links = _next(part, run, waiting, known)
             begin[run, column], known[:, column] = _most_likely(part, run, column, links, known, filter_, headings)
@@ -80,7 +79,7 @@ def _next(recording: Recording, run: int, waiting: list[int], known: Floats) -> 
     every: list[Ints] = []
     for column in waiting:
         links = recording.links.of(column)
-        marks = links[np.isin(recording.links.neighbour[links], recording.landmarks)]
+        marks = to_landmarks(recording, links)
         whole = marks[np.isfinite(recording.relative[run, marks, :2]).all(axis=1)]
         fix = np.isfinite(recording.gnss[run, :, column, 0]).any()
         if fix or len(np.unique(recording.links.neighbour[whole])) > 1:
@@ -100,11 +99,11 @@ def _most_likely(
     tried[:, column] = _hypotheses(recording, run, column, links, place, angles)
     copies = recording.of_runs(np.full(headings, run))
     noise = filter_.assumed or recording.sensors
-    if not np.isin(recording.links.neighbour[links], recording.landmarks).all():
+    if len(to_landmarks(recording, links)) < len(links):
         filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
-    x, _, cost = filter_.follow(copies, pose_unit.alone(copies, column), links, tried, place=place)
+    x, _, cost = filter_.run_filter(copies, [column], links, tried, place=place)
     best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, angles, noise))
-    return tried[best, column], x[best, :, :3]
+    return tried[best, column], x[best, :, 0, :3]
 
 
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
