@@ -29,6 +29,8 @@ NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 Three: TypeAlias = tuple[float, float, float]
 Five: TypeAlias = tuple[float, float, float, float, float]
+Estimates: TypeAlias = tuple[Floats, Floats, Floats]
+"""x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
 ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
@@ -128,6 +130,13 @@ def star_in(memory: Floats, columns: Ints, most: int) -> Star:
 def star_within(most: int) -> Star:
     """Room for `most` members, made by compiled code."""
     return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)
+
+
+@storage
+def new_estimates(seen: Measurements) -> Estimates:
+    """Room for the estimates of all runs and steps, made by compiled code."""
+    runs, steps = seen.gnss.shape[:2]
+    return np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
 
 
 def new_star(most: int) -> Star:
@@ -247,7 +256,7 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
 
 @inner
 def write_ego(
-    out: tuple[Floats, Floats, Floats],
+    out: Estimates,
     star: Star,
     x: Floats,
     cov: Floats,
