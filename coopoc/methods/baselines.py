@@ -103,6 +103,6 @@ def solo_estimates(recording: Recording, known: NoiseModel, egos: Sequence[int])
     links = recording.links
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
     x, p, _ = solo_filter(recording, members, known, FixNoise(known.gnss_variance))
-    all_x, all_p = np.full((2, *recording.gnss.shape), np.nan)
+    all_x, all_p = np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)  # of others nothing is read
     all_x[:, :, members], all_p[:, :, members] = x, p
     return assumptions(recording, known)._replace(broadcast=all_p), all_x

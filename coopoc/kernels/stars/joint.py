@@ -147,14 +147,15 @@ def predict_state(star: Star, joint: Joint, n: int, old: int, row: Numbers) -> N
 def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
     seen = load(star.relative, k, RELATIVE)
-    measured = add(ego, vector(seen))
+    measured: Numbers = add(ego, vector(seen))
     if not incomplete(seen):
         return measured
     lacks = seen[5] + seen[6] + seen[7] - (0.0 * seen[0] + 1e300)
     new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
     near = seen[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
-    return choose_each(lacks, choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere), measured)
+    measured = choose_each(lacks, choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere), measured)
+    return measured
 
 
 @inner
@@ -175,8 +176,9 @@ def placed(joint: Joint, k: int, seen: Numbers, row: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
     whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
-    one = 0.0 * own + 1.0
-    return choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    one: float = 0.0 * own + 1.0
+    one = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    return one
 
 
 @inside

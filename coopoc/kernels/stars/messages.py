@@ -27,6 +27,8 @@ SENT, USES, AGE, HELD, NEW = range(5)
 age in steps, 1 if there is one, and 1 if its position counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
+Index: TypeAlias = Any
+"""An integer, NumPy's unsigned one where the compiler need not look for negative ones."""
 Three: TypeAlias = tuple[float, float, float]
 Five: TypeAlias = tuple[float, float, float, float, float]
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
@@ -297,16 +299,17 @@ def measured(relative: Floats, seen: Five, std: Floats, k: int, lane: int) -> No
 
 
 @inside
-def three_of(values: Floats, run: int, t: int, member: int) -> Three:
+def three_of(values: Any, run: Index, t: Index, member: Index) -> Three:
     """Three of what is broadcastable to (R, T, N, 3)."""
     one = uint64(1)
-    i, j = min(run, uint64(values.shape[0]) - one), min(t, uint64(values.shape[1]) - one)
-    k = min(member, uint64(values.shape[2]) - one)
+    i: Index = min(run, uint64(values.shape[0]) - one)
+    j: Index = min(t, uint64(values.shape[1]) - one)
+    k: Index = min(member, uint64(values.shape[2]) - one)
     return values[i, j, k, uint64(0)], values[i, j, k, one], values[i, j, k, uint64(2)]
 
 
 @inside
-def five_of(relative: Floats, run: int, link: int) -> Five:
+def five_of(relative: Any, run: int, link: int) -> Five:
     """The five numbers of a measurement of `components`."""
     i, j = uint64(run), uint64(link)
     return (
@@ -319,6 +322,6 @@ def five_of(relative: Floats, run: int, link: int) -> Five:
 
 
 @inside
-def put_lane(memory: Floats, at: int, lane: int, values: Three) -> None:
+def put_lane(memory: Floats, at: Index, lane: int, values: Three) -> None:
     """Write three numbers of one run."""
     memory[at, lane], memory[at + uint64(1), lane], memory[at + uint64(2), lane] = values

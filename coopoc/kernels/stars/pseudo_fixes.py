@@ -287,7 +287,8 @@ def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float
 @inside
 def product(a: Numbers, b: Numbers) -> Numbers:
     """A B."""
-    return negate(minus_product(a, b))
+    found: Numbers = negate(minus_product(a, b))
+    return found
 
 
 @inside
