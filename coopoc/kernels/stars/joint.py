@@ -154,8 +154,9 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
     near = seen[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
-    measured = choose_each(lacks, choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere), measured)
-    return measured
+    broadcast = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere)
+    place: Numbers = choose_each(lacks, broadcast, measured)
+    return place
 
 
 @inner
@@ -176,9 +177,9 @@ def placed(joint: Joint, k: int, seen: Numbers, row: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
     whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
-    one: float = 0.0 * own + 1.0
-    one = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
-    return one
+    one = 0.0 * own + 1.0
+    share: float = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    return share
 
 
 @inside
