@@ -147,7 +147,7 @@ def test_a_picture_without_innovations_says_so(tmp_path: Path) -> None:
     first = frame["t"] == frame["t"].min()
     log = read_log(write(frame[first | ~frame["kind"].isin(["x", "y", "z"])], tmp_path / "log.csv"))
     axes = Figure().add_subplot()
-    log_picture.innovations(axes, check(log))
+    log_picture.innovations(axes, check(log), [])
     assert [text.get_text() for text in axes.texts] == ["no vehicle has a fix after its first"]
 
 
