@@ -21,7 +21,7 @@ import coopoc as co
 from coopoc.methods import pose_unit
 from coopoc.methods.pose_begin import body_of, first_poses
 from coopoc.world.inbox import inbox
-from coopoc.world.spherical import wrap
+from coopoc.world.links import wrap
 
 ROUNDS, STEPS, RUNS = 5, 101, 10
 NEIGHBOURS = {0: 3, 10: 1}

@@ -9,9 +9,9 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.methods.pose_filter import PoseFilter
-from coopoc.world.frames import midway, turned
+from coopoc.world.body_frames import midway, turned
+from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import wrap
 
 from .log_check import relative_residuals
 from .log_clocks import clock_warnings

@@ -11,8 +11,8 @@ import numpy as np
 from coopoc.arrays import Floats, robust_std
 from coopoc.evaluate.innovations import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
+from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import wrap
 
 from .log import Log
 from .log_clocks import apart_warnings, clock_warnings, truth_warning

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopoc.arrays import Floats, Ints
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.links import spherical, to_vector, wrap
 
 from .log_vehicle import Vehicle
 

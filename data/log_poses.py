@@ -14,8 +14,8 @@ from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.methods.track import Track
+from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import wrap
 
 from .log import Log
 from .log_body_clocks import GATE, clocks

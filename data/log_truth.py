@@ -8,8 +8,8 @@ import numpy as np
 
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
+from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import wrap
 
 from .log_rows import Rows
 from .log_summary import Tally

@@ -12,7 +12,7 @@ from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
-from coopoc.world.spherical import wrap
+from coopoc.world.links import wrap
 
 from . import mrclam_files as files
 from .nearest import steps_of

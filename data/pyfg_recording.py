@@ -7,8 +7,8 @@ import numpy as np
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats.graph import Graph, PointEdges
+from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X

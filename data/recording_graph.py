@@ -10,7 +10,7 @@ from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats import write_graph
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
-from coopoc.world.frames import turned
+from coopoc.world.body_frames import turned
 from coopoc.world.recording import Recording, check_recording
 
 from .log import Log

@@ -17,7 +17,7 @@ from scipy.linalg import expm
 import coopoc as co
 from coopoc.kernels.poses.pose_filter import PoseOptions, follow
 from coopoc.methods import pose_unit
-from coopoc.world.frames import in_world
+from coopoc.world.body_frames import in_world
 from coopoc.world.inbox import inbox
 
 NOISE = co.Sensors(

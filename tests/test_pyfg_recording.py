@@ -17,7 +17,7 @@ from coopoc.data.recording_graph import recording_graph, write_log_graph
 from coopoc.data.recordings import load_log
 from coopoc.formats import write_graph
 from coopoc.formats.pyfg import read_pyfg
-from coopoc.world.frames import body_motion
+from coopoc.world.body_frames import body_motion
 
 
 @pytest.fixture(scope="module")

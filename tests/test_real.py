@@ -15,7 +15,7 @@ from coopoc.data.mrclam import MrclamLog, read_mrclam
 from coopoc.data.mrclam_calibration import Calibration, calibrate
 from coopoc.data.mrclam_poses import pose_recording
 from coopoc.studies.pose_drives import thinned
-from coopoc.world.body_sensing import gauss_markov
+from coopoc.world.body_frames import gauss_markov
 from coopoc.world.v2x import V2X
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"

@@ -8,8 +8,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints, checked, listed
 from ..errors import InputError
-from ..world.body import Body
-from ..world.recording import Recording
+from ..world.recording import Body, Recording
 from . import pose_unit
 
 

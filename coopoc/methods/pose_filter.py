@@ -13,9 +13,9 @@ from ..arrays import Bools, Floats, Ints, checked, number
 from ..errors import InputError
 from ..plugins import one_of
 from ..short_repr import short_repr
+from ..world.links import wrap
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
-from ..world.spherical import wrap
 from ..world.v2x import NO_MESSAGE, Message
 from . import pose_unit
 from .options import check_options

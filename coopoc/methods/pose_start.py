@@ -8,10 +8,10 @@ import numpy as np
 
 from ..arrays import Floats, Ints, instance, number
 from ..errors import InputError
-from ..world.frames import turned
+from ..world.body_frames import turned
+from ..world.links import to_vector, wrap
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
-from ..world.spherical import to_vector, wrap
 from . import pose_unit
 from .pose_begin import body_of
 from .pose_filter import PoseFilter

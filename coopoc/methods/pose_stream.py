@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..world.spherical import wrap
+from ..world.links import wrap
 from . import pose_unit
 from .motion_history import names_of, seconds
 from .pose_measurement import BodyMeasurement, OwnMeasurement

@@ -12,8 +12,8 @@ from ..kernels.solo import FixNoise, drive
 from ..kernels.stars.messages import Assumptions, Measurements
 from ..kernels.stars.relative import components
 from ..world.inbox import Inbox
+from ..world.links import to_vector
 from ..world.recording import Recording
-from ..world.spherical import to_vector
 from .kalman import drive_of
 from .noise_model import NoiseModel
 from .stream import process_noise

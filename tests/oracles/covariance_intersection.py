@@ -12,7 +12,7 @@ import numpy as np
 from coopoc import NoiseModel
 from coopoc.arrays import Bools, Floats
 from coopoc.methods.covariance_intersection import Criterion
-from coopoc.world.spherical import spherical, to_vector
+from coopoc.world.links import spherical, to_vector
 from oracles.messages import Member
 
 LEAST = 1e-9
