@@ -68,7 +68,7 @@ def _solver(problem: Problem, x: Floats) -> tuple[Ints, Callable[[Floats], Float
     free = InputError(
         "problem", repr(problem), "must hold all nodes", "Measure what is free: see solution.unobservable."
     )
-    if (system := sparse(problem, least=0)) is not None:
+    if (system := sparse(problem)) is not None:
         cholesky = system.cholesky
         if not cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
             raise free

@@ -79,7 +79,7 @@ def agents_of(problem: Problem, owner: tuple[str, ...], links: Sequence[Link]) -
         poses = np.setdiff1d(local.poses, np.searchsorted(nodes, points))
         penalty = [_penalty(problem, link, np.searchsorted(nodes, link.nodes)) for link in mine]
         local = local.replace_unchecked(poses=tuple(poses.tolist()), factors=(*local.factors, *penalty))
-        system = sparse(local, least=0)
+        system = sparse(local)
         if system is None:
             kinds = sorted({f.kind for f in local.factors})
             raise InputError("problem", f"kinds {kinds}", "must run on CasADi's numbers", "Use solve instead.")

@@ -209,9 +209,8 @@ class Layout:
             written = [(write(kind, model), nodes) for kind, nodes in zip(self.kinds, self.nodes, strict=True)]
             self._tapes[model] = [(w.tape, nodes, places_of(self.entries, nodes, w.entries)) for w, nodes in written]
         out = np.zeros(2 if model == "cost" else self.entries.size + len(self.entries.indices) + 2)
-        with np.errstate(all="ignore"):
-            for (tape, nodes, goal), own in zip(self._tapes[model], numbers, strict=True):
-                accumulate(tape, x, nodes, own, goal, out)
+        for (tape, nodes, goal), own in zip(self._tapes[model], numbers, strict=True):
+            accumulate(tape, x, nodes, own, goal, out)
         return out
 
 
@@ -296,10 +295,10 @@ def sparse(problem: Problem) -> Sparse | None:
     """
     if problem.batch is not None:
         return None
-    if problem not in _KEPT:
+    if (kept := _KEPT.get(problem)) is None:
         numbers = tuple(numbers_of(factor) for factor in problem.factors)
-        _KEPT[problem] = Sparse(problem.space, layout_of(problem), numbers)
-    return _KEPT[problem]
+        kept = _KEPT[problem] = Sparse(problem.space, layout_of(problem), numbers)
+    return kept
 
 
 def keep(former: Problem, problem: Problem) -> Problem:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,29 +28,47 @@ class Star:
     arm: Floats
     gradient: Floats
 
-    def solve(self, damping: Floats | float = 0.0) -> tuple[Floats, Floats]:
-        """dx (B, n, d) of (J^T J + diag(damping)) dx = -J^T r, and the blocks (B, n, d, d) of the inverse of each point.
+    def solve(self, damping: Floats | float = 0.0) -> tuple[Floats, Callable[[], Floats]]:
+        """dx (B, n, d) of (J^T J + diag(damping)) dx = -J^T r, and a function that gives each point's block
+        (B, n, d, d) of the inverse; NaN where a block is singular.
 
-        With a point's own block H and its arm A: T = H^-1 A, S = corner - sum A^T T. The separator's covariance is
-        S^-1, a point's H^-1 + T S^-1 T^T.
-
-        Raises:
-            numpy.linalg.LinAlgError: a singular block.
+        With a point's own block H, its arm A to the separator and its gradient g: T = H^-1 A, u = H^-1 g,
+        S = corner - sum A^T T. The separator moves by dx = S^-1 (sum A^T u - its gradient), a point by -(u + T dx);
+        their covariances are S^-1 and H^-1 + T S^-1 T^T.
         """
-        index, own = np.arange(self.own.shape[-1]), self.own.copy()
+        B, n, d = self.gradient.shape
+        others, index, own = np.arange(n) != self.separator, np.arange(d), self.own.copy()
         own[..., index, index] += damping
-        cov, dx = np.empty_like(own), np.empty_like(self.gradient)
-        others = np.arange(own.shape[1]) != self.separator
-        arm, eta = self.arm[:, others], self.gradient[:, others, :, None]
-        inverse = np.linalg.inv(own[:, others])
-        reduced = inverse @ arm
-        back = reduced.swapaxes(-1, -2)
-        corner = np.linalg.inv(own[:, self.separator] - (arm.swapaxes(-1, -2) @ reduced).sum(axis=1))
-        step = corner @ ((back @ eta).sum(axis=1) - self.gradient[:, self.separator, :, None])
-        dx[:, self.separator], cov[:, self.separator] = step[..., 0], corner
-        dx[:, others] = -(inverse @ eta + reduced @ step[:, None])[..., 0]
-        cov[:, others] = inverse + reduced @ corner[:, None] @ back
-        return dx, cov
+        arm, inverse = self.arm[:, others], inverted(own[:, others])
+        reduced = inverse @ np.concatenate([arm, self.gradient[:, others, :, None]], axis=-1)
+        flat = reduced.reshape(B, -1, d + 1)
+        taken = arm.reshape(B, -1, d).swapaxes(-1, -2) @ flat
+        corner = inverted(own[:, self.separator] - taken[..., :d])
+        step = corner @ (taken[..., d:] - self.gradient[:, self.separator, :, None])
+        dx = np.empty_like(self.gradient)
+        dx[:, self.separator] = step[..., 0]
+        dx[:, others] = -(flat[..., d:] + flat[..., :d] @ step).reshape(B, -1, d)
+
+        def marginals() -> Floats:
+            cov, turned = np.empty_like(own), reduced[..., :d]
+            cov[:, self.separator] = corner
+            cov[:, others] = inverse + turned @ corner[:, None] @ turned.swapaxes(-1, -2)
+            return cov
+
+        return dx, marginals
+
+
+def inverted(matrix: Floats) -> Floats:
+    """Inverses (..., d, d); of 3 x 3 by the adjugate, which takes a quarter of LAPACK's time; NaN where singular."""
+    with np.errstate(all="ignore"):
+        if matrix.shape[-1] == 3:
+            a, b, c = np.moveaxis(matrix, -2, 0)
+            adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+            return np.asarray(adjugate / (a * adjugate[..., 0]).sum(axis=-1)[..., None, None])
+        try:
+            return np.linalg.inv(matrix)
+        except np.linalg.LinAlgError:
+            return np.linalg.pinv(matrix) / np.sign(np.abs(np.linalg.det(matrix)))[..., None, None]
 
 
 def is_star(problem: Problem) -> bool:
@@ -63,15 +82,22 @@ def is_star(problem: Problem) -> bool:
 def star_at(problem: Problem, linear: Linear) -> Star:
     """The normal equations of a problem that `is_star`, linearised."""
     count, n, d = linear.x.shape
-    separator, nodes_of = problem.separator[0], np.arange(n)[:, None]
-    star = Star(separator, np.zeros((count, n, d, d)), np.zeros((count, n, d, d)), np.zeros((count, n, d)))
+    separator = problem.separator[0]
+    own, arm = np.zeros((2, count, n, d, d))
+    gradient = np.zeros((count, n, d))
     for factor, residual, (jacobian, *_) in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
-        transposed, M = jacobian.swapaxes(-1, -2), len(factor.nodes)
-        square = np.broadcast_to(transposed @ jacobian, (len(jacobian), M, d, d)).reshape(len(jacobian), M, d * d)
+        nodes, transposed = factor.nodes, jacobian.swapaxes(-1, -2)
+        square = np.broadcast_to(transposed @ jacobian, (len(jacobian), len(nodes), d, d))
         slope = (transposed @ residual[..., None])[..., 0]
-        last = (nodes_of == factor.nodes[:, -1]).astype(np.float64)  # (n, M), 1 where a measurement is of a node
-        first = (nodes_of == factor.nodes[:, 0]) * float(factor.nodes.shape[1] == 2)
-        star.own[:] += ((first + last) @ square).reshape(-1, n, d, d)
-        star.arm[:] -= ((nodes_of != separator) * (first + last) @ square).reshape(-1, n, d, d) * first.any()
-        star.gradient[:] += (last - first) @ slope
-    return star
+        other = np.where(nodes[:, 0] == separator, nodes[:, -1], nodes[:, 0])
+        if nodes.shape[1] == 2:
+            own[:, separator] += square.sum(axis=1)
+            slope = slope * np.where(nodes[:, 1] == separator, -1.0, 1.0)[:, None]
+            gradient[:, separator] -= slope.sum(axis=1)
+        chosen = (np.arange(n)[:, None] == other).astype(np.float64)  # (n, M)
+        of_each = (chosen @ square.reshape(len(square), len(nodes), d * d)).reshape(-1, n, d, d)
+        own += of_each
+        gradient += chosen @ slope
+        if nodes.shape[1] == 2:
+            arm -= of_each
+    return Star(separator, own, arm, gradient)

@@ -7,7 +7,7 @@ moved onto them by the least step; from then on every step keeps them, so that t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -59,14 +59,13 @@ def prepare(
         step = step_of(system)
         if problem.constraints:
             try:
-                start, feasible = _nearest(limits, x[0])
+                x, feasible = _nearest(limits, x)
             except np.linalg.LinAlgError:
-                return SolverResult(x, np.zeros(1, dtype=np.int64), extras=dict(programme.counts))
-            x = start[None]
+                return SolverResult(x, 0, extras=dict(programme.counts))
             if not feasible:
-                return SolverResult(x, np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool), dict(programme.counts))
-        found = minimise(problem, step, x, max_iterations, tolerance)
-        return replace(found, extras=found.extras | dict(programme.counts))
+                return SolverResult(x, 0, True, dict(programme.counts))
+        found = minimise(problem, step, x[None], max_iterations, tolerance)
+        return SolverResult(found.x[0], int(found.iterations[0]), extras=found.extras | dict(programme.counts))
 
     return solver
 
