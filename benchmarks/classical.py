@@ -24,9 +24,8 @@ from timing import medians, timed
 
 import coopoc as co
 from coopoc.kernels.stars.joint_filter import follow
-from coopoc.methods.cooperative_map import Windows
+from coopoc.methods.sliding_window import Windows, dead_reckoned
 from coopoc.methods.star import POSITION, assumptions, measurements
-from coopoc.methods.window import dead_reckoned
 from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.starts.initial import converted

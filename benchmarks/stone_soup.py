@@ -20,9 +20,8 @@ from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, IteratedKalmanUpdater, KalmanUpdater
 
 from coopoc.kernels.stars.joint_filter import follow
-from coopoc.methods.cooperative_map import CooperativeMAP, Windows
+from coopoc.methods.sliding_window import CooperativeMAP, Windows, dead_reckoned
 from coopoc.methods.star import POSITION, assumptions, measurements
-from coopoc.methods.window import dead_reckoned
 from coopoc.optimize import Problem, solve_batch
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, wrap

@@ -8,20 +8,18 @@ from ..one_file import in_file
 from ..plugins import find, names
 from .adaptive import AdaptiveKalman
 from .centralised import BatchSmoother, CentralFilter
-from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
 from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
-from .fixed_lag import FixedLagSmoother
 from .gnss import GNSS
 from .joint_filter import JointFilter
 from .kalman import Kalman
 from .lkf_sa import LKFSA
 from .mds import MDS
-from .moving_horizon import MovingHorizon
 from .msmv import MSMV
 from .noise_model import NoiseModel
 from .qcqp_relaxation import QCQPRelaxation
+from .sliding_window import CooperativeMAP, FixedLagSmoother, MovingHorizon
 from .track import Method
 from .variational import VariationalKalman
 

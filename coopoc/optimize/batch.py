@@ -11,7 +11,7 @@ from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
 from ..short_repr import short_repr
 from .algebra.star import is_star, star_at
-from .assessment.assess import INFLATION, assess
+from .assess.assess import INFLATION, assess
 from .backend import Backend, Options, require_backend
 from .model.problem import Problem
 from .solve import POSITION_TOLERANCE

@@ -215,9 +215,7 @@ class FixedLag:
         x = initial_guess(prior)
         if x0 is None and all(piece.factors[f].kind == "spherical" and piece.factors[f].loss is None for f in rest):
             return np.asarray(x[0])
-        system = sparse(prior)
-        assert system is not None
-        return arrive(system, x[0], 1, TOLERANCE).x
+        return arrive(sparse(prior), x[0], 1, TOLERANCE).x
 
     def _advance(self, graph: Any, entering: Any, moments: dict[int, float]) -> None:
         try:

@@ -286,15 +286,12 @@ class Sparse:
 _KEPT: WeakKeyDictionary[Problem, Sparse] = WeakKeyDictionary()
 
 
-def sparse(problem: Problem) -> Sparse | None:
-    """The cost of a single problem ready to be evaluated, kept as long as the problem is; None if it has realisations.
-    Constraints are no part of it.
+def sparse(problem: Problem) -> Sparse:
+    """The cost of a single problem, without its constraints, ready to be evaluated; kept as long as the problem is.
 
     Raises:
         InputError: a formula that CasADi cannot run.
     """
-    if problem.batch is not None:
-        return None
     if (kept := _KEPT.get(problem)) is None:
         numbers = tuple(numbers_of(factor) for factor in problem.factors)
         kept = _KEPT[problem] = Sparse(problem.space, layout_of(problem), numbers)

@@ -65,10 +65,8 @@ def inverted(matrix: Floats) -> Floats:
             a, b, c = np.moveaxis(matrix, -2, 0)
             adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
             return np.asarray(adjugate / (a * adjugate[..., 0]).sum(axis=-1)[..., None, None])
-        try:
-            return np.linalg.inv(matrix)
-        except np.linalg.LinAlgError:
-            return np.linalg.pinv(matrix) / np.sign(np.abs(np.linalg.det(matrix)))[..., None, None]
+    singular = ~(np.linalg.det(matrix) > 0.0)[..., None, None]
+    return np.where(singular, np.nan, np.linalg.inv(np.where(singular, np.eye(matrix.shape[-1]), matrix)))
 
 
 def is_star(problem: Problem) -> bool:

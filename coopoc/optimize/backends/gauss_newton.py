@@ -29,8 +29,8 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         return star_at(structure, linear).solve(damping)[0]
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        if (system := sparse(problem)) is not None:
-            end = arrive(system, x[0], min(1, max_iterations) if problem.linear else max_iterations, tolerance)
+        if problem.batch is None:
+            end = arrive(sparse(problem), x[0], min(1, max_iterations) if problem.linear else max_iterations, tolerance)
             extras = {"newton_steps": end.newton_steps, "record": end.record}
             return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
         if star:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..algebra.sparse import Sparse, sparse
-from ..assessment.active import constraint_rows
+from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..model.constraint import bounded
@@ -52,7 +52,6 @@ def prepare(
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         system = sparse(problem)
-        assert system is not None
         if system.layout not in programmes:
             programmes[system.layout] = _programme(system, limits, kkt_tolerance)
         programme, step_of = programmes[system.layout]
@@ -65,7 +64,9 @@ def prepare(
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
         found = minimise(problem, step, x[None], max_iterations, tolerance)
-        return SolverResult(found.x[0], int(found.iterations[0]), extras=found.extras | dict(programme.counts))
+        return SolverResult(
+            found.x[0], int(np.ravel(found.iterations)[0]), extras=found.extras | dict(programme.counts)
+        )
 
     return solver
 

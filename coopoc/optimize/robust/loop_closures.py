@@ -193,7 +193,6 @@ class _Search:
         for joins in (0.0, 1.0):
             self.weight[group] = joins
             system = sparse(reweigh(problem, self.marked, self.weight, self.x))
-            assert system is not None
             costs.append(system.cost(arrive(system, self.x, STEPS, TOLERANCE).x if joins else self.x))
         good = 2.0 * (costs[1] - costs[0]) <= self.bound[group]
         self.weight[group] = float(good)
@@ -293,7 +292,7 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         InputError: that leaves nodes free.
     """
     system = sparse(reweigh(problem, marked, weight, x))
-    if system is None or not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
+    if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
         raise InputError("candidates", repr(problem), "must leave known inliers that hold all nodes", HINT)
     distance, volume = np.zeros(len(marked.row)), np.zeros(len(marked.row))
     for k in np.unique(marked.factor):

@@ -39,8 +39,8 @@ def initial_guess(problem: Problem) -> Floats:
         return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.ambient)))
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
-    if (system := sparse(problem)) is not None:
-        x, touched = _solution(system, "converted")
+    if problem.batch is None:
+        x, touched = _solution(sparse(problem), "converted")
         return x if touched else _apart(problem, x)
     if not is_star(problem):
         return np.concatenate([initial_guess(problem.pick(b)) for b in range(batch)])
