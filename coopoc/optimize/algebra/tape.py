@@ -132,7 +132,8 @@ def _cost(kind: Kind, converted: bool) -> tuple[Any, Any, Any, tuple[Any, Any, A
         rho = symbolic.robust(square, kind.loss)
     except Exception as problem:  # the formula is the user's, who must learn what it raised
         hint = "Take its functions from the namespace m, such as m.sqrt, and choose by m.where."
-        raise InputError("kind", repr(known.name), f"must run on CasADi's numbers: {problem}", hint) from problem
+        why = " ".join(str(problem).split())[:80]
+        raise InputError("kind", repr(known.name), f"must run on CasADi's numbers: {why}", hint) from problem
     cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
     return nodes, number, steps, (cost, white, square, rho)
 
