@@ -10,8 +10,8 @@ from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats.graph import Graph, PointEdges
 from coopoc.formats.pyfg import read_pyfg
+from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X

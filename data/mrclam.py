@@ -13,13 +13,12 @@ from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.formats.values import LARGEST, read_table, read_words
 from coopoc.short_repr import short_repr
+from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import midway, turned
-from coopoc.world.links import Links
+from coopoc.world.links import Links, wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe, schedule
 from coopoc.world.sensors import Sensors
-from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
 from .assemble import backward_difference, check_size, check_time, interpolate

@@ -13,7 +13,7 @@ from coopoc.data.commands import check as data_check
 from coopoc.data.graphs import graph_recording
 from coopoc.data.registry import load_log
 from coopoc.formats.pyfg import read_pyfg
-from coopoc.world.frames import body_motion
+from coopoc.world.body_frames import body_motion
 
 
 @pytest.fixture(scope="module")

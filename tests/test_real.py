@@ -13,7 +13,7 @@ import coopoc as co
 from coopoc.data.mrclam import MrclamLog, read_mrclam
 from coopoc.data.mrclam_poses import Calibration, calibrate, grouped, pose_recording, summed
 from coopoc.studies.pose_drives import thinned
-from coopoc.world.body_sensing import gauss_markov
+from coopoc.world.body_frames import gauss_markov
 from coopoc.world.v2x import V2X
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"

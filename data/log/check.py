@@ -15,10 +15,10 @@ from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
+from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import midway, turned
+from coopoc.world.links import spherical, wrap
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import spherical, wrap
 
 from .read import Log
 

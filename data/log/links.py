@@ -10,10 +10,9 @@ import numpy as np
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links
+from coopoc.world.links import Links, spherical, to_vector, wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import schedule
-from coopoc.world.spherical import spherical, to_vector, wrap
 from coopoc.world.v2x import V2X
 
 from ..assemble import SAME

@@ -16,11 +16,10 @@ from coopoc.file_names import given_path
 from coopoc.plugins import one_of, suggestion
 from coopoc.short_repr import short_repr
 from coopoc.world.axes import texts
-from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
+from coopoc.world.links import wrap
+from coopoc.world.recording import Body, Recording
 from coopoc.world.sensors import Sensors
-from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
 from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
