@@ -103,8 +103,7 @@ def method_cases() -> Iterator[Case]:
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
         "kalman-variational": (co.VariationalKalman(), recording, "kalman, plain"),
         "fixed-lag, smoothed": (co.FixedLagSmoother(smoothed=True), recording, "fixed-lag, plain"),
-        "cooperative gain, newest fix": (CooperativeGain(NoiseNet(), sums=False), recording, "joint, plain"),
-        "cooperative gain, sums": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
+        "cooperative gain": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
     }
     for name, (method, measured_by, plain) in others.items():
         yield case(name, plain, method, measured_by, False)
