@@ -13,7 +13,7 @@ import torch
 import coopoc as co
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import GainNet
-from coopoc.learned.federation.federated import federate
+from coopoc.learned.federation.federate import federate
 from coopoc.studies import aggregation, federations
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results

@@ -179,7 +179,8 @@ def read(replies: Iterable[Message], names: dict[int, str], loss: str) -> tuple[
         names: of the nodes, as first reported; a node cannot change its own.
         loss: the loss that an answer must hold.
     """
-    found, rejected = dict[str, Message](), dict[str, str]()
+    found: dict[str, Message] = {}
+    rejected: dict[str, str] = {}
     for reply in sorted(replies, key=lambda reply: reply.metadata.src_node_id):
         node = reply.metadata.src_node_id
         who = names.get(node, f"node {node}")
@@ -192,10 +193,10 @@ def read(replies: Iterable[Message], names: dict[int, str], loss: str) -> tuple[
         except Exception as error:  # a client may send anything
             rejected[who] = f"malformed answer ({type(error).__name__})"
             continue
-        if problem or names.setdefault(node, name) != name or name in (SERVER, *found):
+        if problem or names.get(node, name) != name or name in (SERVER, *found):
             rejected[who] = problem or f"claims the name {name} of another node"
             continue
-        found[name] = reply
+        names[node], found[name] = name, reply
     return dict(sorted(found.items())), rejected
 
 
@@ -207,6 +208,8 @@ def _problem(content: Any, loss: str) -> str:
         float(content["metrics"][loss]),
         content["client"]["version"],
     )
+    if {*content["metrics"]} != {"num-examples", loss} or len(content.metric_records) + len(content.array_records) > 2:
+        return "other records than were asked for"
     if not (0 < len(name) <= LONGEST and name.isprintable()):
         return f"a name that is not 1 to {LONGEST} printable characters"
     if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
