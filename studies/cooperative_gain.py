@@ -175,6 +175,7 @@ STUDY = lineup.study(
     "cooperative_gain",
     "Can transmitted noise estimates replace known noise parameters, also when messages are lost?",
     cell=cell,
+    recipe=None,
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "burst": 1.0, "runs": 30, "train_seeds": 3},
     shares=("receivers", "max_neighbours", "loss"),

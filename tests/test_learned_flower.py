@@ -166,18 +166,22 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
     for row, theirs in zip(rows[1:], expected.history[1:], strict=True):
         assert set(row.training_loss) == set(fleet.ids)
         torch.testing.assert_close(row.weights, theirs.weights, rtol=0, atol=1e-6)
-        assert "not finite" in row.rejected["nan"]
-        assert "shape" in row.rejected["long"]
-        assert "changes the weights" in row.rejected["far"]
-        assert row.rejected["node 7"] == "weights in float64, must be float32"
-        assert row.rejected["node 8"] == "claims the name c1 of another node"
-        assert row.rejected["node 9"] == "malformed answer (KeyError)"
-        assert row.rejected["node 10"] == "out of memory"
-        assert "1 to 200 printable" in row.rejected["node 11"] == row.rejected["node 12"]
-        assert row.rejected["node 13"] == "a training-loss of -1 m^2, must be in [0, 1e+12]"
-        assert "number of pieces" in row.rejected["node 14"]
-        assert "another version" in row.rejected["node 15"]
-        assert "claims the name server" in row.rejected["node 16"]
+        assert len(row.rejected) == len(byzantine)
+        for reason in (
+            "not finite",
+            "weights of shape",
+            "changes the weights",
+            "weights in float64, must be float32",
+            "claims the name c1 of another node",
+            "malformed answer (KeyError)",
+            "out of memory",
+            "1 to 200 printable",
+            "a training-loss of -1 m^2, must be in [0, 1e+12]",
+            "number of pieces",
+            "another version",
+            "claims the name server",
+        ):
+            assert any(reason in found for found in row.rejected.values()), reason
 
 
 def test_a_silent_client_is_absent_and_welcome_back() -> None:
