@@ -1,4 +1,4 @@
-"""Pose filters, alone and of a star of ten neighbours, beside filterpy's extended Kalman filter on the same work.
+"""Pose filters, alone and with ten neighbours in one state, beside filterpy's extended Kalman filter on the same work.
 
     OMP_NUM_THREADS=1 python benchmarks/poses.py               # a Markdown table on stdout, half a minute
 
@@ -18,9 +18,8 @@ from tabulate import tabulate
 from timing import medians, timed
 
 import coopoc as co
-from coopoc.methods import pose_unit
-from coopoc.methods.pose_begin import body_of, first_poses
-from coopoc.world.inbox import inbox
+from coopoc.methods.poses.pose_inputs import body_of, first_poses
+from coopoc.world.links import wrap
 
 ROUNDS, STEPS, RUNS = 5, 101, 10
 NEIGHBOURS = {0: 3, 10: 1}
@@ -44,10 +43,9 @@ def ring(neighbours: int) -> co.Recording:
 
 def ours(recording: co.Recording) -> Callable[[], Any]:
     """The kernel over all runs; poses (R, T, 4) of the ego."""
-    method, box = co.PoseFilter(exact=False), inbox(recording, 0, co.PoseFilter().message)
-    members, begin = pose_unit.star(recording, 0, box), first_poses(recording, None, [0])
-    place = pose_unit.places_of(members, 0)
-    return lambda: method.follow(recording, members, box.link, begin)[0][:, place]
+    method, members = co.PoseFilter(exact=False), list(range(len(recording.ids)))
+    begin, links = first_poses(recording, None, members), np.arange(len(recording.links))
+    return lambda: method.run_filter(recording, members, links, begin)[0][:, :, 0]
 
 
 def filterpys(recording: co.Recording, run: int) -> Any:
@@ -79,7 +77,7 @@ def filterpys(recording: co.Recording, run: int) -> Any:
             ekf.x = (x + np.column_stack([moved, dt * w])).ravel()
             ekf.P = F @ ekf.P @ F.T + whole
         z = fixes[t, order].ravel()
-        z[3::4] = ekf.x[3::4] + wrapped(z[3::4] - ekf.x[3::4])
+        z[3::4] = ekf.x[3::4] + wrap(z[3::4] - ekf.x[3::4])
         ekf.update(z, lambda x: same, lambda x: x, own)
         at = links.step == t
         if n > 1:
@@ -87,15 +85,10 @@ def filterpys(recording: co.Recording, run: int) -> Any:
             where = np.argsort(order)[place]
             h, H = rows(ekf.x, where, n)
             z = recording.relative[run, at]
-            z = (h + np.column_stack([z[:, 0] - h[:, 0], wrapped(z[:, 1:] - h[:, 1:])])).ravel()
+            z = (h + np.column_stack([z[:, 0] - h[:, 0], wrap(z[:, 1:] - h[:, 1:])])).ravel()
             ekf.update(z, lambda x, H=H: H, lambda x, h=h: h.ravel(), noise)
         found[t] = ekf.x[:4]
     return found
-
-
-def wrapped(angle: Any) -> Any:
-    """The same angles in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def rows(state: Any, others: Any, n: int) -> Any:
@@ -124,7 +117,7 @@ def measured() -> list[dict[str, Any]]:
         call = ours(seen)
         wanted = np.stack([filterpys(seen, run) for run in range(few)])
         gap = call()[:few] - wanted
-        right = bool(max(np.abs(gap[..., :3]).max(), np.abs(wrapped(gap[..., 3])).max()) < 1e-6)
+        right = bool(max(np.abs(gap[..., :3]).max(), np.abs(wrap(gap[..., 3])).max()) < 1e-6)
         job = f"poses, K = {neighbours}"
         spend = {
             "filterpy": lambda seen=seen, few=few: timed(lambda: [filterpys(seen, r) for r in range(few)]) / few,

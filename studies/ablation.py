@@ -6,13 +6,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.methods.admm import ConsensusADMM
-from coopoc.methods.cooperative_map import CooperativeMAP
-from coopoc.methods.fixed_lag import FixedLagSmoother
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.methods.joint_filter import JointFilter
-from coopoc.methods.moving_horizon import MovingHorizon
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.sliding_window import CooperativeMAP, FixedLagSmoother, MovingHorizon
 from coopoc.methods.track import Method
 from coopoc.study.numbers import Number, Where, difference, mean, present, ran, sentence
 from coopoc.study.pivot import across, crossed

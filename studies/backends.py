@@ -12,11 +12,11 @@ from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.optimize.initialisation.initial import initial_guess
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.solution import Status
 from coopoc.optimize.solve import solve
+from coopoc.optimize.starts.initial import initial_guess
 from coopoc.study.numbers import Number, Where, present
 from coopoc.study.pivot import across, crossed
 from coopoc.study.study import Params, Row

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopoc.study.numbers import listed, mean, ratio, rms
 from coopoc.study.style import look
-from coopoc.world.channels import CHANNELS
+from coopoc.world.v2x import CHANNELS
 
 from . import budget_tables, lineup, scene, weights
 from .budget_tables import AXES, CAPS, SCHEDULED, SCHEDULES, SHARED, TRAINED, under, way
@@ -179,7 +179,7 @@ STUDY = lineup.study(
     limitations=(
         "Only messages of the K neighbours are counted; those of other vehicles also occupy the channel.",
         "Under a cap the nearest neighbours' messages pass first unless another schedule is named.",
-        "Numbers count as float32; CAMs quantise positions and velocities instead.",
+        "Numbers count as float32; a CAM rounds positions to 6 mm and speeds to 5 mm/s instead.",
     ),
     minutes=13,
     metrics={"rt_le_m": "lower"},

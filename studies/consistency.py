@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-SILENT = ("gnss", "mds", "diffusion", "diffusion-anchored", "cooperative-map-gnc")
+SILENT = ("gnss", "mds", "cooperative-map-gnc")
 """Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
 TRAINED = ("okf", "recursive", "cooperative")
-SOLO = ("kalman", "kalman-adaptive", "kalman-variational", "okf", "recursive")
+SOLO = ("kalman", "kalman-adaptive", "okf", "recursive")
 GATE = 0.95
 USUAL = ("nominal", "trained")
 NOTE = (

@@ -11,17 +11,16 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.metrics import errors
-from coopoc.evaluate.pose_bounds import fleet_pose_bound
-from coopoc.evaluate.pose_metrics import heading_error, pose_nees
+from coopoc.evaluate.bounds import fleet_pose_bound
+from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.joint_filter import JointFilter
-from coopoc.methods.pose_filter import PoseFilter
-from coopoc.methods.pose_start import pose_start
+from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
 from coopoc.study.environment import revision
 from coopoc.study.study import Params, Row, Study
+from coopoc.world.body_frames import in_world, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import in_world, turned
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors

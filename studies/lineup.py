@@ -14,9 +14,9 @@ from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
 from coopoc.evaluate.scores import rows_of, scored
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.sliding_window import CooperativeMAP
 from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study

@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from coopoc.arrays import Bools
-from coopoc.data.log import Log
-from coopoc.data.log_links import under
+from coopoc.data.log.links import under
+from coopoc.data.log.read import Log
 from coopoc.data.registry import kind_of, load_fleet, load_log, recorder
 from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.environment import revision
 from coopoc.study.study import Params
-from coopoc.world import channels
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
@@ -28,6 +27,7 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import spoofed
 from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
+from coopoc.world.v2x import channel as channel_of
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -60,7 +60,7 @@ def _log(data: str) -> Log | None:
     Raises:
         InputError: one in body frames.
     """
-    if kind_of(data) not in ("log", "recording"):
+    if kind_of(data) not in ("log", "pyfg", "recording"):
         return None
     log = load_log(data)
     if log.recording.body is not None:
@@ -244,7 +244,7 @@ def channel(p: Params) -> V2X:
     A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
     """
     cap = float(p.get("cap_bytes_per_second", 0.0))
-    found = channels.channel(str(p.get("channel", "ideal")), int(p.get("max_neighbours", 0)))
+    found = channel_of(str(p.get("channel", "ideal")), int(p.get("max_neighbours", 0)))
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
     given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(

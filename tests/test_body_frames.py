@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.world.frames import body_motion, in_world, true_heading, turned
+from coopoc.world.body_frames import body_motion, in_world, true_heading, turned
 from coopoc.world.storage import read_recording, save_recording
 
 NOISE = co.Sensors(heading_std=0.02, heading_bias_std=0.03, velocity_reading="speed")
@@ -103,9 +102,7 @@ def test_turning_is_a_rotation() -> None:
     assert np.allclose(turned(np.array([3.0, 4.0, 1.0]), np.array(np.pi)), [-3.0, -4.0, 1.0])
 
 
-def test_a_cap_in_body_frames_refuses_the_schedule_that_reads_world_velocities(crossing: co.Fleet) -> None:
-    capped = co.V2X(max_neighbours=3, bytes_per_second=500.0, schedule="most informative")
-    with pytest.raises(co.InputError, match="is for recordings in the world frame"):
-        co.PoseFilter()(co.observe(crossing, NOISE, capped, frame="body"))
-    nearest = co.PoseFilter()(co.observe(crossing, NOISE, replace(capped, schedule="nearest"), frame="body"))
-    assert nearest.received_bytes.max() <= 500.0 * 7.0
+def test_a_cap_acts_in_body_frames(crossing: co.Fleet) -> None:
+    capped = co.V2X(max_neighbours=3, bytes_per_second=500.0)
+    track = co.PoseFilter(fusion="naive")(co.observe(crossing, NOISE, capped, frame="body"))
+    assert track.received_bytes.max() <= 500.0 * 7.0

@@ -15,14 +15,14 @@ import pytest
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.errors import InputError
-from coopoc.evaluate.catalogue import measure
+from coopoc.evaluate.metrics import measure
 from coopoc.fleets import load_fleet
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
 from coopoc.study.run import plan, run_study
-from coopoc.world.channels import channel
+from coopoc.world.v2x import channel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extend.md"
 COOPOC = f"{sys.executable} -W error -m coopoc.cli"

@@ -32,9 +32,9 @@ ROOMS = {
     "optimize": [
         "model",
         "algebra",
-        "assessment",
+        "assess",
         "descent",
-        "initialisation",
+        "starts",
         "agents",
         "robust",
         "convex",

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 
 from coopoc import Fleet
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.learned import federate, load
 from coopoc.learned.federation.history import Federation
 from coopoc.learned.federation.local import local_fit

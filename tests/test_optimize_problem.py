@@ -11,10 +11,10 @@ import pytest
 
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import MEASUREMENTS, Factor, Loss, Problem, SolveError, Status, pose, solve, solve_batch
-from coopoc.optimize.initialisation.initial import converted, initial_guess
 from coopoc.optimize.model.window import relative_std
+from coopoc.optimize.starts.initial import converted, initial_guess
+from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import to_vector, vector_cov
 
 S2 = Sensors.paper_scenario2()
 PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -241,12 +241,8 @@ def test_converted_measurement_has_the_rotated_covariance(recording: Recording) 
     assert cov == pytest.approx(vector_cov(measured, S2.relative_std), rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("most", [0, 200], ids=["kernel", "casadi"])
-def test_a_start_is_the_least_squares_of_the_converted_vectors(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Recording) -> None:
     """Against NumPy's least squares with vectors d u and vector_cov; ranges and losses have no part in it."""
-    monkeypatch.setattr("coopoc.optimize.algebra.layout.DENSE", most)
     star = Problem.from_snapshot(recording, 20, 0)
     fixes, edges = star.factors
     problem = Problem(star.names, star.factors).add("range", (1, 2), 5.0, std=0.1)

@@ -6,27 +6,18 @@ from collections.abc import Callable, Mapping
 
 from ..one_file import in_file
 from ..plugins import find, names
-from .adaptive import AdaptiveKalman
-from .admm import ConsensusADMM
-from .batch_smoother import BatchSmoother
-from .central_filter import CentralFilter
-from .cooperative_map import CooperativeMAP
+from .baselines import LKFSA, MSMV
+from .centralised import BatchSmoother, CentralFilter
 from .covariance_intersection import CovarianceIntersection
-from .diffusion import Diffusion
+from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
-from .fixed_lag import FixedLagSmoother
-from .gbp import GaussianBeliefPropagation
-from .gnss import GNSS
 from .joint_filter import JointFilter
-from .kalman import Kalman
-from .lkf_sa import LKFSA
+from .kalman import GNSS, AdaptiveKalman, Kalman
 from .mds import MDS
-from .moving_horizon import MovingHorizon
-from .msmv import MSMV
 from .noise_model import NoiseModel
 from .qcqp_relaxation import QCQPRelaxation
+from .sliding_window import CooperativeMAP, FixedLagSmoother, MovingHorizon
 from .track import Method
-from .variational import VariationalKalman
 
 Factory = Callable[[NoiseModel | str], Method]
 """Noise model -> the method. A third party's entry point in `coopoc.methods` is one, too."""
@@ -35,7 +26,6 @@ METHODS: Mapping[str, Factory] = {
     "gnss": lambda noise_model: GNSS(),
     "kalman": lambda noise_model: Kalman(noise_model),
     "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
-    "kalman-variational": lambda noise_model: VariationalKalman(),
     "lkf-sa": lambda noise_model: LKFSA(noise_model),
     "lkf-sa-edge": lambda noise_model: JointFilter(noise_model, exact=False, name="lkf-sa-edge"),
     "msmv-r": lambda noise_model: MSMV(noise_model),
@@ -54,15 +44,13 @@ METHODS: Mapping[str, Factory] = {
     "qcqp-relaxation": lambda noise_model: QCQPRelaxation(noise_model),
     "gbp": lambda noise_model: GaussianBeliefPropagation(noise_model),
     "admm": lambda noise_model: ConsensusADMM(noise_model),
-    "diffusion": lambda noise_model: Diffusion(noise_model),
-    "diffusion-anchored": lambda noise_model: Diffusion(noise_model, anchored=True, name="diffusion-anchored"),
     "central-filter": lambda noise_model: CentralFilter(noise_model),
     "batch-smoother": lambda noise_model: BatchSmoother(noise_model),
     "fixed-lag": lambda noise_model: FixedLagSmoother(noise_model=noise_model),
     "mhe": lambda noise_model: MovingHorizon(noise_model=noise_model),
 }
 
-WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"})
+WHOLE_FLEET = frozenset({"gbp", "admm", "central-filter", "batch-smoother"})
 """Methods that need what every vehicle measured, not only the egos."""
 
 

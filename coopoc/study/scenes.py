@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from scipy import stats
 
-from ..arrays import AnyArray, Floats
+from ..arrays import AnyArray, Floats, robust_std
 from ..errors import InputError
 from ..escapes import picture
 from ..world.fleet import Fleet
@@ -89,8 +89,7 @@ def _histogram(axes: Axes, values: Floats, sigma: float, unit: str) -> None:
     grid = np.linspace(-reach, reach, 301)
     axes.plot(grid, stats.norm.pdf(grid, scale=sigma), color="black")
     axes.set_ylim(top=1.4 * axes.get_ylim()[1])
-    middle = np.median(values)
-    robust = 1.4826 * np.median(np.abs(values - middle))
+    middle, robust = np.median(values), robust_std(values)
     axes.text(
         0.98,
         0.98,

@@ -1,0 +1,106 @@
+"""Where to start: the linear least-squares solution of the converted measurements."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...arrays import Floats
+from ...errors import InputError
+from ..algebra.sparse import Sparse, sparse
+from ..algebra.star import is_star, star_at
+from ..algebra.tape import Model
+from ..model.converted import converted_rows, is_converted
+from ..model.factor import Factor, unchecked
+from ..model.measurements import columns
+from ..model.problem import Problem
+
+RIDGE = 1e-9
+"""1/m^2 on every point, so that one without information has a place to start from."""
+
+
+def converted(problem: Problem) -> Problem:
+    """The linear problem: spherical factors become vectors d u with the rotated covariance; other angles are left out.
+
+    d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
+    that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
+    """
+    factors = [_vector(f) if is_converted(f.measurement) else unchecked(f, loss=None) for f in problem.factors]
+    return problem.replace_unchecked(factors=tuple(f for f in factors if f.measurement.linear), x0=None, fixed=())
+
+
+def initial_guess(problem: Problem) -> Floats:
+    """(B, n, ambient): x0 if the problem has one, else the solution of `converted`.
+
+    Raises:
+        InputError: poses without an x0.
+    """
+    batch = problem.batch or 1
+    if problem.x0 is not None:
+        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.ambient)))
+    if problem.poses:
+        raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
+    if problem.batch is None:
+        x, touched = _solution(sparse(problem), "converted")
+        return x if touched else _apart(problem, x)
+    if not is_star(problem):
+        return np.concatenate([initial_guess(problem.pick(b)) for b in range(batch)])
+    x, linear = np.zeros((batch, len(problem.names), problem.dimension)), converted(problem)
+    return _apart(problem, star_at(linear, linear.linearise(x)).solve(RIDGE)[0])
+
+
+def _solution(system: Sparse, model: Model) -> tuple[Floats, bool]:
+    """(1, n, d) where a quadratic cost of points is least, and whether every point has a part in it."""
+    zero = np.zeros(system.entries.number.shape)
+    _, gradient, values = system.quadratic(zero, model)
+    own = values[system.entries.diagonal]
+    values[system.entries.diagonal] = own + RIDGE
+    system.cholesky.factor(values)
+    return system.retract(zero, -system.cholesky.solve(gradient))[None], bool(own.min(initial=np.inf) > 0.0)
+
+
+def somewhere(problem: Problem) -> Floats:
+    """(B, n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
+
+    Raises:
+        InputError: poses without an x0.
+    """
+    if problem.x0 is not None or problem.poses:
+        return initial_guess(problem)
+    x = np.zeros((problem.batch or 1, len(problem.names), problem.dimension))
+    fixes = [f for f in problem.factors if f.kind == "position"]
+    if fixes:
+        x[:] = fixes[0].z[..., :1, :]
+    for f in fixes:
+        x[:, f.nodes[:, 0]] = f.z
+    return x
+
+
+def _apart(problem: Problem, x: Floats) -> Floats:
+    """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
+    touched = np.zeros(x.shape[:2], dtype=bool)
+    for f in problem.factors:
+        if not (f.measurement.linear or is_converted(f.measurement)):
+            continue
+        informative = f.informative
+        if informative.all():
+            touched[:, f.nodes] = True
+        else:
+            for column in f.nodes.T:
+                np.logical_or.at(touched.T, column, np.atleast_2d(informative).T)
+    if touched.all():
+        return x
+    ranges = [f.z[..., 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
+    place = np.cumsum(~touched, axis=1) - 1
+    turn, radius = 2.4 * place, np.sqrt(1.0 + place) * (ranges[0] if ranges else 1.0)
+    spiral = np.zeros_like(x)
+    spiral[..., 0], spiral[..., 1] = radius * np.cos(turn), radius * np.sin(turn)
+    middle = (x * touched[..., None]).sum(axis=1) / np.maximum(touched.sum(axis=1), 1)[:, None]
+    return np.where(touched[..., None], x, middle[:, None] + spiral)
+
+
+def _vector(factor: Factor) -> Factor:
+    d, rows = converted_rows(columns(factor.z), np)
+    inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    z, nothing = d[..., None] * inverse[..., 0, :], np.empty((len(factor.nodes), 0))
+    root = factor.whiten_jacobian(inverse)
+    return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)
