@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints, robust_std
+from coopoc.arrays import Bools, Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.formats.values import LARGEST, read_table, read_words
@@ -302,7 +302,7 @@ def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
     return np.array(table)
 
 
-def _refuse(file: Path, wrong: Floats, allowed: str, hint: str) -> None:
+def _refuse(file: Path, wrong: Bools, allowed: str, hint: str) -> None:
     """InputError with the first line that is wrong."""
     if wrong.any():
         line, words = list(read_words(file))[int(np.argmax(wrong))]

@@ -59,16 +59,6 @@ def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen: co
     assert np.isnan(seen.body.heading).all()
 
 
-def test_thinning_leaves_the_first_part_and_the_robots(seen: co.Recording) -> None:
-    few = thinned(seen, 2, 3000)
-    late = few.links.step >= 3000
-    assert (~late).sum() == (seen.links.step < 3000).sum()
-    assert len(np.unique(few.links.neighbour[late & (few.links.neighbour >= 5)])) == 2
-    robots = seen.links.neighbour < 5
-    assert (few.links.neighbour < 5).sum() == robots.sum()
-    assert not (thinned(seen, 0, 0).links.neighbour >= 5).any()
-
-
 def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened() -> None:
     """Closed form: sums of n terms of an autoregression have variance n s^2 (1 + c) / (1 - c) (Bartlett 1946)."""
     normals = np.random.default_rng(0).standard_normal((200_000, 1))
