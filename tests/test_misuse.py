@@ -51,7 +51,6 @@ METHODS: tuple[Any, ...] = (
     co.GNSS,
     co.Kalman,
     co.AdaptiveKalman,
-    co.VariationalKalman,
     co.JointFilter,
     co.LKFSA,
     co.MSMV,
@@ -114,7 +113,7 @@ def test_methods_refuse_options_and_recordings_of_the_wrong_kind(method: Any) ->
 
 
 def streams() -> Iterator[Any]:
-    yield from (co.Kalman("identity"), co.JointFilter("identity"), co.AdaptiveKalman(), co.VariationalKalman())
+    yield from (co.Kalman("identity"), co.JointFilter("identity"), co.AdaptiveKalman())
 
 
 @pytest.mark.parametrize("method", list(streams()), ids=lambda m: m.name)
