@@ -13,7 +13,7 @@ from classical import KNOWN, NEIGHBOURS, SENSORS
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.incremental import FixedLag
 from coopoc.optimize.starts.initial import initial_guess
-from coopoc.world.spherical import spherical, wrap
+from coopoc.world.links import spherical, wrap
 
 
 def gtsam_linear(problem: Problem) -> Job:

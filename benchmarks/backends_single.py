@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from coopoc.optimize import Problem
 from coopoc.optimize.model.factor import Factor
-from coopoc.world.spherical import wrap
+from coopoc.world.links import wrap
 
 COUNT = 20
 """Stars per call."""

@@ -16,9 +16,9 @@ import coopoc as co
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Sensors, observe
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, posterior_bound
 from coopoc.evaluate.metrics import rt_le
-from coopoc.world.frames import body_motion, midway, true_heading, turned
+from coopoc.world.body_frames import body_motion, midway, true_heading, turned
+from coopoc.world.links import spherical, vector_cov
 from coopoc.world.sensing import find_links
-from coopoc.world.spherical import spherical, vector_cov
 
 S2 = replace(Sensors.paper_scenario2(), velocity_reading="speed")
 NOISE = co.Sensors(

@@ -14,9 +14,8 @@ from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagatio
 from coopoc.world import sensing
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
-from coopoc.world.links import Links
-from coopoc.world.noise import stream
-from coopoc.world.spherical import spherical, wrap
+from coopoc.world.links import Links, spherical, wrap
+from coopoc.world.sensors import stream
 from coopoc.world.v2x import FIX_AND_VELOCITY, Message
 
 S2 = Sensors.paper_scenario2()
@@ -67,7 +66,6 @@ def test_blocks_of_steps_and_coarse_cells_change_nothing(crossing: Fleet, monkey
     far = replace(crossing, position=crossing.position * [5, 1, 1])
     for fleet in (crossing, far):
         monkeypatch.setattr(sensing, "PAIRS", 150)
-        monkeypatch.setattr(sensing, "GRID", 7)
         assert assert_same_links(fleet, range(8), 3, 20.0) > 20
 
 

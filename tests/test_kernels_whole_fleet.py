@@ -18,7 +18,7 @@ from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, NoiseModel, Recordi
 from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.methods.noise_model import resolve
 from coopoc.world.exchange import exchange
-from coopoc.world.spherical import to_vector
+from coopoc.world.links import to_vector
 from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()

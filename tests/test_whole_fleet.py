@@ -20,7 +20,7 @@ from coopoc.kernels.fleets.graph import measurement
 from coopoc.kernels.stars.relative import components
 from coopoc.methods.centralised import BatchSmoother, CentralFilter
 from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
-from coopoc.world.spherical import spherical, to_vector, vector_cov, wrap
+from coopoc.world.links import spherical, to_vector, vector_cov, wrap
 from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()
