@@ -14,8 +14,8 @@ from scipy.optimize import least_squares
 
 from coopoc import V2X, Fleet, InputError, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Backend, Factor, Problem, SolverResult, Status, backends, solve, solve_batch
-from coopoc.optimize.backends import osqp_programme
-from coopoc.optimize.backends.casadi_ import METHODS
+from coopoc.optimize.backends import osqp
+from coopoc.optimize.backends.casadi import METHODS
 from coopoc.optimize.backends.gauss_newton import linear_step
 from coopoc.optimize.starts.initial import converted, initial_guess
 from coopoc.world.recording import Recording
@@ -296,11 +296,11 @@ def test_osqp_ends_the_same_whatever_it_solved_before(dense: Recording) -> None:
     """The workspace of a structure is kept, one per thread; nothing of what it has solved shows."""
     near, far = (Problem.from_snapshot(dense, step, 0, run=None) for step in (10, 11))
     for solver in (solve_batch, lambda problem, name: solve(problem.pick(1), name)):
-        osqp_programme.unbounded.cache_clear()
+        osqp.unbounded.cache_clear()
         first = solver(near, "osqp")
         solver(far, "osqp")
         again = solver(near, "osqp")
-        assert osqp_programme.unbounded.cache_info().misses == 1
+        assert osqp.unbounded.cache_info().misses == 1
         assert np.array_equal(first.x, again.x)
         assert np.array_equal(first.covariance, again.covariance)
 
@@ -315,12 +315,12 @@ def test_osqp_solves_in_threads_what_it_solves_alone(dense: Recording) -> None:
 
 def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
     problem = Problem.from_window(dense, 20, 0, 5)
-    loose = {**osqp_programme.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
+    loose = {**osqp.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(osqp_programme, "SETTINGS", loose)
-        osqp_programme.unbounded.cache_clear()
+        patch.setattr(osqp, "SETTINGS", loose)
+        osqp.unbounded.cache_clear()
         solution = solve(problem, "osqp", throw=False)
-    osqp_programme.unbounded.cache_clear()
+    osqp.unbounded.cache_clear()
     assert solution.extras["repairs"] > 0
 
 

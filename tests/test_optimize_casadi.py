@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, measurement, pose, solve, solve_batch
-from coopoc.optimize.backends import casadi_programme
-from coopoc.optimize.backends.casadi_ import DENSE
-from coopoc.optimize.backends.casadi_programme import programme
+from coopoc.optimize.backends import casadi as casadi_backend
+from coopoc.optimize.backends.casadi import DENSE, programme
 from coopoc.optimize.model.symbolic import _chart
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.recording import Recording
@@ -267,7 +266,7 @@ def test_inequalities_and_many_numbers_are_ipopts(dense: Recording) -> None:
 
 def test_an_answer_that_is_none_is_found_out(monkeypatch: pytest.MonkeyPatch, dense: Recording) -> None:
     """A solver that is content with any gradient: ipopt takes over, one by one and in a batch."""
-    monkeypatch.setitem(casadi_programme.FATROP, "tolerance", 1e6)
+    monkeypatch.setitem(casadi_backend.FATROP, "tolerance", 1e6)
     programme.cache_clear()
     stars = Problem.from_snapshot(dense, 10, 0, run=None)
     problem = stars.pick(1)

@@ -452,12 +452,12 @@ def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
     """min 1/2 x^2 + q x in [-1, 1]: by hand."""
     from scipy.sparse import eye
 
-    from coopoc.optimize.backends.osqp_programme import Programme
+    from coopoc.optimize.backends.osqp import Programme
 
     def holds(q: float, x: float, y: float) -> bool:
         one = eye(1, format="csc")
         sides = np.array([[-1.0], [1.0]])
-        return Programme(one, 1e-9)._holds(one, np.array([q]), *sides, np.array([x]), np.array([y]))
+        return Programme(one, one, 1e-9)._holds(one, np.array([q]), *sides, np.array([x]), np.array([y]))
 
     assert holds(-2.0, 1.0, 1.0)  # pushed by the upper bound
     assert holds(2.0, -1.0, -1.0)
