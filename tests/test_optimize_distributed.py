@@ -13,9 +13,7 @@ from scipy.optimize import least_squares
 from coopoc import InputError
 from coopoc.formats.graph import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
-from coopoc.optimize.agents.agent import agents_of
-from coopoc.optimize.agents.distributed import owners, solve_distributed
-from coopoc.optimize.agents.links import links_of
+from coopoc.optimize.distributed import agents_of, links_of, owners, solve_distributed
 from coopoc.optimize.graphs import from_graph
 
 
