@@ -101,7 +101,6 @@ def method_cases() -> Iterator[Case]:
     others = {
         "drift, time-correlated errors": (DriftFilter(), seen(fleet, drifting, False), "joint, plain"),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
-        "kalman-variational": (co.VariationalKalman(), recording, "kalman, plain"),
         "cooperative gain, newest fix": (CooperativeGain(NoiseNet(), sums=False), recording, "joint, plain"),
         "cooperative gain, sums": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
     }

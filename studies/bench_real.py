@@ -17,7 +17,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.optimize.graphs import read_graph
 from coopoc.optimize.solve import solve
 from coopoc.world.fleet import Fleet

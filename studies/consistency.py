@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SILENT = ("gnss", "mds", "cooperative-map-gnc")
 """Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
 TRAINED = ("okf", "recursive", "cooperative")
-SOLO = ("kalman", "kalman-adaptive", "kalman-variational", "okf", "recursive")
+SOLO = ("kalman", "kalman-adaptive", "okf", "recursive")
 GATE = 0.95
 USUAL = ("nominal", "trained")
 NOTE = (

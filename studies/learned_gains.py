@@ -31,7 +31,6 @@ ASSUMED = {
     ("kalman", "identity"): "1 m per step",
     ("kalman", "fitted"): "a constant, fitted at 10 %",
     ("kalman-adaptive", "nominal"): "10 % of the measured velocity",
-    ("kalman-variational", "nominal"): "10 % of the measured velocity",
     ("kalman", "nominal"): "the acting share of the measured velocity",
     ("kalman", "oracle"): "the acting share of the true velocity",
     **{(name, "trained"): "trained at 10 %" for name in ("okf", "fedokf", "fedkalmannet", "centralised")},

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from coopoc.arrays import robust_std
 from coopoc.study.numbers import present
 from coopoc.study.pivot import pivot
 from coopoc.study.study import Params
@@ -131,11 +132,11 @@ def _innovations(results: Results) -> Plot | None:
     from coopoc.data.mrclam import innovations, read_mrclam
     from coopoc.study import figures
 
-    found = innovations(read_mrclam(data))
+    ranges, bearings = innovations(read_mrclam(data))
     return figures.innovations(
-        {"Range": (found.range, 0.095, "m"), "Bearing": (found.bearing, 0.007, "rad")},
+        {"Range": (ranges, 0.095, "m"), "Bearing": (bearings, 0.007, "rad")},
         caption=f"Innovations of the real robot-to-robot measurements against Vicon, and the Gaussian of 0.095 m and "
-        f"0.007 rad; robust standard deviations {found.range_std:.4f} m and {found.bearing_std:.5f} rad.",
+        f"0.007 rad; robust standard deviations {robust_std(ranges):.4f} m and {robust_std(bearings):.5f} rad.",
     )
 
 

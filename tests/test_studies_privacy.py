@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 import coopoc as co
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import GainNet, LearnedGain, Schedule, clients, federate

@@ -28,11 +28,10 @@ from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .bridge import bridge
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
 from .options import check_options
-from .star import assumptions, measurements
+from .star import assumptions, bridged, measurements
 from .track import Track
 
 if TYPE_CHECKING:
@@ -312,8 +311,7 @@ class Positions:
 def dead_reckoned(recording: Recording, noise_model: NoiseModel) -> Positions:
     """All fixes, and where one is missing the last one moved by odometry, its variance grown by the process noise."""
     new: Bools = np.asarray(np.isfinite(recording.gnss).all(axis=-1))
-    bridged, grown, _ = bridge(recording, noise_model)
-    return Positions(bridged.gnss, np.ascontiguousarray(grown.fix_variance(recording)), new)
+    return Positions(*bridged(recording, noise_model), new)
 
 
 class Windows:

@@ -80,7 +80,7 @@ def solve_distributed(
 
     Raises:
         InputError: no x0, B realisations, constraints, rho not > 0, loss outside [0, 1), rounds, steps or a seed that
-            are no whole numbers, another number of owners, or a kind of measurement that no tape can hold.
+            are no whole numbers, another number of owners, or a formula that CasADi cannot run.
 
     References:
         Boyd et al., Distributed Optimization and Statistical Learning via the ADMM, 2011, section 7; McGann, Lassak and
@@ -117,7 +117,7 @@ def solve_distributed(
         apart.append(max(gaps))
         for agent in agents.values():
             x[agent.nodes[agent.own]] = agent.x[agent.own]
-        cost.append(problem.cost(x) if system is None else system.cost(x))
+        cost.append(system.cost(x))
     messages, sent_bytes = np.outer(once, np.arange(rounds + 1))
     return Distributed(x, np.array(cost), np.array(apart), messages, sent_bytes, tuple(agents))
 
@@ -272,7 +272,7 @@ def agents_of(problem: Problem, owner: tuple[str, ...], links: Sequence[Link]) -
     """The robots of a problem.
 
     Raises:
-        InputError: a kind of measurement that no tape can hold.
+        InputError: a formula that CasADi cannot run.
     """
     by = makers(problem, owner)
     labels, found = np.array(owner), []
@@ -288,11 +288,7 @@ def agents_of(problem: Problem, owner: tuple[str, ...], links: Sequence[Link]) -
         poses = np.setdiff1d(local.poses, np.searchsorted(nodes, points))
         penalty = [_penalty(problem, link, np.searchsorted(nodes, link.nodes)) for link in mine]
         local = local.replace_unchecked(poses=tuple(poses.tolist()), factors=(*local.factors, *penalty))
-        system = sparse(local, least=0)
-        if system is None:
-            kinds = sorted({f.kind for f in local.factors})
-            raise InputError("problem", f"kinds {kinds}", "must run on CasADi's numbers", "Use solve instead.")
-        found.append(Agent(robot, nodes, labels[nodes] == robot, mine, penalty, system, np.array(local.x0)))
+        found.append(Agent(robot, nodes, labels[nodes] == robot, mine, penalty, sparse(local), np.array(local.x0)))
     return found
 
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from .algebra.cholesky import cholesky_of, with_still
-from .assess.curvature import tapes
+from .algebra.sparse import sparse
 from .model.nodes import several
 from .model.problem import Problem
 
@@ -65,15 +64,8 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
 
 def _solver(problem: Problem, x: Floats) -> tuple[Ints, Callable[[Floats], Floats]]:
     """Which unknown a direction (n, dof) of a node is, -1 where it cannot move, and (u,) -> (J^T J)^-1 (u,)."""
-    if (system := tapes(problem)) is not None:
-        factored = system.cholesky if system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]) else None
-        number = system.entries.number
-    else:
-        J, shape = problem.whiten(x)[1], (len(problem.names), problem.space.dof)
-        still = np.zeros(shape, dtype=bool) if problem.movable is None else ~problem.movable
-        factored = cholesky_of(with_still(J.T @ J, still))
-        number = np.where(still, -1, np.arange(still.size).reshape(shape))
-    if factored is None:
+    system = sparse(problem)
+    if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
         hint = "Measure what is free: see solution.unobservable."
         raise InputError("problem", repr(problem), "must hold all nodes", hint)
-    return number, factored.solve
+    return system.entries.number, system.cholesky.solve

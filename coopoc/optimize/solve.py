@@ -10,9 +10,10 @@ import numpy as np
 
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
+from .algebra.sparse import sparse
 from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess
-from .assess.curvature import is_constrained_minimum, newton_decrease, tapes
+from .assess.curvature import is_constrained_minimum, newton_decrease
 from .backend import Backend, Options, require_backend
 from .descent.descend import MAX_ITERATIONS
 from .model.fuse import fused
@@ -132,8 +133,7 @@ def _start(problem: Problem) -> Floats:
     if problem.linear and not problem.constraints:
         return np.asarray(somewhere(problem)[0])
     start: Floats = initial_guess(problem)[0]
-    system = None if problem.constraints else tapes(problem)
-    if system is not None and np.isfinite(system.quadratic(start, "gauss-newton")[1]).all():
+    if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
         return start
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])

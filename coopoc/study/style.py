@@ -62,7 +62,6 @@ METHODS = {
     "fedkalmannet": Look("FedKalmanNet", PURPLE, "*"),
     "centralised": Look("Centralised KalmanNet", "#8A2F63", "X"),
     "kalman-adaptive": Look("Adaptive KF", "#B8860B", "v"),
-    "kalman-variational": Look("Variational KF", "#8B6914", "^"),
     "fedokf": Look("Federated OKF", "#FF8C61", "D"),
     "magnitude": Look("Magnitude-aware net", "#5E3C99", "P"),
     "split": Look("Split-KalmanNet", "#3B7080", "<"),

@@ -233,7 +233,7 @@ def linearise(window: Window, span: tuple[int, int], assumed: Any, how: int) -> 
         ego = row_of(window.layout, step, 0)
         for row in range(ego + 1, ego + count_of(window.sizes, step)):
             gap = gap_of(window.point, ego, row)
-            information, eta = edge(gap, load(window.relative, row, RELATIVE), assumed, how)
+            information, eta = edge(gap, load(window.relative, row, RELATIVE), assumed[0], assumed[1], how)
             store(window.edge, row, information)
             store(window.eta, row, eta)
 

@@ -189,7 +189,7 @@ def linearise_step(window: Window, known: Assumptions, step: int, active: Any) -
 def put_edge(window: Window, known: Assumptions, ego: int, row: int, gap: Any, how: Any, active: Any) -> None:
     """The relative measurement of a row, linear at the vector `gap`, where `active` is positive."""
     z = load(window.relative, row, RELATIVE)
-    information, eta = edge(gap, z, (known.relative_std, known.min_range), how)
+    information, eta = edge(gap, z, known.relative_std, known.min_range, how)
     eta = plus_applied(eta, information, subtract(gap, gap_of(window.point, ego, row)))
     o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole_of(window, row)) - 0.5
     information, eta = choose_each(used, information, zeros(o, ONE)), choose_each(used, eta, zeros(o, ROW))
@@ -293,7 +293,7 @@ def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
         away = subtract(gap_of(window.point, ego, ego + k), gap_of(window.start, ego, ego + k))
         information = load(window.edge, ego + k, ONE)
         eta = plus_applied(load(window.eta, ego + k, ROW), information, away)
-        add_relative(joint.information, joint.eta, joint.stride, (k, n), (information, eta), ROW)
+        add_relative(joint.information, joint.eta, joint.stride, k, n, information, eta, ROW)
     solve(joint.information, joint, joint.eta, n, ROW)
     predict(joint.information, n, joint.stride, joint.process, joint.scratch, ONE, ROW)
     m, prior = count_of(window.sizes, step + 1), 1.0 / known.flat
@@ -333,7 +333,7 @@ def gather_arrived(
         if changed:
             for lane in range(uint64(LANES)):
                 run = min(runs[0] + int(lane), runs[1])
-                receive(star, seen, known, (run, step, link), (k, place, lane))
+                receive(star, seen, known, run, step, link, k, lane)
                 used_since = max(seen.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, known, k, seen.dt)

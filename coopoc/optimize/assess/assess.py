@@ -10,10 +10,9 @@ import numpy as np
 
 from ...arrays import Bools, Floats
 from ..algebra.cholesky import Cholesky, cholesky_of, with_still
-from ..algebra.sparse import Sparse
+from ..algebra.sparse import Sparse, sparse
 from ..model.problem import Problem
 from .active import Active, active_at
-from .curvature import tapes
 
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
@@ -53,13 +52,13 @@ class Assessment:
 
 def assess(problem: Problem, x: Floats) -> Assessment:
     """Assessment of a single problem at x (n, ambient)."""
-    if not problem.constraints and (system := tapes(problem)) is not None:
-        return _by_tapes(problem, system, x)
+    if not problem.constraints:
+        return _unconstrained(problem, sparse(problem), x)
     linear = problem.linearise(x[None])
     J, shape = problem.jacobian(linear), (len(x), problem.space.dof)
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
-    active = active_at(problem, x, gradient.reshape(shape)) if problem.constraints else None
-    size = float(np.linalg.norm(gradient if active is None else gradient + active.constraint_gradient))
+    active = active_at(problem, x, gradient.reshape(shape))
+    size = float(np.linalg.norm(gradient + active.constraint_gradient))
     still = None if problem.movable is None else ~problem.movable
     try:
         cov, dx, sound = _marginals(with_still(J.T @ J, still), gradient, shape, active)
@@ -70,12 +69,11 @@ def assess(problem: Problem, x: Floats) -> Assessment:
         return Assessment(float(linear.cost[0]), size, unknown, np.nan, _unobservable(problem, J, active), active)
     if still is not None:
         cov = cov * ~(still[:, :, None] | still[:, None, :])
-    promised = np.inf if active is not None else -0.5 * float(gradient @ dx)
-    return Assessment(float(linear.cost[0]), size, cov, float(np.abs(dx).max(initial=0.0)), (), active, promised)
+    return Assessment(float(linear.cost[0]), size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
 
 
-def _by_tapes(problem: Problem, system: Sparse, x: Floats) -> Assessment:
-    """The assessment of a problem without constraints by tapes and their factors."""
+def _unconstrained(problem: Problem, system: Sparse, x: Floats) -> Assessment:
+    """The assessment of a problem without constraints."""
     cholesky = system.cholesky
     cost, gradient, values = system.quadratic(x, "gauss-newton")
     size = float(np.sqrt(gradient @ gradient))
@@ -98,9 +96,7 @@ def _by_tapes(problem: Problem, system: Sparse, x: Floats) -> Assessment:
     return Assessment(cost, size, cov, float(np.abs(dx).max(initial=0.0)), promised=promised)
 
 
-def _marginals(
-    hessian: Any, gradient: Floats, shape: tuple[int, int], active: Active | None
-) -> tuple[Floats, Floats, bool]:
+def _marginals(hessian: Any, gradient: Floats, shape: tuple[int, int], active: Active) -> tuple[Floats, Floats, bool]:
     """Marginals under the equalities, the Gauss-Newton step along what holds, and whether the former are bounded.
 
     With Z the directions that remain: cov = Z (Z^T J^T J Z)^-1 Z^T, and the step solves the same system after the least
@@ -109,12 +105,8 @@ def _marginals(
     Raises:
         numpy.linalg.LinAlgError: a matrix that is not positive definite.
     """
-    from scipy.sparse import eye_array
-
-    every = eye_array(len(gradient), format="csc")
-    along, exact = (every, every) if active is None else (active.along, active.exact)
-    onto = np.zeros(len(gradient)) if active is None else active.onto
-    dx = onto - _within(hessian, along)[0](gradient + hessian @ onto)
+    exact, onto = active.exact, active.onto
+    dx = onto - _within(hessian, active.along)[0](gradient + hessian @ onto)
     solve, own = _within(hessian, exact)
     cov = np.zeros((shape[0], shape[1], shape[1]))
     for i, c in np.ndindex(*shape):

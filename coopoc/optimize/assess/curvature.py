@@ -9,28 +9,18 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..algebra.cholesky import cholesky_of, with_still
-from ..algebra.sparse import Sparse, sparse
-from ..model.factor import unchecked
-from ..model.linear import linearise
+from ..algebra.sparse import sparse
 from ..model.local import chain, local
 from ..model.measurements import Measurement
 from ..model.problem import Problem
 from .active import Active, constraint_rows
 
 STEP = 1e-4
-"""rad, m, or share of a pair's distance: where no tape is, the second derivative is a central difference of the exact
+"""rad, m, or share of a pair's distance: the second derivative of a constraint is a central difference of the exact
 first."""
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
 rounding."""
-
-
-def tapes(problem: Problem) -> Sparse | None:
-    """The cost of a single problem by tapes, whatever its separator and constraints; None if a kind has no tape."""
-    found = sparse(problem, least=0)
-    if found is None and (problem.separator or problem.constraints):
-        found = sparse(problem.replace_unchecked(separator=(), constraints=()), least=0)
-    return found
 
 
 def is_minimum(problem: Problem, x: Floats) -> bool:
@@ -53,22 +43,16 @@ def newton_decrease(problem: Problem, x: Floats) -> float | None:
     """
     if problem.linear or problem.constraints:
         return 0.0
-    if (system := tapes(problem)) is not None:
-        _, gradient, values = system.quadratic(x, "newton")
-        if not np.isfinite(values).all():
-            return None
-        if not system.cholesky.factor(values):
-            own = system.entries.diagonal
-            values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
-            if not system.cholesky.factor(values):
-                return None
-        return float(0.5 * gradient @ system.cholesky.solve(gradient))
-    (residual, J), H = problem.whiten(x), hessian(problem, x)
-    if not np.isfinite(H.data).all():
+    system = sparse(problem)
+    _, gradient, values = system.quadratic(x, "newton")
+    if not np.isfinite(values).all():
         return None
-    gradient = J.T @ residual
-    factored = cholesky_of(H) or cholesky_of(with_still(H, SLACK * J.power(2).sum(axis=0)))
-    return None if factored is None else float(0.5 * gradient @ factored.solve(gradient))
+    if not system.cholesky.factor(values):
+        own = system.entries.diagonal
+        values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
+        if not system.cholesky.factor(values):
+            return None
+    return float(0.5 * gradient @ system.cholesky.solve(gradient))
 
 
 def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
@@ -102,31 +86,13 @@ def hessian(problem: Problem, x: Floats) -> Any:
     """(n dof, n dof) sparse exact Hessian of the cost of a single problem at x (n, ambient), 1 for what cannot move."""
     from scipy.sparse import csc_array, csr_array, triu
 
-    size = len(problem.names) * problem.space.dof
+    size, system = len(problem.names) * problem.space.dof, sparse(problem)
     still = None if problem.movable is None else ~problem.movable
-    if (system := tapes(problem)) is not None:
-        upper = system.quadratic(x, "newton")[2], system.entries.indices, system.entries.indptr
-        half = csc_array(upper, shape=(system.size,) * 2)
-        moving = np.flatnonzero(system.entries.number.ravel() >= 0)
-        into = csr_array((np.ones(system.size), (moving, np.arange(system.size))), shape=(size, system.size))
-        return with_still(into @ (half + triu(half, 1).T) @ into.T, still)
-    J = problem.whiten(x)[1]
-    total = with_still(J.T @ J, still)
-    for factor in problem.factors:
-        bare = unchecked(factor, loss=None)
-        linear = linearise(problem.space, [bare], None, x[None])
-        r, by_node = linear.residual[0][0], linear.by_node([bare])[0]
-        s, W = np.square(r).sum(axis=1), np.broadcast_to(factor.root, (*r.shape, r.shape[1]))
-        weight = np.ones_like(s) if factor.loss is None else factor.loss.weight(s)
-        rows, assumed = weight[:, None] * np.einsum("mij,mi->mj", W, r), factor.constants
-        assert assumed is not None
-        second = _second(problem, factor.measurement, assumed, factor.z, x[factor.nodes], rows)
-        if factor.loss is not None:
-            wide = [np.broadcast_to(j[0], (*r.shape, problem.space.dof)) for j in by_node]
-            g = np.concatenate([np.einsum("mkd,mk->md", j, r) for j in wide], axis=1)
-            second = second + 2.0 * factor.loss.second_derivative(s)[:, None, None] * g[:, :, None] * g[:, None, :]
-        total = total + _assembled(problem, factor.nodes, second)
-    return total
+    upper = system.quadratic(x, "newton")[2], system.entries.indices, system.entries.indptr
+    half = csc_array(upper, shape=(system.size,) * 2)
+    moving = np.flatnonzero(system.entries.number.ravel() >= 0)
+    into = csr_array((np.ones(system.size), (moving, np.arange(system.size))), shape=(size, system.size))
+    return with_still(into @ (half + triu(half, 1).T) @ into.T, still)
 
 
 def _second(problem: Problem, kind: Measurement, constants: Floats, z: Floats, at: Floats, weight: Floats) -> Floats:

@@ -12,19 +12,18 @@ exactly for the active set that the iterations have found (polishing).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from threading import get_ident
 from typing import Any
 
 import numpy as np
 
-from ...arrays import Floats
-from ..algebra.arrowhead import structure
-from ..algebra.normal import Pattern, normal_equations
+from ...arrays import Floats, Ints
+from ..algebra.sparse import Layout, Sparse, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
 from ..model.constraint import bounded
 from ..model.linear import Linear
 from ..model.local import local
@@ -85,52 +84,52 @@ def prepare(
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    limits = _limits(structure)
-    programme, step = _programme(structure, limits, kkt_tolerance)
+    limits, programmes = _limits(structure), dict[Layout, Programme]()
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
+        system = sparse(problem)
+        if system.layout not in programmes:
+            programmes[system.layout] = _programme(system, limits, kkt_tolerance)
+        programme = programmes[system.layout]
         programme.counts.update(osqp_iterations=0, repairs=0)
         if problem.constraints:
-            nowhere, extras = np.zeros(1, dtype=np.int64), dict(programme.counts)
             try:
-                start, feasible = _nearest(limits, x[0])
+                x, feasible = _nearest(limits, x)
             except np.linalg.LinAlgError:
-                return SolverResult(x, nowhere, extras=extras)
-            x = start[None]
+                return SolverResult(x, 0, extras=dict(programme.counts))
             if not feasible:
-                return SolverResult(x, nowhere, np.ones(1, dtype=bool), extras)
-        found = minimise(problem, step, x, max_iterations, tolerance)
-        return replace(found, extras=found.extras | dict(programme.counts))
+                return SolverResult(x, 0, True, dict(programme.counts))
+        step = partial(_step, system, limits, programme)
+        found = minimise(problem, step, x[None], max_iterations, tolerance)
+        extras = found.extras | dict(programme.counts)
+        return SolverResult(found.x[0], int(np.ravel(found.iterations)[0]), extras=extras)
 
     return solver
 
 
-def _programme(problem: Problem, limits: _Limits, tolerance: float) -> tuple[Programme, Step]:
-    scheme, _ = structure(problem)
-    pattern, source = _upper(scheme, problem.space.dof)
-    nodes, at_own = [f.nodes for f in problem.factors], np.arange(problem.space.dof)
-    own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
-    if len(limits.lower):
-        programme = Programme(pattern, limits.matrix, tolerance)
-    else:
-        programme = unbounded(pattern.indices.tobytes(), pattern.indptr.tobytes(), tolerance, get_ident())
+def _programme(system: Sparse, limits: _Limits, tolerance: float) -> Programme:
+    """The quadratic programme of a structure."""
+    from scipy.sparse import csc_matrix
 
-    def step(linear: Linear, damping: Floats) -> Floats:
-        blocks, gradient = normal_equations(scheme, linear, nodes)
-        if damping.any():
-            blocks[:, own[:, None], at_own, at_own] += damping[:, scheme.pairs[own, 0]]
-        values, q = blocks.reshape(len(blocks), -1)[:, source], gradient.reshape(len(gradient), -1)
-        if len(limits.lower):
-            return programme.solve(values[0], q[0], *limits.around(linear.x[0])).reshape(damping.shape)
-        dx = np.full_like(q, np.nan)
-        for b in range(len(q)):
-            try:
-                dx[b] = programme.solve(values[b], q[b], limits.lower, limits.upper)
-            except np.linalg.LinAlgError:
-                continue
-        return dx.reshape(damping.shape)
+    entries = system.entries
+    if not len(limits.lower):
+        return unbounded(entries.indices.tobytes(), entries.indptr.tobytes(), tolerance, get_ident())
+    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    return Programme(pattern, csc_matrix(limits.matrix[:, _moving(system)]), tolerance)
 
-    return programme, step
+
+def _moving(system: Sparse) -> Ints:
+    return np.flatnonzero(system.entries.number.ravel() >= 0)
+
+
+def _step(system: Sparse, limits: _Limits, programme: Programme, linear: Linear, damping: Floats) -> Floats:
+    """dx (1, n, dof) of the quadratic programme around a point."""
+    dx, moving = np.zeros(damping.size), _moving(system)
+    _, q, values = system.quadratic(linear.x[0], "gauss-newton")
+    values = np.array(values)
+    values[system.entries.diagonal] += damping.ravel()[moving]
+    dx[moving] = programme.solve(values, np.array(q), *limits.around(linear.x[0]))
+    return dx.reshape(damping.shape)
 
 
 class Infeasible(np.linalg.LinAlgError):
@@ -211,7 +210,7 @@ def unbounded(indices: bytes, indptr: bytes, tolerance: float, thread: int) -> P
     """The programme without bounds of a structure of P, its workspace set up once, its own for each thread."""
     from scipy.sparse import csc_matrix
 
-    row, start = np.frombuffer(indices, np.int32), np.frombuffer(indptr, np.int32)
+    row, start = np.frombuffer(indices, np.int64), np.frombuffer(indptr, np.int64)
     size = len(start) - 1
     identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
     found = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)), tolerance)
@@ -264,25 +263,10 @@ def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:
         return space.retract(x, step.reshape(len(x), -1)), False
 
 
-@lru_cache(maxsize=64)
-def _upper(scheme: Pattern, dof: int) -> tuple[Any, Any]:
-    """Upper triangle of J^T J as CSC with its structure, and where each value lies in the flat blocks."""
-    from scipy.sparse import csc_matrix
-
-    i, j = scheme.pairs.T
-    row = np.broadcast_to(dof * i[:, None, None] + np.arange(dof)[:, None], (len(i), dof, dof)).ravel()
-    col = np.broadcast_to(dof * j[:, None, None] + np.arange(dof), (len(i), dof, dof)).ravel()
-    keep = row <= col
-    shape = (dof * scheme.nodes, dof * scheme.nodes)
-    numbered = csc_matrix((np.flatnonzero(keep) + 1.0, (row[keep], col[keep])), shape=shape)
-    numbered.sort_indices()
-    return numbered, (numbered.data - 1).astype(np.int64)
-
-
 BACKEND = Backend(
     "osqp",
     prepare,
     "sequential quadratic programming, persistent workspace",
     "osqp",
-    Capabilities(batched=True, constraints="linear"),
+    Capabilities(constraints="linear"),
 )
