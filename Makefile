@@ -56,7 +56,8 @@ test-lower:
 		-n $(JOBS) --dist loadfile $(QUICK)
 
 fuzz: $(VENV)/.ready-fuzz
-	OMP_NUM_THREADS=1 PYTHONPATH=tests $(VENV)/bin/python -m fuzz.every --minutes $(MINUTES)
+	export OMP_NUM_THREADS=1 PYTHONPATH=tests; $(VENV)/bin/python -c "from fuzz.readers import READERS as r; print(*r, sep='\n')" | \
+	while read -r name; do $(VENV)/bin/python -m fuzz.run "$$name" --minutes $(MINUTES) --executions 1000000; done
 
 docs: $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 JUPYTER_CONFIG_PATH=docs OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build

@@ -17,7 +17,7 @@ from coopoc.methods.poses.pose_factors import PoseRun, pose_subgraph
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.incremental import FixedLag
 from coopoc.optimize.starts.initial import initial_guess
-from coopoc.world.spherical import spherical, wrap
+from coopoc.world.links import spherical, wrap
 
 
 def gtsam_linear(problem: Problem) -> Job:

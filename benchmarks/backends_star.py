@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 import coopoc as co
 from coopoc.optimize import Problem, solve, solve_batch
 from coopoc.optimize.model.factor import Factor
-from coopoc.world.spherical import wrap
+from coopoc.world.links import wrap
 
 TOLERANCE = 1e-4
 """m, of the iterated solves of all rows."""

@@ -12,8 +12,8 @@ from scipy import stats
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Sensors, observe
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import rt_le
+from coopoc.world.links import spherical, vector_cov
 from coopoc.world.sensing import find_links
-from coopoc.world.spherical import spherical, vector_cov
 
 S2 = replace(Sensors.paper_scenario2(), velocity_reading="speed")
 

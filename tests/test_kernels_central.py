@@ -14,7 +14,7 @@ from oracles.whole_fleet import Drive
 from coopoc import V2X, CentralFilter, Fleet, NoiseModel, Recording, Sensors, observe
 from coopoc.methods.noise_model import resolve
 from coopoc.world.exchange import exchange
-from coopoc.world.spherical import to_vector
+from coopoc.world.links import to_vector
 from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()

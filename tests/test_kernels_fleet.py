@@ -15,9 +15,8 @@ from scipy.optimize import least_squares
 from coopoc import V2X, BatchSmoother, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.world import sensing
 from coopoc.world.exchange import exchange
-from coopoc.world.links import Links
-from coopoc.world.noise import stream
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.links import Links, spherical, to_vector, wrap
+from coopoc.world.sensors import stream
 from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()

@@ -7,7 +7,7 @@ import pytest
 
 from coopoc import V2X, Fleet, Sensors, observe
 from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
-from coopoc.world.spherical import to_vector
+from coopoc.world.links import to_vector
 
 S2 = Sensors.paper_scenario2()
 

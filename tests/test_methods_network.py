@@ -21,8 +21,8 @@ from coopoc.methods.centralised import BatchSmoother, CentralFilter
 from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
+from coopoc.world.links import spherical, to_vector, vector_cov
 from coopoc.world.sensing import find_links
-from coopoc.world.spherical import spherical, to_vector, vector_cov
 from coopoc.world.v2x import FIX_AND_VELOCITY, Message
 
 S2 = Sensors.paper_scenario2()

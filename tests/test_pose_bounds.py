@@ -11,9 +11,9 @@ from scipy import stats
 from test_pose_methods import convoy
 
 import coopoc as co
-from coopoc.world.frames import body_motion, midway, true_heading, turned
+from coopoc.world.body_frames import body_motion, midway, true_heading, turned
+from coopoc.world.links import spherical
 from coopoc.world.sensing import find_links
-from coopoc.world.spherical import spherical
 
 gtsam = pytest.importorskip("gtsam")
 NOISE = co.Sensors(

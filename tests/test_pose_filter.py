@@ -15,7 +15,7 @@ from oracles import pose_filter as oracle
 
 import coopoc as co
 from coopoc.methods.poses.pose_inputs import pose_measurements, pose_noise, to_landmarks
-from coopoc.world.frames import in_world
+from coopoc.world.body_frames import in_world
 
 NOISE = co.Sensors(
     gnss_std=(1.0, 1.0, 0.5),

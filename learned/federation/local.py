@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import Ints
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from ..nets.gain import Gain
 from ..training.clients import Client, Segments

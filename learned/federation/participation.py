@@ -12,8 +12,7 @@ from torch import Tensor
 from coopoc.errors import InputError
 from coopoc.methods.options import check_options
 from coopoc.world.fleet import Fleet
-from coopoc.world.noise import stream
-from coopoc.world.sensors import Sensors
+from coopoc.world.sensors import Sensors, stream
 
 from ..training.clients import Client, Segments, clients
 from .rule import within

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from coopoc.errors import InputError
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from .compression import Compression
 from .guard import screen

@@ -16,7 +16,7 @@ from torch import Tensor
 from coopoc.arrays import number
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.methods.options import check_options
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from ..federation.aggregate import rule
 from ..federation.rule import Combine, Rule, within

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from ..nets.gain import Gain
 from ..training.clients import Batch, Segments

@@ -16,7 +16,7 @@ from coopoc.arrays import Floats, Ints, instance
 from coopoc.errors import InputError
 from coopoc.methods.options import check_options
 from coopoc.short_repr import short_repr
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from ..nets.gain import Gain
 from ..nets.stack import flatten, unflatten

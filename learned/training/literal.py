@@ -15,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from coopoc.world.fleet import Fleet
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from ..nets.gain_net import GainNet
 from ..nets.stack import flatten

@@ -15,7 +15,7 @@ from ...optimize.model.inputs import check_std
 from ...optimize.model.measurements import lookup
 from ...optimize.model.problem import Problem
 from ...optimize.model.space import Space, pose
-from ...world.frames import turned
+from ...world.body_frames import turned
 from ...world.recording import Recording
 from ...world.sensors import Sensors
 from .pose_inputs import LEAST_HEADING_STD, LEAST_YAW_RATE_STD, body_of, present

@@ -14,9 +14,9 @@ from ...errors import InputError
 from ...plugins import one_of
 from ...short_repr import short_repr
 from ...world.inbox import inbox
+from ...world.links import wrap
 from ...world.recording import Recording, check_recording
 from ...world.sensors import Sensors
-from ...world.spherical import wrap
 from ...world.v2x import NO_MESSAGE, Message
 from ..options import check_options
 from ..track import Track

@@ -1,7 +1,7 @@
-"""One ego's filter by (split) covariance intersection: `coopoc.methods.covariance_intersection`.
+"""Filters of an ego that fuse a pseudo-fix from each neighbour: MSMV-R, and (split) covariance intersection.
 
-Each source, the ego's own estimate and the pseudo-fixes of its neighbours, has a dependent and an independent
-covariance D and I. With s = w for the ego and 1 - w for all others its information is
+In covariance intersection each source, the ego's own estimate and the pseudo-fixes of its neighbours, has a dependent
+and an independent covariance D and I. With s = w for the ego and 1 - w for all others its information is
 
     L(s) = (D / s + I)^-1 = s K,  K = (D + s I)^-1,  L' = K D K,  L'' = -2 sym(K I L'),
 
@@ -35,7 +35,6 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose
-from .joint_filter import Estimates
 from .messages import (
     HELD,
     MOVED,
@@ -48,10 +47,12 @@ from .messages import (
     ROW,
     VARIANCE,
     Assumptions,
+    Estimates,
     Measurements,
     Star,
     gather,
     largest,
+    new_estimates,
     star_within,
     write_ego,
 )
@@ -61,6 +62,64 @@ ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
 """Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
 LEAST = 1e-9
 """Least weight of the ego's own estimate: at zero nothing might be left to invert."""
+
+
+@as_written
+def run_msmv(seen: Measurements, known: Assumptions) -> Estimates:
+    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
+
+    Args:
+        seen: `broadcast` holds every vehicle's own estimate.
+        known: `broadcast` its variance m^2.
+    """
+    runs, steps = seen.gnss.shape[:2]
+    out = new_estimates(seen)
+    most, x, cov = largest(seen.start), np.zeros((3, LANES)), np.zeros((9, LANES))
+    for first in range(0, runs, LANES):
+        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        for t in range(steps):
+            n = gather(star, seen, known, first, last, t, old)
+            fuse_pseudo_fixes(star, known, x, cov, n, old)
+            write_ego(out, star, x, cov, first, last, t, seen.start[t], n)
+            old = n
+    return out
+
+
+@inside
+def fuse_pseudo_fixes(star: Star, known: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
+    """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
+    fix = load(star.motion, POSITION, ROW)
+    if old == 0:
+        at, p = fix, zeros(fix[0], square(ROW))
+        flat = 0.0 * fix[0] + known.flat
+        p = add_diagonal(p, (flat, flat, flat))
+    else:
+        at = add(load(x, 0, ROW), load(star.motion, MOVED, ROW))
+        p = add_diagonal(load(cov, 0, square(ROW)), load(star.motion, PROCESS, ROW))
+    weight, variance = load(star.status, NEW, (0.0,))[0], load(star.motion, VARIANCE, ROW)
+    own = weight / variance[0], weight / variance[1], weight / variance[2]
+    information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
+    for k in range(1, n):
+        position, variance = pseudo_fix(star, known, k, at)
+        new = load(star.status, 5 * k + NEW, (0.0,))[0]
+        weight_k = scale(inverse(variance), new)
+        information, eta = add(information, weight_k), add(eta, apply(weight_k, subtract(position, at)))
+    p = inverse(information)
+    store(x, 0, add(at, apply(p, eta)))
+    store(cov, 0, p)
+
+
+@inside
+def pseudo_fix(star: Star, known: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
+    """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
+    theirs, relative = load(star.motion, 4 * k + POSITION, ROW), load(star.relative, k, RELATIVE)
+    seen = completed(relative, subtract(theirs, at))
+    one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
+    cov = from_upper((one, o, o, one, o, one))
+    if len(known.relative_std):
+        cov = from_upper(converted_cov(seen, (relative[5], relative[6], relative[7]), known.min_range))
+        cov = add_diagonal(cov, load(star.motion, 4 * k + VARIANCE, ROW))
+    return subtract(theirs, vector(seen)), cov
 
 
 class Fusion(NamedTuple):
@@ -88,7 +147,7 @@ class Fusion(NamedTuple):
 
 
 @as_written
-def run_filter(seen: Measurements, known: Assumptions, split: bool) -> Estimates:
+def run_intersection(seen: Measurements, known: Assumptions, split: bool) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
@@ -97,7 +156,7 @@ def run_filter(seen: Measurements, known: Assumptions, split: bool) -> Estimates
         split: keep independent errors apart.
     """
     runs, steps = seen.gnss.shape[:2]
-    out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
+    out = new_estimates(seen)
     most = largest(seen.start)
     fusion = Fusion(
         np.zeros((3, LANES)),
@@ -113,14 +172,14 @@ def run_filter(seen: Measurements, known: Assumptions, split: bool) -> Estimates
         star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
             n = gather(star, seen, known, first, last, t, old)
-            step(star, known, fusion, n, old)
+            intersect(star, known, fusion, n, old)
             write_ego(out, star, fusion.x, fusion.cov, first, last, t, seen.start[t], n)
             old = n
     return out
 
 
 @inner
-def step(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) -> None:
+def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) -> None:
     """Predict and fuse."""
     fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
     o = 0.0 * fix[0]
@@ -228,7 +287,8 @@ def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float
 @inside
 def product(a: Numbers, b: Numbers) -> Numbers:
     """A B."""
-    return negate(minus_product(a, b))
+    found: Numbers = negate(minus_product(a, b))
+    return found
 
 
 @inside
