@@ -77,12 +77,6 @@ FOUND = {
         "2, 0.81 m from the true position, 1.23 m with noise of the speed; a fitted Kalman filter differs from it by "
         "0.04 m at most (20 runs, two training seeds).",
     ),
-    "privacy": (
-        "privacy.md",
-        "**With four clients a net of 19,938 weights cannot be trained at any epsilon tried; nine parameters "
-        "can**: the federated OKF loses 9 % at epsilon 10 with four clients, 3 % at epsilon 1 with "
-        "sixty.",
-    ),
     "scaling": (
         "performance.md#as-fleets-grow",
         "**The time per vehicle and step at most doubles from 60 to 1,980 vehicles** (CPU times beside other load); "

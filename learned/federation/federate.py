@@ -1,4 +1,4 @@
-"""federate: local training on every client, aggregation at a server or among neighbours, for some rounds."""
+"""Federated training: local training on every client and aggregation at a server, for some rounds."""
 
 from __future__ import annotations
 
@@ -7,9 +7,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import get_args
-
-import torch
-from torch import Tensor
 
 from coopoc.arrays import instance, listed
 from coopoc.errors import InputError, shown
@@ -21,22 +18,13 @@ from ..nets.stack import flatten
 from ..training.clients import Client
 from ..training.machine import one_core, watched
 from ..training.schedule import STEPS, Epoch, Schedule
-from .aggregate import rule
-from .compression import Compression
+from .combine import FLOAT32, SERVER, Answer, Standing, combine
 from .history import Federation, Round
-from .local import Work, stacked
-from .participation import Participation, Turn
-from .rule import Combine, Rule
-from .server import SERVER, Exchange, Group, Protection, Server, Standing
-from .topology import Mesh, Topology, connected, disagreement
+from .local import Group, Work, stacked
+from .participation import Participation
+from .rules import Combine, Rule, rule
 
-KINDS = {
-    "aggregate": object,  # `rule` says what is none
-    "schedule": Schedule,
-    "participation": Participation,
-    "compression": Compression,
-    "topology": Topology,
-}
+KINDS = {"aggregate": object, "schedule": Schedule, "participation": Participation}
 
 
 @dataclass(frozen=True)
@@ -56,24 +44,10 @@ class Plan:
     schedule: Schedule = field(default_factory=Schedule)
     epoch: Epoch = "pass"
     participation: Participation = field(default_factory=Participation)
-    compression: Compression | None = None
-    privacy: Protection | None = None
-    topology: Topology | None = None
 
     def __post_init__(self) -> None:
         check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, KINDS)
         one_of("epoch", self.epoch, get_args(Epoch))
-        if self.topology is None:
-            return
-        if self.aggregate != "mean":
-            hint = "Neighbours mix by Metropolis weights."
-            raise InputError("aggregate", self.aggregate, 'must be "mean" with a topology', hint)
-        for name in ("compression", "privacy"):
-            if (given := getattr(self, name)) is not None:
-                allowed = (
-                    "must be None with a topology: the receiver of an update must know the weights it started from"
-                )
-                raise InputError(name, given, allowed, "Train with a server.")
 
     @property
     def rule(self) -> Rule:
@@ -83,22 +57,14 @@ class Plan:
     @property
     def local(self) -> Schedule:
         """Schedule of a client's round."""
-        return self.rule.local(replace(self.schedule, epochs=self.local_epochs, epoch=self.epoch))
+        return replace(self.schedule, epochs=self.local_epochs, epoch=self.epoch)
 
-    def step(self, team: Group) -> Server | Mesh:
-        """The server or the mesh of a team; InputError for a rule that needs more clients, or that privacy does not
-        cover."""
-        if self.topology is not None:
-            return Mesh(connected(self.topology, team.names), self.participation)
-        chosen, asked = self.rule, self.participation.count(len(team.names))
+    def check(self, clients: int) -> None:
+        """InputError for a rule that needs more clients than a round asks."""
+        chosen, asked = self.rule, self.participation.count(clients)
         if asked < chosen.least:
             given, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
             raise InputError("aggregate", given, allowed, "Ask more clients, or take the median.")
-        if self.privacy is not None:
-            if not callable(getattr(self.privacy, "check", None)):
-                raise InputError("privacy", shown(self.privacy), "must be a Privacy", "Give Privacy(...), or None.")
-            self.privacy.check(chosen)
-        return Server(chosen, self.participation, self.compression, self.privacy)
 
 
 def federate(
@@ -113,9 +79,6 @@ def federate(
     epoch: Epoch = "pass",
     *,
     participation: Participation | None = None,
-    compression: Compression | None = None,
-    privacy: Protection | None = None,
-    topology: Topology | None = None,
 ) -> Federation:
     """Train one net on many clients: each adapts the global weights on its own pieces, the server combines the results.
 
@@ -133,15 +96,10 @@ def federate(
         schedule: batch, rate, decay, clip.
         progress: name of the stage for a progress bar on stderr, None for no bar.
         epoch: "pass" over the client's pieces, or "step", one optimiser step as in KalmanNet's published loop.
-        participation: sampling, drop-outs, stragglers; default all clients in all rounds.
-        compression: of the clients' updates.
-        privacy: protection of the clients' updates.
-        topology: train without a server, each client mixing its weights with those of its neighbours; excludes rules,
-            compression and privacy.
+        participation: the clients that a round asks; default all.
 
     Raises:
-        InputError: unknown names, a rule that needs more clients, two clients of one name, a graph that is not
-            connected, or options that exclude each other.
+        InputError: unknown names, a rule that needs more clients, or two clients of one name.
 
     References:
         arXiv 2411.05847, algorithm 1; McMahan et al., AISTATS 2017.
@@ -159,8 +117,7 @@ def federate(
         raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
     optimiser = Schedule() if schedule is None else schedule
     presence = Participation() if participation is None else participation
-    protection = compression, privacy, topology
-    plan = Plan(rounds, aggregate, local_epochs, optimiser, epoch, presence, *protection)
+    plan = Plan(rounds, aggregate, local_epochs, optimiser, epoch, presence)
     return federate_many([start], [clients], [seed], plan, progress)[0]
 
 
@@ -173,29 +130,35 @@ def federate_many(
     progress: str | None = None,
 ) -> list[Federation]:
     """`federate` for many independent federations in one rollout."""
-    began, local, presence, meshed = time.perf_counter(), plan.local, plan.participation, plan.topology is not None
+    began, local, chosen, presence = time.perf_counter(), plan.local, plan.rule, plan.participation
     teams = [_group(group, seed) for group, seed in zip(groups, seeds, strict=True)]
-    steps = [plan.step(team) for team in teams]
+    for team in teams:
+        plan.check(len(team.names))
     stack = stacked(models[0], groups, teams)
-    standings = [_start(theta, team, plan.rule) for theta, team in zip(flatten(models), teams, strict=True)]
-    reports = stack.validated(standings)
+    standings = [Standing(theta, chosen.start(theta)) for theta in flatten(models)]
+    reports = stack.validated([s.theta for s in standings])
     histories = [[Round(0, s.theta, (math.nan,) * len(r), r)] for s, r in zip(standings, reports, strict=True)]
     for number in watched(range(1, plan.rounds + 1), progress, "round"):
-        turns = [presence.turns(team.seed, number, team.names) for team in teams]
-        local_work = stack.adapted(standings, turns, number, plan.rounds, local)
-        exchanges = []
-        for i, (step, team, work) in enumerate(zip(steps, teams, local_work, strict=True)):
-            standings[i], exchange = step(team, standings[i], number, turns[i], work.weights, reports[i])
-            exchanges.append(exchange)
-        reports = stack.validated(standings)
-        for history, *rest in zip(histories, teams, standings, turns, local_work, exchanges, reports, strict=True):
+        asked = [presence.asked(team.seed, number, team.names) for team in teams]
+        done = stack.adapted([s.theta for s in standings], asked, number, plan.rounds, local)
+        notes = []
+        for i, (team, work) in enumerate(zip(teams, done, strict=True)):
+            theta, sizes = standings[i].theta, dict(zip(team.names, team.sizes, strict=True))
+            answers = {
+                name: Answer(presence.answer(name, theta, weights), sizes[name])
+                for name, weights in work.weights.items()
+            }
+            standings[i], rejected, note = combine(chosen, standings[i], answers)
+            notes.append((rejected, note))
+        reports = stack.validated([s.theta for s in standings])
+        for history, *rest in zip(histories, teams, standings, asked, done, notes, reports, strict=True):
             history.append(_row(history[-1], *rest))
     seconds = (time.perf_counter() - began) / len(groups)
-    own = [s.held if meshed else None for s in standings]
-    return [
-        _selected(models[0], *rest, seconds, plan.privacy is not None)
-        for rest in zip(histories, teams, own, strict=True)
-    ]
+    found = []
+    for history, team in zip(histories, teams, strict=True):
+        federation = Federation(models[0], tuple(history), team.sizes, seconds, team.names)
+        found.append(replace(federation, model=federation.after(federation.best.number)))
+    return found
 
 
 def _group(clients: Sequence[Client], seed: int) -> Group:
@@ -208,42 +171,29 @@ def _group(clients: Sequence[Client], seed: int) -> Group:
     return Group(names, tuple(len(client.training) for client in clients), seed)
 
 
-def _start(theta: Tensor, team: Group, chosen: Rule) -> Standing:
-    held = theta.expand(len(team.names), -1)
-    return Standing(theta, held, chosen.start(theta), torch.zeros_like(held), (None,) * len(team.names))
-
-
 def _row(
     before: Round,
     team: Group,
     standing: Standing,
-    turns: Sequence[Turn],
+    asked: frozenset[str],
     work: Work,
-    exchange: Exchange,
+    outcome: tuple[dict[str, str], str],
     reports: Sequence[float],
 ) -> Round:
-    """The next row of a history."""
-    rejected = work.failed | exchange.rejected
-    named = list(zip(team.names, turns, strict=True))
-    counted = [turn.absent is None and name not in rejected for name, turn in named]
-    last = [new if good else old for new, old, good in zip(reports, before.validation_loss, counted, strict=True)]
+    """The next row of a history; a client whose answer does not count keeps its last validation loss."""
+    rejected, size = work.failed | outcome[0], FLOAT32 * len(standing.theta)
+    last = [
+        new if name in asked and name not in rejected else old
+        for name, new, old in zip(team.names, reports, before.validation_loss, strict=True)
+    ]
     return Round(
         before.number + 1,
         standing.theta,
         work.losses,
         tuple(last),
-        exchange.traffic,
+        dict.fromkeys(work.weights, size + FLOAT32),
+        {name: size for name in team.names if name in asked},
         rejected,
-        {name: turn.absent for name, turn in named if turn.absent is not None},
-        {name: f"made {turn.share:.0%} of its local steps" for name, turn in named if 0 < turn.share < 1},
-        exchange.note,
-        disagreement(standing.held),
+        {name: "not asked" for name in team.names if name not in asked},
+        outcome[1],
     )
-
-
-def _selected(
-    like: Gain, history: Sequence[Round], team: Group, own: Tensor | None, seconds: float, last: bool
-) -> Federation:
-    """The federation with its best round's weights; under privacy its last round's, as losses are sent in the clear."""
-    federation = Federation(like, tuple(history), team.sizes, seconds, team.names, own)
-    return replace(federation, model=federation.after(len(history) - 1 if last else federation.best.number))
