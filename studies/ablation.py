@@ -15,7 +15,7 @@ from coopoc.methods.moving_horizon import MovingHorizon
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.study.numbers import Number, Where, difference, mean, present, ran, sentence
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.study import Params, Row
 from coopoc.study.style import look
 

@@ -10,7 +10,7 @@ from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
 from coopoc.study.numbers import Where, interval, listed, mean, per_seed, present, seed_means
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
 from coopoc.study.tables import Table

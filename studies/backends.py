@@ -18,7 +18,7 @@ from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.solution import Status
 from coopoc.optimize.solve import solve
 from coopoc.study.numbers import Number, Where, present
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.study import Params, Row
 from coopoc.study.style import look
 from coopoc.world.recording import Recording

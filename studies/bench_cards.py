@@ -17,7 +17,7 @@ from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find, names, unknown
-from coopoc.study.environment import environment
+from coopoc.study.provenance import environment
 from coopoc.study.numbers import three
 
 from .bench_tasks import VERSION, Task, bound, recording

@@ -10,7 +10,7 @@ import numpy as np
 from coopoc.evaluate.ledger import Kind, Ledger, Way, break_even
 from coopoc.evaluate.scores import BYTES
 from coopoc.study.numbers import Number, Where, difference, interval, mean, present
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.style import look
 from coopoc.study.tables import Table
 from coopoc.world.channel_load import BIT_RATE, CARRIER_SENSE, channel_load

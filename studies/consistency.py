@@ -9,7 +9,7 @@ import numpy as np
 
 from coopoc.methods.catalogue import METHODS
 from coopoc.study.numbers import Number, Where, mean
-from coopoc.study.pivot import crossed
+from coopoc.study.tables import crossed
 from coopoc.study.style import look
 
 from . import lineup, scene

@@ -10,7 +10,7 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
 from coopoc.study.numbers import listed, present
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.study import Params, Row
 
 from . import lineup, scene, weights

@@ -14,7 +14,7 @@ from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.numbers import interval, mean, present, seed_std, verdict
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.study import Params, Row
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import Number, mean, present, ratio, rms, sentence
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.style import look
 
 from . import lineup, scene

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import Number, Where, interval, listed, mean, present, ratio, seed_std, verdict
-from coopoc.study.pivot import crossed
+from coopoc.study.tables import crossed
 from coopoc.study.study import Params, Row
 
 from . import lineup, scene, weights

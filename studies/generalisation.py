@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import Number, Where, mean, present, ran, ratio, rms, sentence
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.study import Params, Row
 from coopoc.study.style import look
 

@@ -18,7 +18,7 @@ from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.methods.track import Track
-from coopoc.study.environment import revision
+from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
 from coopoc.world.frames import in_world, turned

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import mean, present, rms, sentence
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 from coopoc.study.style import look
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from coopoc.study.numbers import Number, Where, interval, mean, present, ran, ratio, rms, seed_std
-from coopoc.study.pivot import crossed
+from coopoc.study.tables import crossed
 from coopoc.study.style import look
 
 from . import lineup, scene

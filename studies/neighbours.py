@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import present
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.study import Params
 
 from . import lineup, scene, weights

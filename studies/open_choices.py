@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import Number, interval, listed, mean, present, ran, seed_means, seed_std
-from coopoc.study.pivot import across, crossed
+from coopoc.study.tables import across, crossed
 
 from . import lineup, scene
 from .error_cdf import CASES, LINEUP, case, meaningful, worse_than_gnss

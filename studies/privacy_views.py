@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.numbers import mean, present
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.style import look
 from coopoc.study.tables import Table
 

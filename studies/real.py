@@ -20,7 +20,7 @@ from coopoc.evaluate.pose_metrics import heading_error, pose_nees
 from coopoc.learned.pose_noise import PoseTask, fit_pose_noise
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.track import Track
-from coopoc.study.environment import revision
+from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X

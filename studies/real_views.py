@@ -13,7 +13,7 @@ from coopoc.data.source import split
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.marks import series
 from coopoc.study.numbers import Number, difference, interval, mean, present, ran, sentence
-from coopoc.study.pivot import crossed, pivot
+from coopoc.study.tables import crossed, pivot
 from coopoc.study.style import look, words
 
 from . import pose_drives

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coopoc.plugins import find
-from coopoc.study.environment import revision
+from coopoc.study.provenance import revision
 from coopoc.study.numbers import mean, ran
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look

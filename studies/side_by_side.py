@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from coopoc.evaluate.innovations import dimensions
 from coopoc.study.numbers import present, ran, rms
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.style import look
 
 from . import lineup, scene

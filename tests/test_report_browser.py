@@ -14,7 +14,7 @@ import pytest
 
 from coopoc.errors import MissingLibraryError
 from coopoc.study import pdf
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.report import report
 from coopoc.study.results import Results
 from coopoc.study.run import run_study

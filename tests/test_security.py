@@ -23,7 +23,7 @@ from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.compare import compare
 from coopoc.study.merge import merge
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.publish import tables, views
 from coopoc.study.report import report
 from coopoc.study.results import Results

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from coopoc.errors import InputError
-from coopoc.study.pivot import pivot
-from coopoc.study.reached import code_of
+from coopoc.study.tables import pivot
+from coopoc.study.provenance import code_of
 from coopoc.study.results import Results
 from coopoc.study.run import find_study, plan, run_study
 from coopoc.study.study import Study

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from coopoc.errors import InputError
-from coopoc.study.pivot import pivot
+from coopoc.study.tables import pivot
 from coopoc.study.results import Results
 
 

@@ -15,7 +15,7 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.cell import Params, Row
+from coopoc.study.study import Params, Row
 from coopoc.study.manifest import read
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Study
