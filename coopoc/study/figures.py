@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,14 +13,14 @@ from ..escapes import picture
 from ..evaluate.statistics import Interval
 from .numbers import Number, Where, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
-from .style import NEUTRAL, SYMBOLS, label, look, title, words
+from .style import NEUTRAL, SYMBOLS, Panel, label, look, title, words
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from .results import Results
 
-__all__ = ["Panel", "Plot", "cdf", "convergence", "curves", "multiples", "pareto", "sweep"]
+__all__ = ["Plot", "cdf", "convergence", "curves", "multiples", "pareto", "sweep"]
 
 
 def sweep(
@@ -184,25 +183,6 @@ def pareto(
         panel.set(xlabel=words(x), ylabel=words(y))
         legend(panel, drawn)
     return Plot(figure, caption or f"{words(y)} against {words(x)}.")
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A panel of `curves`.
-
-    Args:
-        x: place on the horizontal axis -> what it adds to the selection of a line.
-        where: what the panel adds.
-        title: over it.
-        xlabel: under it.
-        ticks: place -> text; default matplotlib's ticks, or the places if there are at most eight.
-    """
-
-    x: Mapping[float, Where]
-    where: Where = field(default_factory=dict)
-    title: str = ""
-    xlabel: str = ""
-    ticks: Mapping[float, str] = field(default_factory=dict)
 
 
 STYLE = ("label", "color", "marker", "linestyle", "linewidth")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = (
@@ -25,6 +26,25 @@ class Look:
     label: str
     color: str
     marker: str
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A panel of `curves`.
+
+    Args:
+        x: place on the horizontal axis -> what it adds to the selection of a line.
+        where: what the panel adds.
+        title: over it.
+        xlabel: under it.
+        ticks: place -> text; default matplotlib's ticks, or the places if there are at most eight.
+    """
+
+    x: Mapping[float, Mapping[str, Any]]
+    where: Mapping[str, Any] = field(default_factory=dict)
+    title: str = ""
+    xlabel: str = ""
+    ticks: Mapping[float, str] = field(default_factory=dict)
 
 
 NEUTRAL = "#9DB0C3"
