@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from backends_casadi import PLAIN, casadi_exact
-from backends_convex import cvxpy_linear, osqp_linear
+from backends_convex import osqp_linear
 from backends_gtsam import fixed_lag, gtsam_exact, gtsam_linear
 from backends_poses import pose_lag
 from backends_single import one_by_one
@@ -24,7 +24,7 @@ from backends_star import Job, star
 from tabulate import tabulate
 from timing import timed
 
-from coopoc.optimize.initialisation.initial import converted
+from coopoc.optimize.starts.initial import converted
 
 ROUNDS, RUNS, STEPS = 7, 200, 60
 
@@ -40,7 +40,6 @@ def jobs(runs: int = RUNS, steps: int = STEPS) -> list[Job]:
         pose_lag(),
         *(casadi_exact(exact, method) for method in PLAIN),
         osqp_linear(linear),
-        cvxpy_linear(linear),
         one_by_one(linear, "converted"),
         one_by_one(exact, "exact"),
     ]

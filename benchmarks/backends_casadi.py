@@ -10,7 +10,7 @@ from backends_star import Job, Row, as_good, ours
 from classical import KNOWN, NEIGHBOURS, SENSORS
 
 from coopoc.optimize import Problem
-from coopoc.optimize.initialisation.initial import initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 
 PLAIN: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
     "fatrop": ("fatrop", {"print_time": False}, {"print_level": 0}),

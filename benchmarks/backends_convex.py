@@ -1,14 +1,13 @@
-"""OSQP's and CVXPY's rows of backends.py."""
+"""OSQP's rows of backends.py."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cvxpy
 import numpy as np
 import osqp
 from backends_star import Job, Row, as_good, ours, single
-from classical import KNOWN, NEIGHBOURS
+from classical import NEIGHBOURS
 from scipy.sparse import csc_matrix, triu
 
 from coopoc.optimize import Problem
@@ -70,57 +69,6 @@ def osqp_linear(problem: Problem) -> Job:
             Row(job, "hand-written, without osqp's Python class", runs, bare),
             Row(job, "setup at each solve", 10, setups),
             Row(job, "ours, solve() one by one", 4, single(problem, "osqp", 4)),
-        ],
-        as_good(problem),
-    )
-
-
-def cvxpy_linear(problem: Problem) -> Job:
-    """Weights and measurements as parameters, so that CVXPY canonicalises once."""
-    fixes, edges = problem.factors
-    weight, root = 1.0 / np.array(KNOWN.gnss_std), edges.root
-    whitened = np.einsum("bkij,bkj->bki", root, edges.z)
-    options = {"solver": "CLARABEL", "max_threads": 1}
-
-    def programme(weights: Any, fix: Any, gradient: Any) -> tuple[Any, Any]:
-        """x (n, 3) and the programme; the weights (9, K), row by row, with the whitened vectors (K, 3)."""
-        x = cvxpy.Variable((NEIGHBOURS + 1, 3))
-        gap = (x[1:] - np.ones((NEIGHBOURS, 1)) @ x[:1]).T
-        parts = [cvxpy.sum(cvxpy.multiply(weights[3 * i : 3 * i + 3], gap), axis=0) - gradient[:, i] for i in range(3)]
-        terms = [
-            cvxpy.sum_squares(part) for part in (cvxpy.multiply(x - fix, np.tile(weight, (NEIGHBOURS + 1, 1))), *parts)
-        ]
-        return x, cvxpy.Problem(cvxpy.Minimize(sum(terms)))
-
-    given = [cvxpy.Parameter(shape) for shape in ((9, NEIGHBOURS), (NEIGHBOURS + 1, 3), (NEIGHBOURS, 3))]
-    held = programme(*given)
-
-    def numbers(b: int) -> tuple[Any, Any, Any]:
-        return root[b].reshape(NEIGHBOURS, 9).T, fixes.z[b], whitened[b]
-
-    def batch() -> Any:
-        found = []
-        for b in range(10):
-            for parameter, value in zip(given, numbers(b), strict=True):
-                parameter.value = value
-            held[1].solve(**options)
-            found.append(held[0].value)
-        return np.stack(found)
-
-    def rebuilt() -> Any:
-        found = []
-        for b in range(4):
-            x, model = programme(*numbers(b))
-            model.solve(**options)
-            found.append(x.value)
-        return np.stack(found)
-
-    job = "cvxpy, snapshot, converted"
-    return Job(
-        [
-            Row(job, "ours", 10, ours(problem, "cvxpy", 10)),
-            Row(job, "hand-written", 10, batch),
-            Row(job, "rebuilt", 4, rebuilt),
         ],
         as_good(problem),
     )

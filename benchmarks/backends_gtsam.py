@@ -12,7 +12,7 @@ from classical import KNOWN, NEIGHBOURS, SENSORS
 
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.incremental import FixedLag
-from coopoc.optimize.initialisation.initial import initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.spherical import spherical, wrap
 
 

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from coopoc.optimize import Problem
 from coopoc.optimize.model.factor import Factor
+from coopoc.world.spherical import wrap
 
 COUNT = 20
 """Stars per call."""
@@ -27,7 +28,7 @@ def rows_of(problem: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.nda
             predicted, slope = (spherical if kind == "spherical" else straight)(vector)
             gap = predicted - z
             if kind == "spherical":
-                gap[:, 1] = (gap[:, 1] + np.pi) % (2 * np.pi) - np.pi
+                gap[:, 1] = wrap(gap[:, 1])
             residuals.append((root @ gap[..., None]).ravel())
             wide, slope = np.zeros((len(nodes), 3, *x.shape)), root @ slope
             wide[np.arange(len(nodes)), :, nodes[:, -1]] = slope

@@ -28,8 +28,8 @@ from coopoc.methods.cooperative_map import Windows
 from coopoc.methods.star import POSITION, assumptions, measurements
 from coopoc.methods.window import dead_reckoned
 from coopoc.optimize.batch import solve_batch
-from coopoc.optimize.initialisation.initial import converted
 from coopoc.optimize.model.problem import Problem
+from coopoc.optimize.starts.initial import converted
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, to_vector
 from coopoc.world.v2x import FIX_AND_VELOCITY

@@ -33,7 +33,7 @@ from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
-from coopoc.optimize.backends.gtsam_forms import pose_of
+from coopoc.optimize.backends.gtsam_factors import pose_of
 from coopoc.optimize.graphs import from_graph
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
@@ -46,15 +46,15 @@ def plain_gtsam(problem: Problem) -> tuple[np.ndarray, int]:
     d, space, noise = problem.dimension, problem.space, gtsam.noiseModel
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, row in enumerate(problem.x0):
-        values.insert(k, pose_of(gtsam, d, row))
+        values.insert(k, pose_of(d, row))
     prior = getattr(gtsam, f"PriorFactorPose{d}")
     for k in problem.fixed:
-        graph.add(prior(k, pose_of(gtsam, d, problem.x0[k]), noise.Constrained.All(space.dof)))
+        graph.add(prior(k, pose_of(d, problem.x0[k]), noise.Constrained.All(space.dof)))
     free = np.full(space.dof, UNMEASURED)
     free[: d * (d - 1) // 2] = 1.0
     free = free if d == 3 else free[::-1]
     for k in set(range(len(problem.names))) - set(problem.poses):
-        graph.add(prior(k, pose_of(gtsam, d, problem.x0[k]), noise.Diagonal.Sigmas(free)))
+        graph.add(prior(k, pose_of(d, problem.x0[k]), noise.Diagonal.Sigmas(free)))
     chord, ranged = getattr(gtsam, f"FrobeniusBetweenFactorPose{d}"), getattr(gtsam, f"RangeFactorPose{d}")
     fix, place = getattr(gtsam, f"FrobeniusPriorPose{d}"), getattr(gtsam, f"PoseTranslationPrior{d}D")
     for factor in problem.factors:
@@ -68,10 +68,10 @@ def plain_gtsam(problem: Problem) -> tuple[np.ndarray, int]:
             elif factor.kind == "position":
                 graph.add(place(nodes[0], z, noise.Diagonal.Sigmas(s)))
             elif factor.kind == "pose_chordal":
-                graph.add(fix(nodes[0], pose_of(gtsam, d, z).matrix(), model))
+                graph.add(fix(nodes[0], pose_of(d, z).matrix(), model))
             else:
                 full = z if len(z) > d else space.join(z)
-                graph.add(chord(*nodes, pose_of(gtsam, d, full), model))
+                graph.add(chord(*nodes, pose_of(d, full), model))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams())
     found = optimizer.optimize()
     poses = [getattr(found, f"atPose{d}")(k) for k in range(len(problem.names))]
@@ -106,7 +106,7 @@ def row(name: str, graph: Graph) -> list[object]:
     if problem.poses:
         x, iterations = plain_gtsam(problem)
     else:
-        own = solve(problem, "gtsam", throw=False, optimizer="lm")
+        own = solve(problem, "gtsam", throw=False)
         x, iterations = own.x, own.iterations
     return [*cells, problem.cost(x), iterations, time.process_time() - began, error(graph, x[:, : graph.dimension])]
 

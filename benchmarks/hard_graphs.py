@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopoc.formats.graph import Graph
-from coopoc.formats.rotations import to_orientation
+from coopoc.formats.values import to_orientation
 from coopoc.optimize.model.space import exp
 
 FIELDS = ("relative_pose", "relative_point", "ranges", "pose_prior", "point_prior")

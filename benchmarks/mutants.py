@@ -12,6 +12,8 @@ mutant that survives is equivalent or shows a missing test.
 from __future__ import annotations
 
 import argparse
+import ast
+import copy
 import csv
 import os
 import random
@@ -22,13 +24,177 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import cast
 
-from mutant_tests import affected, tests_of
-from mutations import ROOT, Mutant, mutants
 from tqdm import tqdm
+
+ROOT = Path(__file__).resolve().parents[1]
+COMPARISONS = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+}
+OPERATORS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult}
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """A changed file.
+
+    Args:
+        file: relative to the project.
+        line: of the change.
+        change: in words.
+        text: of the whole file.
+    """
+
+    file: str
+    line: int
+    change: str
+    text: str
+
+
+def changes(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
+    """Every change of one node, with what it does."""
+    match node:
+        case ast.Compare(ops=[op]) if type(op) in COMPARISONS:
+            other = COMPARISONS[type(op)]
+            changed = copy.deepcopy(node)
+            changed.ops = [other()]
+            yield f"{type(op).__name__} -> {other.__name__}", changed
+        case ast.BoolOp(op=op):
+            changed = copy.deepcopy(node)
+            changed.op = COMPARISONS[type(op)]()
+            yield f"{type(op).__name__} -> {type(changed.op).__name__}", changed
+        case ast.BinOp(op=op) if type(op) in OPERATORS and not isinstance(node.right, ast.Constant | ast.JoinedStr):
+            changed = copy.deepcopy(node)
+            changed.op = OPERATORS[type(op)]()
+            yield f"{type(op).__name__} -> {type(changed.op).__name__}", changed
+            if isinstance(op, ast.Add | ast.Sub):
+                yield "second term left out", copy.deepcopy(node.left)
+        case ast.UnaryOp(op=ast.USub(), operand=operand):
+            yield "sign left out", copy.deepcopy(operand)
+        case ast.Constant(value=value) if isinstance(value, int | float) and not isinstance(value, bool):
+            other = value + 1 if isinstance(value, int) else value * 10 if value else 1.0
+            yield f"{value} -> {other}", ast.Constant(other)
+        case ast.If(body=[ast.Raise()], orelse=[]):
+            yield "check left out", ast.Pass()
+
+
+def mutants(file: Path) -> Iterator[Mutant]:
+    """All mutants of a file, whose annotations and docstrings stay."""
+    text = file.read_bytes()
+    starts = [0, *(found.end() for found in re.finditer(rb"\n", text))]
+    for node in _inside_functions(ast.parse(text)):
+        first = starts[node.lineno - 1] + node.col_offset
+        last = starts[cast(int, node.end_lineno) - 1] + cast(int, node.end_col_offset)
+        for change, other in changes(node):
+            words = ast.unparse(ast.fix_missing_locations(other))
+            within = f"({words})" if isinstance(other, ast.expr) else words
+            whole = text[:first] + within.encode() + text[last:]
+            yield Mutant(str(file.relative_to(ROOT)), node.lineno, change, whole.decode())
+
+
+def _inside_functions(tree: ast.Module) -> Iterator[ast.expr | ast.stmt]:
+    """Nodes of the statements of all functions, but for what words an error."""
+    waiting: list[ast.AST] = [node for outer in tree.body for node in _bodies(outer)]
+    while waiting:
+        node = waiting.pop(0)
+        if isinstance(node, ast.Raise | ast.Import | ast.ImportFrom | ast.arguments | ast.JoinedStr):
+            continue
+        if isinstance(node, ast.expr | ast.stmt):
+            yield node
+        waiting += [node.value] if isinstance(node, ast.AnnAssign) and node.value else ast.iter_child_nodes(node)
+
+
+def _bodies(outer: ast.AST) -> list[ast.stmt]:
+    if isinstance(outer, ast.FunctionDef):
+        return outer.body
+    return [part for inner in outer.body for part in _bodies(inner)] if isinstance(outer, ast.ClassDef) else []
+
+
+MOST_TESTS = 3
+"""Files of tests, those that mention the file's names most."""
+LONG = re.compile("test_(study|studies|cli|install|extend|site|examples|reliability|layering)")
+"""Files of tests that run whole studies or look at conventions: they take minutes and see little of a formula."""
+ORACLE = re.compile(r"^from (oracles|coopoc\.kernels)|callable_part", re.MULTILINE)
+"""In tests that compare kernels with an oracle."""
+
+
+def tests_of(file: str) -> list[str]:
+    """Files of tests that mention most what a file defines, what files define that import it, and those that import
+    these, each less than the one before; a shared word in the names of the files counts as ten mentions. For a kernel
+    two, first those that compare with an oracle and mention at least a quarter as much as the best."""
+    weights, level, scores = {ROOT / file: 9}, {ROOT / file}, Counter[str]()
+    for weight in (3, 1):
+        level = {user for used in level for user in _importers(used)} - weights.keys()
+        weights |= dict.fromkeys(level, weight)
+    for used, weight in weights.items():
+        for test, words in _words().items():
+            shared = set(used.stem.split("_")) & set(Path(test).stem.split("_")[1:])
+            scores[test] += weight * (sum(words[name] for name in _defined(used)) + 10 * len(shared))
+    tests = [test for test, score in scores.most_common() if score]
+    if file.startswith("coopoc/kernels/"):
+        much = scores.most_common(1)[0][1] / 4
+        near = [test for test in tests if scores[test] >= much]
+        oracles = [test for test in near if "test_kernels" in test or ORACLE.search((ROOT / test).read_text())]
+        return [*dict.fromkeys([*oracles, *tests])][:2]
+    return [*tests[:MOST_TESTS], file]
+
+
+@cache
+def _words() -> dict[str, Counter[str]]:
+    """How often each word stands in each file of tests that is not LONG."""
+    texts = {str(test.relative_to(ROOT)): test.read_text() for test in (ROOT / "tests").glob("test_*.py")}
+    return {test: Counter(re.findall(r"\w+", text)) for test, text in texts.items() if not LONG.search(test)}
+
+
+@cache
+def _defined(file: Path) -> tuple[str, ...]:
+    """Public names of a file that are more than a common word, and its own."""
+    kinds = ast.FunctionDef | ast.ClassDef
+    names = [node.name for node in ast.parse(file.read_text()).body if isinstance(node, kinds)]
+    return (file.stem, *(name for name in names if name[0] != "_" and (name != name.lower() or "_" in name)))
+
+
+@cache
+def _importers(file: Path) -> tuple[Path, ...]:
+    """Files that import from a file."""
+    folders = (ROOT / "coopoc", ROOT / "learned")
+    every = [other for folder in folders for other in folder.rglob("*.py") if other.name != "__init__.py"]
+    return tuple(other for other in every if file in _imported(other))
+
+
+@cache
+def _imported(file: Path) -> frozenset[Path]:
+    """Files that a file imports from, among others that there are not."""
+    found = set[Path]()
+    for node in ast.walk(ast.parse(file.read_bytes())):
+        if isinstance(node, ast.ImportFrom):
+            above = file.parents[node.level - 1] if node.level else ROOT
+            module = above.joinpath(*(node.module or "").split("."))
+            found |= {module.with_suffix(".py"), *(module / f"{name.name}.py" for name in node.names)}
+    return frozenset(found)
+
+
+def affected(file: Path) -> set[Path]:
+    """A file and all that import it, directly or through others."""
+    found, level = {file}, {file}
+    while level := {user for used in level for user in _importers(used)} - found:
+        found |= level
+    return found
+
 
 LIBRARIES = ("numba", "pandas", "pytest", "scipy.optimize", "scipy.sparse.linalg", "torch")
 """What every run of tests has loaded when it begins."""

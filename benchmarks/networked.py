@@ -30,7 +30,6 @@ JOBS = {
     "ci": "nominal",
     "gbp": "nominal",
     "admm": "nominal",
-    "diffusion-anchored": "nominal",
     "central-filter": "nominal",
     "central-filter, identity": "identity",
 }

@@ -37,7 +37,6 @@ ORDER = (
     "mhe",
     "gbp",
     "admm",
-    "diffusion-anchored",
     "central-filter",
     "batch-smoother",
 )

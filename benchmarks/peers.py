@@ -24,7 +24,7 @@ from classical import KNOWN, NEIGHBOURS, SENSORS
 from tabulate import tabulate
 
 from coopoc.optimize import Problem
-from coopoc.optimize.initialisation.initial import initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 
 RUNS, FEW = 200, 40
 

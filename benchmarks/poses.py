@@ -21,6 +21,7 @@ import coopoc as co
 from coopoc.methods import pose_unit
 from coopoc.methods.pose_begin import body_of, first_poses
 from coopoc.world.inbox import inbox
+from coopoc.world.spherical import wrap
 
 ROUNDS, STEPS, RUNS = 5, 101, 10
 NEIGHBOURS = {0: 3, 10: 1}
@@ -79,7 +80,7 @@ def filterpys(recording: co.Recording, run: int) -> Any:
             ekf.x = (x + np.column_stack([moved, dt * w])).ravel()
             ekf.P = F @ ekf.P @ F.T + whole
         z = fixes[t, order].ravel()
-        z[3::4] = ekf.x[3::4] + wrapped(z[3::4] - ekf.x[3::4])
+        z[3::4] = ekf.x[3::4] + wrap(z[3::4] - ekf.x[3::4])
         ekf.update(z, lambda x: same, lambda x: x, own)
         at = links.step == t
         if n > 1:
@@ -87,15 +88,10 @@ def filterpys(recording: co.Recording, run: int) -> Any:
             where = np.argsort(order)[place]
             h, H = rows(ekf.x, where, n)
             z = recording.relative[run, at]
-            z = (h + np.column_stack([z[:, 0] - h[:, 0], wrapped(z[:, 1:] - h[:, 1:])])).ravel()
+            z = (h + np.column_stack([z[:, 0] - h[:, 0], wrap(z[:, 1:] - h[:, 1:])])).ravel()
             ekf.update(z, lambda x, H=H: H, lambda x, h=h: h.ravel(), noise)
         found[t] = ekf.x[:4]
     return found
-
-
-def wrapped(angle: Any) -> Any:
-    """The same angles in [-pi, pi)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def rows(state: Any, others: Any, n: int) -> Any:
@@ -124,7 +120,7 @@ def measured() -> list[dict[str, Any]]:
         call = ours(seen)
         wanted = np.stack([filterpys(seen, run) for run in range(few)])
         gap = call()[:few] - wanted
-        right = bool(max(np.abs(gap[..., :3]).max(), np.abs(wrapped(gap[..., 3])).max()) < 1e-6)
+        right = bool(max(np.abs(gap[..., :3]).max(), np.abs(wrap(gap[..., 3])).max()) < 1e-6)
         job = f"poses, K = {neighbours}"
         spend = {
             "filterpy": lambda seen=seen, few=few: timed(lambda: [filterpys(seen, r) for r in range(few)]) / few,

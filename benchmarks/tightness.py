@@ -15,9 +15,8 @@ from tqdm import tqdm
 
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Status, pose, solve
-from coopoc.optimize.convex.quadratic import quadratic
-from coopoc.optimize.convex.relaxation import Relaxation, shor
-from coopoc.optimize.convex.staircase import staircase
+from coopoc.optimize.convex.qcqp import quadratic
+from coopoc.optimize.convex.relaxation import Relaxation, shor, staircase
 
 Case = Callable[[int], Problem]
 

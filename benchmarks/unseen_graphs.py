@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from hard_graphs import worse_odometry
 
-from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
-from coopoc.formats.rotations import to_orientation
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
+from coopoc.formats.values import to_orientation
 from coopoc.optimize.model.space import exp
 
 

@@ -137,6 +137,15 @@ def number(
     return found
 
 
+def robust_std(values: Floats) -> float:
+    """1.4826 median(|v - median(v)|), the standard deviation of a Gaussian without its outliers (MAD).
+
+    >>> round(robust_std(np.array([-1.0, 0, 1, 100])), 4)
+    1.4826
+    """
+    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+
+
 Kind = TypeVar("Kind")
 
 

@@ -16,8 +16,8 @@ def short_repr(self: Any) -> str:
 
     Fields that are None or empty are left out. Use it as `__repr__ = short_repr` in the body of the class.
 
-    >>> from coopoc.evaluate.ledger import Ledger
-    >>> Ledger.empty(["red", "blue"], [10.0, 12.0])
+    >>> from coopoc.evaluate.ledger import of_training
+    >>> of_training(["red", "blue"], [10.0, 12.0], [8.0, 8.0])
     Ledger(names=('red', 'blue'), seconds (2,), sent (2, 2, 1, 2), received (2, 2, 1, 2))
     """
     parts = (_part(each.name, getattr(self, each.name)) for each in fields(self) if each.repr)

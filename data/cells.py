@@ -12,7 +12,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, MissingLibraryError
-from coopoc.formats.lines import LARGEST
+from coopoc.formats.values import LARGEST
 
 if TYPE_CHECKING:
     import pandas as pd

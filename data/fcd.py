@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.formats.lines import LARGEST
+from coopoc.formats.values import LARGEST
 from coopoc.world.fleet import Fleet
 
 from .rows import assemble

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, robust_std
 from coopoc.evaluate.innovations import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
 from coopoc.world.recording import Recording
+from coopoc.world.spherical import wrap
 
 from .log import Log
 from .log_clocks import apart_warnings, clock_warnings, truth_warning
 from .log_truth import frame_warning
-from .mrclam import robust_std
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE, NARROW = 2.0, 0.4
@@ -165,7 +165,7 @@ def relative_residuals(rec: Recording, x: Floats, variance: Floats) -> tuple[Flo
     flat, d = np.hypot(gap[:, 0], gap[:, 1]), np.linalg.norm(gap, axis=1)
     computed = np.column_stack([d, np.arctan2(gap[:, 1], gap[:, 0]), np.arctan2(flat, gap[:, 2])])
     residual = rec.relative[0] - computed
-    residual[:, 1:] = (residual[:, 1:] + np.pi) % (2 * np.pi) - np.pi
+    residual[:, 1:] = wrap(residual[:, 1:])
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
     noise = rec.sensors
     spread = np.column_stack([both, both / np.maximum(flat, 1.0) ** 2, both / np.maximum(d, 1.0) ** 2])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from coopoc.escapes import picture
-from coopoc.evaluate.pose_metrics import heading_error
+from coopoc.evaluate.metrics import heading_error
 from coopoc.methods.track import Track
 from coopoc.pictures import COLORS, INK
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, robust_std
 from coopoc.errors import InputError
-from coopoc.evaluate.metrics import errors
-from coopoc.evaluate.pose_metrics import heading_error, pose_nees
+from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.methods.track import Track
@@ -87,7 +86,7 @@ def check_poses(log: Log) -> PoseCheck:
             warnings.append(f"{rec.ids[column]}: errors are {larger:.0f} times as large as the filter states.")
     measurements = []
     for name, unit, residual, std in _residuals(rec, track):
-        spread = float(1.4826 * np.median(np.abs(residual - np.median(residual))))
+        spread = robust_std(residual)
         row = {"measurement": name, "unit": unit, "number": len(residual), "median": float(np.median(residual))}
         measurements.append(row | {"robust_std": spread, "stated_std": std})
         if max(spread, abs(row["median"])) > WRONG * std:

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
+from coopoc.world.spherical import wrap
 
 from . import mrclam_files as files
 from .nearest import steps_of
@@ -103,19 +104,10 @@ class Innovations:
         ]
 
 
-def robust_std(residual: Floats) -> float:
-    """1.4826 median(|r - median(r)|), the standard deviation of a Gaussian without its outliers.
-
-    >>> round(robust_std(np.array([-1.0, 0, 1, 100])), 4)
-    1.4826
-    """
-    return float(1.4826 * np.median(np.abs(residual - np.median(residual))))
-
-
 def innovations(log: MrclamLog) -> Innovations:
     """Measured minus true range and bearing, where Vicon saw both robots."""
     seen = np.isfinite(log.true_range)
-    return Innovations((log.range - log.true_range)[seen], _wrap(log.bearing - log.true_bearing)[seen])
+    return Innovations((log.range - log.true_range)[seen], wrap(log.bearing - log.true_bearing)[seen])
 
 
 def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP) -> MrclamLog:
@@ -207,9 +199,4 @@ def _true(seen: Floats, truths: list[Floats], start: float, max_gap: float) -> t
     rows = np.arange(len(seen))
     here, there = poses[seen[:, 1].astype(int), rows], poses[seen[:, 2].astype(int), rows]
     dx, dy = (there - here)[:, :2].T
-    return np.hypot(dx, dy), _wrap(np.arctan2(dy, dx) - here[:, 2]), here[:, 2]
-
-
-def _wrap(angle: Floats) -> Floats:
-    wrapped: Floats = (angle + np.pi) % (2 * np.pi) - np.pi
-    return wrapped
+    return np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2]), here[:, 2]

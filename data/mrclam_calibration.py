@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.world.frames import midway, turned
 from coopoc.world.sensors import Sensors
@@ -137,7 +137,7 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
 def _grouped(error: Floats, observer: Ints, t: Floats) -> float:
     """Standard deviation of white noise whose sums over what a robot measures in a window are as large as those of the
     errors (M,), outliers aside."""
-    spread = 1.4826 * np.median(np.abs(error - np.median(error)))
+    spread = robust_std(error)
     inlier = np.abs(error - np.median(error)) <= ROBUST * spread
     group = np.unique(observer[inlier] * 10**6 + np.floor(t[inlier] / WINDOW), return_inverse=True)[1]
     sums = np.bincount(group, error[inlier])

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
-from coopoc.formats.lines import LARGEST
+from coopoc.formats.values import LARGEST
 
 from .scale import check_time
 

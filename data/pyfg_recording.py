@@ -6,8 +6,7 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
-from coopoc.formats.edges import PointEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PointEdges
 from coopoc.world.fleet import Fleet
 from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording

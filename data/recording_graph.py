@@ -9,8 +9,7 @@ import numpy as np
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats import write_graph
-from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.world.frames import turned
 from coopoc.world.recording import Recording, check_recording
 

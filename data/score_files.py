@@ -13,16 +13,14 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from coopoc.errors import InputError
-from coopoc.formats.kitti import read_kitti
-from coopoc.formats.lines import read_words
-from coopoc.formats.rotations import to_rotation
-from coopoc.formats.tum import read_tum
+from coopoc.formats.trajectories import read_kitti, read_tum
+from coopoc.formats.values import read_words, to_rotation
 
 from .cells import numeric, read_frame, seconds, words
 from .source import split
 
 if TYPE_CHECKING:
-    from coopoc.evaluate.score import Path, Score
+    from coopoc.evaluate.trajectory_scores import Path, Score
 
 Aligned = Literal["none", "each", "team"]
 Unit = Literal["steps", "m"]
@@ -40,7 +38,7 @@ def read_paths(name: str) -> dict[str, Path]:
     Raises:
         InputError: a file with a fault, named with its line or row.
     """
-    from coopoc.evaluate.score import Path
+    from coopoc.evaluate.trajectory_scores import Path
 
     word, options = split(name)
     file = File(word)
@@ -58,7 +56,7 @@ def read_paths(name: str) -> dict[str, Path]:
 
 
 def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
-    from coopoc.evaluate.score import Path
+    from coopoc.evaluate.trajectory_scores import Path
 
     frame = read_frame(file, columns.get("id", "id")).rename(columns={header: key for key, header in columns.items()})
     for column in ("t", "x", "y"):
@@ -116,7 +114,7 @@ def score(
         unit: unit of delta, steps or metres.
         output: file for the scores as JSON.
     """
-    from coopoc.evaluate.score import scores
+    from coopoc.evaluate.trajectory_scores import scores
 
     if not truth:
         raise InputError("truth", "()", "must name a file", "Add --truth FILE.")

@@ -9,8 +9,8 @@ import numpy as np
 
 from coopoc.errors import InputError
 from coopoc.file_names import file_name, inside
-from coopoc.formats import tum
-from coopoc.formats.trajectory import Trajectory
+from coopoc.formats import trajectories
+from coopoc.formats.trajectories import Trajectory
 from coopoc.world.fleet import Fleet
 
 from .rows import assemble
@@ -46,12 +46,12 @@ def read_tum(
         repeats: "drop" leaves out a pose whose stamp is that of the pose before, "refuse" raises.
 
     Raises:
-        InputError: no file, or what `coopoc.formats.tum.read_tum` raises.
+        InputError: no file, or what `coopoc.formats.trajectories.read_tum` raises.
     """
     files = tum_files(path)
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
-    poses = [tum.read_tum(file, repeats=repeats) for file in files]
+    poses = [trajectories.read_tum(file, repeats=repeats) for file in files]
     return assemble(
         [file.stem for file, one in zip(files, poses, strict=True) for _ in range(len(one))],
         np.concatenate([one.stamps for one in poses]),
@@ -84,4 +84,4 @@ def write_tum(fleet: Fleet, folder: Path) -> None:
         present = fleet.present[:, column]
         position = fleet.position[present, column]
         poses = Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
-        tum.write_tum(poses, path)
+        trajectories.write_tum(poses, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import re
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from latex2mathml.converter import convert
 from matplotlib.ticker import LogLocator, NullFormatter
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
@@ -102,6 +104,14 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     }
     _place(config.nav, places)
     return config
+
+
+FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Render the formulas of a page and of its docstrings as MathML, which browsers draw without any script."""
+    return FORMULA.sub(lambda m: convert(html.unescape(m[2]), display="inline" if m[1] == "span" else "block"), content)
 
 
 def _place(entries: Any, places: dict[str, list[Any]]) -> None:

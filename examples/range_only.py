@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from coopoc.optimize import Problem, solve
-from coopoc.optimize.convex.certificate import certify
-from coopoc.optimize.convex.relaxation import shor
+from coopoc.optimize.convex import certify, shor
 
 ANCHOR_STD, RANGE_STD = 0.3, 0.1
 

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 import coopoc as co
 from coopoc.arrays import Floats
-from coopoc.formats.kitti import read_kitti
+from coopoc.formats.trajectories import read_kitti
 from coopoc.learned import load_method
 from coopoc.methods.adaptive import ASSUMED
 from coopoc.world.noise import stream

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 from coopoc.arrays import Floats, number
 from coopoc.errors import InputError
-from coopoc.evaluate.pose_metrics import pose_covariance, pose_nees
+from coopoc.evaluate.metrics import pose_covariance, pose_nees
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.track import Track
 from coopoc.world.fleet import Fleet

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 
 REACH = 12.0
 """m within which robots see one another and landmarks."""

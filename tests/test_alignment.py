@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from coopoc.errors import InputError
 from coopoc.evaluate.alignment import absolute_error, align
-from coopoc.formats.kitti import read_kitti
-from coopoc.formats.rotations import to_rotation
+from coopoc.formats.trajectories import read_kitti
+from coopoc.formats.values import to_rotation
 
 
 def test_aligned_error_is_evos(shared: Path) -> None:

@@ -91,8 +91,6 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours: in
 
 
 def test_exact_fixes_have_no_bound(crossing: Fleet) -> None:
-    with pytest.raises(InputError, match=r"information = 'fleets': must be one of star, fleet. Did you mean fleet\?"):
-        posterior_bound(crossing, Sensors(), 0, V2X(), information="fleets")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="relative_std"):
         posterior_bound(crossing, Sensors(range_std=0), 0, V2X(max_neighbours=2))
     with pytest.raises(InputError, match="vehicle"):

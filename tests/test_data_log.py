@@ -220,7 +220,7 @@ def test_methods_run_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
     assert error < 2.2, "a fix is 2.2 m off"
 
 
-WHOLE = ("gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother", "mds", "qcqp-relaxation")
+WHOLE = ("gbp", "admm", "central-filter", "batch-smoother", "mds", "qcqp-relaxation")
 
 
 @pytest.mark.parametrize("name", WHOLE)

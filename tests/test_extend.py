@@ -15,7 +15,7 @@ import pytest
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.errors import InputError
-from coopoc.evaluate.catalogue import measure
+from coopoc.evaluate.metrics import measure
 from coopoc.fleets import load_fleet
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file

@@ -11,11 +11,8 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.formats import load_graph, write_graph
-from coopoc.formats.edges import PointEdges, RangeEdges
-from coopoc.formats.graph import Graph
-from coopoc.formats.kitti import read_kitti, write_kitti
-from coopoc.formats.trajectory import Trajectory
-from coopoc.formats.tum import read_tum, write_tum
+from coopoc.formats.graph import Graph, PointEdges, RangeEdges
+from coopoc.formats.trajectories import Trajectory, read_kitti, read_tum, write_tum
 
 PYFG = """VERTEX_SE2 0 A0 0 0 0
 VERTEX_SE2 1 A1 1 0 0.5
@@ -188,11 +185,12 @@ def test_a_bad_kitti_line_is_named(tmp_path: Path, text: str, thing: str, hint: 
 
 def test_stamps_of_kitti_stand_in_a_file_of_their_own(tmp_path: Path) -> None:
     poses = Trajectory([0.0, 1, 2], np.ones((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
-    _assert_refused(lambda: write_kitti(poses, tmp_path / "a.txt"), "times = None", "of their own")
     _assert_refused(lambda: write_tum(replace(poses, stamps=None), tmp_path / "a.tum"), "stamps = None", "KITTI")
-    write_kitti(poses, tmp_path / "a.txt", tmp_path / "t.txt")
-    _file(tmp_path / "t.txt", "0\n1\n")
-    _assert_refused(lambda: read_kitti(tmp_path / "a.txt", tmp_path / "t.txt"), "times = 2 stamps", "must be 3")
+    _file(tmp_path / "a.txt", KITTI)
+    _file(tmp_path / "t.txt", "0\n1\n2\n")
+    _assert_refused(lambda: read_kitti(tmp_path / "a.txt", tmp_path / "t.txt"), "times = 3 stamps", "must be 2")
+    _file(tmp_path / "t.txt", "0.5\n1\n")
+    assert read_kitti(tmp_path / "a.txt", tmp_path / "t.txt").stamps.tolist() == [0.5, 1.0]
 
 
 def _file(path: Path, text: str) -> Path:

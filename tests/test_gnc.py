@@ -1,4 +1,4 @@
-"""GNCBatch non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
+"""Graduated non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from coopoc import CooperativeMAP, InputError
 from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
-from coopoc.optimize.robust.surrogates import SURROGATES
+from coopoc.optimize.robust.gnc import SURROGATES
 
 
 def paper_rho(loss: str, r: float, mu: float, c: float = 1.0) -> float:
@@ -34,7 +34,7 @@ def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
         "geman-mcclure": lambda w: mu * (np.sqrt(w) - 1) ** 2,
     }
     for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
-        weight = float(SURROGATES[loss].weight(np.array(r**2), np.array(mu)))
+        weight = float(SURROGATES[loss].weight(np.array(r**2), mu))
         gradient_ = (paper_rho(loss, np.sqrt(r**2 + 1e-7), mu) - paper_rho(loss, np.sqrt(r**2 - 1e-7), mu)) / 2e-7
         assert weight == pytest.approx(gradient_, abs=1e-6)
         dual = minimize_scalar(lambda w, r=r: w * r**2 + penalties[loss](w), bounds=(0, 1), options={"xatol": 1e-12})
@@ -46,13 +46,13 @@ def test_schedules_end_at_the_losses() -> None:
     """At first no candidate is given up; at last the weights are those of the loss (Remark 5)."""
     s = np.array([[0.1, 0.9, 1.1, 30.0]])
     for loss, last in (("truncated", 1e9), ("geman-mcclure", 1.0)):
-        first = SURROGATES[loss].first(s.max(axis=1))
+        first = SURROGATES[loss].first(s.max())
         expected = 1 / (2 * 30 - 1) if loss == "truncated" else 60.0
         assert first == pytest.approx(expected)
         assert (SURROGATES[loss].weight(s, first) > 0).all()
-        assert SURROGATES[loss].weight(s, np.array([last])) == pytest.approx(Loss(loss, 1.0).weight(s), abs=1e-6)
-    assert SURROGATES["truncated"].later(np.array([2.0])) == pytest.approx(2.8)
-    assert SURROGATES["geman-mcclure"].later(np.array([2.8])) == pytest.approx(2.0)
+        assert SURROGATES[loss].weight(s, last) == pytest.approx(Loss(loss, 1.0).weight(s), abs=1e-6)
+    assert SURROGATES["truncated"].later(2.0) == pytest.approx(2.8)
+    assert SURROGATES["geman-mcclure"].later(2.8) == pytest.approx(2.0)
 
 
 def test_of_all_subsets_it_finds_the_best() -> None:

@@ -47,7 +47,7 @@ def test_angles_side_by_side_are_those_of_atan2() -> None:
     """Where all are small, where some are, and where one is missing."""
     import numba
 
-    from coopoc.kernels.compiling.batched import pack, put, take
+    from coopoc.kernels.compiling.vectors import pack, put, take
     from coopoc.kernels.stars.relative import angle
 
     @numba.njit

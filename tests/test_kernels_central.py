@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
-from conftest import callable_part, crossing_fleet
+from conftest import crossing_fleet
 from filterpy.kalman import KalmanFilter
 from oracles.central_filter import central_filter
 from oracles.whole_fleet import Drive
@@ -99,67 +98,6 @@ def test_the_filter_is_filterpys(crossing: Fleet) -> None:
             assert track.x[run, t].ravel() == pytest.approx(peer.x, abs=1e-9)
             own = peer.P.reshape(6, 3, 6, 3)[np.arange(6), :, np.arange(6)]
             assert track.covariance[run, t] == pytest.approx(own, abs=1e-9)
-
-
-def matrix(members: int, rng: np.random.Generator, share: float) -> tuple[Any, Any, Any, Any]:
-    """A covariance, an information of few pairs, who shares it, and the plan of one component."""
-    from coopoc.kernels.fleets.components import arrange
-
-    n = 3 * members
-    near = np.triu(rng.random((members, members)) < share, 1)
-    info = np.diag(rng.uniform(0.5, 2.0, n))
-    for i, j in np.argwhere(near):
-        root = np.zeros((n, 3))
-        root[3 * i : 3 * i + 3] = rng.normal(size=(3, 3))
-        root[3 * j : 3 * j + 3] = -root[3 * i : 3 * i + 3]
-        info += root @ root.T
-    root, plan = rng.normal(size=(n, 2 * n)), np.zeros((6, members + 1), np.int64)
-    callable_part(arrange)(np.zeros(members, np.int64), plan)
-    return root @ root.T / n, info, near | near.T, plan
-
-
-@pytest.mark.parametrize("members", [1, 2, 4, 5, 13, 29])
-@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
-def test_what_a_sparse_information_adds_is_what_numpy_inverts(members: int, share: float) -> None:
-    """From the upper triangle of P and the lower one of F, whatever stands in the others' place of P."""
-    from coopoc.kernels.fleets.components import STRIDE
-    from coopoc.kernels.fleets.low_rank import scratch, update
-
-    rng = np.random.default_rng(members)
-    spread, info, near, plan = matrix(members, rng, share)
-    n, stride = 3 * members, int(plan[STRIDE, 0])
-    wanted = np.linalg.inv(np.linalg.inv(spread) + info)
-    p, f = np.zeros((2, stride, stride))
-    p[:n, :n], f[:n, :n] = np.triu(spread) + np.tril(np.full((n, n), 7.0), -1), np.tril(info)
-    flat = p.ravel()
-    eta, moved = rng.normal(size=(2, members, 3)), np.empty((2, stride))
-    callable_part(update)(plan, 0, flat, f.ravel(), near, scratch(members, stride), eta.copy(), moved)
-    found = np.triu(flat.reshape(stride, stride)[:n, :n])
-    np.testing.assert_allclose(found, np.triu(wanted), atol=1e-12 * np.abs(wanted).max())
-    np.testing.assert_allclose(moved[:, :n], eta.reshape(2, n) @ wanted, atol=1e-11)
-
-
-def test_components_merge_where_vehicles_meet_and_stay_together() -> None:
-    from coopoc.kernels.fleets.components import BEGIN, HOME, MEMBER, arrange, connect
-
-    arrange, connect = callable_part(arrange), callable_part(connect)
-    label, plan = np.full(5, -1), np.zeros((6, 6), np.int64)
-    all_active, none_active = np.ones(5, bool), np.zeros(5, bool)
-    first, second = np.array([0, 1]), np.array([3, 4])
-    assert connect(none_active, all_active, first, second, np.array([True, False]), label)
-    assert arrange(label, plan) == 4
-    assert plan[HOME, :5].tolist() == [0, 1, 2, 0, 3]
-    assert not connect(all_active, all_active, first, second, np.array([True, False]), label)
-    assert not connect(all_active, all_active, first, second, np.array([False, False]), label)
-    assert connect(all_active, all_active, np.array([3]), np.array([4]), np.array([True]), label)
-    assert arrange(label, plan) == 3
-    gone = np.array([True, True, True, False, True])
-    assert connect(all_active, gone, first, second, np.array([False, False]), label)
-    assert arrange(label, plan) == 3
-    assert plan[HOME, :5].tolist() == [0, 1, 2, -1, 0]
-    assert plan[MEMBER, : plan[BEGIN, 3]].tolist() == [0, 4, 1, 2]
-    assert connect(gone, all_active, first, second, np.array([False, False]), label)
-    assert arrange(label, plan) == 4
 
 
 def test_vehicles_in_one_place_are_the_oracle() -> None:

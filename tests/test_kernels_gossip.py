@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from coopoc import V2X, Fleet, Sensors, observe
-from coopoc.methods.admm import ConsensusADMM
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.world.spherical import to_vector
 
 S2 = Sensors.paper_scenario2()

@@ -8,7 +8,7 @@ import pytest
 from coopoc.optimize import Factor, Problem, pose, solve, solve_batch
 from coopoc.optimize.algebra.arrowhead import marginals, structure
 from coopoc.optimize.algebra.normal import normal_equations
-from coopoc.optimize.initialisation.initial import initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 
 RUNS = 9
 

@@ -9,8 +9,8 @@ import pytest
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import as_written
-from coopoc.kernels.compiling.lanes import LANES
 from coopoc.kernels.compiling.small import store
+from coopoc.kernels.compiling.vectors import LANES
 from coopoc.kernels.stars.elimination import eliminate, predict, substitute
 
 BLOCKS = 4

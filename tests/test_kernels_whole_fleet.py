@@ -9,13 +9,11 @@ import pytest
 from oracles.admm import admm
 from oracles.batch_smoother import batch_smoother
 from oracles.central_filter import central_filter
-from oracles.diffusion import diffusion
 from oracles.gbp import gbp
 from oracles.whole_fleet import Drive
 
-from coopoc import V2X, BatchSmoother, CentralFilter, Diffusion, Fleet, NoiseModel, Recording, Sensors, observe
-from coopoc.methods.admm import ConsensusADMM
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, NoiseModel, Recording, Sensors, observe
+from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.methods.noise_model import resolve
 from coopoc.world.exchange import exchange
 
@@ -26,8 +24,6 @@ METHODS = {
     "gbp-damped": lambda known: GaussianBeliefPropagation(known, rounds=2, damping=0.4),
     "gbp-belief": lambda known: GaussianBeliefPropagation(known, rounds=2, carry="belief"),
     "admm": lambda known: ConsensusADMM(known, rounds=2, rho=0.7),
-    "diffusion": Diffusion,
-    "diffusion-anchored": lambda known: Diffusion(known, anchored=True),
     "central-filter": CentralFilter,
     "batch-smoother": lambda known: BatchSmoother(known, exact_steps=12, settle=1e-9),
 }
@@ -73,9 +69,6 @@ def compare(name: str, known: str, recording: Recording) -> None:
             x, P = gbp(one, method.rounds, method.damping, method.carry)
         elif name == "admm":
             x, P = admm(one, method.rounds, method.rho)
-        elif name.startswith("diffusion"):
-            x = diffusion(one, method.rounds, method.anchored)
-            P = np.zeros((*x.shape, 3))
         elif name == "central-filter":
             x, P = central_filter(one)
         else:
@@ -83,7 +76,7 @@ def compare(name: str, known: str, recording: Recording) -> None:
         for e, n in enumerate((0, 5)):
             wanted, cov = x[:, n], P[:, n]
             if name != "batch-smoother" and (arrival > met.step).any():
-                wanted, cov = one.late(x, P, n, rounds, fixes=not name.startswith("diffusion"))
+                wanted, cov = one.late(x, P, n, rounds)
             np.testing.assert_allclose(track.x[run, :, e], wanted, atol=1e-7, rtol=0)
             if track.covariance is not None:
                 np.testing.assert_allclose(track.covariance[run, :, e], cov, atol=1e-7, rtol=1e-6)
@@ -103,7 +96,7 @@ def test_noise_models(name: str, known: str, crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("runs", [1, 5])
-@pytest.mark.parametrize("name", ["gbp", "admm", "diffusion-anchored", "central-filter", "batch-smoother"])
+@pytest.mark.parametrize("name", ["gbp", "admm", "central-filter", "batch-smoother"])
 def test_batches_of_runs_without_gaps(name: str, runs: int, crossing: Fleet) -> None:
     compare(name, "nominal", drive(crossing, "plain", runs=runs, gaps=False, absences=False))
 

@@ -34,7 +34,7 @@ ROOMS = {
         "algebra",
         "assessment",
         "descent",
-        "initialisation",
+        "starts",
         "agents",
         "robust",
         "convex",

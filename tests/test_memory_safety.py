@@ -155,17 +155,12 @@ def test_checks_of_single_arrays_and_numbers() -> None:
 
 CODE = """
 import numpy as np
-from coopoc.kernels.compiling.batched import put, take
+from coopoc.kernels.compiling.vectors import put, take
 from coopoc.kernels.compiling.compile import as_written, part
-from coopoc.kernels.compiling.lanes import subtract
 
 @part
 def copied(array, at):
     put(array, np.uint64(0), take(array, np.uint64(at)))
-
-@part
-def lowered(array, at):
-    subtract(array, at, array, 0, array, 0, 4, 1)
 
 @part
 def plain(array, at):
@@ -175,12 +170,10 @@ def plain(array, at):
 def call(which, array, at):
     if which == 0:
         copied(array, at)
-    elif which == 1:
-        lowered(array, at)
     else:
         plain(array, at)
 
-for which, (name, last) in enumerate((("copied", 2), ("lowered", 0), ("plain", 11))):
+for which, (name, last) in enumerate((("copied", 2), ("plain", 11))):
     call(which, np.zeros(12), last)
     try:
         call(which, np.zeros(12), last + 1)
@@ -194,4 +187,4 @@ def test_under_the_switch_scalar_and_vector_access_is_checked() -> None:
     command = [sys.executable, "-c", CODE]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1"}
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
-    assert done.stdout.split("\n")[:-1] == ["copied checks", "lowered checks", "plain checks"]
+    assert done.stdout.split("\n")[:-1] == ["copied checks", "plain checks"]

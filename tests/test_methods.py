@@ -11,8 +11,8 @@ from filterpy.kalman import KalmanFilter
 from coopoc import GNSS, LKFSA, MSMV, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
 from coopoc.methods.covariance_intersection import CovarianceIntersection
+from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.methods.fixed_lag import FixedLagSmoother
-from coopoc.methods.gbp import GaussianBeliefPropagation
 from coopoc.methods.mds import MDS
 from coopoc.methods.star import FORGOTTEN
 from coopoc.world.spherical import spherical, to_vector

@@ -14,14 +14,11 @@ from scipy import optimize, stats
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe, posterior_bound
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
-from coopoc.kernels.fleets.fleet_graph import measurement
+from coopoc.kernels.fleets.graph import measurement
 from coopoc.kernels.stars.relative import components
-from coopoc.methods.admm import ConsensusADMM
-from coopoc.methods.batch_smoother import BatchSmoother
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.central_filter import CentralFilter
-from coopoc.methods.diffusion import Diffusion
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc.methods.centralised import BatchSmoother, CentralFilter
+from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
 from coopoc.world.sensing import find_links
@@ -37,15 +34,13 @@ LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.
 CAUSAL = [
     GaussianBeliefPropagation(),
     ConsensusADMM(),
-    Diffusion(),
-    Diffusion("nominal", anchored=True),
     CentralFilter(),
 ]
 METHODS_HERE = [*CAUSAL, BatchSmoother()]
 
 
 def label(method: object) -> str:
-    return f"{method.name}{'-anchored' if getattr(method, 'anchored', False) else ''}"  # type: ignore[attr-defined]
+    return method.name  # type: ignore[attr-defined, no-any-return]
 
 
 def still(position: list[list[float]], steps: int = 2) -> Fleet:
@@ -229,52 +224,6 @@ def test_more_rounds_come_nearer_to_the_fleets_optimum(crossing: Fleet) -> None:
         assert all(later < 0.8 * sooner for sooner, later in pairwise(gap))
 
 
-def test_diffusion_adapts_and_combines_as_published() -> None:
-    """Independent check: the formulas of methods.md section 4.2 in loops, one round at the first step."""
-    recording = observe(CHAIN, S2, V2X(max_neighbours=2, radius=25.0))
-    sees = {i: {j for j in (i - 1, i + 1) if 0 <= j < 5} for i in range(5)}
-    links, vectors = recording.links, to_vector(recording.relative[0])
-    at_start = [(int(links.observer[k]), int(links.neighbour[k]), k) for k in np.flatnonzero(links.step == 0)]
-    measured = {(i, j): vectors[k] for i, j, k in at_start}
-    fix = recording.gnss[0, 0]
-    psi = {}
-    for i in range(5):
-        w = {k: fix[k].copy() for k in {i, *sees[i]}}
-        degree = len(sees[i])
-        gap = -sum(measured[i, j] for j in sees[i]) - (degree * w[i] - sum(w[j] for j in sees[i]))
-        mu = min(2 / (degree**2 + degree), 0.1)
-        for k in w:
-            w[k] = w[k] + mu * gap * (degree if k == i else -1)
-        psi[i] = w
-    for i in range(5):
-        mix = {j: 1 / max(len(sees[i]) + 1, len(sees[j]) + 1) for j in sees[i]}
-        expected = psi[i][i] * (1 - sum(mix.values())) + sum(c * psi[j][i] for j, c in mix.items())
-        assert Diffusion(rounds=1)(recording, [i]).x[0, 0, 0] == pytest.approx(expected, abs=1e-12)
-
-
-def test_diffusion_alone_drifts_or_takes_a_fixed_gain(crossing: Fleet) -> None:
-    """Closed forms without neighbours: dead reckoning from the first fix; three rounds of gain 0.1 with an anchor."""
-    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
-    path = np.cumsum(0.1 * recording.velocity[:, :, 0], axis=1)
-    reckoned = recording.gnss[:, :1, 0] + path - path[:, :1]
-    assert Diffusion()(recording, [0]).x[:, :, 0] == pytest.approx(reckoned)
-    x = recording.gnss[:, 0, 0]
-    for t in range(1, 60):
-        x = x + 0.1 * recording.velocity[:, t, 0]
-        x = x + (1 - 0.9**3) * (recording.gnss[:, t, 0] - x)
-    assert Diffusion(anchored=True)(recording, [0]).x[:, -1, 0] == pytest.approx(x)
-
-
-def test_diffusion_on_l_alone_takes_no_position_after_the_start(crossing: Fleet) -> None:
-    """L is singular: fixes after the first one of each vehicle change nothing, unless there is an anchor."""
-    recording = observe(crossing, S2, V2X(max_neighbours=7, radius=1e3), runs=2)
-    gnss = recording.gnss + np.where(np.arange(60)[:, None, None] > 0, 50.0, 0.0)
-    moved = replace(recording, gnss=gnss)
-    assert Diffusion()(moved, [0]).x == pytest.approx(Diffusion()(recording, [0]).x)
-    last = [Diffusion(anchored=True)(seen, [0]).x[:, -1].mean() for seen in (recording, moved)]
-    assert last[1] > last[0] + 20
-
-
 @pytest.mark.parametrize("method", METHODS_HERE, ids=label)
 def test_zero_noise_gives_zero_error(method, crossing: Fleet) -> None:
     recording = observe(crossing, SILENT, V2X(max_neighbours=4), assumed=S2)
@@ -301,7 +250,7 @@ def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> Non
     assert method(observe(crossing.between(0, 25), S2, budget, runs=4), [0]).x == pytest.approx(many[:, :25], abs=1e-9)
 
 
-@pytest.mark.parametrize("method", [m for m in METHODS_HERE if m.name != "diffusion"], ids=label)
+@pytest.mark.parametrize("method", METHODS_HERE, ids=label)
 @pytest.mark.parametrize(
     "channel",
     [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0), V2X(max_neighbours=4, latency=2.0)],
@@ -403,7 +352,6 @@ def test_bytes_have_closed_forms() -> None:
     for method, received, sent in (
         (GaussianBeliefPropagation(rounds=3), 3 * (3 * (36 + 100) + 20), 3 * (3 * (36 + 100) + 20)),
         (ConsensusADMM(rounds=2), 3 * (3 * (12 + 100) + 56), 3 * (3 * (12 + 100) + 56)),
-        (Diffusion(rounds=2), 3 * (2 * (20 + 3 * 16 + 100) + 24), 2 * (20 + 3 * 16 + 100) + 24),
         (CentralFilter(), 44 + 100, 32 + 3 * 16 + 100),
         (BatchSmoother(), 44 + 100, 32 + 3 * 16 + 100),
     ):
@@ -490,20 +438,15 @@ def test_the_fleets_bounds_equal_gtsam_marginals(crossing: Fleet) -> None:
         expected = whole.marginalCovariance(gtsam.symbol(chr(97 + i), t))
         assert smoothing[t, i] == pytest.approx(expected, rel=1e-6, abs=1e-9)
     assert np.isnan(filtering[5, 1]).all()
-    assert posterior_bound(fleet, SPEED, 3, v2x, information="fleet") == pytest.approx(filtering[:, 3])
 
 
 def test_the_fleet_knows_more_than_a_star(crossing: Fleet) -> None:
     v2x = V2X(max_neighbours=4)
-    solo, star, whole = (
-        posterior_bound(crossing, SPEED, 0, v, information=i)  # type: ignore[arg-type]
-        for v, i in ((None, "star"), (v2x, "star"), (v2x, "fleet"))
-    )
+    solo, star = (posterior_bound(crossing, SPEED, 0, v) for v in (None, v2x))
+    whole = fleet_bound(crossing, SPEED, v2x)[:, 0]
     assert np.linalg.eigvalsh(solo - star).min() > -1e-9
     assert np.linalg.eigvalsh(star - whole).min() > -1e-9
     assert bound_rt_le(whole) < 0.95 * bound_rt_le(star)
-    with pytest.raises(InputError, match="information"):
-        posterior_bound(crossing, SPEED, 0, v2x, information="town")  # type: ignore[arg-type]
 
 
 def test_bad_settings_are_named() -> None:
@@ -513,7 +456,6 @@ def test_bad_settings_are_named() -> None:
         (GaussianBeliefPropagation, {"carry": "all"}),
         (ConsensusADMM, {"rho": 0.0}),
         (ConsensusADMM, {"rounds": 1.5}),
-        (Diffusion, {"rounds": -1}),
         (BatchSmoother, {"exact_steps": -1}),
         (BatchSmoother, {"settle": 0.0}),
         (Message, {"name": "x", "numbers": -1}),
@@ -524,7 +466,7 @@ def test_bad_settings_are_named() -> None:
 
 
 def test_the_catalogue_has_them() -> None:
-    for name in ("gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"):
+    for name in ("gbp", "admm", "central-filter", "batch-smoother"):
         method = METHODS[name]("nominal")
         assert method.name == name
         assert method.cooperative

@@ -16,8 +16,8 @@ from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, measurement, po
 from coopoc.optimize.backends import casadi_programme
 from coopoc.optimize.backends.casadi_ import DENSE
 from coopoc.optimize.backends.casadi_programme import programme
-from coopoc.optimize.initialisation.initial import initial_guess
 from coopoc.optimize.model.symbolic import _chart
+from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.recording import Recording
 
 METHODS = ["auto", "fatrop", "ipopt"]

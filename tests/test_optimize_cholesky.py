@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu
 
-from coopoc.kernels.graphs.graph_fronts import RELAXED, supernodes
+from coopoc.kernels.graphs.multifrontal import supernodes
 from coopoc.optimize.algebra.cholesky import Cholesky
 
 
@@ -71,5 +71,5 @@ def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros() -> None:
     n = 20
     parent, begin, rows = np.arange(1, n + 1), np.r_[np.arange(n), n - 1], np.arange(1, n)
     parent[-1] = -1
-    found = supernodes(parent, begin, rows, np.ones(n, np.int64), np.array(RELAXED))
+    found = supernodes(parent, begin, rows, np.ones(n, np.int64))
     assert found.tolist() == [0, 5, 10, 15, 20]

@@ -13,8 +13,7 @@ from random_graphs import random_graph
 
 from coopoc.cli import main
 from coopoc.formats import write_graph
-from coopoc.formats.edges import PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import backends
 
 ROOT = Path(__file__).resolve().parents[1]

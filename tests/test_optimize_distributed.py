@@ -11,7 +11,7 @@ from random_graphs import random_graph
 from scipy.optimize import least_squares
 
 from coopoc import InputError
-from coopoc.formats.edges import RangeEdges
+from coopoc.formats.graph import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
 from coopoc.optimize.agents.agent import agents_of
 from coopoc.optimize.agents.distributed import owners, solve_distributed

@@ -20,28 +20,25 @@ from scipy.sparse import csc_array
 from scipy.sparse.csgraph import dijkstra
 
 from coopoc import InputError
-from coopoc.formats.edges import PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.arrowhead import structure
 from coopoc.optimize.algebra.sparse import Sparse, _made, sparse
 from coopoc.optimize.assessment.assess import SMALL, assess
 from coopoc.optimize.assessment.curvature import matrix, newton_decrease, true_blocks
-from coopoc.optimize.backends.gtsam_forms import forms
-from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, values, which_turn
+from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.local_problem import LocalProblem
 from coopoc.optimize.descent.trust_region import arrive
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
-from coopoc.optimize.initialisation.linear_start import linear_start, project
-from coopoc.optimize.initialisation.race import expected
-from coopoc.optimize.initialisation.starts import chained, separated
-from coopoc.optimize.initialisation.trilateration import located
-from coopoc.optimize.initialisation.walk import Moves, walk
 from coopoc.optimize.model.dual import Dual
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.model.fuse import fused
 from coopoc.optimize.model.search import Search
 from coopoc.optimize.model.space import exp
+from coopoc.optimize.starts.graph_starts import chained, separated
+from coopoc.optimize.starts.linear import linear_start, nearest_rotation
+from coopoc.optimize.starts.race import expected
+from coopoc.optimize.starts.walk import Moves, trilaterate, walk
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
@@ -118,7 +115,7 @@ def test_matrices_project_to_the_nearest_rotations() -> None:
     rng = np.random.default_rng(202)
     for d in (2, 3):
         matrix = rng.normal(size=(50, d, d))
-        found = project(matrix)
+        found = nearest_rotation(matrix)
         left, _, right = np.linalg.svd(matrix)
         left[:, :, -1] *= np.linalg.det(left @ right)[:, None]
         assert found == pytest.approx(left @ right, abs=1e-9)
@@ -316,8 +313,7 @@ def test_no_minimum_lies_above_gtsams(seed: int) -> None:
     """From the same chained odometry, bad enough to matter, on graphs that GTSAM has every factor of."""
     graph = random_graph(seed, steps=120, seen=0, loops=40, ranges=120, turn_std=0.05)
     problem = from_graph(graph, start="odometry")
-    native = native_graph(problem, forms(problem)).graph
-    fix_nodes(problem, native)
+    native = graph_of(problem, forms(problem))
     at = values(problem.space, which_turn(problem), problem.x0, range(len(problem.names)))
     theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams()).optimize()
     found = solve(from_graph(graph))
@@ -334,8 +330,7 @@ def test_a_drive_of_thousands_of_poses_needs_few_factorisations(monkeypatch: pyt
     system = sparse(problem)
     assert system is not None
     end = arrive(system, problem.x0, 100, 1e-8)
-    native = native_graph(problem, forms(problem)).graph
-    fix_nodes(problem, native)
+    native = graph_of(problem, forms(problem))
     at = values(problem.space, which_turn(problem), problem.x0, range(len(problem.names)))
     theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams())
     assert system.cost(end.x) <= native.error(theirs.optimize()) * (1 + 1e-9)
@@ -436,7 +431,7 @@ def test_a_point_is_located_as_scipy_finds_it() -> None:
             return np.linalg.norm(at - p, axis=1) - r
 
         best = min(least_squares(residual, rng.normal(0, 10, d)).cost for _ in range(30))
-        assert 0.5 * np.square(residual(located(places, ranges))).sum() == pytest.approx(best, rel=1e-6)
+        assert 0.5 * np.square(residual(trilaterate(places, ranges))).sum() == pytest.approx(best, rel=1e-6)
 
 
 def test_ranges_of_zero_and_ends_in_one_place_are_taken() -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -14,13 +12,10 @@ from random_graphs import random_graph
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.optimize import Loss, Problem, Status, pose, solve
-from coopoc.optimize.backends.gtsam_forms import Part, forms
-from coopoc.optimize.backends.gtsam_native import fix_nodes, native_graph, tangent, values, which_turn
-from coopoc.optimize.backends.gtsam_optimizers import copied
+from coopoc.optimize.backends.gtsam_factors import forms, graph_of, tangent, values, which_turn
 from coopoc.optimize.graphs import from_graph
 from coopoc.optimize.incremental import Estimates, FixedLag, priors
 
-OWN = ("lm",)
 LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 
 
@@ -102,7 +97,7 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension: int, name: str
         problem = measured(dimension, kind, nodes, noise, Loss(loss, scale) if loss else None)
         posed, x = which_turn(problem), problem.x0
         at = values(problem.space, posed, x, range(5))
-        graph = native_graph(problem, forms(problem)).graph
+        graph = graph_of(problem, forms(problem))
         assert graph.error(at) == pytest.approx(problem.cost(x), rel=1e-12)
         residual, jacobian = problem.whiten(x)
         gradient, theirs = (jacobian.T @ residual).reshape(5, -1), graph.linearize(at).gradientAtZero()
@@ -131,8 +126,9 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension: int, name: str
 )
 def test_what_gtsam_lacks_is_named(dimension: int, kind: str, nodes: list, noise: dict, loss, why: str) -> None:
     problem = measured(dimension, kind, nodes, noise, Loss(loss, 1.0) if loss else None)
-    with pytest.raises(InputError, match=f"{kind}: .*{why}.*elimination"):
-        solve(problem, "gtsam", optimizer="lm")
+    (form,) = forms(problem)
+    assert isinstance(form, str)
+    assert why in form
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -155,7 +151,7 @@ def test_a_lower_triangle_is_not_taken_for_a_diagonal() -> None:
     at.insert(0, np.ones(3))
     error = gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Gaussian.SqrtInformation(root, True)).error(at)
     problem = Problem(("a",)).add("position", "a", [0, 0, 0], sqrt_information=root)
-    ours = native_graph(problem, forms(problem)).graph.error(at)
+    ours = graph_of(problem, forms(problem)).error(at)
     assert ours == pytest.approx(0.5 * np.sum((root @ np.ones(3)) ** 2))
     assert error != pytest.approx(ours)
 
@@ -258,29 +254,13 @@ CASES: dict[str, Callable[[Fleet], Problem]] = {
     "SE(2) truncated": lambda fleet: plane(loss=Loss("truncated", 3.0), wrong=2),
     **{name: lambda fleet, name=name: range_star(4, Loss(name, 2.0), wrong=1) for name in LOSSES},
 }
-UNSUPPORTED = {
-    **{("ten spherical neighbours", o): "spherical: GTSAM has no such factor" for o in (*OWN, "gnc")},
-    **{("SE(2) with forward and sideways std", o): "relative_pose: it needs one std" for o in (*OWN, "gnc")},
-    **{
-        (case, "gnc"): "none: must be one of"
-        for case in CASES
-        if case not in ("SE(2) truncated", *LOSSES)
-        and case not in ("ten spherical neighbours", "SE(2) with forward and sideways std")
-    },
-    **{(case, "gnc"): f"{case} 2.0: must be one of" for case in ("huber", "cauchy")},
-}
-"""What an optimizer does not take, and what it says."""
 
 
-@pytest.mark.parametrize("optimizer", ["elimination", *OWN])
+@pytest.mark.parametrize("optimizer", ["auto", "elimination"])
 @pytest.mark.parametrize("case", CASES)
 def test_optimizers_find_the_minimum_of_gauss_newton(formation: Fleet, case: str, optimizer: str) -> None:
     """Cost to 1e-9, estimates and covariances to 1e-6, before any refinement of ours."""
     problem = CASES[case](formation)
-    if (case, optimizer) in UNSUPPORTED:
-        with pytest.raises(InputError, match=re.escape(UNSUPPORTED[case, optimizer])):
-            solve(problem, "gtsam", optimizer=optimizer)
-        return
     ours, theirs = solve(problem), solve(problem, "gtsam", optimizer=optimizer)
     assert theirs.status is Status.SOLVED
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
@@ -288,115 +268,22 @@ def test_optimizers_find_the_minimum_of_gauss_newton(formation: Fleet, case: str
     assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-6)
 
 
-@pytest.mark.parametrize("case", [case for case, optimizer in UNSUPPORTED if optimizer == "gnc"])
-def test_what_gnc_does_not_take(formation: Fleet, case: str) -> None:
-    with pytest.raises(InputError, match=re.escape(UNSUPPORTED[case, "gnc"])):
-        solve(CASES[case](formation), "gtsam", optimizer="gnc")
-
-
 @pytest.mark.parametrize("case", ["ranges 0", "SE(2)"])
-@pytest.mark.parametrize("optimizer", OWN)
-def test_a_limit_of_iterations_is_kept(formation: Fleet, case: str, optimizer: str) -> None:
-    solution = solve(CASES[case](formation), "gtsam", optimizer=optimizer, max_iterations=2, throw=False)
+def test_a_limit_of_iterations_is_kept(formation: Fleet, case: str) -> None:
+    solution = solve(CASES[case](formation), "gtsam", max_iterations=2, throw=False)
     assert solution.status is Status.MAX_ITERATIONS
     assert solution.iterations == 2
 
 
-@pytest.mark.parametrize("optimizer", OWN)
-def test_a_free_node_is_named(optimizer: str) -> None:
+def test_a_free_node_is_named() -> None:
     problem = Problem(("a", "b"), x0=[[0, 0, 0], [3, 1, 0]]).add("range", ("a", "b"), [3.0], std=1.0)
     with pytest.raises(InputError, match="can move freely"):
-        solve(problem.add("position", "a", [0, 0, 0], std=1.0), "gtsam", optimizer=optimizer)
-
-
-@pytest.mark.parametrize("name", ["truncated", "geman-mcclure"])
-def test_gnc_finds_who_is_wrong(name: str) -> None:
-    """Two of six ranges are 40 m too long; for truncated ones the answer is least squares without them."""
-    loss = Loss(name, 3.0)
-    problem = range_star(7, loss, wrong=2)
-    solution = solve(problem, "gtsam", optimizer="gnc")
-    fixes, ranges = solution.extras["weights"]
-    assert (fixes == 1).all()
-    assert (ranges[:2] < 0.1).all()
-    assert (ranges[2:] > 0.6).all()
-    if name == "truncated":
-        seen = problem.factors[1]
-        honest = replace(seen, nodes=seen.nodes[2:], z=seen.z[2:], loss=None)
-        without = solve(replace(problem, factors=(problem.factors[0], honest)))
-        assert set(ranges) == {0.0, 1.0}
-        assert solution.x == pytest.approx(without.x, abs=1e-6)
-        assert solution.cost == pytest.approx(without.cost + 2 * 0.5 * 3.0**2)
-
-
-def test_gnc_believes_odometry_and_needs_no_good_start() -> None:
-    """In the plane, two of eight ranges 6 m too long; the plain descent from the same start ends higher or there."""
-    problem = plane(loss=Loss("truncated", 3.0), wrong=2)
-    solution = solve(problem, "gtsam", optimizer="gnc")
-    assert solution.extras["weights"][1].tolist() == [0, 0, 1, 1, 1, 1, 1, 1]
-    assert all((w == 1).all() for k, w in enumerate(solution.extras["weights"]) if k != 1)
-    assert solution.cost <= solve(problem).cost * (1 + 1e-9)
-
-
-def test_gncs_threshold_is_the_scale_of_the_loss() -> None:
-    """Ranges between known points that miss by 2.8 and 3.6 std, c = 3."""
-    problem = Problem(("a", "b", "c")).add("position", [0, 1, 2], [[0, 0, 0], [9, 0, 0], [0, 9, 0]], std=1e-3)
-    problem = problem.add("range", [(0, 1), (0, 2)], [[9.28], [9.36]], std=0.1, loss=Loss("truncated", 3.0))
-    assert solve(problem, "gtsam", optimizer="gnc").extras["weights"][1].tolist() == [1, 0]
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("error", ["position", "rotation"])
-def test_what_stands_in_for_a_relative_pose_weighs_the_same(dimension: int, error: str) -> None:
-    """In graduation GTSAM's logarithm of the pose: equal to ours where only the position, or the rotation, is off."""
-    problem = measured(
-        dimension, "relative_pose", BETWEEN[:1], {"cov": apart(spd(dimension), spd(2 * dimension - 3, 0.3, 7))}
-    )
-    factor, x = problem.factors[0], problem.x0.copy()
-    turn = factor.z[0, dimension:].reshape(dimension, dimension)
-    first = x[0, dimension:].reshape(dimension, dimension)
-    off = 0.4 if dimension == 2 else [0.4, -0.3, 0.2]
-    tilt = pose(np.zeros(dimension), off)[dimension:].reshape(dimension, dimension)
-    x[1, :dimension] = x[0, :dimension] + first @ (factor.z[0, :dimension] + 0.7 * (error == "position"))
-    x[1, dimension:] = (first @ turn @ (tilt if error == "rotation" else np.eye(dimension))).ravel()
-    native = native_graph(problem, [copied(factor, [chord(dimension)], dimension)])
-    at = values(problem.space, which_turn(problem), x, range(5))
-    assert native.graph.error(at) == pytest.approx(problem.cost(x), rel=1e-9)
-    assert problem.cost(x) > 0.01
-
-
-def chord(dimension: int) -> Part:
-    """The part of a relative pose that GTSAM cannot copy."""
-    return Part({(True, True): f"FrobeniusBetweenFactorPose{dimension}"}, lambda *_: (), np.empty(0))
-
-
-@pytest.mark.parametrize(
-    ("problem", "words"),
-    [(range_star(0, Loss("truncated", 3.0)), "one scale"), (space(chordal=True), "cannot copy Frobenius")],
-)
-def test_gnc_says_what_it_lacks(problem: Problem, words: str) -> None:
-    problem = problem.add("range", (1, 2), [9.0], std=1.0, loss=Loss("truncated", 2.0))
-    with pytest.raises(InputError, match=words):
-        solve(problem, "gtsam", optimizer="gnc")
+        solve(problem.add("position", "a", [0, 0, 0], std=1.0), "gtsam")
 
 
 def test_unknown_optimizers_list_the_known() -> None:
-    with pytest.raises(InputError, match=r"elimination.*lm.*gnc"):
+    with pytest.raises(InputError, match=r"auto.*elimination"):
         solve(range_star(), "gtsam", optimizer="newton")
-
-
-def test_marginals_of_points_equal_gtsams() -> None:
-    problem = range_star(1)
-    solution = solve(problem, "gtsam", optimizer="lm")
-    graph, at = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    wide, narrow = gtsam.noiseModel.Isotropic.Sigma(3, 2.0), gtsam.noiseModel.Isotropic.Sigma(1, 0.5)
-    for i, (x, z) in enumerate(zip(solution.x, problem.factors[0].z, strict=True)):
-        at.insert(i, x)
-        graph.add(gtsam.PriorFactorPoint3(i, z, wide))
-    for j, z in enumerate(problem.factors[1].z[:, 0], start=1):
-        graph.add(gtsam.RangeFactor3(0, j, z, narrow))
-    marginals = gtsam.Marginals(graph, at)
-    for i, covariance in enumerate(solution.covariance):
-        assert covariance == pytest.approx(marginals.marginalCovariance(i), abs=1e-6)
 
 
 def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
@@ -409,7 +296,7 @@ def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
     problem = problem.add("pose", [0, 1, 2], pose(at[:3] + 0.3, angle[:3] + 0.1), std=[1.0, 2.0, 0.3])
     problem = problem.add("range", [("a", "b"), ("b", "l"), ("c", "l")], [[9.0], [12.0], [11.0]], std=0.3)
     problem = problem.add("bearing", [("a", "l"), ("b", "l"), ("c", "a")], [[0.3], [0.9], [-2.0]], std=0.05)
-    solution = solve(problem, "gtsam", optimizer="lm")
+    solution = solve(problem, "gtsam")
     graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
     found.insert(3, solution.position[3])
     for i, (node, z) in enumerate(zip(solution.x[:3], problem.factors[0].z, strict=True)):
@@ -435,27 +322,6 @@ def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
     assert solution.covariance[3, :2, :2] == pytest.approx(marginals.marginalCovariance(3), abs=1e-6)
 
 
-def test_marginals_of_odometry_in_the_plane_equal_gtsams_own_between() -> None:
-    """Where all residuals vanish the logarithm of the whole pose has our derivatives too."""
-    rng = np.random.default_rng(9)
-    x = pose(rng.uniform(-9, 9, (5, 2)), rng.uniform(-3, 3, 5))
-    graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
-    poses = [gtsam.Pose2(*node[:2], np.arctan2(node[4], node[2])) for node in x]
-    for i, node in enumerate(poses):
-        found.insert(i, node)
-    z = [a.between(b) for a, b in pairwise(poses)]
-    for i, between in enumerate(z):
-        graph.add(gtsam.BetweenFactorPose2(i, i + 1, between, noise.Diagonal.Sigmas(np.array([0.2, 0.2, 0.05]))))
-    graph.add(gtsam.PriorFactorPose2(0, poses[0], noise.Diagonal.Sigmas(np.array([0.5, 0.3, 0.1]))))
-    problem = Problem(tuple("abcde"), x0=x, dimension=2, poses=range(5)).add("pose", 0, x[:1], std=[0.5, 0.3, 0.1])
-    moved = pose([b.translation() for b in z], [b.theta() for b in z])
-    problem = problem.add("relative_pose", [(i, i + 1) for i in range(4)], moved, std=[0.2, 0.2, 0.05])
-    solution, marginals = solve(problem, "gtsam", optimizer="lm"), gtsam.Marginals(graph, found)
-    for i, turn in enumerate(solution.rotation):
-        own, wide = marginals.marginalCovariance(i), apart(turn, np.eye(1))
-        assert solution.covariance[i] == pytest.approx(wide @ own @ wide.T, abs=1e-9)
-
-
 def test_marginals_of_poses_in_space_equal_gtsams() -> None:
     """Priors and ranges; GTSAM has the rotation first and moves a position along the body's axes."""
     rng = np.random.default_rng(10)
@@ -465,7 +331,7 @@ def test_marginals_of_poses_in_space_equal_gtsams() -> None:
     std = np.array([0.5, 0.6, 0.7, 0.05, 0.06, 0.07])
     problem = Problem(tuple("abc"), x0=x, poses=range(3)).add("pose", [0, 1, 2], z, std=std)
     problem = problem.add("range", [(0, 1), (1, 2), (0, 2)], [[9.0], [8.0], [7.0]], std=0.2)
-    solution = solve(problem, "gtsam", optimizer="lm")
+    solution = solve(problem, "gtsam")
     graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
     for i, (node, prior) in enumerate(zip(solution.x, z, strict=True)):
         found.insert(i, gtsam.Pose3(gtsam.Rot3(node[3:].reshape(3, 3)), node[:3]))
@@ -707,8 +573,7 @@ def test_gtsam_is_gtsam_where_it_has_every_factor(dimension: int) -> None:
     problem = from_graph(graph, start="odometry")
     found = solve(problem, "gtsam")
     assert found.extras["method"] == "lm"
-    native = native_graph(problem, forms(problem)).graph
-    fix_nodes(problem, native)
+    native = graph_of(problem, forms(problem))
     posed = which_turn(problem)
     at = values(problem.space, posed, problem.x0, range(len(problem.names)))
     theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,8 @@ import coopoc as co
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import write_graph
-from coopoc.formats.edges import PointEdges, PoseEdges
-from coopoc.formats.graph import Graph
-from coopoc.formats.rotations import to_orientation
+from coopoc.formats.graph import Graph, PointEdges, PoseEdges
+from coopoc.formats.values import to_orientation
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.commands import solve_file
 from coopoc.optimize.graphs import from_graph, loop_closures
@@ -104,7 +103,8 @@ def judged(fleet: Fleet, graph: Graph, bad: Bools) -> tuple[int, int, float, flo
     solution = solve_gnc(problem, [(factor, rows)], start="known")
     rejected = solution.extras["weights"] < 0.5
     count = len(fleet.chain)
-    right = graph.relative_pose.rows(np.concatenate([np.arange(count), count + np.flatnonzero(~bad)]))
+    kept, edges = np.concatenate([np.arange(count), count + np.flatnonzero(~bad)]), graph.relative_pose
+    right = replace(edges, **{field.name: getattr(edges, field.name)[kept] for field in fields(edges)})
     clean = co.solve(from_graph(replace(graph, relative_pose=right), start="tree"))
     errors = [
         float(absolute_error(x[: len(fleet.position)], fleet.position).rmse)

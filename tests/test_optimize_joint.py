@@ -9,8 +9,7 @@ from random_graphs import random_graph
 
 from coopoc import InputError
 from coopoc.optimize import MEASUREMENTS, Problem, measurement, solve
-from coopoc.optimize.backends.gtsam_forms import forms
-from coopoc.optimize.backends.gtsam_native import native_graph, values, which_turn
+from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
 from coopoc.optimize.graphs import from_graph
 from coopoc.optimize.joint import joint_covariance
 
@@ -47,7 +46,7 @@ def ring(kind: str = "range") -> Problem:
 def test_joint_marginals_are_gtsams() -> None:
     problem = ring()
     found = solve(problem)
-    graph = native_graph(problem, forms(problem)).graph
+    graph = graph_of(problem, forms(problem))
     tree = gtsam.Marginals(graph, values(problem.space, which_turn(problem), found.x, range(30)))
     whole = tree.jointMarginalCovariance(keys := [0, 7, 21])
     joint = joint_covariance(problem, found, keys)

@@ -12,13 +12,12 @@ import pytest
 import coopoc as co
 from coopoc.arrays import Bools, Ints
 from coopoc.formats import write_graph
-from coopoc.formats.edges import PoseEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Problem, Status, pose, solve_gnc
 from coopoc.optimize.graphs import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
-from coopoc.optimize.robust.outliers import mark
-from coopoc.optimize.robust.predictions import predicted
+from coopoc.optimize.robust.candidates import mark
+from coopoc.optimize.robust.loop_closures import predicted
 
 STD = np.array([0.02, 0.02, 0.01])
 
@@ -78,9 +77,9 @@ def test_predictions_are_those_of_dense_algebra() -> None:
     problem = from_graph(drive(5, steps=150, loops=20)[0], start="odometry")
     (candidate,) = loop_closures(problem)
     marked = mark(problem, [candidate])
-    x = np.asarray(problem.x0)[None]
-    distance, spread = predicted(problem, marked, np.zeros((1, len(candidate[1]))), x)
-    linear = problem.linearise(x)
+    x = np.asarray(problem.x0)
+    distance, spread = predicted(problem, marked, np.zeros(len(candidate[1])), x)
+    linear = problem.linearise(x[None])
     whole = problem.jacobian(linear).toarray()
     size = problem.factors[0].size
     rows: Ints = (size * np.array(candidate[1])[:, None] + np.arange(size)).ravel()

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 import coopoc as co
 from coopoc.evaluate.alignment import absolute_error
 from coopoc.formats import load_graph
-from coopoc.formats.edges import PoseEdges, RangeEdges
-from coopoc.formats.graph import Graph
+from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
 from coopoc.optimize.graphs import from_graph
 from coopoc.optimize.model.space import Space, exp, log

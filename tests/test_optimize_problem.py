@@ -11,8 +11,8 @@ import pytest
 
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import MEASUREMENTS, Factor, Loss, Problem, SolveError, Status, pose, solve, solve_batch
-from coopoc.optimize.initialisation.initial import converted, initial_guess
 from coopoc.optimize.model.window import relative_std
+from coopoc.optimize.starts.initial import converted, initial_guess
 from coopoc.world.recording import Recording
 from coopoc.world.spherical import to_vector, vector_cov
 

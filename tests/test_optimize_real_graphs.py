@@ -74,8 +74,3 @@ def test_graphs_that_gtsam_reads_end_where_gtsam_does(name: str, tmp_path: Path)
     pose = values.atPose2(first) if planar else values.atPose3(first)
     assert solution.status is Status.SOLVED
     assert solution.cost == pytest.approx(least(graph, values, (first, pose)), rel=ALIKE, abs=1e-9)
-
-
-def test_the_older_format_is_named_with_the_way_to_convert_it() -> None:
-    with pytest.raises(co.InputError, match=r"w100_30.g2o: line 1 = VERTEX2: is TORO's.*gtsam.load2D"):
-        co.read_graph(DATA / "w100_30.g2o")

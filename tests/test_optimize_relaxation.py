@@ -1,4 +1,5 @@
-"""Relaxations: they bound every cost, agree with models written for CVXPY by hand, and are attained where tight."""
+"""Relaxations and certificates: they bound every cost, agree with models written for CVXPY by hand, and are attained
+where tight; a local minimum or a saddle gets no certificate."""
 
 from __future__ import annotations
 
@@ -17,18 +18,12 @@ from scipy.optimize import least_squares
 
 from coopoc import InputError
 from coopoc.arrays import Floats
-from coopoc.optimize import Problem, Status, solve
-from coopoc.optimize.backends.cvxpy_ import prepare
-from coopoc.optimize.convex.certificate import certify
-from coopoc.optimize.convex.cones import semidefinite
-from coopoc.optimize.convex.manifold import minimise, tangent
-from coopoc.optimize.convex.newton import minimise_sparsely, tangent_basis
-from coopoc.optimize.convex.qcqp import Quadratic, multipliers
-from coopoc.optimize.convex.quadratic import quadratic
-from coopoc.optimize.convex.relaxation import first_vectors, polished, shor
-from coopoc.optimize.convex.schur import Dense, Sparse
-from coopoc.optimize.convex.staircase import scaled_bound, staircase
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize import Problem, Solution, Status, pose, solve
+from coopoc.optimize.convex import certify, newton, shor, staircase
+from coopoc.optimize.convex.newton import Reduced, minimise, tangent_basis
+from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
+from coopoc.optimize.convex.relaxation import scaled_bound
+from coopoc.optimize.graphs import from_graph, read_graph
 
 PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
 UP = 0.6
@@ -120,10 +115,13 @@ def cora(name: str) -> tuple[Quadratic, Problem, Any]:
     if name == "single_range":
         problem = Problem(("L0", "L1"), x0=[[11, 19], [11, 21]], dimension=2).add("range", (0, 1), 2.0, 1.0)  # type: ignore[arg-type]
     else:
-        from coopoc.optimize.graphs import read_graph
-
         problem = replace(read_graph(folder / "factor_graph.pyfg", start="file"), fixed=())
     return quadratic(problem), problem, lambda matrix: np.asarray(mmread(folder / f"{matrix}.mm").todense())
+
+
+def tangent(form: Quadratic, X: Floats, V: Floats) -> Floats:
+    """The part of V that keeps the constraints to first order."""
+    return V - multipliers(form, X, V).matrix @ X
 
 
 @pytest.mark.parametrize("name", ["single_range", "single_rpm", "small_ra_slam_problem"])
@@ -142,9 +140,8 @@ def test_matrices_are_coras(name: str) -> None:
     assert gradient == pytest.approx(expected("expected_egrad"), abs=1e-7)
     L = multipliers(form, Y[:c], gradient[:c])
     S = Q.copy()
-    S[:c, :c] -= L.dense
+    S[:c, :c] -= L.matrix.toarray()
     assert pytest.approx(expected("S_rand"), abs=1e-6) == S
-    assert L.sparse.toarray() == pytest.approx(L.dense)
     gradient_ = np.concatenate([tangent(form, Y[:c], gradient[:c]), gradient[c:]])
     assert gradient_ == pytest.approx(expected("expected_rgrad"), abs=1e-7)
     bent = S @ expected("rand_dX")
@@ -222,22 +219,25 @@ def test_some_of_them_are_tight() -> None:
 @pytest.mark.parametrize(
     "make", [two_robots, partial(two_robots, d=3), partial(two_robots, fixed=True), swarm, partial(swarm, up=UP)]
 )
-def test_sparse_elimination_is_the_dense_one(make: Any) -> None:
-    problem = make(0)
-    form = quadratic(problem)
-    relaxed = shor(problem, refine=False).x
-    x, turned = problem.space.position(relaxed), problem.space.rotation(relaxed)
-    dense, sparse = Dense(form), Sparse(form)
+def test_the_elimination_is_numpys(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """C and its products by numpy.linalg.lstsq, eigenvalues by eigh and by Lanczos."""
+    form = quadratic(make(0))
+    reduced, A = Reduced(form), form.rows.toarray()
+    rest = A @ np.concatenate(
+        [np.eye(form.bound), -np.linalg.lstsq(A[:, form.bound :], A[:, : form.bound], rcond=None)[0]]
+    )
+    C = rest.T @ rest
     X = form.project(np.random.default_rng(0).standard_normal((form.bound, form.columns)))
-    assert sparse.times(X) == pytest.approx(dense.times(X), abs=1e-7 * np.abs(dense.matrix).max())
-    costs = [np.square(form.rows @ part.settle(X)).sum() for part in (dense, sparse)]
-    assert costs[0] == pytest.approx(costs[1], rel=1e-9)
-    L = multipliers(form, X, dense.times(X))
-    (a, v), (b, w) = dense.smallest(L), sparse.smallest(L)
+    assert reduced.matrix == pytest.approx(C, abs=1e-9 * np.abs(C).max())
+    assert reduced.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
+    assert np.square(A @ reduced.settle(X)).sum() == pytest.approx(np.sum(X * (C @ X)), rel=1e-9)
+    L = multipliers(form, X, reduced.times(X))
+    a, v = reduced.smallest(L)
+    assert a == pytest.approx(np.linalg.eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
+    monkeypatch.setattr(newton, "DENSE", 0)
+    b, w = reduced.smallest(L)
     assert a == pytest.approx(b, rel=1e-7)
     assert abs(v @ w) == pytest.approx(1.0, abs=1e-5)
-    ends = [minimise(form, part, form.lift(x, turned)[: form.bound]).cost for part in (dense, sparse)]
-    assert ends[0] == pytest.approx(ends[1], rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -252,56 +252,12 @@ def test_the_staircase_climbs_to_shors_bound_from_anywhere(seed: int) -> None:
 @pytest.mark.slow
 def test_robots_that_do_not_know_where_the_others_are() -> None:
     """mrclam5a, every robot starting at the origin: better than the local minimum at 78.2 in the data's README."""
-    from coopoc.optimize.graphs import read_graph
-
     if not (PYFG / "mrclam5a.pyfg").exists():
         pytest.skip(f"{PYFG} is absent")
-    problem = read_graph(PYFG / "mrclam5a.pyfg", start="apart")
-    relaxed = staircase(problem, refine=False)
-    form = quadratic(problem)
-    x, _ = polished(problem, form, Sparse(form), relaxed.x)
-    assert 67.8 < relaxed.lower_bound < problem.cost(x) < 69.11
-    assert problem.cost(x) == pytest.approx(69.10, abs=0.01)  # an independent Levenberg-Marquardt from ground truth
-
-
-def test_a_programme_is_built_once_per_shape() -> None:
-    shor(swarm(0), refine=False)
-    before = semidefinite.cache_info()
-    shor(swarm(1), refine=False)
-    after = semidefinite.cache_info()
-    assert (after.hits, after.misses) == (before.hits + 1, before.misses)
-
-
-@pytest.mark.parametrize("up", [1.0, UP])
-def test_cvxpys_primal_agrees_with_clarabels_dual(up: float) -> None:
-    """Before any refinement: bounds to 1e-5; SDP costs to 1e-5 of the optimum, positions to a centimetre."""
-    problem = swarm(0, up=up)
-    ours = shor(problem)
-    found = solve(problem, "cvxpy", throw=False, refine=False)
-    assert found.extras["lower_bound"] == pytest.approx(ours.lower_bound, rel=1e-5)
-    assert found.extras["rounded_cost"] == pytest.approx(found.cost, rel=1e-12)
-    assert ours.solution is not None
-    if ours.tight:
-        assert found.cost == pytest.approx(ours.solution.cost, rel=1e-5)
-        assert found.x == pytest.approx(ours.solution.x, abs=0.01)
-    assert solve(problem, "cvxpy").cost <= found.cost
-
-
-def test_cvxpys_quadratic_programme_is_lstsq() -> None:
-    """numpy.linalg.lstsq on the whitened system, with a held point too; nothing is refined."""
-    rng = np.random.default_rng(0)
-    names = [f"v{i}" for i in range(5)]
-    problem = Problem(tuple(names)).add("position", names, rng.normal(1e5, 20, (5, 3)), [3.5, 3.5, 6.0])
-    problem = problem.add("displacement", [(i, i + 1) for i in range(4)], rng.normal(0, 9, (4, 3)), 0.05)
-    for case in (problem, replace(problem, x0=rng.normal(1e5, 20, (5, 3)), fixed=(2,))):
-        x = np.full((5, 3), 1e5) if case.x0 is None else case.x0
-        r, J = case.whiten(x)
-        free = np.flatnonzero(np.ones(15) if case.movable is None else case.movable)
-        expected = x.copy()
-        expected.reshape(-1)[free] -= np.linalg.lstsq(J.toarray()[:, free], r, rcond=None)[0]
-        ended = prepare(case)(case, x[None])
-        assert ended.x[0] == pytest.approx(expected, abs=1e-6)
-        assert ended.extras == {"relaxation": "qp", "refined": False}
+    relaxed = staircase(read_graph(PYFG / "mrclam5a.pyfg", start="apart"))
+    assert relaxed.solution is not None
+    assert 67.8 < relaxed.lower_bound < relaxed.solution.cost < 69.11
+    assert relaxed.solution.cost == pytest.approx(69.10, abs=0.01)  # an independent Levenberg-Marquardt from the truth
 
 
 def test_the_backend_is_held_to_the_same_check_as_the_others() -> None:
@@ -322,10 +278,6 @@ def test_what_has_no_relaxation_is_refused() -> None:
         shor(problem.add("azimuth", ("v0", "v1"), 0.1, 0.1))
     with pytest.raises(InputError, match="constraints"):
         shor(problem.constrain("position", "v0", lower=-1.0))
-    with pytest.raises(InputError, match="relaxation = 'lp'"):
-        solve(problem, "cvxpy", relaxation="lp")
-    with pytest.raises(InputError, match="needs points and only position and displacement"):
-        solve(problem, "cvxpy", relaxation="qp")
     with pytest.raises(InputError, match="staircase"):
         shor(swarm(0, vehicles=20))
     poses = two_robots(0)
@@ -357,7 +309,7 @@ def test_newtons_steps_end_at_shors_bound(seed: int, d: int) -> None:
     for problem in (two_robots(seed, d=d, noise=3.0), two_robots(seed, d=d, fixed=True), swarm(seed, d=d, up=UP)):
         form = quadratic(problem)
         random = np.random.default_rng(seed).standard_normal((form.bound, form.columns + 3))
-        found = minimise_sparsely(form, Sparse(form), form.project(random))
+        found = minimise(Reduced(form), form.project(random))
         assert found.converged
         assert found.cost == pytest.approx(shor(problem, refine=False).lower_bound, rel=1e-5, abs=1e-5)
 
@@ -379,9 +331,9 @@ def test_a_share_of_any_multipliers_bounds_every_cost(seed: int) -> None:
     """Of those at random points, which are far from feasible: at most the bound that CVXPY's solver finds."""
     problem = two_robots(seed, noise=3.0)
     form = quadratic(problem)
-    reduced, best = Sparse(form), shor(problem, refine=False).lower_bound
-    found = minimise_sparsely(
-        form, reduced, form.lift(problem.space.position(problem.x0), problem.space.rotation(problem.x0))[: form.bound]
+    reduced, best = Reduced(form), shor(problem, refine=False).lower_bound
+    found = minimise(
+        reduced, form.lift(problem.space.position(problem.x0), problem.space.rotation(problem.x0))[: form.bound]
     )
     rng = np.random.default_rng(seed)
     for noise in (0.0, 0.1):
@@ -402,11 +354,162 @@ def test_a_certificate_takes_the_time_it_is_given() -> None:
         staircase(problem, seconds=0.0)
 
 
-def test_the_first_vectors_are_those_of_the_nearest_matrix_of_their_rank() -> None:
-    """Eckart and Young: what is left has the other eigenvalues; the gap is the first of them over the last kept."""
-    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((7, 7)))[0]
-    Z = (turn * [9.0, 6.0, 3.0, 2.0, 1.0, 0.5, 0.1]) @ turn.T
-    X, gap = first_vectors(Z, 2)
-    left = np.linalg.eigvalsh(Z - X @ X.T)
-    np.testing.assert_allclose(left, [0, 0, 0.1, 0.5, 1, 2, 3], atol=1e-12)
-    assert gap == pytest.approx(0.5)
+def anchored(seed: int, anchors: int = 4, vehicles: int = 2, d: int = 2, std: float = 0.1) -> Problem:
+    """Surveyed anchors, vehicles without a fix, all ranges to and between vehicles: flips are local minima."""
+    rng = np.random.default_rng(seed)
+    n = anchors + vehicles
+    truth = rng.uniform(-20, 20, (n, d))
+    names = [f"a{i}" for i in range(anchors)] + [f"v{i}" for i in range(vehicles)]
+    problem = Problem(tuple(names), dimension=d)
+    problem = problem.add("position", names[:anchors], truth[:anchors] + 0.3 * rng.standard_normal((anchors, d)), 0.3)
+    pairs = [(i, j) for i in range(n) for j in range(max(i + 1, anchors), n)]
+    ranges = [np.linalg.norm(truth[i] - truth[j]) + std * rng.standard_normal() for i, j in pairs]
+    return problem.add("range", pairs, np.abs(ranges)[:, None], std)
+
+
+def minima(problem: Problem, starts: int = 15) -> list[Solution]:
+    """The minima that Gauss-Newton reaches from random starts, the lowest first."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(starts):
+        solution = solve(
+            replace(problem, x0=rng.uniform(-20, 20, (len(problem.names), problem.dimension))), throw=False
+        )
+        if solution.status is Status.SOLVED:
+            found.append(solution)
+    return sorted(found, key=lambda solution: solution.cost)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 6])
+def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int) -> None:
+    """Gauss-Newton reports SOLVED at both; scipy.optimize.least_squares finds nothing below the certified one."""
+    problem = anchored(seed)
+    best, *others = minima(problem)
+    local = [solution for solution in others if solution.cost > best.cost + 1.0]
+    assert local
+    verdict = certify(problem, best)
+    assert verdict.certified
+    assert str(verdict) == f"certified global optimum of {problem!r}"
+    assert verdict.gap <= 1e-6 * max(best.cost, 1.0)
+    for solution in local:
+        refused = certify(problem, solution)
+        assert not refused.certified
+        assert refused.lower_bound <= best.cost
+        assert refused.smallest_eigenvalue < -1e-3
+        assert str(refused).startswith("not certified")
+    rng = np.random.default_rng(1)
+    for _ in range(8):
+        start, jacobian = rng.uniform(-20, 20, 12), lambda y: problem.whiten(y.reshape(6, 2))[1].toarray()
+        found = least_squares(lambda y: problem.whiten(y.reshape(6, 2))[0], start, jac=jacobian)
+        assert found.cost >= verdict.lower_bound * (1 - 1e-9)
+
+
+def test_a_point_beside_the_optimum_is_refused_by_default_and_certified_if_asked() -> None:
+    """A gap of 1e-5 to 1e-3 of the cost is none of rounding: the tolerance of 1e-6 refuses, one of a tenth does not."""
+    problem = anchored(1)
+    best = minima(problem)[0]
+    away = np.random.default_rng(0).normal(size=best.x.shape)
+    gaps = []
+    for step in 10.0 ** np.arange(-12.0, -4.0, 0.25):
+        x = best.x + step * away
+        beside = replace(best, x=x, cost=0.5 * float((problem.whiten(x)[0] ** 2).sum()))
+        verdict = certify(problem, beside)
+        share = verdict.gap / max(beside.cost, 1.0)
+        assert verdict.certified == (share <= 1e-6)
+        if 1e-5 < share < 1e-3:
+            gaps.append(share)
+            assert certify(problem, beside, tolerance=0.1).certified
+    assert gaps
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_bounds_hold_and_certificates_agree_with_the_relaxation(d: int) -> None:
+    """Certified means tight, with the relaxation's bound; what is not certified still has a bound below every cost."""
+    verdicts = []
+    for seed in range(8):
+        problem = anchored(seed, anchors=d + 2, vehicles=1, d=d, std=0.5)
+        relaxed = shor(problem)
+        assert relaxed.solution is not None
+        verdict = certify(problem, relaxed.solution)
+        verdicts.append(verdict.certified)
+        assert verdict.certified == relaxed.tight
+        assert verdict.lower_bound <= relaxed.lower_bound * (1 + 1e-6) + 1e-6
+        for solution in minima(problem, starts=8):
+            assert certify(problem, solution).lower_bound <= relaxed.solution.cost * (1 + 1e-9)
+    assert 2 <= sum(verdicts) < len(verdicts)
+
+
+def test_the_eigenvalue_is_that_of_the_whole_matrix() -> None:
+    """Schur complement and Q - diag(L, 0) are indefinite together; numpy.linalg.eigvalsh on the latter."""
+    for seed in range(4):
+        problem = anchored(seed)
+        form = quadratic(problem)
+        for solution in minima(problem, starts=6):
+            X = form.lift(solution.x, np.tile(np.eye(2), (6, 1, 1)))
+            Q = (form.rows.T @ form.rows).toarray()
+            CX = (Q @ X)[: form.bound]
+            assert np.abs((Q @ X)[form.bound :]).max() < 1e-4 * np.abs(Q).max()
+            S = Q.copy()
+            for block in form.stiefel:
+                S[np.ix_(block, block)] -= 0.5 * (CX[block] @ X[block].T + X[block] @ CX[block].T)
+            for (row,) in form.sphere:
+                S[row, row] -= CX[row] @ X[row]
+            smallest = certify(problem, solution).smallest_eigenvalue
+            tolerance = 1e-9 * np.abs(Q).max()
+            assert (np.linalg.eigvalsh(S)[0] < -tolerance) == (smallest < -tolerance)
+
+
+def test_a_saddle_is_refused() -> None:
+    """An ego on the line between two others whose ranges are longer than that line."""
+    line = Problem(("ego", "a", "b"), x0=[[0, 0, 0], [-5, 0, 0], [5, 0, 0]])  # type: ignore[arg-type]
+    line = line.add(
+        "position", ["ego", "a", "b"], [[0, 0, 0], [-5, 0, 0], [5, 0, 0]], [[9.0], [0.1], [0.1]] * np.ones(3)
+    )
+    problem = line.add("range", [("ego", "a"), ("ego", "b")], [[8.0], [8.0]], 0.5)
+    saddle = solve(problem, throw=False)
+    assert saddle.status is Status.SADDLE
+    assert not certify(problem, saddle).certified
+    aside = solve(replace(problem, x0=np.array([[0, 3, 1.0], [-5, 0, 0], [5, 0, 0]])), throw=False)
+    assert aside.cost < saddle.cost
+
+
+def ring(steps: int, d: int, seed: int = 0) -> Problem:
+    """Poses around a loop with its closure, and ranges across it; more than DENSE constrained rows for many steps."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * np.arange(steps) / steps
+    at = np.zeros((steps, d))
+    at[:, :2] = 0.2 * steps * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    truth = pose(at, angle if d == 2 else np.stack([0 * angle, 0 * angle, angle], axis=1))
+    names = tuple(f"x{k}" for k in range(steps))
+    problem = Problem(names, x0=truth, dimension=d, poses=names, fixed=(0,))  # type: ignore[arg-type]
+    pairs = [(k, (k + 1) % steps) for k in range(steps)]
+    turned = truth[:, d:].reshape(-1, d, d)
+    z = np.array([np.concatenate([turned[i].T @ (at[j] - at[i]), (turned[i].T @ turned[j]).ravel()]) for i, j in pairs])
+    z[:, :d] += 0.02 * rng.standard_normal((steps, d))
+    problem = problem.add("relative_pose_chordal", pairs, z, [0.02] * d + [0.01] * d * d)
+    across = [(k, (k + steps // 2) % steps) for k in range(0, steps // 2, 5)]
+    ranges = [np.linalg.norm(at[i] - at[j]) + 0.1 * rng.standard_normal() for i, j in across]
+    return problem.add("range", across, np.abs(ranges)[:, None], 0.1)
+
+
+@pytest.mark.parametrize(("steps", "d"), [(12, 3), (40, 2), (260, 2)])
+def test_loops_of_poses_are_certified(steps: int, d: int) -> None:
+    problem = ring(steps, d)
+    solution = solve(problem)
+    verdict = certify(problem, solution)
+    assert verdict.certified, str(verdict)
+    assert (quadratic(problem).bound > newton.DENSE) == (steps == 260)
+
+
+def test_a_loop_wound_the_wrong_way_is_refused() -> None:
+    """Started with every heading turned by one more revolution around the loop: a local minimum of pose graphs."""
+    steps = 24
+    problem = ring(steps, 2)
+    assert problem.x0 is not None
+    lap = 2 * np.pi * np.arange(steps) / steps
+    wound = pose(problem.x0[:, :2] * 0.2, 2 * lap)
+    wound[0] = problem.x0[0]
+    local = solve(replace(problem, x0=wound), throw=False)
+    best = solve(problem)
+    assert certify(problem, best).certified
+    assert local.cost > 10 * best.cost
+    assert not certify(problem, local).certified

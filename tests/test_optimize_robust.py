@@ -12,9 +12,8 @@ import pytest
 from scipy.optimize import approx_fprime, least_squares
 from scipy.stats import chi2
 
-from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, solve, solve_gnc, solve_gnc_batch
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, solve, solve_gnc
 from coopoc.optimize.assessment.curvature import is_minimum
-from coopoc.optimize.robust.surrogates import SURROGATES
 
 M = gtsam.noiseModel.mEstimator
 GTSAMS = {"huber": M.Huber, "cauchy": M.Cauchy, "geman-mcclure": M.GemanMcClure, "truncated": M.TruncatedLeastSquares}
@@ -220,27 +219,6 @@ def test_any_backend_and_any_weighting_may_solve_the_rounds(backend: str) -> Non
     kept = np.flatnonzero(ours.extras["weights"]).tolist()
     inside = inside.add("position", kept, problem.factors[3].z[kept], std=1.0)
     assert solve(inside, backend).covariance == pytest.approx(ours.covariance, abs=1e-9)
-
-
-def test_a_batch_is_each_of_its_realisations() -> None:
-    """With realisations that lack measurements, and one that needs no round at all."""
-    each = [native(seed, wrong) for seed, wrong in ((0, 0), (1, 3), (2, 7))]
-    factors = []
-    for parts in zip(*(p.factors for p in each), strict=True):
-        std = np.stack([np.broadcast_to(f.std, (len(f.nodes), f.size)) for f in parts])
-        std[1, 1] = np.inf
-        factors.append(replace(parts[0], z=np.stack([f.z for f in parts]), std=std))
-    batch = replace(each[0], factors=tuple(factors), x0=np.stack([p.x0 for p in each]))
-    groups = np.repeat(np.arange(6), 2)
-    for loss in SURROGATES:
-        found = solve_gnc_batch(batch, [3], loss=loss, groups=groups)
-        assert found.converged.all()
-        for b in range(3):
-            alone = solve_gnc(batch.pick(b), [3], loss=loss, groups=groups)
-            assert found.x[b] == pytest.approx(alone.x, abs=1e-6)
-            assert found.weights[b] == pytest.approx(alone.extras["weights"], abs=1e-6)
-            assert found.covariance[b] == pytest.approx(alone.covariance, abs=1e-6)
-            assert found.rounds[b] == alone.extras["rounds"]
 
 
 def test_a_saddle_far_from_the_origin_is_one() -> None:

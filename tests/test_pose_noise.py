@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from test_pose_methods import WHITE, convoy, observed
 
 import coopoc as co
-from coopoc.evaluate.pose_metrics import pose_covariance
+from coopoc.evaluate.metrics import pose_covariance
 from coopoc.learned.pose_noise import PoseTask, fit_pose_noise, log_score
 from coopoc.world.frames import true_heading
 

@@ -1,4 +1,4 @@
-"""Schedules under a cap on bytes: the token bucket, turns, and the neighbour that lowers the bound most."""
+"""Schedules under a cap on bytes: the token bucket, nearest first and round robin."""
 
 from __future__ import annotations
 
@@ -7,22 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
-from scipy.linalg import solve_discrete_are
 
-from coopoc import V2X, CentralFilter, Fleet, InputError, JointFilter, MovingHorizon, Recording, Sensors, observe
-from coopoc.arrays import Floats
-from coopoc.methods.gbp import GaussianBeliefPropagation
+from coopoc import V2X, Fleet, InputError, JointFilter, MovingHorizon, Recording, Sensors, observe
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
-from coopoc.world.informative import UNKNOWN, MostInformative
-from coopoc.world.schedules import Nearest, order, within_cap
-from coopoc.world.spherical import vector_cov
-from coopoc.world.v2x import ESTIMATE, FIX_AND_VELOCITY, Message, Schedule
+from coopoc.world.schedules import within_cap
+from coopoc.world.v2x import FIX_AND_VELOCITY, Message, Schedule
 
 S2 = Sensors.paper_scenario2()
 WORD = Message("word", 25, unicast=True)
-INFORMATIVE: Schedule = "most informative"
 
 
 def still(places: list[list[float]], steps: int = 20) -> Fleet:
@@ -64,7 +57,7 @@ def test_messages_of_many_sizes_pass_the_bucket_nearest_first(crossing: Fleet) -
     seen = observe(crossing, S2, channel, runs=5)
     link = seen.links.of(0)
     size, start = rng.integers(10, 90, len(link)), np.searchsorted(seen.links.step[link], np.arange(len(seen.t) + 1))
-    given = (seen.arrival[:, link], size, start, seen, Nearest())
+    given = (seen.arrival[:, link], size, start, seen.links.neighbour[link], seen)
     found = within_cap(*given)
     wanted, depth = np.full_like(found, -1), 500.0
     for run in range(5):
@@ -122,145 +115,9 @@ def test_turns_are_turns() -> None:
     assert len(received) == 10 + 59
 
 
-def covariance(own: Floats, vectors: Floats, fix: Floats, received: tuple[int, ...]) -> Floats:
-    """(3, 3) of the ego after the fixes received: the dense information matrix of ego and vectors, inverted."""
-    n = len(vectors)
-    blocks = [own, *vectors]
-    information = np.zeros((3 * n + 3, 3 * n + 3))
-    for k, block in enumerate(blocks):
-        information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.linalg.inv(block)
-    for j in received:
-        row = np.zeros((3, 3 * n + 3))
-        row[:, :3] = row[:, 3 * j + 3 : 3 * j + 6] = np.eye(3)
-        information += row.T @ np.diag(1 / fix) @ row
-    return np.linalg.inv(information)[:3, :3]
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_greedy_choice_is_the_best_of_all(seed: int) -> None:
-    """Every subset of four neighbours by brute force: each pick lowers the trace most of all that are left, by its
-    utility, and two picks are within a hundredth of the best pair."""
-    rng = np.random.default_rng(seed)
-    places = [[0.0, 0, 0], *(rng.uniform(-20, 20, (4, 3)) * [1, 1, 0.1]).tolist()]
-    sensors, channel = replace(S2, gnss_std=(2.0, 3.0, 5.0)), V2X(4, radius=100.0, schedule=INFORMATIVE)
-    seen = observe(still(places, 2), sensors, channel, runs=2, seed=seed)
-    link = seen.links.of(0)
-    schedule = order(seen, 0, link, FIX_AND_VELOCITY)
-    assert isinstance(schedule, MostInformative)
-    schedule.measure(0, slice(0, 4))
-    sender, fix = seen.links.neighbour[link[:4]], np.square(seen.sensors.fix_std)
-    begin = schedule.own.copy()
-    received: list[tuple[int, ...]] = [(), ()]
-    for _ in range(3):
-        worth, picks = schedule.utility(0, slice(0, 4)), []
-        for run in range(2):
-            vectors = schedule.vector[run, sender]
-            before = np.trace(covariance(begin[run], vectors, fix, received[run]))
-            gains = {
-                j: before - np.trace(covariance(begin[run], vectors, fix, (*received[run], j)))
-                for j in range(4)
-                if j not in received[run]
-            }
-            np.testing.assert_allclose([worth[run, j] for j in gains], list(gains.values()), rtol=1e-6)
-            picks.append(max(gains, key=lambda j: gains[j]))
-            received[run] = (*received[run], picks[-1])
-        schedule.receive(0, np.arange(2), np.array(picks))
-    for run in range(2):
-        pairs = {
-            two: np.trace(covariance(begin[run], schedule.vector[run, sender], fix, two))
-            for two in itertools.combinations(range(4), 2)
-        }
-        assert pairs[tuple(sorted(received[run][:2]))] < 1.01 * min(pairs.values())  # type: ignore[index]
-
-
-def test_what_the_receiver_knows_is_what_a_filter_knows(crossing: Fleet) -> None:
-    """Against filterpy: the ego's own fixes, and the vector to a neighbour whose messages arrive at steps 1, 2 and 6,
-    forgotten 0.35 s later, and not measured at step 8."""
-    seen = observe(crossing.between(0, 12), S2, V2X(7, radius=1e3, max_age=0.35, schedule=INFORMATIVE))
-    link = seen.links.of(0)
-    link = link[(seen.links.step[link] != 8) | (seen.links.neighbour[link] != 3)]
-    schedule = order(seen, 0, link, FIX_AND_VELOCITY)
-    assert isinstance(schedule, MostInformative)
-    own, vector = KalmanFilter(3, 3), KalmanFilter(3, 3)
-    own.H, vector.H, own.P, vector.P = np.eye(3), np.eye(3), UNKNOWN * np.eye(3), UNKNOWN * np.eye(3)
-    own.R, age, last = np.diag(np.square(S2.fix_std)), 0, np.zeros(3)
-    for t in range(12):
-        span = slice(*np.searchsorted(seen.links.step[link], [t, t + 1]).tolist())
-        schedule.measure(t, span)
-        moved = np.square(0.1 * S2.assumed_velocity_std(seen.velocity[0, t, 0]))
-        own.predict(Q=np.diag(moved))
-        own.update(np.zeros(3))
-        np.testing.assert_allclose(schedule.own[0], own.P, rtol=1e-6)
-        age += 1
-        if t == 8:
-            continue
-        (k,) = np.flatnonzero(seen.links.neighbour[link[span]] == 3) + span.start
-        tracked = last.any() and age <= 3 and t != 9
-        vector.predict(Q=np.diag(moved + (2 * age - 1) * 0.01 * last) if tracked else UNKNOWN * np.eye(3))
-        vector.update(np.zeros(3), R=vector_cov(seen.relative[0, link[k]], S2.relative_std, S2.min_range))
-        np.testing.assert_allclose(schedule.vector[0, 3], vector.P, rtol=1e-4)
-        if t in (1, 2, 6):
-            schedule.receive(t, np.array([0]), np.array([k]))
-            own.update(np.zeros(3), R=own.R + vector.P)
-            last, age = np.square(S2.assumed_velocity_std(seen.velocity[0, t, 3])), 0
-
-
-def test_a_message_without_a_fix_brings_a_velocity_only(crossing: Fleet) -> None:
-    seen = observe(crossing, S2, V2X(3, schedule=INFORMATIVE), runs=2)
-    gnss = seen.gnss.copy()
-    gnss[1, 0, 1:] = np.nan
-    seen, link = replace(seen, gnss=gnss), seen.links.of(0)
-    schedule = order(seen, 0, link, FIX_AND_VELOCITY)
-    assert isinstance(schedule, MostInformative)
-    schedule.measure(0, slice(0, int(np.searchsorted(seen.links.step[link], 1))))
-    before = schedule.own.copy()
-    schedule.receive(0, np.array([0, 1]), np.array([0, 0]))
-    assert np.trace(schedule.own[0]) < np.trace(before[0])
-    assert np.array_equal(schedule.own[1], before[1])
-    assert (schedule.last[:, seen.links.neighbour[link[0]]] == 0).all()
-
-
-def test_an_estimate_holds_the_fixes_since_the_last(crossing: Fleet) -> None:
-    """What a sender's filter settles at is SciPy's Riccati solution; soon after, an estimate is worth a fix or two."""
-    seen = observe(crossing, S2, V2X(7, radius=1e3, schedule=INFORMATIVE))
-    link = seen.links.of(0)[:14]
-    schedule = order(seen, 0, link, ESTIMATE)
-    assert isinstance(schedule, MostInformative)
-    fix, (j,) = np.diag(np.square(S2.fix_std)), seen.links.neighbour[link[:1]]
-
-    def worth(brought: Floats) -> float:
-        own, vector = schedule.own[0], schedule.vector[0, j]
-        return float(np.trace(own) - np.trace(np.linalg.inv(np.linalg.inv(own) + np.linalg.inv(vector + brought))))
-
-    schedule.measure(0, slice(0, 7))
-    prior = solve_discrete_are(np.eye(3), np.eye(3), np.diag(0.01 * schedule.speed[0, j]), fix)
-    settled = np.linalg.inv(np.linalg.inv(prior) + np.linalg.inv(fix))
-    assert schedule.utility(0, slice(0, 7))[0, 0] == pytest.approx(worth(settled), rel=1e-6)
-    schedule.receive(0, np.array([0]), np.array([0]))
-    schedule.measure(1, slice(7, 14))
-    k = seen.links.neighbour[link[7:]].tolist().index(j)
-    assert schedule.utility(1, slice(7, 14))[0, k] == pytest.approx(worth(fix), rel=1e-6)
-    schedule.measure(2, slice(7, 14))
-    assert schedule.utility(2, slice(7, 14))[0, k] == pytest.approx(worth(fix / 2), rel=1e-6)
-
-
-def test_fixes_come_from_the_nearest_and_estimates_in_turns() -> None:
-    """Two neighbours, one message a step: another fix of the same is as good, another estimate is not."""
-    fleet = still([[0, 0, 0], [9, 0, 0], [0, 12, 0]], 40)
-    seen = observe(fleet, S2, V2X(2, bytes_per_second=320.0, schedule=INFORMATIVE))
-    received = {}
-    for message in (FIX_AND_VELOCITY, ESTIMATE):
-        box = inbox(seen, 0, message)
-        late = (box.arrival[0] >= 0) & (seen.links.step[box.link] >= 20)
-        received[message.name] = np.bincount(seen.links.neighbour[box.link][late], minlength=3)[1:]
-    assert received["fix and velocity"].tolist() == [20, 0]
-    assert abs(int(received["estimate"][0]) - int(received["estimate"][1])) <= 4
-
-
-@pytest.mark.parametrize("schedule", ["round robin", "most informative"])
-def test_schedules_are_paired_and_repeat(crossing: Fleet, schedule: Schedule) -> None:
+def test_schedules_are_paired_and_repeat(crossing: Fleet) -> None:
     """Fewer runs are a part of more; another schedule takes other messages of the same, for the same bytes."""
-    channel = V2X(5, radius=60.0, loss=0.2, bytes_per_second=300.0, schedule=schedule)
+    channel = V2X(5, radius=60.0, loss=0.2, bytes_per_second=300.0, schedule="round robin")
     many, few = (inbox(observe(crossing, S2, channel, runs=runs), 2, FIX_AND_VELOCITY) for runs in (4, 2))
     assert np.array_equal(many.arrival[:2], few.arrival)
     assert not np.array_equal(many.arrival[0], many.arrival[1])
@@ -272,7 +129,7 @@ def test_schedules_are_paired_and_repeat(crossing: Fleet, schedule: Schedule) ->
         assert np.array_equal(track.received_bytes[:, 0], few.received_bytes)
 
 
-def test_an_exchange_takes_turns_and_does_not_guess_utility() -> None:
+def test_an_exchange_takes_turns() -> None:
     """b is in contact with a, whom it sees, and with c, who sees it: one message a step, in turns."""
     fleet = still([[0, 0, 0], [9, 0, 0], [20, 0, 0]], 100)
     channel = V2X(max_neighbours=1, bytes_per_second=1000.0, schedule="round robin")
@@ -283,10 +140,6 @@ def test_an_exchange_takes_turns_and_does_not_guess_utility() -> None:
     assert far[:9].all()  # the bucket is full at first
     assert (near[10:] ^ far[10:]).all()
     assert (near[10:-1] ^ near[11:]).all()
-    guess = observe(fleet, S2, replace(channel, schedule="most informative"))
-    with pytest.raises(InputError, match="schedule = 'most informative': must be 'nearest' or 'round robin' in an exc"):
-        GaussianBeliefPropagation()(guess, [0])
-    assert CentralFilter()(guess, [0]).received_bytes.sum() > 0  # its cap acts on nothing
 
 
 def test_an_unknown_schedule_is_named() -> None:

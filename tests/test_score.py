@@ -12,12 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from coopoc.data.score_files import read_paths, score
 from coopoc.errors import InputError
-from coopoc.evaluate.association import associated
-from coopoc.evaluate.relative_error import relative_error
-from coopoc.evaluate.score import Path as Track
-from coopoc.evaluate.score import rms_interval, scores
-from coopoc.formats.kitti import read_kitti
-from coopoc.formats.tum import write_tum
+from coopoc.evaluate.alignment import relative_error
+from coopoc.evaluate.trajectory_scores import Path as Track
+from coopoc.evaluate.trajectory_scores import associated, rms_interval, scores
+from coopoc.formats.trajectories import read_kitti, write_tum
 
 EVO = {(1, "steps"): (0.028120377, 4540), (10, "steps"): (0.194007758, 454), (100, "m"): (1.193975925, 36)}
 """evo 1.38.1, `metrics.RPE`, translation part, of KITTI 00 and ORB-SLAM: rmse m, and number of pairs."""

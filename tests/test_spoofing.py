@@ -14,7 +14,7 @@ import pytest
 
 from coopoc import V2X, CooperativeMAP, Fleet, InputError, Sensors, observe, rt_le
 from coopoc.optimize import Problem, Solution, solve, solve_gnc
-from coopoc.optimize.robust.surrogates import SURROGATES
+from coopoc.optimize.robust.gnc import SURROGATES
 from coopoc.world.recording import Recording
 from coopoc.world.spoofing import spoofed
 

@@ -1,41 +1,43 @@
-"""The posterior Cramer-Rao bound of an information set: solo, star or whole fleet, filtering or smoothing."""
+"""Posterior Cramer-Rao bounds of an information set: solo, star or whole fleet; of positions or of poses.
+
+One recursion over the steps of a drive with members that come and go serves all, filtering or smoothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from tqdm import tqdm
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from ..methods.drift_state import drifting, require_white
-from ..plugins import unknown
+from ..methods.drift_state import Drift, drifting, require_white
+from ..world.axes import columns
 from ..world.fleet import Fleet
+from ..world.frames import body_motion, midway, true_heading, turned
 from ..world.links import Links
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
+from ..world.spherical import spherical, vector_cov
 from ..world.v2x import V2X
-from .recursion import covariances, drifting_covariances, stages_of
+
+UNKNOWN_HEADING = 3.0 / np.pi**2
+"""1/rad^2 of a heading of which nothing is known: uniform over a turn."""
 
 
 def posterior_bound(
-    fleet: Fleet,
-    sensors: Sensors,
-    ego: int | str,
-    v2x: V2X | None = None,
-    *,
-    smoothing: bool = False,
-    information: Literal["star", "fleet"] = "star",
+    fleet: Fleet, sensors: Sensors, ego: int | str, v2x: V2X | None = None, *, smoothing: bool = False
 ) -> Floats:
     """Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
 
     Filtering: J_t = (Q_t + J_{t-1}^-1)^-1 + F_t (Tichavsky, Muravchik, Nehorai 1998), F_t the Fisher information of the
     fixes and relative measurements at the true positions, Q_t the true motion noise. Smoothing adds the information of
     the future. The information set is the ego's own measurements (solo, `v2x` None or K = 0), also the fixes and
-    velocities of the linked neighbours over an ideal channel (star), or all that any vehicle measures (fleet); a
-    vehicle that leaves the star is forgotten, as its motion is not received. The bias is left out: it is unobservable
-    from a GNSS start. Drift and common errors of the fixes are unknowns beside the positions (filtering only).
+    velocities of the linked neighbours over an ideal channel (star); a vehicle that leaves the star is forgotten, as
+    its motion is not received. The bias is left out: it is unobservable from a GNSS start. Drift and common errors of
+    the fixes are unknowns beside the positions (filtering only).
 
     Args:
         fleet: truth.
@@ -43,8 +45,6 @@ def posterior_bound(
         ego: column or id.
         v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
-        information: "fleet" costs O(T (3N)^3); for several egos use
-            `fleet_bound`, which gives all at once.
 
     Raises:
         InputError: an acting std of zero, for which the bound is zero; an ego that is unknown or absent.
@@ -53,22 +53,10 @@ def posterior_bound(
     >>> float(posterior_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0)[1, 0, 0])  # standing still: 4 / 2
     2.0
     """
-    v2x = checked_noise(fleet, sensors, v2x)
-    if not isinstance(information, str) or information not in ("star", "fleet"):
-        raise unknown("information", information, ("star", "fleet"), "For solo give K = 0.")
-    instance("smoothing", smoothing, bool)
-    column = fleet.index(ego)
-    if not fleet.present[:, column].all():
-        raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
-    if information == "fleet":
-        return fleet_bound(fleet, sensors, v2x, smoothing=smoothing)[:, column]
+    v2x, column = checked_noise(fleet, sensors, v2x), _present(fleet, ego)
+    instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range)
-    steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
-    members = [np.concatenate([[column], near]) for near in steps]
-    out = np.empty((len(fleet.t), 3, 3))
-    for t, cov in _recursion(fleet, sensors, links, members, smoothing):
-        out[t] = cov[:3, :3]
-    return out
+    return _bound(fleet, sensors, links, _star(fleet, links, column), smoothing)[:, column]
 
 
 def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
@@ -89,11 +77,7 @@ def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
     """
     links = find_links(fleet, [ego], v2x.max_neighbours, v2x.radius, sensors.min_range)
     members = [np.flatnonzero(row) for row in fleet.present]
-    out = np.empty((len(fleet.t), 3, 3))
-    for t, cov in _recursion(fleet, sensors, links, members, smoothing=False):
-        own = 3 * int(np.searchsorted(members[t], ego)) + np.arange(3)
-        out[t] = cov[np.ix_(own, own)]
-    return out
+    return _bound(fleet, sensors, links, members, smoothing=False)[:, ego]
 
 
 def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoothing: bool = False) -> Floats:
@@ -108,24 +92,69 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
     """
     v2x = checked_noise(fleet, sensors, v2x)
     instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
-    everyone = range(len(fleet.ids))
-    links = find_links(fleet, everyone, v2x.max_neighbours, v2x.radius, sensors.min_range)
-    members = [np.flatnonzero(row) for row in fleet.present]
-    out = np.full((*fleet.position.shape, 3), np.nan)
-    for t, cov in _recursion(fleet, sensors, links, members, smoothing):
-        n = len(members[t])
-        out[t, members[t]] = cov.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-    return out
+    links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, sensors.min_range)
+    return _bound(fleet, sensors, links, [np.flatnonzero(row) for row in fleet.present], smoothing)
 
 
-def _recursion(
-    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool
-) -> Iterator[tuple[int, Floats]]:
-    if not drifting(sensors):
-        return covariances(stages_of(fleet, sensors, links, members), smoothing)
-    if smoothing:
-        require_white(sensors, "the smoothing bound")
-    return drifting_covariances(stages_of(fleet, sensors, links, members, fixes=False), sensors, fleet.dt)
+def pose_bound(
+    fleet: Fleet,
+    sensors: Sensors,
+    ego: int | str,
+    v2x: V2X | None = None,
+    *,
+    landmarks: Sequence[int | str] = (),
+) -> Floats:
+    """Bound covariance of the ego's (x, y, z, heading, ...) at every step, filtering, (T, d, d) m and rad.
+
+    J_t = (F_t J_{t-1}^-1 F_t^T + G_t Q_t G_t^T)^-1 + H_t^T R^-1 H_t (Tichavsky, Muravchik, Nehorai 1998) with the
+    derivatives of `PoseFilter`'s motion and measurements at the truth. An error that lasts and acts is one number more,
+    in this order: the speed's scale, the yaw rate's bias, the compass's bias. Nothing is known of first positions, of
+    first headings that they lie within a turn.
+
+    Args:
+        fleet: truth.
+        sensors: the noise that acts.
+        ego: column or id.
+        v2x: K and radius, not loss; None or K = 0: a vehicle alone with its landmarks.
+        landmarks: columns or ids of vehicles that stand at known positions.
+
+    Raises:
+        InputError: an acting std of zero, for which the bound is zero; drifting fixes; an ego that is unknown,
+            absent or a landmark.
+
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> bound = pose_bound(fleet, Sensors(heading_std=0.2), 0)  # at first little is known but one compass
+    >>> bool(abs(bound[0, 3, 3] - 1 / (1 / 0.2**2 + 3 / np.pi**2)) < 1e-12)
+    True
+    """
+    column = _present(instance("fleet", fleet, Fleet), ego)
+    marks = columns("landmarks", landmarks, fleet.ids)
+    if column in marks:
+        raise InputError("ego", fleet.ids[column], "is a landmark", "Its position is known.")
+    v2x = checked_noise(fleet, sensors, v2x, bool(marks))
+    links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range, marks)
+    stages = pose_stages(fleet, sensors, links, _star(fleet, links, column, marks))
+    return _marginals(fleet, stages, covariances(stages, smoothing=False))[:, column]
+
+
+def fleet_pose_bound(
+    fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landmarks: Sequence[int | str] = ()
+) -> Floats:
+    """Bound covariances (T, N, d, d) of all vehicles from all that any measures; NaN where absent and for landmarks.
+
+    Args and errors: as in `pose_bound`.
+
+    >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
+    >>> alone, together = (fleet_pose_bound(fleet, Sensors(compass=False), V2X(k))[0, 0, 3, 3] for k in (0, 1))
+    >>> bool(together < 0.1 * alone)  # a bearing of a neighbour with a fix gives a heading
+    True
+    """
+    marks = columns("landmarks", landmarks, instance("fleet", fleet, Fleet).ids)
+    v2x = checked_noise(fleet, sensors, v2x, bool(marks))
+    links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, sensors.min_range, marks)
+    members = [np.setdiff1d(np.flatnonzero(row), marks) for row in fleet.present]
+    stages = pose_stages(fleet, sensors, links, members)
+    return _marginals(fleet, stages, covariances(stages, smoothing=False))
 
 
 def bound_rt_le(cov: Floats) -> float:
@@ -143,3 +172,249 @@ def checked_noise(fleet: Fleet, sensors: Sensors, v2x: V2X | None, landmarks: bo
     if (v2x.max_neighbours or landmarks) and min(sensors.relative_std) <= 0:
         raise InputError("relative_std", sensors.relative_std, "must be > 0", "An exact one merges two vehicles.")
     return v2x
+
+
+def _present(fleet: Fleet, ego: int | str) -> int:
+    """Column of an ego; InputError where it is absent."""
+    column = fleet.index(ego)
+    if not fleet.present[:, column].all():
+        raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
+    return column
+
+
+def _star(fleet: Fleet, links: Links, ego: int, landmarks: Sequence[int] = ()) -> list[Ints]:
+    """The ego and its neighbours of each step."""
+    vehicle = ~np.isin(links.neighbour, landmarks)
+    step, neighbour = links.step[vehicle], links.neighbour[vehicle]
+    return [np.append(ego, near) for near in np.split(neighbour, np.searchsorted(step, np.arange(1, len(fleet.t))))]
+
+
+def _bound(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool) -> Floats:
+    """Bound covariances (T, N, 3, 3) m^2 of positions, NaN for those that are no members."""
+    if drifting(sensors) and smoothing:
+        require_white(sensors, "the smoothing bound")
+    if not drifting(sensors):
+        stages = position_stages(fleet, sensors, links, members)
+        return _marginals(fleet, stages, covariances(stages, smoothing))
+    stages = position_stages(fleet, sensors, links, members, fixes=False)
+    return _marginals(fleet, stages, drifting_covariances(stages, sensors, fleet.dt))
+
+
+def _marginals(fleet: Fleet, stages: list[Stage], found: Iterator[tuple[int, Floats]]) -> Floats:
+    """(T, N, d, d) of each member from the covariances of all at each step."""
+    d = len(stages[0].prior)
+    out = np.full((*fleet.position.shape[:2], d, d), np.nan)
+    for t, cov in found:
+        n = len(stages[t].members)
+        out[t, stages[t].members] = cov.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """One step of n members with d numbers each, at the truth.
+
+    Attributes:
+        members: (n,) columns.
+        previous: (n,) their places one step before, -1 for a new member.
+        motion: (n, d, d) derivatives F of a member's state by the one before.
+        process: (n, d, d) covariance Q of the motion.
+        prior: (d,) information of what is known of a new member's numbers.
+        gained: (dn, dn) information of the step's measurements.
+    """
+
+    members: Ints
+    previous: Ints
+    motion: Floats
+    process: Floats
+    prior: Floats
+    gained: Floats
+
+
+def position_stages(
+    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], *, fixes: bool = True
+) -> list[Stage]:
+    """Every step of the positions of vehicles (columns) that are members of it, with fixes or without."""
+    stages: list[Stage] = []
+    alone = np.diag(1.0 / np.square(sensors.gnss_std)) * fixes
+    for now, previous, edges in steps_of(fleet, links, members):
+        t, n = len(stages), len(now)
+        process = (fleet.dt * sensors.velocity_std(fleet.velocity[t, now]))[:, :, None] ** 2 * np.eye(3)
+        gained = edge_information(edges, (n, 3), sensors.relative_std) + diagonal(np.tile(alone, (n, 1, 1)))
+        stages.append(Stage(now, previous, np.tile(np.eye(3), (n, 1, 1)), process, np.zeros(3), gained))
+    return stages
+
+
+def pose_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints]) -> list[Stage]:
+    """Every step of the poses of vehicles (columns) that are members of it.
+
+    Raises:
+        InputError: an exact compass, or fixes whose errors drift.
+    """
+    require_white(sensors, "the bound of poses")
+    if sensors.compass and sensors.heading_std <= 0:
+        raise InputError("heading_std", sensors.heading_std, "must be > 0", "Give a small one, or compass=False.")
+    acting = (sensors.speed_scale_std, sensors.yaw_rate_bias_std, sensors.heading_bias_std * sensors.compass)
+    lasting = [kind for kind, std in enumerate(acting) if std > 0]
+    own, d = _own(sensors, lasting), 4 + len(lasting)
+    prior = np.concatenate([[0, 0, 0, UNKNOWN_HEADING], 1.0 / np.square([acting[kind] for kind in lasting])])
+    motion, process = _motion(fleet, sensors, lasting)
+    stages: list[Stage] = []
+    for now, previous, edges in steps_of(fleet, links, members):
+        t, n = len(stages), len(now)
+        gained = edge_information(edges, (n, d), sensors.relative_std) + diagonal(np.tile(own, (n, 1, 1)))
+        stages.append(Stage(now, previous, motion[t, now], process[t, now], prior, gained))
+    return stages
+
+
+def _own(sensors: Sensors, lasting: list[int]) -> Floats:
+    """Information (d, d) of a fix and a compass, which measures its bias with the heading."""
+    rows = np.zeros((4, 4 + len(lasting)))
+    rows[:4, :4] = np.eye(4)
+    if 2 in lasting:
+        rows[3, 4 + lasting.index(2)] = 1.0
+    weight = np.append(1.0 / np.square(sensors.fix_std), sensors.heading_std**-2.0 if sensors.compass else 0.0)
+    return np.asarray((rows.T * weight) @ rows)
+
+
+def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats, Floats]:
+    """Derivatives F (T, N, d, d) of th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) u / (1 + s) at the truth,
+    and the covariance Q (T, N, d, d) of its noise."""
+    (forward, _), dt, d = body_motion(fleet), fleet.dt, 4 + len(lasting)
+    heading = midway(true_heading(fleet))
+    moved, shape = dt * turned(forward, heading), heading.shape
+    aside = np.stack([-moved[..., 1], moved[..., 0], np.zeros(shape)], axis=-1)
+    motion, noise = np.zeros((*shape, d, d)), np.zeros((*shape, d, d))
+    motion[...] = np.eye(d)
+    motion[..., :3, 3] = aside
+    std = sensors.velocity_std(forward)
+    for axis, unit in enumerate(np.eye(3)):
+        noise[..., :3, axis] = dt * turned(std[..., axis, None] * unit, heading)
+    noise[..., :3, 3], noise[..., 3, 3] = 0.5 * dt * sensors.yaw_rate_std * aside, dt * sensors.yaw_rate_std
+    keep = float(np.exp(-dt / sensors.odometry_error_time))
+    for place, kind in enumerate(lasting, 4):
+        if kind == 0:
+            motion[..., :3, place] = -moved
+        elif kind == 1:
+            motion[..., :3, place], motion[..., 3, place] = -0.5 * dt * aside, -dt
+        if kind < 2:
+            fresh = (sensors.speed_scale_std, sensors.yaw_rate_bias_std)[kind] * np.sqrt(1.0 - keep**2)
+            motion[..., place, place], noise[..., place, place] = keep, fresh
+    return motion, noise @ noise.swapaxes(-1, -2)
+
+
+Edges = tuple[Floats, Ints, Ints]
+"""Vectors (E, 3) m of relative measurements, places of observers and neighbours among the members, -1 if it is none."""
+
+
+def steps_of(fleet: Fleet, links: Links, members: list[Ints]) -> Iterator[tuple[Ints, Ints, Edges]]:
+    """Members of each step, their places one step before (-1 for new ones), and its true vectors."""
+    start, before = np.searchsorted(links.step, np.arange(len(fleet.t) + 1)), np.full(len(fleet.ids), -1)
+    for t, now in enumerate(members):
+        place = np.full(len(fleet.ids), -1)
+        place[now] = np.arange(len(now))
+        observer, neighbour = (side[start[t] : start[t + 1]] for side in (links.observer, links.neighbour))
+        vector = fleet.position[t, neighbour] - fleet.position[t, observer]
+        yield now, before[now], (vector, place[observer], place[neighbour])
+        before = place
+
+
+def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats) -> Floats:
+    """Information (dn, dn) of relative measurements about n members of d numbers, the fourth, if any, the heading.
+
+    A measured vector v moves by dp_j - dp_i, and with the observer's heading by -dth (-v_y, v_x, 0).
+
+    Args:
+        edges: of the step.
+        sizes: n and d.
+        std: (3,) m, rad, rad.
+    """
+    (vector, observer, neighbour), (n, d) = edges, sizes
+    own, other = np.zeros((2, len(vector), 3, d))
+    own[..., :3] = -np.eye(3)
+    if d > 3:
+        own[:, 0, 3], own[:, 1, 3] = vector[:, 1], -vector[:, 0]
+    other[..., :3] = np.eye(3) * (neighbour >= 0)[:, None, None]
+    weight = np.linalg.inv(vector_cov(np.stack(spherical(*vector.T), axis=-1), std))
+    found, ends = np.zeros((n, n, d, d)), ((observer, own), (np.maximum(neighbour, 0), other))
+    for here, rows in ends:
+        for there, others in ends:
+            np.add.at(found, (here, there), rows.swapaxes(1, 2) @ weight @ others)
+    return found.swapaxes(1, 2).reshape(n * d, n * d)
+
+
+def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Floats]]:
+    """Steps and the bound (dn, dn) of their members: forward, or for smoothing from the last step to the first.
+
+    Smoothing is the two-filter form: information from the past with the present, plus that of the future.
+    """
+    filtered: list[Floats] = []
+    cov: Floats = np.zeros((0, 0))
+    with tqdm(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0) as bar:
+        for t, stage in enumerate(stages):
+            information = _onward(cov, stage) + stage.gained
+            cov = np.linalg.inv(information)
+            bar.update()
+            if smoothing:
+                filtered.append(information)
+            else:
+                yield t, cov
+        future: Floats = np.zeros_like(cov)
+        for t in range(len(filtered) - 1, -1, -1):
+            yield t, np.linalg.inv(filtered.pop() + future)
+            future = _backward(future, stages[t], len(stages[t - 1].members)) if t else future
+            bar.update()
+
+
+def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> Iterator[tuple[int, Floats]]:
+    """Filtering bound (3n, 3n) where fixes have time-correlated errors, which the state then holds (`Drift`).
+
+    Args:
+        stages: without the fixes, which do not see positions alone.
+    """
+    drift = Drift.of(sensors, dt)
+    cov: Floats = np.zeros((0, 0))
+    for t, stage in enumerate(tqdm(stages, desc="bound", unit="step", delay=2.0)):
+        n, process = len(stage.members), np.diagonal(stage.process, axis1=1, axis2=2)
+        fix_matrix, weight = drift.fix_matrix(n), np.tile(1.0 / np.square(sensors.gnss_std), n)
+        information = np.linalg.inv(drift.carry(cov, stage.previous, process)) + (fix_matrix.T * weight) @ fix_matrix
+        information[: 3 * n, : 3 * n] += stage.gained
+        cov = np.linalg.inv(information)
+        yield t, cov[: 3 * n, : 3 * n]
+
+
+def _onward(cov: Floats, stage: Stage) -> Floats:
+    """Information about the members of a step from the covariance one step before, (F P F^T + Q)^-1."""
+    n, d = stage.motion.shape[:2]
+    stays, out = np.flatnonzero(stage.previous >= 0), np.diag(np.tile(stage.prior, n))
+    if len(stays):
+        here, there = _numbers(stays, d), _numbers(stage.previous[stays], d)
+        motion = diagonal(stage.motion[stays])
+        moved = motion @ cov[np.ix_(there, there)] @ motion.T + diagonal(stage.process[stays])
+        out[np.ix_(here, here)] = np.linalg.inv(moved)
+    return out
+
+
+def _backward(future: Floats, stage: Stage, n: int) -> Floats:
+    """Information of a step and its future about the n members one step before, whose motion is the inverse one."""
+    d, back = len(stage.prior), np.linalg.inv(stage.motion)
+    stays, previous = np.flatnonzero(stage.previous >= 0), np.full(n, -1)
+    previous[stage.previous[stays]] = stays
+    motion, process = np.zeros((2, n, d, d))
+    motion[stage.previous[stays]] = back[stays]
+    process[stage.previous[stays]] = (back @ stage.process @ back.swapaxes(1, 2))[stays]
+    reverse = replace(stage, previous=previous, motion=motion, process=process, prior=np.zeros(d))
+    return _onward(np.linalg.inv(future + stage.gained), reverse)
+
+
+def diagonal(blocks: Floats) -> Floats:
+    """The matrix (nd, nd) that has n blocks (n, d, d) on its diagonal."""
+    n, d = blocks.shape[:2]
+    found = np.zeros((n, d, n, d))
+    found[np.arange(n), :, np.arange(n)] = blocks
+    return found.reshape(n * d, n * d)
+
+
+def _numbers(places: Ints, d: int) -> Ints:
+    """Places of all numbers of members."""
+    return np.asarray(d * places[:, None] + np.arange(d)).ravel()

@@ -38,9 +38,9 @@ class Ledger:
     Raises:
         InputError: shapes that do not fit together, a name twice, a server that does not take part.
 
-    >>> both = of_training(["a", "b"], [400.0, 400.0], [200.0, 200.0]) + Ledger.empty(["b"], [10.0])
-    >>> both.per_vehicle("training"), both.seconds.tolist()
-    (200.0, [0.0, 10.0])
+    >>> once = of_training(["a", "b"], [400.0, 400.0], [200.0, 200.0])
+    >>> once.per_vehicle("training"), once
+    (200.0, Ledger(names=('a', 'b'), seconds (2,), sent (2, 2, 1, 2), received (2, 2, 1, 2)))
     """
 
     names: tuple[str, ...]
@@ -64,12 +64,6 @@ class Ledger:
         if len(set(self.names)) < len(self.names) or not set(self.servers) <= set(self.names):
             raise InputError("names", self.names, f"must differ and hold the servers {self.servers}", "Rename them.")
 
-    @classmethod
-    def empty(cls, names: Sequence[str], seconds: npt.ArrayLike = 0.0, runs: int = 1) -> Ledger:
-        """Participants that have moved nothing, in so many seconds of driving."""
-        nothing, drive = np.zeros((2, 2, runs, len(names))), np.broadcast_to(np.asarray(seconds, float), len(names))
-        return cls(tuple(names), drive, nothing, nothing)
-
     def of(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> Floats:
         """(R, V) bytes."""
         array = self.sent if _place(Way, "way", way) == 0 else self.received
@@ -86,21 +80,6 @@ class Ledger:
         if not self.seconds.sum() > 0:
             raise InputError("seconds", self.seconds.tolist(), "must be > 0 for some vehicle", "Add a drive.")
         return float(self.of("online", kind, way).sum(axis=1).mean() / self.seconds.sum())
-
-    def __add__(self, other: Ledger) -> Ledger:
-        """All that both hold, by name: drives of one vehicle come one after the other; one run stands for all."""
-        names = tuple(dict.fromkeys([*self.names, *other.names]))
-        servers = tuple(dict.fromkeys([*self.servers, *other.servers]))
-        runs = {ledger.sent.shape[2] for ledger in (self, other)} - {1}
-        if len(runs) > 1:
-            raise InputError("runs", sorted(runs), "must be the same in both, or one", "Average one of them first.")
-        seconds, moved = np.zeros(len(names)), np.zeros((2, 2, 2, max(runs, default=1), len(names)))
-        for ledger in (self, other):
-            place = [names.index(name) for name in ledger.names]
-            seconds[place] += ledger.seconds
-            moved[0][..., place] += ledger.sent
-            moved[1][..., place] += ledger.received
-        return Ledger(names, seconds, moved[0], moved[1], servers)
 
 
 def of_training(

@@ -1,16 +1,21 @@
-"""Errors of a Track against its Fleet: RT-LE, maximum, CDF, NEES with its band."""
+"""Errors of a Track against its Fleet: RT-LE, maximum, heading, NEES with its band; metrics by name."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from scipy import stats
 
-from ..arrays import Floats, instance, number, refuse
+from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
 from ..kernels.scores import distances, normalised, root_mean_squares
 from ..methods.track import Track
+from ..plugins import find
 from ..world.fleet import Fleet
+from ..world.frames import true_heading
 from ..world.recording import Recording
+from ..world.spherical import wrap
 
 
 def errors(track: Track, fleet: Fleet) -> Floats:
@@ -129,3 +134,86 @@ def share_of_average(average: Floats, runs: int, level: float = 0.99) -> Floats:
     low, high = nees_band(runs, level)
     inside = np.where(np.isnan(average), np.nan, (average >= low) & (average <= high))
     return np.asarray(np.nanmean(inside, axis=0))
+
+
+def heading_error(track: Track, fleet: Fleet) -> Floats:
+    """Estimated less true heading, (R, T, E) rad in [-pi, pi); NaN where the truth is unknown.
+
+    Raises:
+        InputError: a track without headings, or another fleet's.
+
+    >>> from coopoc import PoseFilter, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 1], [[[0, 0, 0]], [[9, 0, 0]]], np.full((2, 1, 3), [9.0, 0, 0]))
+    >>> heading_error(PoseFilter("solo")(observe(fleet, Sensors(), frame="body")), fleet).shape
+    (1, 2, 1)
+    """
+    errors(track, fleet)  # checks that both fit each other
+    if track.heading is None:
+        raise InputError("heading", None, "this method estimates none", "Take a pose filter.")
+    return np.asarray(wrap(track.heading - true_heading(fleet)[:, list(track.egos)]))
+
+
+def pose_nees(track: Track, fleet: Fleet) -> Floats:
+    """Normalised estimation error squared of (x, y, heading), (R, T, E); its mean is 3 for a consistent filter.
+
+    Heights stay out: a vehicle on the ground has three degrees of freedom, so that `nees_band(runs)` is its band.
+
+    Raises:
+        InputError: as `heading_error`, or a track without covariances.
+
+    >>> from coopoc import PoseFilter, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 1], [[[0, 0, 0]], [[9, 0, 0]]], np.full((2, 1, 3), [9.0, 0, 0]))
+    >>> pose_nees(PoseFilter("solo")(observe(fleet, Sensors(), runs=5, frame="body")), fleet).shape
+    (5, 2, 1)
+    """
+    turn = heading_error(track, fleet)
+    error = np.concatenate([(track.x - fleet.position[:, list(track.egos)])[..., :2], turn[..., None]], axis=-1)
+    solved = np.linalg.solve(pose_covariance(track), error[..., None])[..., 0]
+    return np.asarray((error * solved).sum(axis=-1))
+
+
+def pose_covariance(track: Track) -> Floats:
+    """Covariance (R, T, E, 3, 3) of (x, y, heading), m and rad.
+
+    Raises:
+        InputError: a track without covariances.
+    """
+    if track.covariance is None or track.heading_covariance is None:
+        raise InputError("covariance", None, "this method claims none", "NEES needs one.")
+    cov = np.empty((*track.x.shape, 3))
+    cov[..., :2, :2] = track.covariance[..., :2, :2]
+    cov[..., 2, :2] = cov[..., :2, 2] = track.heading_covariance[..., :2]
+    cov[..., 2, 2] = track.heading_covariance[..., 3]
+    return cov
+
+
+def mean_nees(track: Track, fleet: Fleet) -> Floats:
+    """Mean over time of the normalised estimation error squared, (R, E); 3 for a consistent filter."""
+    return np.asarray(np.nanmean(nees(track, fleet), axis=1))
+
+
+METRICS: Mapping[str, Callable[[Track, Fleet], Floats]] = {
+    "rt_le_m": rt_le,
+    "max_error_m": max_error,
+    "nees": mean_nees,
+}
+"""Column of a table -> function of a Track and its Fleet; a unit that is not SI stands in the name."""
+
+
+def measure(name: str, track: Track, fleet: Fleet) -> Floats:
+    """One metric of a track, (R, E).
+
+    Args:
+        name: one of METRICS, an entry point in `coopoc.metrics`, or "mine.py:NAME", a function of Track and Fleet.
+        track: the estimates.
+        fleet: the truth.
+
+    Raises:
+        InputError: an unknown name, another shape than (R, E), or an error of the metric itself.
+
+    >>> from coopoc import GNSS, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> measure("rt_le_m", GNSS()(observe(fleet, Sensors(), runs=5)), fleet).shape
+    (5, 1)
+    """
+    return checked(name, find("coopoc.metrics", name)(track, fleet), "(R, E)", (len(track.x), len(track.egos)))

@@ -12,9 +12,8 @@ from ..errors import InputError
 from ..methods.track import Method, Track
 from ..world.fleet import Fleet
 from ..world.recording import Recording
-from .catalogue import measure
 from .ledger import Kind, Way, of_track
-from .metrics import distance, errors, nees, neighbour_rt_le, rt_le, share_of_average
+from .metrics import distance, errors, measure, nees, neighbour_rt_le, rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),

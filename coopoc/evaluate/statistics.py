@@ -75,22 +75,6 @@ def paired_difference(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: 
     return mean_interval(a - b, level, resamples, seed)
 
 
-def paired_ratio(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
-    """mean(a) / mean(b) on the same egos and runs, with its interval: both means take the same resample.
-
-    Args and errors: as in `paired_difference`.
-
-    >>> paired_ratio(np.array([2.0, 4.0]), np.array([1.0, 2.0])).mean
-    2.0
-    """
-    a, b = _pair(a, b)
-    below = _resampled(b, resamples, seed)
-    if not below.all():
-        raise InputError("b", float(b.mean()), "must have means that are not zero", "Compare by paired_difference.")
-    ratios = _resampled(a, resamples, seed) / below
-    return _interval(ratios, float(a.mean() / b.mean()), a, level)
-
-
 @dataclass(frozen=True)
 class Seeds:
     """A metric per training seed: `means` (S,), and the Student-t interval of their mean."""

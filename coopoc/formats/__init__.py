@@ -1,7 +1,8 @@
-"""Files of graphs and trajectories: PyFG, g2o, JRL, TUM, KITTI, as read and write pairs that name what is wrong."""
+"""Files of graphs and trajectories: PyFG and g2o read and written, JRL read, TUM and KITTI trajectories."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 from ..arrays import instance
@@ -11,10 +12,10 @@ from ..plugins import suggestion
 from .g2o import read_g2o, write_g2o
 from .graph import Graph
 from .jrl import read_jrl
-from .jrl_write import write_jrl
 from .pyfg import read_pyfg, write_pyfg
 
-GRAPHS = {".pyfg": (read_pyfg, write_pyfg), ".g2o": (read_g2o, write_g2o), ".jrl": (read_jrl, write_jrl)}
+GRAPHS = {".pyfg": read_pyfg, ".g2o": read_g2o, ".jrl": read_jrl}
+WRITERS = {".pyfg": write_pyfg, ".g2o": write_g2o}
 
 
 def load_graph(path: str | Path) -> Graph:
@@ -27,21 +28,21 @@ def load_graph(path: str | Path) -> Graph:
     Traceback (most recent call last):
     coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o or .jrl. Rename or convert the file.
     """
-    return GRAPHS[_suffix(path)][0](path)
+    return GRAPHS[_suffix(path, GRAPHS)](path)
 
 
 def write_graph(graph: Graph, path: str | Path) -> None:
-    """Write a graph, .pyfg, .g2o or .jrl.
+    """Write a graph, .pyfg or .g2o.
 
     Raises:
-        InputError: another suffix, or what `write_pyfg`, `write_g2o` and `write_jrl` raise.
+        InputError: another suffix, or what `write_pyfg` and `write_g2o` raise.
     """
-    GRAPHS[_suffix(path)][1](instance("graph", graph, Graph), path)
+    WRITERS[_suffix(path, WRITERS)](instance("graph", graph, Graph), path)
 
 
-def _suffix(path: str | Path) -> str:
-    suffix = given_path(path).suffix
-    if suffix not in GRAPHS:
-        hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
-        raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)
+def _suffix(path: str | Path, known: Iterable[str]) -> str:
+    suffix, known = given_path(path).suffix, list(known)
+    if suffix not in known:
+        hint = suggestion(suffix, known, "Rename or convert the file.")
+        raise InputError("path", Path(path).name, f"must end in {' or '.join(known)}", hint)
     return suffix

@@ -9,16 +9,11 @@ import numpy as np
 from ..arrays import instance
 from ..errors import InputError
 from ..file_names import given_path
-from .check import NAME
-from .compose import to_lines
-from .graph import Graph
-from .lines import read_words, to_numbers
-from .parse import to_graph
+from .graph import NAME, Graph
 from .records import Grammar, Record
+from .values import read_words, to_numbers
 
 OFFSET = "PARAMS_SE3OFFSET id x y z qx qy qz qw"
-TORO = ("VERTEX2", "EDGE2", "VERTEX3", "EDGE3")
-"""Records of an older format, whose matrices have another order."""
 
 
 def _name(word: str, kind: str) -> str:
@@ -85,10 +80,9 @@ def read_g2o(path: str | Path) -> Graph:
     records = [line for line in lines if line[1][0] not in GRAMMAR.others]
     identity = _identities(path.name, [line for line in lines if line[1][0] == "PARAMS_SE3OFFSET"])
     for number, words in records:
-        _refuse_toro(path.name, number, words[0])
         _refuse_offset(path.name, number, words, identity)
     fixed = [(number, word) for number, words in lines if words[0] == "FIX" for word in words[1:]]
-    return to_graph(path.name, records, GRAMMAR, fixed)
+    return GRAMMAR.read(path.name, records, fixed)
 
 
 def write_g2o(graph: Graph, path: str | Path) -> None:
@@ -108,7 +102,7 @@ def write_g2o(graph: Graph, path: str | Path) -> None:
         short = name[0] == "L" if name in point else plain
         return str(int(name[1:]) + (0 if short else ord(name[0]) << 56))
 
-    lines = to_lines(graph, GRAMMAR, label)
+    lines = GRAMMAR.write(graph, label)
     if graph.dimension == 3 and (len(graph.relative_point) or len(graph.pose_prior)):
         lines.insert(0, "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1")
     lines += [f"FIX {label(graph.names[k])}" for k in graph.fixed.tolist()]
@@ -119,12 +113,6 @@ def _identities(file: str, lines: list[tuple[int, list[str]]]) -> dict[str, bool
     """Id of every sensor offset, and whether it is none."""
     poses = to_numbers(file, [number for number, _ in lines], [words[2:] for _, words in lines], OFFSET, 7)
     return {words[1]: bool((pose == np.eye(7)[6]).all()) for (_, words), pose in zip(lines, poses, strict=True)}
-
-
-def _refuse_toro(file: str, number: int, tag: str) -> None:
-    if tag in TORO:
-        load = f"gtsam.writeG2o(*gtsam.load{tag[-1]}D(path), path + '.g2o')"
-        raise InputError(f"{file}: line {number}", tag, "is TORO's, not g2o's", f"Convert the file: {load}.")
 
 
 def _refuse_offset(file: str, number: int, words: list[str], identity: dict[str, bool]) -> None:

@@ -1,26 +1,142 @@
-"""Graph: the vertices and measurements of a PyFG or g2o file."""
+"""Graph: the vertices and measurements of a PyFG, g2o or JRL file, and the rules that they keep."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import InitVar, dataclass, replace
+from dataclasses import InitVar, dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Ints, frozen
-from .check import check, no_edges
-from .edges import ENDS, PointEdges, PoseEdges, RangeEdges
-from .vertices import Vertices
+from ..arrays import AnyArray, Bools, Floats, Ints, frozen
+from ..errors import InputError
+from ..short_repr import short_repr
+from .values import LEAST, UNIT, to_rotation
+
+ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge must be
+    "pose_prior": ("pose",),
+    "point_prior": ("point",),
+    "relative_pose": ("pose", "pose"),
+    "relative_point": ("pose", "point"),
+    "ranges": ("any", "any"),
+}
+NAME = re.compile(r"[A-Za-z](0|[1-9][0-9]{0,14})")
+ROUNDING = 1e-9
+"""What may be left below zero, or unequal, of the largest eigenvalue or entry."""
+Place = Callable[[str, int], str]
 
 
-def _row(field: str, row: int) -> str:
-    return f"{field}[{row}]"
+class Edges:
+    """Base of the three kinds: read-only arrays with one row per measurement, NaN for a stamp that is not given."""
+
+    nodes: Ints
+    stamps: Floats
+
+    __repr__ = short_repr
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def __post_init__(self) -> None:
+        for field in fields(self):  # type: ignore[arg-type]
+            dtype: Any = np.int64 if field.name == "nodes" else np.float64
+            object.__setattr__(self, field.name, frozen(getattr(self, field.name), dtype))
+        if not len(self.stamps):
+            object.__setattr__(self, "stamps", frozen(np.full(len(self.nodes), np.nan)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PoseEdges(Edges):
+    """M measured poses: of the second vertex in the frame of the first, or of a single vertex in the world (priors).
+
+    Args:
+        nodes: (M, 2), or (M, 1) for priors: places in Graph.names.
+        position: (M, d) m.
+        orientation: (M, 1) rad in 2-D, (M, 4) qx qy qz qw in 3-D, as in the file; of matrices by `to_orientation`.
+        covariance: (M, D, D) of x, y, theta (D = 3), or of x, y, z and the rotation vector (D = 6), m and rad.
+        stamps: (M,) s.
+
+    >>> PoseEdges([[0, 1]], [[1, 0]], [[0.0]], [np.eye(3)]).rotation.shape
+    (1, 2, 2)
+    """
+
+    nodes: Ints = ()  # type: ignore[assignment]
+    position: Floats = ()  # type: ignore[assignment]
+    orientation: Floats = ()  # type: ignore[assignment]
+    covariance: Floats = ()  # type: ignore[assignment]
+    stamps: Floats = ()  # type: ignore[assignment]
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(M, d, d)."""
+        return to_rotation(self.orientation)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointEdges(Edges):
+    """M measured points: of the second vertex in the frame of the first, or of a single vertex in the world (priors).
+
+    Args:
+        nodes: (M, 2), or (M, 1) for priors.
+        position: (M, d) m.
+        covariance: (M, d, d) m^2.
+        stamps: (M,) s.
+
+    >>> len(PointEdges([[0, 1]], [[1, 0]], [np.eye(2)]))
+    1
+    """
+
+    nodes: Ints = ()  # type: ignore[assignment]
+    position: Floats = ()  # type: ignore[assignment]
+    covariance: Floats = ()  # type: ignore[assignment]
+    stamps: Floats = ()  # type: ignore[assignment]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RangeEdges(Edges):
+    """M measured distances between any two vertices.
+
+    Args:
+        nodes: (M, 2).
+        distance: (M,) m.
+        variance: (M,) m^2.
+        stamps: (M,) s.
+
+    >>> len(RangeEdges([[0, 1]], [5.0], [0.01]))
+    1
+    """
+
+    nodes: Ints = ()  # type: ignore[assignment]
+    distance: Floats = ()  # type: ignore[assignment]
+    variance: Floats = ()  # type: ignore[assignment]
+    stamps: Floats = ()  # type: ignore[assignment]
+
+
+def edges_of(kind: str, nodes: npt.ArrayLike, values: Floats, covariance: Floats, stamps: npt.ArrayLike) -> Edges:
+    """Edges of a kind from the rows of a file.
+
+    Args:
+        kind: as in `ENDS`.
+        nodes: (M, 1 or 2).
+        values: (M, C) a distance, a position, or a position and an orientation.
+        covariance: (M, D, D).
+        stamps: (M,) s.
+    """
+    if kind == "ranges":
+        arrays = (values[:, 0], covariance[:, 0, 0])
+        return RangeEdges(nodes, *arrays, stamps)  # type: ignore[arg-type]
+    if "point" in kind:
+        return PointEdges(nodes, values, covariance, stamps)  # type: ignore[arg-type]
+    d = 2 if values.shape[1] == 3 else 3
+    return PoseEdges(nodes, values[:, :d], values[:, d:], covariance, stamps)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
-class Graph(Vertices):
+class Graph:
     """A factor graph as a file holds it: n poses and points, and what was measured between them.
 
     Orientations are kept as the file writes them (an angle or a quaternion), so that writing what was read changes no
@@ -50,6 +166,12 @@ class Graph(Vertices):
     Graph(2-D: 1 poses of 1 robots, 1 points; 1 ranges)
     """
 
+    dimension: int
+    names: tuple[str, ...]
+    is_pose: Bools
+    position: Floats
+    orientation: Floats
+    stamps: Floats = ()  # type: ignore[assignment]
     relative_pose: PoseEdges = PoseEdges()
     relative_point: PointEdges = PointEdges()
     ranges: RangeEdges = RangeEdges()
@@ -67,16 +189,22 @@ class Graph(Vertices):
         if not len(self.stamps):
             object.__setattr__(self, "stamps", frozen(np.full(len(self.names), np.nan)))
         for field in ENDS:
-            if not len(getattr(self, field)):
-                object.__setattr__(self, field, no_edges(field, self.dimension))
-        check(self, {field: getattr(self, field) for field in ENDS}, self.fixed, place or _row)
+            if not len(edges := getattr(self, field)):
+                empty = {name: np.zeros(shape) for name, shape in shapes(field, self.dimension, 0).items()}
+                object.__setattr__(self, field, type(edges)(**empty))
+        check(self, place or (lambda field, row: f"{field}[{row}]"))
+
+    @cached_property
+    def rotation(self) -> Floats:
+        """(n, d, d), the identity for points."""
+        return to_rotation(self.orientation)
 
     @cached_property
     def robots(self) -> Mapping[str, Ints]:
         """Letter -> places in names of that robot's poses, in the order of the file."""
         letter = np.array([name[0] for name in self.names])
         first = dict.fromkeys(letter[self.is_pose].tolist())
-        return {one: np.flatnonzero(self.is_pose & (letter == one)) for one in first}
+        return {robot: np.flatnonzero(self.is_pose & (letter == robot)) for robot in first}
 
     def stamped(self, stamps: npt.ArrayLike) -> Graph:
         """The same graph with other stamps, an edge that of its first pose, else point; NaN takes them away.
@@ -105,3 +233,128 @@ class Graph(Vertices):
             + (f"; {', '.join(measured)}" if measured else "")
             + (f"; {len(self.fixed)} fixed)" if len(self.fixed) else ")")
         )
+
+
+def shapes(field: str, dimension: int, rows: int) -> dict[str, tuple[int, ...]]:
+    """Shape of every array of a kind of edge with that many rows.
+
+    >>> shapes("ranges", 2, 5)["nodes"]
+    (5, 2)
+    """
+    common = {"nodes": (rows, len(ENDS[field])), "stamps": (rows,)}
+    if field == "ranges":
+        return {**common, "distance": (rows,), "variance": (rows,)}
+    if "point" in field:
+        return {**common, "position": (rows, dimension), "covariance": (rows, dimension, dimension)}
+    turn, size = (1, 3) if dimension == 2 else (4, 6)
+    poses = {"position": (rows, dimension), "orientation": (rows, turn), "covariance": (rows, size, size)}
+    return {**common, **poses}
+
+
+def check(graph: Graph, place: Place) -> None:
+    """InputError at the first rule that a graph breaks: `Graph` lists them.
+
+    Args:
+        graph: all its fields as arrays.
+        place: (field, row) -> where it came from.
+    """
+    if graph.dimension not in (2, 3):
+        raise InputError("dimension", graph.dimension, "must be 2 or 3", "Give the dimension of the positions.")
+    n, d = len(graph.names), graph.dimension
+    if not n:
+        raise InputError("names", "0 vertices", "must be at least one", "Check that the file is complete.")
+    wanted = {"is_pose": (n,), "position": (n, d), "orientation": (n, 1 if d == 2 else 4), "stamps": (n,)}
+    for field, shape in wanted.items():
+        _shape(field, getattr(graph, field), shape)
+    _vertices(graph, place)
+    for field in ENDS:
+        edges = getattr(graph, field)
+        for name, shape in shapes(field, d, len(edges)).items():
+            _shape(f"{field}.{name}", getattr(edges, name), shape)
+        if len(edges):
+            _ends(graph, field, edges.nodes, place)
+            _values(edges, field, place)
+    fixed = graph.fixed
+    _refuse(place, "fixed", (fixed < 0) | (fixed >= n), fixed, f"must be in 0..{n - 1}", "Give places in names.")
+
+
+def _vertices(graph: Graph, place: Place) -> None:
+    names, first = graph.names, dict[str, int]()
+    for row, name in enumerate(names):
+        if not NAME.fullmatch(name):
+            raise InputError(place("names", row), repr(name), "must be a letter and a number as A0", "Rename it.")
+        if first.setdefault(name, row) != row:
+            before = f"must be given once, and is at {place('names', first[name])}"
+            raise InputError(place("names", row), f"vertex {name}", before, "Remove or rename one of them.")
+    infinite = np.isinf(np.hstack([graph.position, graph.orientation])).any(axis=1)
+    allowed = "must be finite, or NaN where unknown"
+    _refuse(place, "names", infinite, [f"vertex {name} at infinity" for name in names], allowed, "Mend the number.")
+    timed = [f"stamp {stamp} of {name}" for stamp, name in zip(graph.stamps, names, strict=True)]
+    wrong = np.isfinite(graph.stamps) & ~graph.is_pose
+    _refuse(place, "names", wrong, timed, "must be NaN: a point has none", "Give stamps to poses only.")
+    _unit(graph.orientation, "names", place)
+
+
+def _ends(graph: Graph, field: str, nodes: Ints, place: Place) -> None:
+    n = len(graph.names)
+    outside, hint = ((nodes < 0) | (nodes >= n)).any(axis=1), "Give places in names."
+    _refuse(place, field, outside, nodes, f"must be in 0..{n - 1}", hint, "vertices ")
+    for end, role in enumerate(ENDS[field]):
+        if role != "any":
+            wrong, called = graph.is_pose[nodes[:, end]] != (role == "pose"), np.array(graph.names)[nodes[:, end]]
+            _refuse(
+                place,
+                field,
+                wrong,
+                called,
+                f"must be a {role} in {field}",
+                "Check the order of the vertices.",
+                "vertex ",
+            )
+    loops, twice = (nodes[:, :1] == nodes[:, 1:]).any(axis=1), [f"{graph.names[k]} twice" for k in nodes[:, 0]]
+    _refuse(place, field, loops, twice, "must be two vertices", "Remove the measurement.")
+
+
+def _values(edges: Edges, field: str, place: Place) -> None:
+    for name in [n for n in shapes(field, 2, 0) if n not in ("nodes", "stamps")]:
+        values: Floats = getattr(edges, name).reshape(len(edges), -1)
+        mend, given = "Mend the number.", f"{name} "
+        _refuse(place, field, ~np.isfinite(values).all(axis=1), values, "must be finite", mend, given)
+        if name in ("distance", "variance"):
+            _refuse(place, field, values[:, 0] < 0, [f"{value:g}" for (value,) in values], "must be >= 0", mend, given)
+        if name in ("variance", "covariance"):
+            size = values[:, :: math.isqrt(values.shape[1]) + 1]  # the diagonal
+            extreme = (((size > 0) & (size < LEAST)) | (size > 1 / LEAST)).any(axis=1)
+            allowed = f"must be 0, or of a size in {LEAST:g}..{1 / LEAST:g}: its inverse overflows"
+            _refuse(place, field, extreme, values, allowed, mend, given)
+        if name == "orientation":
+            _unit(getattr(edges, name), field, place)
+        if name == "covariance":
+            covariance: Floats = getattr(edges, name)
+            eigenvalues = np.linalg.eigvalsh(covariance)
+            least = ROUNDING * np.maximum(eigenvalues[:, -1], 0)
+            uneven = np.abs(covariance - covariance.swapaxes(-1, -2)).max(axis=(-2, -1))
+            wrong, hint = (eigenvalues[:, 0] < -least) | (uneven > least), "Order of the upper triangle: by rows."
+            _refuse(place, field, wrong, covariance, "must be symmetric and positive semi-definite", hint, given)
+
+
+def _unit(orientation: Floats, field: str, place: Place) -> None:
+    if orientation.shape[-1] == 4:
+        off = np.abs(np.linalg.norm(orientation, axis=1) - 1) > UNIT
+        allowed, hint = f"must have length 1 to within {UNIT:g}", "Order is qx qy qz qw; 0 0 0 1 is no rotation."
+        _refuse(place, field, off, orientation, allowed, hint, "quaternion ")
+
+
+def _refuse(
+    place: Place, field: str, wrong: npt.ArrayLike, given: npt.ArrayLike, allowed: str, hint: str, label: str = ""
+) -> None:
+    """InputError at the first row that is wrong, with what is given there."""
+    rows = np.flatnonzero(wrong)
+    if len(rows):
+        entry = np.asarray(given)[rows[0]].tolist()
+        raise InputError(place(field, int(rows[0])), f"{label}{entry}", allowed, hint)
+
+
+def _shape(field: str, array: AnyArray, shape: tuple[int, ...]) -> None:
+    if array.shape != shape:
+        raise InputError(field, f"shape {array.shape}", f"must have shape {shape}", "One row per vertex or edge.")

@@ -7,12 +7,9 @@ from pathlib import Path
 from ..arrays import instance
 from ..errors import InputError
 from ..file_names import given_path
-from .check import NAME
-from .compose import to_lines
-from .graph import Graph
-from .lines import read_words
-from .parse import to_graph
+from .graph import NAME, Graph
 from .records import Grammar, Record
+from .values import read_words
 
 GRAMMAR = Grammar(
     "PyFG",
@@ -58,7 +55,7 @@ def read_pyfg(path: str | Path) -> Graph:
     array([2.])
     """
     path = given_path(path)
-    return to_graph(path.name, read_words(path), GRAMMAR)
+    return GRAMMAR.read(path.name, read_words(path))
 
 
 def write_pyfg(graph: Graph, path: str | Path) -> None:
@@ -75,5 +72,5 @@ def write_pyfg(graph: Graph, path: str | Path) -> None:
             "PyFG has no record for fixed vertices",
             "Write dataclasses.replace(graph, fixed=()), or a pose prior.",
         )
-    lines = to_lines(graph, GRAMMAR, lambda name: name)
+    lines = GRAMMAR.write(graph, lambda name: name)
     given_path(path).write_text("\n".join([*lines, ""]))

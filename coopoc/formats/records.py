@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
+import numpy as np
+
+from ..arrays import Floats, Ints
 from ..errors import InputError
 from ..plugins import suggestion
-from .edges import ENDS
-from .lines import wrong
+from .graph import ENDS, Edges, Graph, edges_of
+from .values import inverse, malformed, symmetric, to_numbers, to_text, upper_triangle
 
 VALUES = {"pose2": "x y theta", "pose3": "x y z qx qy qz qw", "point2": "x y", "point3": "x y z"}
+Index = dict[str, dict[str, int]]  # pose or point -> the word for a vertex -> its place
 
 
 @dataclass(frozen=True)
@@ -54,14 +59,28 @@ class Record:
         return 0 if self.kind not in ENDS else 6 if "qw" in self.values else len(self.values.split())
 
     @property
+    def triangle(self) -> int:
+        """Numbers of the covariance's upper triangle."""
+        return self.size * (self.size + 1) // 2
+
+    @property
     def width(self) -> int:
         """Words of the line, the tag included."""
-        return 1 + len(self.words.split()) + self.size * (self.size + 1) // 2
+        return 1 + len(self.words.split()) + self.triangle
+
+
+@dataclass
+class _Rows:
+    """The lines of one kind: what they are, and for each its number and words."""
+
+    tag: str
+    lines: list[int] = field(default_factory=list)
+    words: list[list[str]] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
 class Grammar:
-    """A format.
+    """A format of lines, as `read` and `write` need it.
 
     Args:
         format: its name.
@@ -79,53 +98,179 @@ class Grammar:
 
     def form(self, tag: str) -> str:
         """Form of a line with a tag."""
+        record, noise = self.records[tag], []
+        if record.size == 1:
+            noise = ["variance" if self.noise == "covariance" else "information"]
+        elif record.size:
+            noise = [f"and the {record.triangle} numbers of the {self.noise}'s upper triangle"]
+        return " ".join([tag, record.words, *noise])
+
+    def read(self, file: str, lines: Iterable[tuple[int, list[str]]], fixed: Sequence[tuple[int, str]] = ()) -> Graph:
+        """Graph of the lines of a file.
+
+        Args:
+            file: named in messages.
+            lines: (line number, words) of every record.
+            fixed: (line number, vertex) of those that stay where they are.
+
+        Raises:
+            InputError: with the line, an unknown tag or vertex, another number of words, 2-D beside 3-D, no vertex at
+                all, a singular information, or what `Graph` raises.
+        """
+        dimension, rows = self._collect(file, lines)
+        origin = {kind: given.lines for kind, given in rows.items()}
+        origin["names"], words, arrays = self._vertices(file, rows, dimension)
+        origin["fixed"] = [line for line, _ in fixed]
+
+        def place(kind: str, row: int) -> str:
+            return f"{file}: line {origin[kind][row]}"
+
+        names, index = [], Index(pose={}, point={})
+        for row, (word, is_pose) in enumerate(zip(words, arrays["is_pose"], strict=True)):
+            kind = "pose" if is_pose else "point"
+            names.append(self.name(word, kind))
+            if not names[-1]:
+                hint = "PyFG: a letter and a number as A0. g2o: a number."
+                raise InputError(place("names", row), f"vertex {word}", f"must be called as {self.format} does", hint)
+            index[kind][word] = row
+        vertices = Graph(dimension, tuple(names), **arrays, place=place)
+        edges: dict[str, Any] = {kind: self._edges(file, rows[kind], index) for kind in ENDS if kind in rows}
+        still = [_find(place("fixed", row), word, "any", index) for row, (_, word) in enumerate(fixed)]
+        return replace(vertices, **edges, fixed=np.array(still, dtype=np.int64), place=place)
+
+    def _collect(self, file: str, lines: Iterable[tuple[int, list[str]]]) -> tuple[int, dict[str, _Rows]]:
+        """Dimension of a file, and its lines by kind."""
+        rows: dict[str, _Rows] = {}
+        dimension, since = 0, ""
+        width = {tag: record.width for tag, record in self.records.items()}
+        for number, words in lines:
+            tag, place = words[0], f"{file}: line {number}"
+            record = self.records.get(tag)
+            if record is None:
+                known = [*self.records, *self.others]
+                hint = suggestion(tag, known, "Remove or convert the line.")
+                raise InputError(place, tag, f"must be one of {', '.join(known)}", hint)
+            if record.dimension and not dimension:
+                dimension, since = record.dimension, f"line {number}, {tag}"
+            if record.dimension not in (0, dimension):
+                hint = "Keep 2-D and 3-D in separate files."
+                raise InputError(place, tag, f"must be {dimension}-D as {since}", hint)
+            if len(words) != width[tag]:
+                raise malformed(file, number, words, self.form(tag))
+            given = rows.setdefault(record.kind, _Rows(tag))
+            given.lines.append(number)
+            given.words.append(words)
+        if not {"pose", "point"} & set(rows):
+            hint = "Check that the file is complete."
+            raise InputError(file, "0 vertices", "must have a line for every vertex", hint)
+        return dimension, rows
+
+    def _vertices(
+        self, file: str, rows: Mapping[str, _Rows], dimension: int
+    ) -> tuple[list[int], list[str], dict[str, Any]]:
+        """Lines, words for and arrays of the poses and points, in the order of the file."""
+        parts = []
+        for kind in ("pose", "point"):
+            if kind in rows:
+                stamps, ids, values = self._split(file, rows[kind])
+                turn = values[:, dimension:]
+                if kind == "point":
+                    turn = np.tile(np.zeros(1) if dimension == 2 else np.eye(4)[3], (len(ids), 1))
+                is_pose, words = np.full(len(ids), kind == "pose"), np.array([word for (word,) in ids])
+                parts.append((np.array(rows[kind].lines), words, is_pose, values[:, :dimension], turn, stamps))
+        lines, words, *arrays = [np.concatenate(part) for part in zip(*parts, strict=True)]
+        order = np.argsort(lines)
+        fields = ("is_pose", "position", "orientation", "stamps")
+        return lines[order].tolist(), words[order].tolist(), {f: a[order] for f, a in zip(fields, arrays, strict=True)}
+
+    def _edges(self, file: str, rows: _Rows, index: Index) -> Edges:
+        record, (stamps, ids, numbers) = self.records[rows.tag], self._split(file, rows)
+        places = [f"{file}: line {line}" for line in rows.lines]
+        nodes = [
+            [_find(place, word, role, index) for word, role in zip(words, record.ends, strict=True)]
+            for place, words in zip(places, ids, strict=True)
+        ]
+        count = len(record.values.split())
+        noise = symmetric(numbers[:, count:], record.size)
+        if self.noise == "information":
+            noise = inverse(noise, places.__getitem__, "information")
+        return edges_of(record.kind, nodes, numbers[:, :count], noise, stamps)
+
+    def _split(self, file: str, rows: _Rows) -> tuple[Floats, list[list[str]], Floats]:
+        """Stamps (M,), vertices, and the other numbers (M, C) of the lines of one kind."""
+        record = self.records[rows.tag]
+        start = 1 + record.stamped
+        stop = start + len(record.ends)
+        digits = [words[1:start] + words[stop + record.offset :] for words in rows.words]
+        numbers = to_numbers(file, rows.lines, digits, self.form(rows.tag), len(digits[0]))
+        stamps = numbers[:, 0] if record.stamped else np.full(len(digits), np.nan)
+        return stamps, [words[start:stop] for words in rows.words], numbers[:, start - 1 :]
+
+    def write(self, graph: Graph, label: Callable[[str], str]) -> list[str]:
+        """Lines of a graph: vertices in its order, then what was measured, kind by kind.
+
+        Args:
+            graph: any.
+            label: name of a vertex -> the word for it.
+
+        Raises:
+            InputError: a position or stamp that the format needs and the graph lacks, a stamp that the format could not
+                keep, or a singular covariance where it wants information.
+        """
+        tags = {r.kind: tag for tag, r in self.records.items() if r.dimension in (0, graph.dimension)}
+        labels = [label(name) for name in graph.names]
+        out: list[str] = [""] * len(labels)
+        for kind in ("pose", "point"):
+            own = np.flatnonzero(graph.is_pose == (kind == "pose"))
+            values = np.hstack([graph.position, graph.orientation] if kind == "pose" else [graph.position])[own]
+            lines = self._lines(graph, tags[kind], graph.stamps[own], own[:, None], labels, values)
+            for k, line in zip(own, lines, strict=True):
+                out[k] = line
+        for kind in ENDS:
+            edges = getattr(graph, kind)
+            if kind == "ranges":
+                values, noise = edges.distance[:, None], edges.variance[:, None, None]
+            else:
+                values, noise = edges.position, edges.covariance
+            if "pose" in kind:
+                values = np.hstack([values, edges.orientation])
+            if self.noise == "information":
+                noise = inverse(noise, f"{kind}[{{}}]".format, "covariance")
+            numbers = np.hstack([values, upper_triangle(noise)])
+            out += self._lines(graph, tags[kind], edges.stamps, edges.nodes, labels, numbers)
+        return out
+
+    def _lines(
+        self, graph: Graph, tag: str, stamps: Floats, nodes: Ints, labels: Sequence[str], values: Floats
+    ) -> list[str]:
         record = self.records[tag]
-        one = "variance" if self.noise == "covariance" else "information"
-        triangle = f"and the {record.size * (record.size + 1) // 2} numbers of the {self.noise}'s upper triangle"
-        return " ".join([tag, record.words, *([one if record.size == 1 else triangle] if record.size else [])])
-
-
-@dataclass(frozen=True)
-class Rows:
-    """The lines of one kind: what they are, and for each its number and words."""
-
-    record: Record
-    form: str
-    lines: list[int] = field(default_factory=list)
-    words: list[list[str]] = field(default_factory=list)
-
-
-def collect(file: str, lines: Iterable[tuple[int, list[str]]], grammar: Grammar) -> tuple[int, dict[str, Rows]]:
-    """Dimension of a file, and its lines by kind.
-
-    Raises:
-        InputError: an unknown tag, another number of words, 2-D beside 3-D, or no vertex at all; with the line.
-    """
-    rows: dict[str, Rows] = {}
-    dimension, since = 0, ""
-    width = {tag: record.width for tag, record in grammar.records.items()}
-    for number, words in lines:
-        tag = words[0]
-        record = grammar.records.get(tag)
-        if record is None:
-            known = [*grammar.records, *grammar.others]
-            hint = suggestion(tag, known, "Remove or convert the line.")
-            raise InputError(f"{file}: line {number}", tag, f"must be one of {', '.join(known)}", hint)
-        if record.dimension and not dimension:
-            dimension, since = record.dimension, f"line {number}, {tag}"
-        if record.dimension not in (0, dimension):
+        missing = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if len(missing):
+            hint = "Give it a position and an orientation, such as an initial guess."
+            name = graph.names[nodes[missing[0], 0]]
+            raise InputError(f"vertex {name}", "NaN", f"must be known: {tag} holds it", hint)
+        off = np.flatnonzero(np.isfinite(stamps) != record.stamped)
+        if len(off):
+            needs, value = ("must be given", "t") if record.stamped else ("has no place", "np.nan")
             raise InputError(
-                f"{file}: line {number}",
-                tag,
-                f"must be {dimension}-D as {since}",
-                "Keep 2-D and 3-D in separate files.",
+                f"stamp of {record.kind} of {graph.names[nodes[off[0], 0]]}",
+                stamps[off[0]],
+                f"{needs} in a line {tag} of {self.format}",
+                f"Write graph.stamped({value}), or replace the stamps.",
             )
-        if len(words) != width[tag]:
-            raise wrong(file, number, words, grammar.form(tag))
-        if record.kind not in rows:
-            rows[record.kind] = Rows(record, grammar.form(tag))
-        rows[record.kind].lines.append(number)
-        rows[record.kind].words.append(words)
-    if not {"pose", "point"} & set(rows):
-        raise InputError(file, "0 vertices", "must have a line for every vertex", "Check that the file is complete.")
-    return dimension, rows
+        times = [f" {t!r}" if record.stamped else "" for t in stamps.tolist()]
+        ends = [" ".join(labels[k] for k in pair) + " 0" * record.offset for pair in nodes.tolist()]
+        return [f"{tag}{t} {names} {text}" for t, names, text in zip(times, ends, to_text(values), strict=True)]
+
+
+def _find(place: str, word: str, role: str, index: Index) -> int:
+    """Place of a vertex in the graph; InputError if there is none, or more than one."""
+    roles = ("pose", "point") if role == "any" else (role,)
+    candidates = [index[each][word] for each in roles if word in index[each]]
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        raise InputError(place, f"vertex {word}", "is both a pose and a point", "Give every vertex its own id.")
+    other = any(word in names for names in index.values())
+    allowed = f"must be a {role}" if other else "must be one of the vertices of the file"
+    raise InputError(place, f"vertex {word}", allowed, "Check the order." if other else "Add its VERTEX line.")

@@ -7,15 +7,12 @@ from collections.abc import Callable, Mapping
 from ..one_file import in_file
 from ..plugins import find, names
 from .adaptive import AdaptiveKalman
-from .admm import ConsensusADMM
-from .batch_smoother import BatchSmoother
-from .central_filter import CentralFilter
+from .centralised import BatchSmoother, CentralFilter
 from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
-from .diffusion import Diffusion
+from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
 from .fixed_lag import FixedLagSmoother
-from .gbp import GaussianBeliefPropagation
 from .gnss import GNSS
 from .joint_filter import JointFilter
 from .kalman import Kalman
@@ -54,15 +51,13 @@ METHODS: Mapping[str, Factory] = {
     "qcqp-relaxation": lambda noise_model: QCQPRelaxation(noise_model),
     "gbp": lambda noise_model: GaussianBeliefPropagation(noise_model),
     "admm": lambda noise_model: ConsensusADMM(noise_model),
-    "diffusion": lambda noise_model: Diffusion(noise_model),
-    "diffusion-anchored": lambda noise_model: Diffusion(noise_model, anchored=True, name="diffusion-anchored"),
     "central-filter": lambda noise_model: CentralFilter(noise_model),
     "batch-smoother": lambda noise_model: BatchSmoother(noise_model),
     "fixed-lag": lambda noise_model: FixedLagSmoother(noise_model=noise_model),
     "mhe": lambda noise_model: MovingHorizon(noise_model=noise_model),
 }
 
-WHOLE_FLEET = frozenset({"gbp", "admm", "diffusion", "diffusion-anchored", "central-filter", "batch-smoother"})
+WHOLE_FLEET = frozenset({"gbp", "admm", "central-filter", "batch-smoother"})
 """Methods that need what every vehicle measured, not only the egos."""
 
 

@@ -13,13 +13,12 @@ from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..optimize.backend import require_backend
 from ..optimize.batch import solve_batch
-from ..optimize.initialisation.initial import converted
 from ..optimize.model.problem import Problem
-from ..optimize.robust.gnc import ROUNDS, solve_gnc
-from ..optimize.robust.outliers import Candidates, mark, reweigh
-from ..optimize.robust.surrogates import EASY, RATE, SETTLED, surrogate_of
+from ..optimize.robust.candidates import Candidates, mark, reweigh
+from ..optimize.robust.gnc import EASY, RATE, ROUNDS, SETTLED, solve_gnc, surrogate_of
 from ..optimize.solution import Status
 from ..optimize.solve import solve
+from ..optimize.starts.initial import converted
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -165,7 +164,7 @@ class CooperativeMAP:
         if np.isnan(found.covariance).any():
             counts[REJECTED] += 1
             weights = np.ones_like(weights)
-        return reweigh(problem, mark(problem, candidates), weights[None], found.x[None]).pick(0)
+        return reweigh(problem, mark(problem, candidates), weights, found.x)
 
 
 class Windows:
@@ -211,7 +210,7 @@ class Windows:
 
     def problems(self, ended: Ints) -> Iterator[tuple[int, int, Problem, Ints]]:
         """Run, step, problem and the vehicle of each point, of all windows that are not solved."""
-        from ..kernels.compiling.lanes import LANES
+        from ..kernels.compiling.vectors import LANES
         from ..kernels.windows.window import LOST, gather_window, new_windows
 
         for first in range(0, len(ended), LANES):

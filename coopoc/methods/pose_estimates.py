@@ -12,8 +12,8 @@ from ..world.inbox import inbox
 from ..world.recording import Recording
 from ..world.v2x import Message
 from . import pose_unit
-from .central_filter import centre
 from .pose_begin import check_compass
+from .whole_fleet import centre
 
 Follow: TypeAlias = Callable[..., tuple[Floats, Floats, Floats]]
 

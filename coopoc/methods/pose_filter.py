@@ -18,13 +18,13 @@ from ..world.sensors import Sensors
 from ..world.spherical import wrap
 from ..world.v2x import NO_MESSAGE, Message
 from . import pose_unit
-from .central_filter import CENTRE
 from .options import check_options
 from .pose_begin import first_poses, pose_egos
 from .pose_estimates import each, whole
 from .pose_stream import PoseStream
 from .pose_unit import Members
 from .track import Track
+from .whole_fleet import CENTRE
 
 if TYPE_CHECKING:
     from ..kernels.poses.pose_filter import PoseOptions

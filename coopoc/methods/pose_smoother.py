@@ -18,12 +18,12 @@ from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import Message
 from . import pose_unit
-from .central_filter import CENTRE, centre
 from .options import check_options
 from .pose_begin import first_poses, pose_egos
 from .pose_filter import SPREAD
 from .pose_piece import PLANE, Drive, node, pose_piece, vehicles
 from .track import Track
+from .whole_fleet import CENTRE, centre
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ODOMETRY = Message("fix, compass, velocity and yaw rate", 10)
 """Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2)."""
-POSE = Message("pose and covariance", 16, cumulative=True)
+POSE = Message("pose and covariance", 16)
 """Position and heading (4), covariance (10), id and time (2)."""
 UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_neighbour=4)
 LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5

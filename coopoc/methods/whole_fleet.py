@@ -1,22 +1,32 @@
-"""The loop of the whole-fleet methods: arrays by name for the kernels, answers that come late, bytes, the Track."""
+"""Whole-fleet methods: arguments of their kernels, delayed fusion of late results, bytes, the Track."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..world.exchange import Exchange
+from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, check_recording
+from ..world.v2x import NO_MESSAGE, Message
 from .contradiction import contradicted
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
 if TYPE_CHECKING:
-    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.graph import Assumed, Measured, Pairs
+
+UPLOAD = Message("fix, velocity and relative measurements", 8, per_neighbour=4)
+"""To the centre: fix (3), velocity (3), id and time (2); range, two angles and id for each vehicle that is measured."""
+DOWNLOAD = Message("estimate and covariance", 11)
+"""From the centre: position (3), covariance (6), id and time (2)."""
+CENTRE = (
+    "needs a centre that every vehicle reaches; loss and delay act on relative measurements only, a byte cap on neither"
+)
 
 
 class Answer(NamedTuple):
@@ -24,18 +34,15 @@ class Answer(NamedTuple):
 
     Attributes:
         x: (R, T, N, 3) m of all vehicles, of any shape.
-        covariance: (R, T, N, 3, 3) m^2, of any shape, or None.
+        covariance: (R, T, N, 3, 3) m^2, of any shape.
         rounds: of messages a step, None if an answer needs all vehicles that pairs connect, 0 if it is never late.
         notes: of the Track.
     """
 
     x: Floats
-    covariance: Floats | None
+    covariance: Floats
     rounds: int | None
     notes: tuple[str, ...] = ()
-
-
-Solve = Callable[["Measured", "Pairs", "Assumed"], Answer]
 
 
 def fleet_track(
@@ -43,10 +50,9 @@ def fleet_track(
     noise_model: NoiseModel | str,
     recording: Recording,
     egos: Sequence[int | str],
-    contacts: Callable[[], Exchange],
-    solve: Solve,
+    solve: Callable[[Measured, Pairs, Assumed], Answer],
     *,
-    both_ways: bool = True,
+    central: bool = False,
 ) -> Track:
     """Track of the egos from the whole fleet's estimates.
 
@@ -55,70 +61,78 @@ def fleet_track(
         noise_model: as the method was given it.
         recording: observed by all vehicles.
         egos: columns or ids.
-        contacts: makes the pairs in contact.
         solve: the method's kernel.
-        both_ways: whether a pair takes part only if the messages of both ways arrive, or if either does.
+        central: whether a centre has the messages: then a pair takes part if those of either way arrive, else if those
+            of both ways do.
 
     Raises:
         InputError: an ego that is unknown, absent at times or without a fix at first; a recording that not all vehicles
             observed.
     """
-    from ..kernels.fleets.answers import bring_forward, dead_reckon, newest
+    from ..kernels.fleets.graph import fuse_delayed, latest_available
 
     began = time.perf_counter()
     columns = check_recording(recording).columns(egos, missing=True)
-    met, known = contacts(), resolve(noise_model, recording)
-    arrival = met.both if both_ways else met.either
-    measured, pairs, assumed = kernel_arguments(recording, met, known, arrival)
-    found = solve(measured, pairs, assumed)
+    model = resolve(noise_model, recording)
+    met = centre(recording, method.message) if central else exchange(recording, method.message)
+    arrival = met.either if central else met.both
+    measured, pairs, assumed = kernel_arguments(recording, met, model, arrival)
+    answer = solve(measured, pairs, assumed)
     shape = (recording.runs, len(recording.t), len(columns))
-    x = found.x.reshape(recording.gnss.shape).take(columns, axis=2)
-    cov = None if found.covariance is None else found.covariance.reshape(*recording.gnss.shape[:3], 9).take(columns, 2)
-    if found.rounds != 0 and (arrival > met.step).any():
-        rounds = len(recording.ids) if found.rounds is None else found.rounds
-        ready = np.where(pairs.alive, arrival, -1)
-        held = newest(pairs.first, pairs.second, pairs.start, ready, len(recording.ids), rounds).take(columns, axis=2)
+    x = answer.x.reshape(recording.gnss.shape).take(columns, axis=2)
+    cov = answer.covariance.reshape(*recording.gnss.shape[:3], 9).take(columns, axis=2)
+    if answer.rounds != 0 and (arrival > met.step).any():
+        vehicles = len(recording.ids)
+        rounds = vehicles if answer.rounds is None else answer.rounds
+        latest = latest_available(pairs, np.where(pairs.alive, arrival, -1), vehicles, rounds).take(columns, axis=2)
         own = measured._replace(gnss=measured.gnss.take(columns, 2), velocity=measured.velocity.take(columns, 2))
-        if cov is None:
-            x = dead_reckon(held, x, own)
-        else:
-            process, fix = (_columns(values, columns) for values in (assumed.process, assumed.fix))
-            x, cov = (values.reshape(*shape[:2], -1) for values in (x, cov))
-            x, cov = bring_forward(held, x, cov, own, assumed._replace(process=process, fix=fix))
-    x, cov = x.reshape(*shape, 3), None if cov is None else cov.reshape(*shape, 3, 3)
-    received, sent, seconds = met.received_bytes[:, columns], met.sent_bytes[:, columns], time.perf_counter() - began
+        process, fix = (
+            values.take(columns, 2) if values.shape[2] > 1 else values for values in (assumed.process, assumed.fix)
+        )
+        assumed = assumed._replace(process=process, fix=fix)
+        x, cov = fuse_delayed(latest, x.reshape(*shape[:2], -1), cov.reshape(*shape[:2], -1), own, assumed)
+    x = x.reshape(*shape, 3)
     return Track(
         recording.t,
         tuple(columns),
         x,
-        cov,
-        received,
-        sent,
-        seconds,
-        notes=known.notes + found.notes + contradicted(x, recording, columns),
+        cov.reshape(*shape, 3, 3),
+        met.received_bytes[:, columns],
+        met.sent_bytes[:, columns],
+        time.perf_counter() - began,
+        notes=model.notes + answer.notes + contradicted(x, recording, columns),
     )
 
 
+def centre(recording: Recording, upload: Message) -> Exchange:
+    """Contacts as over the channel, with the bytes of every vehicle's `upload` to a centre and of its answer."""
+    links, overhead, present = recording.links, recording.v2x.overhead, np.isfinite(recording.velocity[0, :, :, 0])
+    measured = np.zeros(present.shape, dtype=np.int64)
+    np.add.at(measured, (links.step, links.observer), 1)
+    sent = (present * upload.size(overhead, measured)).sum(axis=0, dtype=float)
+    received = present.sum(axis=0) * float(DOWNLOAD.size(overhead))
+    runs = np.ones((recording.runs, 1))
+    return replace(exchange(recording, NO_MESSAGE), sent_bytes=runs * sent, received_bytes=runs * received)
+
+
 def kernel_arguments(
-    recording: Recording, met: Exchange, known: NoiseModel, arrival: Ints
+    recording: Recording, met: Exchange, model: NoiseModel, arrival: Ints
 ) -> tuple[Measured, Pairs, Assumed]:
     """Arguments of the kernels by name; a pair takes part if its messages arrive and both vehicles are active."""
-    from ..kernels.fleets.fleet_graph import Assumed, Measured, Pairs
+    from ..kernels.fleets.graph import Assumed, Measured, Pairs
     from ..kernels.stars.relative import components
 
     active = located(recording)
     both = active[:, met.step, met.first] & active[:, met.step, met.second]
-    alive = np.ascontiguousarray(both & (arrival >= 0))
     columns = (met.first, met.second, met.link, met.link_back, met.start)
     first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
-    pairs = Pairs(first, second, link, link_back, start, alive)
+    pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
     relative = components(recording.relative, np.arange(len(recording.links)))
-    variances = known.process_variance(recording), known.fix_variance(recording)
-    process, fix = (np.ascontiguousarray(each, dtype=float) for each in variances)
-    sensors = known.sensors
-    std, min_range = (sensors.relative_std, sensors.min_range) if sensors else (np.zeros(0), 0.0)
-    assumed = Assumed(process, fix, std, min_range)
-    return Measured(recording.gnss, recording.velocity, relative, active, recording.dt), pairs, assumed
+    variances = model.process_variance(recording), model.fix_variance(recording)
+    process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in variances)
+    std, min_range = (model.sensors.relative_std, model.sensors.min_range) if model.sensors else (np.zeros(0), 0.0)
+    measured = Measured(recording.gnss, recording.velocity, relative, active, recording.dt)
+    return measured, pairs, Assumed(process, fix, std, min_range)
 
 
 def located(recording: Recording) -> Bools:
@@ -134,7 +148,3 @@ def located(recording: Recording) -> Bools:
     joined = np.maximum.accumulate(np.where(present & ~before, step, -1))
     fix = np.maximum.accumulate(np.where(np.isfinite(recording.gnss).all(axis=-1), step, -1), axis=1)
     return np.asarray(present & (fix >= joined))
-
-
-def _columns(values: Floats, columns: Sequence[int]) -> Floats:
-    return values.take(columns, axis=2) if values.shape[2] > 1 else values

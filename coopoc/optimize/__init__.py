@@ -14,7 +14,7 @@ from .model.losses import Loss
 from .model.measurements import MEASUREMENTS, Measurement, measurement
 from .model.problem import Problem
 from .model.space import Space, pose
-from .robust.gnc import GNCBatch, solve_gnc, solve_gnc_batch
+from .robust.gnc import solve_gnc
 from .solution import Solution, SolveError, Status
 from .solve import solve
 
@@ -26,7 +26,6 @@ __all__ = [
     "Constraint",
     "Distributed",
     "Factor",
-    "GNCBatch",
     "LocalProblem",
     "Loss",
     "Measurement",
@@ -45,5 +44,4 @@ __all__ = [
     "solve_batch",
     "solve_distributed",
     "solve_gnc",
-    "solve_gnc_batch",
 ]

@@ -14,9 +14,9 @@ from .algebra.arrowhead import Arrow, marginals, structure
 from .algebra.normal import normal_equations
 from .assessment.assess import bounded
 from .backend import Backend, Options, require_backend
-from .initialisation.initial import initial_guess, somewhere
 from .model.problem import Problem
 from .solve import POSITION_TOLERANCE
+from .starts.initial import initial_guess, somewhere
 
 CHUNK = 40_000
 """Blocks of 3x3 numbers that one chunk may hold, so that a batch stays in the cache."""

@@ -17,13 +17,13 @@ from ..formats import load_graph
 from ..formats.graph import Graph
 from .backend import backends
 from .graphs import Objective, Start, from_graph, loop_closures, read_graph
-from .initialisation.race import expected as expected_cost
 from .model.problem import Problem
 from .model.search import Search
 from .robust.gnc import solve_gnc
-from .robust.hypotheses import AGREEING
+from .robust.loop_closures import AGREEING
 from .solution import Solution, Status
 from .solve import solve
+from .starts.race import expected as expected_cost
 
 UNLIKELY = 30.0
 """Factor by which residuals may differ from what is stated; on real graphs they are 0.2 to 1 times as large."""

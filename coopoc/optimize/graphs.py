@@ -12,18 +12,16 @@ import numpy as np
 from ..arrays import Floats, frozen, instance
 from ..errors import InputError
 from ..formats import load_graph
-from ..formats.edges import ENDS
-from ..formats.graph import Graph
+from ..formats.graph import ENDS, Graph
 from ..plugins import one_of
 from .algebra.sparse import keep
-from .initialisation.incremental_start import incremental_start
-from .initialisation.linear_start import parts
-from .initialisation.race import race
-from .initialisation.starts import STARTS, contenders, separated
 from .model.factor import Factor
 from .model.problem import Problem
 from .model.search import Search
 from .model.space import Space
+from .starts.graph_starts import STARTS, contenders, incremental_start, separated
+from .starts.race import race
+from .starts.walk import parts
 
 Objective = Literal["chordal", "geodesic"]
 Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
@@ -58,7 +56,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
 
-    >>> from coopoc.formats.edges import RangeEdges
+    >>> from coopoc.formats.graph import RangeEdges
     >>> ranges = RangeEdges([[0, 1]], [5.0], [0.01])
     >>> from_graph(Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges))
     Problem(2 nodes in the plane; 1 range)

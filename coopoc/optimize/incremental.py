@@ -15,13 +15,12 @@ from ..plugins import suggestion
 from ..short_repr import short_repr
 from .backend import require_backend
 from .backends.gauss_newton import linear_step
-from .backends.gtsam_forms import forms
-from .backends.gtsam_native import estimate, linearised, native_graph, tangent, values, which_turn
+from .backends.gtsam_factors import estimate, forms, graph_of, linearised, tangent, values, which_turn
 from .descent.descend import descend
-from .initialisation.initial import initial_guess, somewhere
 from .model.factor import Factor
 from .model.problem import Problem
 from .model.space import Space
+from .starts.initial import initial_guess, somewhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +44,7 @@ class FixedLag:
     """The most probable nodes of the last `lag` seconds, given all that was ever measured.
 
     `update` adds a piece of the problem: new nodes, and factors among them and those of the window. What GTSAM has with
-    exactly our objective (see backends/gtsam_forms.py) it linearises afresh where a node has moved by more than
+    exactly our objective (see backends/gtsam_factors.py) it linearises afresh where a node has moved by more than
     `threshold`. All else, such as range and angles in the world frame, is linearised once, robust weights included, at
     the most probable geometry given the piece and the marginals of the nodes before it: after the converted
     measurement, which makes a poor prior harmless, one exact step. Nodes that fall out of
@@ -124,7 +123,7 @@ class FixedLag:
             self._keys[piece.names[i]] = next(self._count)
             self._turns[piece.names[i]] = posed[i]
         keys = [self._keys[name] for name in piece.names]
-        graph = native_graph(piece, forms_, keys).graph
+        graph = graph_of(piece, forms_, keys)
         for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
         entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])

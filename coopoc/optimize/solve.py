@@ -17,11 +17,11 @@ from .assessment.curvature import newton_decrease
 from .assessment.lagrangian import is_constrained_minimum
 from .backend import Backend, Options, require_backend
 from .descent.descend import MAX_ITERATIONS
-from .initialisation.initial import initial_guess, somewhere
 from .model.fuse import fused
 from .model.problem import Problem
 from .model.search import Search
 from .solution import Solution, SolveError, Status
+from .starts.initial import initial_guess, somewhere
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -64,7 +64,7 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
-    problem = problem if options.get("optimizer") == "gnc" else fused(problem)  # which has a weight per factor
+    problem = fused(problem)
     solution = _solved(problem, known, options)
     if solution.status is not Status.SOLVED and (other := known.fallback(problem, options)) is not None:
         solution = _after(solution, _solved(problem, known, other))

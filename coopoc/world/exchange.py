@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from ..errors import InputError
 from .recording import Recording
-from .schedules import Nearest, Order, RoundRobin, within_cap
+from .schedules import within_cap
 from .v2x import Message
 
 
@@ -69,8 +69,7 @@ def exchange(recording: Recording, message: Message) -> Exchange:
         message: its size counts against `v2x.bytes_per_second`.
 
     Raises:
-        InputError: the links of some vehicles were not recorded; a cap whose schedule is "most informative", since the
-            value of a belief depends on the other messages of the same round.
+        InputError: the links of some vehicles were not recorded.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> from coopoc.world.v2x import Message
@@ -142,22 +141,7 @@ def _receive(recording: Recording, pairs: tuple[Ints, ...], arrivals: tuple[Ints
         order = np.lexsort((rank, both, receiver))
         for mine in np.split(order, np.searchsorted(receiver[order], np.arange(1, vehicles))):
             start = np.searchsorted(both[mine], np.arange(len(recording.t) + 1))
-            schedule = _order(recording, sender[mine])
-            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], start, recording, schedule)
+            arrival[:, mine] = within_cap(arrival[:, mine], sizes[mine], start, sender[mine], recording)
         arrivals[0][:], arrivals[1][:] = arrival[:, :count], arrival[:, count:]
     there = (arrival >= 0) & (arrival < len(recording.t))
     return np.stack([np.bincount(receiver, row * sizes, minlength=vehicles) for row in there]).astype(float)
-
-
-def _order(recording: Recording, sender: Ints) -> Order:
-    """The schedule of one receiver of beliefs."""
-    if recording.v2x.schedule == "most informative":
-        raise InputError(
-            "schedule",
-            repr(recording.v2x.schedule),
-            "must be 'nearest' or 'round robin' in an exchange",
-            "Take it with a method of a star, such as the joint filter.",
-        )
-    if recording.v2x.schedule == "nearest":
-        return Nearest()
-    return RoundRobin(sender, np.full((recording.runs, len(recording.ids)), -1))

@@ -9,7 +9,7 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from .recording import Recording
-from .schedules import order, within_cap
+from .schedules import within_cap
 from .v2x import Message
 
 
@@ -60,11 +60,11 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     link = recording.links.of(ego)
     at = recording.links.step[link]
     start, size = np.searchsorted(at, np.arange(steps + 1)), message.size(recording.v2x.overhead)
-    schedule = order(recording, ego, link, message)
     sent = np.full(len(link), size)
-    arrival = within_cap(recording.arrival.take(link, axis=1), sent, start, recording, schedule)
+    sender = recording.links.neighbour[link]
+    arrival = within_cap(recording.arrival.take(link, axis=1), sent, start, sender, recording)
     arrival = np.where(arrival < steps, arrival, -1)
-    newest, fresh = _newest(arrival, at, recording.links.neighbour[link], steps)
+    newest, fresh = _newest(arrival, at, sender, steps)
     too_old = at - newest > recording.v2x.max_age / recording.dt + 1e-9
     newest[too_old] = -1
     broadcasts = recording.broadcasts[:, ego].sum() if recording.v2x.max_neighbours else 0

@@ -28,7 +28,7 @@ from .sums_stream import SumsStream, model_noise, net_noise
 
 NEWEST = Message("fix, velocity and noise", 14)
 """Fix (3), velocity (3), the variance of each (6), id and time (2)."""
-SUMS = Message("sums since departure", 17, cumulative=True)
+SUMS = Message("sums since departure", 17)
 """Motion (3), its variance (3), 1/r (3) and (fix - motion)/r (3), each summed since departure; r of now (3); id and
 time (2)."""
 

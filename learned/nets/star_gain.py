@@ -13,8 +13,8 @@ import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
 from coopoc.kernels.compiling.compile import as_written, inner, inside
-from coopoc.kernels.compiling.lanes import LANES
 from coopoc.kernels.compiling.small import add, load, square, store
+from coopoc.kernels.compiling.vectors import LANES
 from coopoc.kernels.stars.elimination import rescale
 from coopoc.kernels.stars.joint import Joint, joint_within
 from coopoc.kernels.stars.joint_filter import step, write

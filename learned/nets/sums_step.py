@@ -11,8 +11,8 @@ import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
 from coopoc.kernels.compiling.compile import as_written, inner, storage
-from coopoc.kernels.compiling.lanes import LANES
 from coopoc.kernels.compiling.small import load, store
+from coopoc.kernels.compiling.vectors import LANES
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.stars.joint import joint_in
 from coopoc.kernels.stars.joint_filter import step

@@ -13,8 +13,7 @@ from coopoc import read_graph
 from coopoc.data.log import read_log
 from coopoc.data.recordings import load_log
 from coopoc.data.registry import load_fleet
-from coopoc.formats.kitti import read_kitti
-from coopoc.formats.tum import read_tum
+from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
 from coopoc.seals import UNSEALED, sealed

@@ -70,7 +70,7 @@ class Drive:
     def start(self, t, n):  # type: ignore[no-untyped-def]
         return self.gnss[t, n].copy(), np.diag(self.r[t, n])
 
-    def late(self, x, P, n, rounds, fixes=True):  # type: ignore[no-untyped-def]
+    def late(self, x, P, n, rounds):  # type: ignore[no-untyped-def]
         """What vehicle n believes at each step: the answer whose messages have arrived, and its own steps since."""
         ready, when = np.zeros(self.vehicles, dtype=int), []
         for t in range(self.steps):
@@ -86,7 +86,7 @@ class Drive:
             s = held[-1] if held else 0
             one = (x[s, n], P[s, n]) if held else self.start(0, n)
             for u in range(s + 1, t + 1):
-                one = self.solo(u, n, *one) if fixes else (one[0] + self.dt * self.velocity[u, n], one[1])
+                one = self.solo(u, n, *one)
             out.append(one)
         return np.array([a for a, _ in out]), np.array([b for _, b in out])
 

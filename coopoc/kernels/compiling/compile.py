@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -19,12 +20,12 @@ def compiled(function: Function) -> Function:
     The machine code is kept beside the source, or in the user's cache where that is read-only. It is made anew after a
     change of any file of the kernels or of the function's own folder, since it holds what it calls.
     """
-    return _kept(_made(function, {"contract"}), function)
+    return _kept(function, {"contract"})
 
 
 def as_written(function: Function) -> Function:
     """Compiled, each product and sum rounded as it stands, so that numbers and vectors of them get the same digits."""
-    return _kept(_made(function, set()), function)
+    return _kept(function, set())
 
 
 def part(function: Function) -> Function:
@@ -61,35 +62,45 @@ def storage(function: Function) -> Function:
 KERNELS = Path(__file__).resolve().parents[1]
 PATIENCE = 2.0
 """s of compiling after which a line on stderr reports it."""
+PLAIN = "COOPOC_PLAIN_NJIT"
+"""Environment variable: 1 compiles by numba's public interface alone."""
 
 
 @cache
-def _watching() -> None:
+def _hooks() -> Any:
+    """The module of private hooks, or None: it is switched off, or numba has changed."""
+    if os.environ.get(PLAIN) == "1":
+        return None
+    try:
+        from . import pipeline
+    except (ImportError, AttributeError):
+        return None
+    return pipeline
+
+
+@cache
+def _watch() -> None:
     """While a kernel compiles collect no garbage, which a tenth of the time would go to; report it after PATIENCE."""
     from numba.core import event
 
     class Watcher(event.Listener):
-        depth = 0
+        timers: list[threading.Timer] = []  # noqa: RUF012
         collects = True
-        timer: threading.Timer
 
         def on_start(self, event: Any) -> None:
-            self.depth += 1
-            if self.depth == 1:
-                name = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
-                line = f"compiling the {name} kernel, once per machine\n"
-                self.timer = threading.Timer(PATIENCE, sys.stderr.write, [line])
-                self.timer.daemon = True
-                self.timer.start()
+            name = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
+            line = f"compiling the {name} kernel, once per machine\n"
+            self.timers.append(threading.Timer(PATIENCE, sys.stderr.write, [line]))
+            if len(self.timers) == 1:
+                self.timers[0].daemon = True
+                self.timers[0].start()
                 self.collects = gc.isenabled()
                 gc.disable()
 
         def on_end(self, event: Any) -> None:
-            self.depth -= 1
-            if self.depth == 0:
-                self.timer.cancel()
-                if self.collects:
-                    gc.enable()
+            self.timers.pop().cancel()
+            if self.collects and not self.timers:
+                gc.enable()
 
     event.register("numba:compile", Watcher())
 
@@ -97,27 +108,28 @@ def _watching() -> None:
 def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
     import numba
 
-    from .pipeline import Kernel, Part
-
-    _watching()
-    options["pipeline_class"] = Part if part else Kernel
+    _watch()
+    if hooks := _hooks():
+        options["pipeline_class"] = hooks.Part if part else hooks.Kernel
+        if part:
+            options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
 
 
 def _within(function: Function, liberties: set[str], **options: bool) -> Function:
-    """Without wrappers for callers from Python, and without counts of references."""
-    made = _made(function, liberties, True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False, **options)
-    return cast(Function, made)
+    return cast(Function, _made(function, liberties, True, **options))
 
 
-def _kept(made: Any, function: Function) -> Function:
+def _kept(function: Function, liberties: set[str]) -> Function:
+    made = _made(function, liberties)
     try:
         made.enable_caching()
+    except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
+        return cast(Function, made)
+    if _hooks():
         file = made._cache._cache_file
         file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
         file._load_index = partial(_index_or_none, file._load_index)
-    except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
-        pass
     return cast(Function, made)
 
 

@@ -1,7 +1,7 @@
 """Small matrices of any fixed size as tuples of numbers, unrolled by the compiler.
 
 A vector of d numbers is a tuple of d, a d x d matrix a tuple of d * d, row by row. A number is a float, or LANES runs
-side by side (`coopoc.kernels.compiling.batched`): one text serves both. Memory is a flat array of floats, or an array
+side by side (`coopoc.kernels.compiling.vectors`): one text serves both. Memory is a flat array of floats, or an array
 (., LANES).
 
 Products and sums are fused where `plus` and `less` stand and nowhere else, so that all runs get the digits of a run
@@ -11,10 +11,9 @@ alone.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
-from .symbolic import Number, Numbers, less, plus, unrolled
+from .vectors import Number, Numbers, unrolled
 
 
 def order(matrix: Numbers) -> int:
@@ -26,10 +25,10 @@ def _entries(d: int) -> list[tuple[int, int]]:
     return [(i, j) for i in range(d) for j in range(d)]
 
 
-def _dot(first: Number, a: Numbers, b: Numbers, how: Callable[[Number, Number, Number], Number] = less) -> Number:
-    """first - a b, or + with `plus`, product by product."""
+def _dot(first: Number, a: Numbers, b: Numbers) -> Number:
+    """first - a b, product by product."""
     for x, y in zip(a, b, strict=True):
-        first = how(first, x, y)
+        first = first.less(x, y)
     return first
 
 
@@ -223,9 +222,11 @@ def inverse(m: Any) -> Any:
 
 
 def _adjugate(m: Numbers) -> Numbers:
-    a, b, c = less(m[4] * m[8], m[5], m[5]), less(m[2] * m[5], m[1], m[8]), less(m[1] * m[5], m[2], m[4])
-    s = plus(plus(m[0] * a, m[1], b), m[2], c).over()
-    d, e, f = less(m[0] * m[8], m[2], m[2]) * s, less(m[1] * m[2], m[0], m[5]) * s, less(m[0] * m[4], m[1], m[1]) * s
+    a = (m[4] * m[8]).less(m[5], m[5])
+    b, c = (m[2] * m[5]).less(m[1], m[8]), (m[1] * m[5]).less(m[2], m[4])
+    s = (m[0] * a).plus(m[1], b).plus(m[2], c).over()
+    d, e = (m[0] * m[8]).less(m[2], m[2]) * s, (m[1] * m[2]).less(m[0], m[5]) * s
+    f = (m[0] * m[4]).less(m[1], m[1]) * s
     a, b, c = a * s, b * s, c * s
     return [a, b, c, b, d, e, c, e, f]
 

@@ -14,15 +14,13 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import Floats
-from ..compiling.batched import less, plus, put, take
 from ..compiling.compile import part
-from ..compiling.lanes import LANES, subtracting
+from ..compiling.vectors import LANES, less, plus, put, take
 
 HEADING = 3
 """Place of the heading in a member's state."""
 ROWS = 4
 """Rows that may be pending, so that one pass over the covariance serves them all."""
-subtract_rows = subtracting(ROWS)
 X, AT, KEPT, TOTAL, COLUMN, SCALED = 0, 1, 2, 3, 4, 4 + ROWS
 """Rows of `Poses.vector`: the state, the state at which rows are linear, the state before the relative measurements;
 the sum of r^2 / s + log s, the number of rows that were used, and of those pending with the 1 / s of each; ROWS columns
@@ -129,10 +127,15 @@ def settle(poses: Poses, size: int) -> None:
     for q in range(pending, ROWS):
         for i in range(stride):
             vector[SCALED + q, i] = 0.0
-    tiles = (size + LANES - 1) // LANES
-    for i in range(0, size, ROWS):
-        if any_of(vector, i, size):
-            subtract_rows(poses.cov, i * stride, vector, SCALED * stride + i, vector, COLUMN * stride, stride, tiles)
+    tiles, width = (size + LANES - 1) // LANES, stride // LANES
+    for first in range(0, size, ROWS):
+        if any_of(vector, first, size):
+            for i in range(first, first + ROWS):
+                for tile in range(tiles):
+                    row = take(poses.cov, uint64(i * width + tile))
+                    for q in range(ROWS):
+                        row = less(row, vector[SCALED + q, i], take(vector, uint64((COLUMN + q) * width + tile)))
+                    put(poses.cov, uint64(i * width + tile), row)
     vector[TOTAL, PENDING] = 0.0
 
 

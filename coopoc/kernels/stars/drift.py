@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from ..compiling.compile import inner, inside
 from ..compiling.small import add, add_diagonal, first3, load, store, subtract, times, zeros
-from ..compiling.symbolic import unrolled
+from ..compiling.vectors import unrolled
 from .elimination import rescale
 from .joint import Joint, block_of, place
 from .messages import MOVED, NEW, POSITION, PROCESS, ROW, VARIANCE, Star

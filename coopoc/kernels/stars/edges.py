@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ..compiling.batched import choose, plus
 from ..compiling.compile import inner
 from ..compiling.small import apply, choose_each, from_upper, scale, subtract
+from ..compiling.vectors import choose, plus
 from .relative import completed, converted, exact, vector
 
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05
-"""m; of the converted start, as in `coopoc.optimize.initialisation.initial`."""
+"""m; of the converted start, as in `coopoc.optimize.starts.initial`."""
 EXACT, AT_MEASUREMENT, AT_GAP = np.arange(3)
 """Linear in range and angles at the present points; converted to a vector, weighted by the geometry of the measurement
 itself or by that of the points, which must not depend on the measurement. NumPy's integers: for each constant of

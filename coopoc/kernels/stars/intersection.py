@@ -9,7 +9,7 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats
 from ..compiling.compile import compiled, part
-from ..compiling.lanes import LANES
+from ..compiling.vectors import LANES
 from .fusion import DIAGONAL, NOTHING, PLACE, UNIT, Fusion, best_weight, describe, fuse, inverse3, plus, six, times
 from .messages import (
     MOVED,

@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...arrays import AnyArray, Floats
-from ..compiling.batched import choose
 from ..compiling.compile import inner, inside, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_corner,
@@ -34,6 +32,7 @@ from ..compiling.small import (
     with_first3,
     zeros,
 )
+from ..compiling.vectors import LANES, choose
 from .elimination import eliminate, substitute
 from .messages import MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
 from .relative import completed, converted, exact, incomplete, vector

@@ -12,8 +12,8 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import as_written, inner
-from ..compiling.lanes import LANES
 from ..compiling.small import first3, load, negate, square, store, subtract, with_first3
+from ..compiling.vectors import LANES
 from .drift import Drift, add_common, add_drifting_fixes, begin_common, decay, drift_noise, drift_prior
 from .elimination import predict
 from .joint import (

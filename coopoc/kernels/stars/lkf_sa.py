@@ -11,10 +11,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Floats
-from ..compiling.batched import pack
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import load, store
+from ..compiling.vectors import LANES, pack
 from .elimination import predict
 from .joint import LEAST_PROCESS, Joint, block_of, joint_in, joint_size, move, rearrange, solve, stayed
 from .messages import (

@@ -14,10 +14,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Bools, Floats, Ints
-from ..compiling.batched import choose, put, take
 from ..compiling.compile import inner, inside, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import add, load, scale, store
+from ..compiling.vectors import LANES, choose, put, take
 from ..motion import MotionNoise, process_variance
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)

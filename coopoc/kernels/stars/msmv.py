@@ -8,7 +8,6 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import as_written, inside
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -23,6 +22,7 @@ from ..compiling.small import (
     times,
     zeros,
 )
+from ..compiling.vectors import LANES
 from .messages import (
     MOVED,
     NEW,

@@ -13,9 +13,8 @@ from numba.extending import overload
 from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
-from ..compiling.batched import Batched, choose, lane, less, pack, plus, put
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.lanes import LANES
+from ..compiling.vectors import LANES, Batched, choose, lane, less, pack, plus, put
 
 QUARTER = (math.pi / 2, 6.123233995736766e-17)
 """Of a turn, rad: the nearest number, and what it lacks."""
@@ -58,7 +57,7 @@ def or_else(value: float, missing: float) -> float:
 @as_written
 def sine_and_cosine(turn: Any) -> Any:
     """By their Taylor series within an eighth of a turn of a multiple of a quarter, exact to the last bit there."""
-    quarters = math.floor(turn * (2.0 / math.pi) + 0.5)
+    quarters = 1.0 * math.floor(turn * (2.0 / math.pi) + 0.5)
     x = less(less(turn, quarters, QUARTER[0]), quarters, QUARTER[1])
     s = x * x
     sine = less(1 / 6227020800, s, less(1 / 1307674368000, s, 1 / 355687428096000))

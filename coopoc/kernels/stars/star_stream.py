@@ -13,8 +13,8 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import as_written, inner, inside, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import load, square, store
+from ..compiling.vectors import LANES
 from ..motion import ROUNDING, MotionNoise, process_variance
 from ..solo import ESTIMATE, NO_FIX_YET, dead_reckon
 from .joint import Joint, joint_in, joint_size

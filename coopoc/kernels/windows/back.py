@@ -8,7 +8,6 @@ import numpy as np
 
 from ...arrays import AnyArray, Floats
 from ..compiling.compile import inner, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -25,6 +24,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
+from ..compiling.vectors import LANES
 from ..stars.joint import Joint, block_of
 from .slots import ONE, ROW, Window, count_of, motion, place_of
 

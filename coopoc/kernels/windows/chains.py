@@ -13,9 +13,7 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import Floats
-from ..compiling.batched import take
 from ..compiling.compile import inner
-from ..compiling.lanes import LANES
 from ..compiling.small import (
     add,
     add_diagonal,
@@ -35,6 +33,7 @@ from ..compiling.small import (
     times,
     zeros,
 )
+from ..compiling.vectors import LANES, take
 from ..stars.elimination import eliminate, substitute
 from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, place_of
 

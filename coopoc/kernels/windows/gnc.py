@@ -13,11 +13,10 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import Bools, Floats
-from ..compiling.batched import choose, put, take
-from ..compiling.batched import lane as lane_of
 from ..compiling.compile import inner
-from ..compiling.lanes import LANES
 from ..compiling.small import load, scale, store, times
+from ..compiling.vectors import LANES, choose, put, take
+from ..compiling.vectors import lane as lane_of
 from .slots import ROW, Window, count_of, fix_gap, motion, place_of
 
 TINY = 1e-30

@@ -14,10 +14,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Bools, Floats
-from ..compiling.batched import put, take
 from ..compiling.compile import as_written, inner
-from ..compiling.lanes import LANES
 from ..compiling.small import load, negate, store
+from ..compiling.vectors import LANES, put, take
 from ..stars.joint import Joint, new_joint
 from ..stars.messages import (
     NEW,

@@ -8,10 +8,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
-from ..compiling.batched import put, take
 from ..compiling.compile import inner, storage
-from ..compiling.lanes import LANES
 from ..compiling.small import load, store, subtract, times
+from ..compiling.vectors import LANES, put, take
 from ..stars.edges import edge
 from ..stars.messages import MOVED, POSITION, PROCESS, RELATIVE, Assumptions, Measurements, Star, gather
 

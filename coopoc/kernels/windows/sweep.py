@@ -12,7 +12,6 @@ from typing import Any
 from numpy import uint64
 
 from ...arrays import AnyArray
-from ..compiling.batched import choose, put, take
 from ..compiling.compile import inner, inside
 from ..compiling.small import (
     add,
@@ -31,6 +30,7 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
+from ..compiling.vectors import choose, put, take
 from ..stars.edges import AT_GAP, EXACT, edge
 from ..stars.elimination import predict
 from ..stars.joint import Joint, add_relative, block_of, copy, rearrange, solve

@@ -13,10 +13,9 @@ import numpy as np
 from numpy import uint64
 
 from ...arrays import AnyArray, Bools, Floats, Ints
-from ..compiling.batched import put, take
 from ..compiling.compile import as_written, inner
-from ..compiling.lanes import LANES
 from ..compiling.small import load, store, subtract
+from ..compiling.vectors import LANES, put, take
 from ..stars.edges import AT_MEASUREMENT, EXACT
 from ..stars.messages import HELD, NEW, POSITION, USES, VARIANCE, Assumptions, Measurements, Star, new_star
 from .chains import Memory, move, new_memory

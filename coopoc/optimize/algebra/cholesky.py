@@ -26,7 +26,7 @@ class Cholesky:
     """
 
     def __init__(self, indptr: Ints, indices: Ints, group: Ints | None = None) -> None:
-        from ...kernels.graphs.graph_cholesky import places
+        from ...kernels.graphs.multifrontal import places
 
         size = len(indptr) - 1
         self._fronts = analysed(indptr, indices, np.arange(size) if group is None else group)
@@ -37,13 +37,13 @@ class Cholesky:
 
     def factor(self, values: Floats) -> bool:
         """Factor an upper triangle's values; whether it is positive definite."""
-        from ...kernels.graphs.graph_cholesky import factorise
+        from ...kernels.graphs.multifrontal import factorise
 
         return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        from ...kernels.graphs.graph_cholesky import solved
+        from ...kernels.graphs.multifrontal import solved
 
         return solved(self._fronts, self._factor, rhs)
 
@@ -52,8 +52,7 @@ class Cholesky:
 
         See `selected_inverse`; time and memory are those of the factor, not of the inverse.
         """
-        from ...kernels.graphs.graph_cholesky import places
-        from ...kernels.graphs.graph_inverse import selected_inverse
+        from ...kernels.graphs.multifrontal import places, selected_inverse
 
         found = selected_inverse(self._fronts, self._factor)
         return found[places(self._fronts, self._rank[rows], self._rank[columns])]
@@ -93,7 +92,7 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     """
     from scipy.sparse import coo_array
 
-    from ...kernels.graphs.graph_fronts import RELAXED, Fronts, elimination_tree, structures, supernodes
+    from ...kernels.graphs.multifrontal import Fronts, structures, supernodes
 
     name, begin, width = np.unique(group, return_index=True, return_counts=True)
     n, last = len(name), begin + width - 1
@@ -104,9 +103,9 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     both = np.concatenate([row, column]), np.concatenate([column, row])
     pattern = coo_array((np.ones(2 * len(row)), both), shape=(n, n)).tocsr()
     both_ways = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
-    order, parent = elimination_tree(*both_ways, minimum_degree(*both_ways))
-    at, below = structures(*both_ways, order, parent)
-    head = supernodes(parent, at, below, width[order], np.array(RELAXED))
+    order = minimum_degree(*both_ways)
+    parent, at, below = structures(*both_ways, order)
+    head = supernodes(parent, at, below, width[order])
     first = np.concatenate([[0], np.cumsum(width[order])])
     top = head[1:] - 1
     of = np.repeat(np.arange(len(top)), at[top + 1] - at[top])

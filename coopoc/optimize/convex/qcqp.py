@@ -1,4 +1,4 @@
-"""Quadratic: a quadratic cost with quadratic equalities (QCQP), the form of a problem that relaxations need.
+"""The quadratically constrained quadratic programme (QCQP) of a problem, whose relaxations bound every cost.
 
 The rows of X are points on simple manifolds, every measurement is linear in them, and the cost is 1/2 |A X|_F^2
 (CORA, arXiv 2302.11614):
@@ -13,12 +13,18 @@ displacement weighs its axes differently the columns are stacked into one, X = [
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ...arrays import Floats, Ints
+from ...errors import InputError
+from ..model.factor import Factor
+from ..model.problem import Problem
+from ..starts.linear import nearest_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,14 +81,13 @@ class Quadratic:
         unit = np.where(length > 0, gap / np.where(length > 0, length, 1.0), np.eye(self.dimension)[0])
         frame = np.eye(self.columns)[: self.columns * self.framed]
         turned = np.swapaxes(rotation[self.poses], 1, 2).reshape(-1, self.dimension)
-        parts = [frame, *(part.reshape(-1, self.columns) for part in (turned, unit, at[self.nodes]))]
-        return np.concatenate(parts)
+        return np.concatenate([frame, *(part.reshape(-1, self.columns) for part in (turned, unit, at[self.nodes]))])
 
     def drop(self, X: Floats) -> tuple[Floats, Floats]:
         """Positions (n, d) m and rotations (n, d, d) of X, turned so that H = I, mirrored if most R_k are."""
-        d, k, poses = self.dimension, self.stiefel.shape[1], len(self.poses)
+        d, poses = self.dimension, len(self.poses)
         if self.framed:
-            X = X @ _orthogonal(X[:k]).T
+            X = X @ orthogonal(X[: self.stiefel.shape[1]]).T
         at = X[self.bound :].reshape(-1, d)
         position, rotation = self.position.copy(), self.rotation.copy()
         if poses:
@@ -95,16 +100,16 @@ class Quadratic:
         return position, rotation
 
     def project(self, X: Floats) -> Floats:
-        """The nearest point on the manifolds to the constrained rows X (bound, p)."""
+        """The nearest point on the manifolds to rows X (bound, p): the polar factor on a Stiefel block.
+
+        Unlike a triangular factor that turns all blocks alike where X does, so that a robot's chain stays rigid.
+        """
         out = np.array(X)
-        if len(self.stiefel):
-            out[self.stiefel] = _orthogonal(X[self.stiefel])
-        if len(self.sphere):
-            s = X[self.sphere]
-            length = np.sqrt(np.square(s).sum(axis=(1, 2), keepdims=True))
-            out[self.sphere] = np.where(
-                length > 1e-12, s / np.where(length > 1e-12, length, 1.0), np.sqrt(1 / s[0].size)
-            )
+        out[self.stiefel] = orthogonal(X[self.stiefel])
+        s = X[self.sphere]
+        length = np.sqrt(np.square(s).sum(axis=(1, 2), keepdims=True))
+        even = np.sqrt(1.0 / max(s[:1].size, 1))
+        out[self.sphere] = np.where(length > 1e-12, s / np.where(length > 1e-12, length, 1.0), even)
         return out
 
 
@@ -121,25 +126,9 @@ class Multipliers:
         """What they promise: 1/2 trace is a lower bound if C - L is positive semidefinite."""
         return float(np.einsum("nii->", self.stiefel) + self.sphere.sum())
 
-    def times(self, V: Floats) -> Floats:
-        """L V."""
-        out = np.zeros_like(V)
-        out[self.problem.stiefel] = self.stiefel @ V[self.problem.stiefel]
-        out[self.problem.sphere] = self.sphere[:, None, None] * V[self.problem.sphere]
-        return out
-
-    @property
-    def dense(self) -> Floats:
-        """L (bound, bound)."""
-        stiefel, sphere = self.problem.stiefel, self.problem.sphere
-        out = np.zeros((self.problem.bound, self.problem.bound))
-        out[stiefel[:, :, None], stiefel[:, None, :]] = self.stiefel
-        out[sphere, sphere] = self.sphere[:, None]
-        return out
-
-    @property
-    def sparse(self) -> Any:
-        """L, sparse."""
+    @cached_property
+    def matrix(self) -> Any:
+        """L (bound, bound), sparse."""
         from scipy.sparse import csc_array
 
         stiefel, sphere = self.problem.stiefel, self.problem.sphere
@@ -156,14 +145,212 @@ def multipliers(problem: Quadratic, X: Floats, CX: Floats) -> Multipliers:
     return Multipliers(problem, 0.5 * (block + np.swapaxes(block, 1, 2)), along)
 
 
-def _orthogonal(blocks: Floats) -> Floats:
+def orthogonal(blocks: Floats) -> Floats:
     """The nearest matrices with orthonormal rows to (..., k, p)."""
     u, _, v = np.linalg.svd(blocks, full_matrices=False)
     return np.asarray(u @ v)
 
 
-def nearest_rotation(blocks: Floats) -> Floats:
-    """The nearest rotations to (..., d, d)."""
-    u, _, v = np.linalg.svd(blocks)
-    u[..., -1] *= np.sign(np.linalg.det(u @ v))[..., None]
-    return np.asarray(u @ v)
+def quadratic(problem: Problem) -> Quadratic:
+    """The QCQP of a single problem.
+
+    Exact for position, displacement (any weights; among poses the same for all axes), range, relative_position (one
+    weight), pose_chordal and relative_pose_chordal (one weight for the position, one for the rotation). Other kinds
+    have no such form.
+
+    Raises:
+        InputError: another kind, weights that differ between axes where a rotation acts, a robust loss, constraints, B
+            realisations.
+
+    >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+    >>> quadratic(problem.add("range", ("a", "b"), 5.0, std=0.5)).rows.shape
+    (3, 6)
+    """
+    _check(problem)
+    d, n = problem.dimension, len(problem.names)
+    world = [f for f in problem.factors if f.kind in WORLD]
+    uneven = [f for f in world if f.kind != "pose_chordal" and one_weight(f.root) is None]
+    if uneven and problem.poses:
+        _refuse(uneven[0])
+    fixes = [f.z[:, :d] for f in world if f.kind != "displacement"]
+    origin = np.concatenate(fixes).mean(axis=0) if fixes else np.zeros(d)
+    edges = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes for f in problem.factors if f.kind == "range")])
+    rows = _Rows(problem, bool(uneven), bool(world or problem.fixed), len(edges), origin)
+    for factor in problem.factors:
+        TERMS[factor.kind](rows, factor)
+    x = np.zeros((n, problem.space.ambient)) if problem.x0 is None else problem.x0
+    position, rotation = problem.space.position(x), np.array(problem.space.rotation(x))
+    if not problem.fixed:
+        rotation[:] = np.eye(d)
+    A, kept = rows.without_fixed(position - origin, rotation)
+    poses = np.setdiff1d(rows.poses, problem.fixed)
+    top = len(rows.frame) + d * len(poses)
+    return Quadratic(
+        rows=A[:, kept],
+        stiefel=np.arange(top).reshape(-1, len(rows.frame) if uneven else d),
+        sphere=top + np.arange(len(edges) * rows.width).reshape(len(edges), rows.width),
+        dimension=d,
+        stacked=bool(uneven),
+        framed=rows.framed,
+        nodes=np.setdiff1d(np.arange(n), problem.fixed),
+        poses=poses,
+        position=position,
+        rotation=rotation,
+        origin=origin,
+        edges=edges,
+    )
+
+
+class _Rows:
+    """The rows of A, and where X has the rotation and the position of each node: `width` rows of X per unit vector and
+    per position."""
+
+    def __init__(self, problem: Problem, stacked: bool, framed: bool, ranges: int, origin: Floats) -> None:
+        self.d, self.n, self.origin, self.framed = problem.dimension, len(problem.names), origin, framed
+        self.poses, self.fixed = (np.array(each, dtype=np.int64) for each in (problem.poses, problem.fixed))
+        self.stacked, self.width = stacked, self.d if stacked else 1
+        self.frame = np.arange((1 if stacked else self.d) * framed)
+        self.first_unit = len(self.frame) + self.d * len(self.poses)
+        self.first_position = self.first_unit + self.width * ranges
+        self.used = 0
+        self.parts: list[tuple[Floats, Ints]] = []
+
+    def rotation(self, node: Ints) -> Ints:
+        """(M, d) rows of X with the R^T of poses."""
+        order = np.full(self.n, -1, dtype=np.int64)
+        order[self.poses] = np.arange(len(self.poses))
+        return len(self.frame) + self.d * order[node][:, None] + np.arange(self.d)
+
+    def position(self, node: Ints) -> Ints:
+        """(M, width) rows of X with the positions of nodes."""
+        return self.first_position + self.width * node[:, None] + np.arange(self.width)
+
+    def units(self, count: int) -> Ints:
+        """(M, width) rows of X with the next unit vectors."""
+        first = self.first_unit + self.width * self.used
+        self.used += count
+        return first + np.arange(count * self.width).reshape(count, self.width)
+
+    def add(self, values: list[Floats], columns: list[Ints]) -> None:
+        """k rows of A per measurement: values (M, k, c) in columns (M, c)."""
+        self.parts.append((np.concatenate(values, axis=2), np.concatenate(columns, axis=1)))
+
+    def matrix(self) -> Any:
+        """A over all nodes."""
+        from scipy.sparse import csr_array, vstack
+
+        size, found = self.first_position + self.width * self.n, []
+        for value, columns in self.parts:
+            count, k, c = value.shape
+            at = np.broadcast_to(columns[:, None], value.shape).ravel()
+            found.append(csr_array((value.ravel(), at, np.arange(0, count * k * c + 1, c)), shape=(count * k, size)))
+        A = vstack(found, format="csr")
+        A.sum_duplicates()
+        return A
+
+    def without_fixed(self, position: Floats, rotation: Floats) -> tuple[Any, Ints]:
+        """A with the terms of fixed nodes moved to the frame, t_i = p_i^T H and R_i^T = R_i^T H, and the columns to
+        keep."""
+        from scipy.sparse import csr_array
+
+        A, fixed = self.matrix(), self.fixed
+        if not len(fixed):
+            return A, np.arange(A.shape[1])
+        at, turned = self.position(fixed), np.intersect1d(fixed, self.poses)
+        gone = np.concatenate([at.ravel(), self.rotation(turned).ravel()])
+        values = [position[fixed].reshape(at.size, -1)]
+        if len(turned):
+            values.append(np.swapaxes(rotation[turned], 1, 2).reshape(-1, self.d))
+        size = len(self.frame)
+        frame = csr_array((np.ones(size), (np.arange(size), self.frame)), shape=(size, A.shape[1]))
+        moved = A[:, gone] @ csr_array(np.concatenate(values)) @ frame
+        return csr_array(A + moved), np.setdiff1d(np.arange(A.shape[1]), gone)
+
+
+def _position(rows: _Rows, factor: Factor) -> None:
+    """W (t_i - z), or of a displacement W (t_j - t_i - z), z in the world's frame."""
+    z = factor.z if factor.kind == "displacement" else factor.z - rows.origin
+    root = factor.root if rows.stacked else factor.root[:, :1, :1]
+    measured = z[:, :, None] if rows.stacked else z[:, None, :]
+    ends = [-root, root][2 - factor.nodes.shape[1] :]
+    frame = np.tile(rows.frame, (len(z), 1))
+    rows.add([*ends, -root @ measured], [*(rows.position(node) for node in factor.nodes.T), frame])
+
+
+def _range(rows: _Rows, factor: Factor) -> None:
+    """w (t_j - t_i + r s)."""
+    root = factor.root * np.eye(rows.width)
+    columns = [*(rows.position(node) for node in factor.nodes.T), rows.units(len(factor.nodes))]
+    rows.add([-root, root, factor.z[..., None] * root], columns)
+
+
+def _pose(rows: _Rows, factor: Factor) -> None:
+    """w (t_i - z), and w (R_i^T - R_z^T H)."""
+    (i,), d = factor.nodes.T, rows.d
+    w, angular = _weights(factor, d)
+    frame, turn = np.tile(rows.frame, (len(i), 1)), np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
+    rows.add([w, -w * (factor.z[:, None, :d] - rows.origin)], [rows.position(i), frame])
+    rows.add([angular * np.eye(d), -angular * turn], [rows.rotation(i), frame])
+
+
+def _relative(rows: _Rows, factor: Factor) -> None:
+    """w (t_j - t_i - z R_i^T), as rows, and of a relative pose w (R_j^T - R_ij^T R_i^T)."""
+    (i, j), d = factor.nodes.T, rows.d
+    w, angular = _weights(factor, d)
+    rows.add([-w, w, -w * factor.z[:, None, :d]], [rows.position(i), rows.position(j), rows.rotation(i)])
+    if factor.z.shape[1] > d:
+        turn = np.swapaxes(factor.z[:, d:].reshape(-1, d, d), 1, 2)
+        rows.add([-angular * turn, angular * np.eye(d)], [rows.rotation(i), rows.rotation(j)])
+
+
+TERMS: dict[str, Callable[[_Rows, Factor], None]] = {
+    "position": _position,
+    "displacement": _position,
+    "range": _range,
+    "relative_position": _relative,
+    "pose_chordal": _pose,
+    "relative_pose_chordal": _relative,
+}
+"""Measurements of this form."""
+WORLD = ("position", "displacement", "pose_chordal")
+"""Measurements in the world's frame."""
+
+
+def _weights(factor: Factor, d: int) -> tuple[Floats, Floats]:
+    """(M, 1, 1) of the position and, if there is one, of the rotation; InputError if either is not one number."""
+    root = factor.root
+    position, turn = one_weight(root[:, :d, :d]), one_weight(root[:, d:, d:])
+    if position is None or turn is None or root[:, :d, d:].any() or root[:, d:, :d].any():
+        _refuse(factor)
+    return position[:, None, None], turn[:, None, None]
+
+
+def one_weight(root: Floats) -> Floats | None:
+    """(M,) w if every W (M, k, k) is w I, else None."""
+    weight = root[:, 0, 0] if root.size else np.zeros(len(root))
+    return weight if np.allclose(root, weight[:, None, None] * np.eye(root.shape[-1]), rtol=1e-9, atol=0.0) else None
+
+
+def _check(problem: Problem) -> None:
+    if problem.batch is not None:
+        raise InputError("problem", repr(problem), "must be a single realisation", "Pick one with problem.pick(0).")
+    if not problem.factors:
+        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    if problem.constraints:
+        raise InputError("constraints", problem.constraints[0], "have no place in a relaxation", "Leave them out.")
+    for factor in problem.factors:
+        if factor.kind not in TERMS:
+            hint = "Measure ranges and chords, or trust the curvature that `solve` checks."
+            raise InputError("kind", repr(factor.kind), f"is not quadratic: it must be one of {sorted(TERMS)}", hint)
+        if factor.loss is not None:
+            raise InputError("loss", factor.loss.name, "is not quadratic: must be None", "Use least squares.")
+
+
+def _refuse(factor: Factor) -> NoReturn:
+    raise InputError(
+        f"std of {factor.kind}",
+        "differs between axes",
+        "must be one number for the position and one for the rotation "
+        "where poses turn: other weights are no QCQP of this form, and would cost the relaxation its tightness",
+        "Give one std to all axes.",
+    )

@@ -1,33 +1,51 @@
-"""Convex relaxations of the QCQP: a bound that no point beats, and a start from which to refine.
+"""Semidefinite relaxation of the QCQP: Shor's by a cone solver, and by low-rank factors for graphs (the staircase).
 
-With the free positions eliminated (schur.py) the cost is 1/2 <C, Z>, Z = X X^T. `shor` keeps Z positive semidefinite
-with the diagonal blocks that the constraints give it, and drops its rank. A programme depends on the number of blocks
-only, so it is built once for all problems of a shape (cones.py).
+With the free positions eliminated (newton.py) the cost is 1/2 <C, Z>, Z = X X^T. The relaxation keeps Z positive
+semidefinite with the diagonal blocks that the constraints give it, and drops its rank: a bound that no point beats, and
+a start from which to refine.
 """
 
 from __future__ import annotations
 
+import importlib
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.util import find_spec
 
 import numpy as np
+from tqdm import tqdm
 
 from ...arrays import Floats
-from ...errors import InputError
+from ...errors import InputError, MissingLibraryError
 from ...short_repr import short_repr
+from ..algebra.cholesky import cholesky_of
 from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve
-from .cones import semidefinite
-from .manifold import minimise
-from .qcqp import Multipliers, Quadratic
-from .quadratic import quadratic
-from .schur import Dense, Reduced, lower_bound
+from .newton import DENSE, Reduced, Stationary, minimise
+from .qcqp import Multipliers, quadratic
 
 LARGEST = 60
 """Constrained rows up to which `shor` takes seconds at most; from some 30 rows on `staircase` is the faster one."""
 TIGHT = 1e-6
 """Gap of a tight relaxation, as a share of the cost (at least of 1)."""
+SOLVER = {"solver": "CLARABEL", "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10, "max_threads": 1}
+POLISHED = 1e-13
+"""Decrease that the last step of a refinement may promise, as a share of the cost (at least of 1)."""
+START = 2
+"""Columns beyond d at a random start: with none to spare the first steps end in local minima."""
+HEIGHT = 12
+"""Columns beyond d after which the staircase gives up; the bound then is what it has proved by that time."""
+FAR = 1e-2
+"""Gap, as a share of the cost (at least of 1), from which a share of the multipliers may prove more than all."""
+BISECTIONS = 10
+"""Of that share."""
+ROUNDING = 1e-12
+"""Of the mean diagonal, by which a factorisation may be off."""
+STALL = 1e-9
+"""Share of the cost (at least of 1) that one more column must save to be followed by another."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,20 +83,19 @@ class Relaxation:
 
 
 def shor(problem: Problem, refine: bool = True) -> Relaxation:
-    """Shor's semidefinite relaxation, rounded and refined.
+    """Shor's semidefinite relaxation by CVXPY and Clarabel, rounded and refined.
 
-    minimise 1/2 <C, Z> over Z >= 0 with Z_BB = I on Stiefel blocks, tr Z_BB = 1 on spheres; solved in its dual form,
-    one variable per constraint. For scalar weights Z has d + m rows with m ranges, and the same value as with the
-    d m + 1 rows of [1; vec s][1; vec s]^T. Tight (rank d) in nearly all stars whose vehicles have fixes, in half of
-    the plane's meshes, less often with anisotropic weights or precise ranges beside vague fixes, seldom where vehicles
-    have no fix (benchmarks/tightness.py).
+    minimise 1/2 <C, Z> over Z >= 0 with Z_BB = I on Stiefel blocks, tr Z_BB = 1 on spheres. For scalar weights Z has
+    d + m rows with m ranges, and the same value as with the d m + 1 rows of [1; vec s][1; vec s]^T. Tight (rank d) in
+    nearly all stars whose vehicles have fixes, in half of the plane's meshes, less often with anisotropic weights or
+    precise ranges beside vague fixes, seldom where vehicles have no fix (benchmarks/tightness.py).
 
     Args:
         problem: one that `quadratic` takes.
         refine: follow by `solve` from the rounded point.
 
     Raises:
-        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: Clarabel.
+        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: CVXPY.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> relaxed = shor(problem.add("range", ("a", "b"), 6.0, std=1.0))
@@ -86,57 +103,150 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
     (0.666667, True)
     """
     began = time.perf_counter()
-    form = small(quadratic(problem))
-    reduced = Dense(form)
-    block, sphere, Z = semidefinite(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
-    bound, *_ = lower_bound(reduced, Multipliers(form, block, sphere))
-    return rounded(problem, form, reduced, *first_vectors(Z, form.columns), bound, began, refine)
-
-
-def first_vectors(Z: Floats, d: int) -> tuple[Floats, float]:
-    """X (bound, d), the nearest of rank d to Z = X X^T, and eigenvalue d + 1 over eigenvalue d."""
-    values, vectors = np.linalg.eigh(Z)
-    gap = float(max(values[-d - 1], 0.0) / max(values[-d], 1e-300)) if len(values) > d else 0.0
-    top = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
-    return np.pad(top, ((0, 0), (0, d - top.shape[1]))), gap
-
-
-def rounded(
-    problem: Problem,
-    form: Quadratic,
-    reduced: Reduced,
-    X: Floats,
-    gap: float,
-    bound: float,
-    began: float,
-    refine: bool,
-) -> Relaxation:
-    """The relaxation whose X (bound, d) is put back on the manifolds, with its cost and what refining makes of it.
-
-    The refined point's own bound is taken where it is better; it never exceeds Shor's.
-    """
-    x = problem.space.join(*form.drop(reduced.settle(form.project(X))))
-    solution = None
-    if refine:
-        near, proved = polished(problem, form, reduced, x)
-        solution = solve(replace(problem, x0=near), throw=False)
-        bound = max(bound, proved)
-    return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
-
-
-def polished(problem: Problem, form: Quadratic, reduced: Reduced, x: Floats) -> tuple[Floats, float]:
-    """(n, ambient) the stationary point near x, by Newton's steps, and the bound of its own multipliers.
-
-    Gauss-Newton's steps creep in range-only problems, and a solver's bound is short of a tight one by its tolerance.
-    """
-    space = problem.space
-    found = minimise(form, reduced, form.lift(space.position(x), space.rotation(x))[: form.bound])
-    return space.join(*form.drop(reduced.settle(found.X))), lower_bound(reduced, found.multipliers)[0]
-
-
-def small(form: Quadratic) -> Quadratic:
-    """The form, unless it has more than LARGEST constrained rows: then InputError."""
+    form = quadratic(problem)
     if form.bound > LARGEST:
         hint = "Use staircase(problem): the same relaxation by low-rank factors."
         raise InputError("problem", f"{form.bound} constrained rows", f"must have at most {LARGEST}", hint)
-    return form
+    reduced = Reduced(form)
+    block, sphere, Z = semidefinite(form.stiefel.shape, form.sphere.shape)(reduced.matrix)
+    bound = reduced.lower_bound(Multipliers(form, block, sphere))[0]
+    values, vectors = np.linalg.eigh(Z)
+    return _rounded(problem, reduced, vectors * np.sqrt(np.maximum(values, 0.0)), bound, began, refine)
+
+
+@lru_cache(maxsize=64)
+def semidefinite(
+    stiefel: tuple[int, int], sphere: tuple[int, int]
+) -> Callable[[Floats], tuple[Floats, Floats, Floats]]:
+    """Solver of min 1/2 <C, Z> for blocks of these shapes, built once with C as a parameter.
+
+    It takes C (bound, bound) and returns the multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
+    """
+    if find_spec("cvxpy") is None:
+        raise MissingLibraryError("cvxpy", "a convex relaxation", "cvxpy")
+    cp = importlib.import_module("cvxpy")
+    (n, k), (m, q) = stiefel, sphere
+    size = n * k + m * q
+    C, Z = cp.Parameter((size, size), symmetric=True), cp.Variable((size, size), PSD=True)
+    blocks = [Z[k * b : k * b + k, k * b : k * b + k] == np.eye(k) for b in range(n)]
+    units = [cp.sum(cp.reshape(cp.diag(Z)[n * k :], (m, q), order="C"), axis=1) == 1] if m else []
+    programme = cp.Problem(cp.Minimize(cp.sum(cp.multiply(C, Z))), [*blocks, *units])
+
+    def run(cost: Floats) -> tuple[Floats, Floats, Floats]:
+        scale = max(float(np.trace(cost)) / size, 1e-300)
+        C.value = 0.5 * (cost + cost.T) / scale
+        programme.solve(**SOLVER)
+        duals = np.array([block.dual_value for block in blocks]).reshape(n, k, k)
+        spheres = -scale * np.asarray(units[0].dual_value) if m else np.zeros(0)
+        return -scale * 0.5 * (duals + np.swapaxes(duals, 1, 2)), spheres, np.asarray(Z.value)
+
+    return run
+
+
+def _rounded(problem: Problem, reduced: Reduced, Y: Floats, bound: float, began: float, refine: bool) -> Relaxation:
+    """The relaxation Z = Y Y^T put back on the manifolds by the nearest of rank d, and what refining makes of it.
+
+    Gauss-Newton's steps creep in range-only problems: Newton's go first. The refined point's own bound is taken where
+    it is better; it never exceeds Shor's.
+    """
+    form, space = reduced.problem, problem.space
+    _, values, rows = np.linalg.svd(Y, full_matrices=False)
+    d = form.columns
+    gap = float(np.square(values[d] / max(values[d - 1], 1e-300))) if len(values) > d else 0.0
+    top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
+    x, solution = space.join(*form.drop(reduced.settle(form.project(top)))), None
+    if refine:
+        found = minimise(reduced, form.lift(space.position(x), space.rotation(x))[: form.bound], POLISHED)
+        near = space.join(*form.drop(reduced.settle(found.X)))
+        solution = solve(replace(problem, x0=near), throw=False)
+        bound = max(bound, reduced.lower_bound(found.multipliers)[0])
+    return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
+
+
+def staircase(
+    problem: Problem, refine: bool = True, seed: int = 0, height: int = HEIGHT, seconds: float = np.inf
+) -> Relaxation:
+    """The semidefinite relaxation of `shor` with Z = Y Y^T, Y of a few columns (Burer and Monteiro), rounded and
+    refined.
+
+    minimise 1/2 <C, Y Y^T> over Y with p columns; if C - L has a negative eigenvalue there, its eigenvector in a new
+    column p + 1 leads down, else the relaxation is solved: whatever the start, the bound is that of `shor` (CORA, arXiv
+    2302.11614). Poses need not be known even roughly: the start is random unless the problem has an x0. A thousand
+    poses take seconds.
+
+    Args:
+        problem: one that `quadratic` takes.
+        refine: follow by `solve` from the rounded point.
+        seed: of the random start.
+        height: columns beyond d at which to give up.
+        seconds: after which to stop, with the best bound by then.
+
+    Raises:
+        InputError: as `quadratic`; height below 1, seconds that are not positive.
+
+    >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
+    >>> round(staircase(problem.add("range", ("a", "b"), 6.0, std=1.0)).lower_bound, 6)
+    0.666667
+    """
+    if not isinstance(height, int) or height < 1:
+        raise InputError("height", height, "must be a whole number >= 1", f"Leave it out for {HEIGHT}.")
+    if not seconds > 0:
+        raise InputError("seconds", seconds, "must be positive", "Leave it out for as long as it takes.")
+    began, space = time.perf_counter(), problem.space
+    form = quadratic(problem)
+    reduced = Reduced(form)
+    if problem.x0 is None:
+        Y = form.project(np.random.default_rng(seed).standard_normal((form.bound, form.columns + START)))
+    else:
+        Y = form.lift(space.position(problem.x0), space.rotation(problem.x0))[: form.bound]
+    found, bound = _climb(reduced, Y, form.columns + height, began + seconds)
+    return _rounded(problem, reduced, found.X, bound, began, refine)
+
+
+def _climb(reduced: Reduced, Y: Floats, most: int, deadline: float) -> tuple[Stationary, float]:
+    """A stationary point and the best bound on the way; the two agree, unless `most` columns, rounding or the time
+    (time.perf_counter() of the `deadline`) stop it."""
+    bound, before = -np.inf, np.inf
+    with tqdm(desc="staircase", unit=" steps", delay=2.0) as bar:
+        while True:
+            found = minimise(reduced, Y, deadline=deadline, tick=bar.update)
+            proved, smallest, vector = reduced.lower_bound(found.multipliers)
+            bound, size = max(bound, proved), max(found.cost, 1.0)
+            if reduced.problem.bound > DENSE and found.cost - proved > FAR * size:
+                bound = max(bound, scaled_bound(reduced, found.multipliers))
+            late = Y.shape[1] >= most or time.perf_counter() > deadline
+            if late or found.cost - bound <= TIGHT * size or before - found.cost <= STALL * size:
+                return found, bound
+            bar.set_postfix(columns=Y.shape[1] + 1, cost=f"{found.cost:.6g}", bound=f"{max(bound, 0.0):.6g}")
+            Y, before = _escape(reduced, found, smallest, vector), found.cost
+
+
+def scaled_bound(reduced: Reduced, L: Multipliers) -> float:
+    """1/2 a tr L with the largest share a in [0, 1) of the multipliers for which C - a L is positive semidefinite.
+
+    Such multipliers are feasible, whatever L. Where C - L is indefinite in a few directions they prove more than a
+    shift of all rows by the smallest eigenvalue.
+    """
+    share, fails, shift = 0.0, 1.0, ROUNDING * reduced.scale
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (share + fails)
+        if cholesky_of(reduced.shifted(middle * L.matrix, -shift)) is None:
+            fails = middle
+        else:
+            share = middle
+    return 0.5 * (share * L.trace - shift * L.problem.trace)
+
+
+def _escape(reduced: Reduced, found: Stationary, smallest: float, v: Floats) -> Floats:
+    """A lower point with one more column: along v the cost is cost + 1/2 smallest a^2 + O(a^3)."""
+    form = reduced.problem
+    wide = np.column_stack([found.X, np.zeros(len(v))])
+    along = np.zeros_like(wide)
+    along[:, -1] = v
+    reach = np.sqrt(form.bound)
+    while True:
+        Y = form.project(wide + reach * along)
+        cost = 0.5 * float(np.sum(Y * reduced.times(Y)))
+        if cost <= found.cost + 0.125 * smallest * reach * reach or reach < 1e-6:
+            return Y
+        reach *= 0.5

@@ -9,38 +9,72 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, instance
+from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...plugins import one_of
-from ...short_repr import short_repr
 from ..backend import Backend
-from ..batch import Batch, solve_batch
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
-from .compatible import compatible
-from .outliers import Candidates, Marked, bounds, mark, reweigh, squares
-from .surrogates import surrogate_of
+from .candidates import Candidates, bounds, mark, reweigh, squares
+from .loop_closures import known_start
 
 Start = Literal["all", "known"]
 ROUNDS = 300
 """About 20 are needed."""
+RATE = 1.4
+"""By which mu changes from round to round."""
+SETTLED = 1e-6
+"""Largest change of a weight that is none."""
+EASY = 1e-6
+"""Below this mu is not inverted: all candidates are far within their thresholds."""
 
 
-@dataclass(frozen=True, eq=False)
-class GNCBatch(Batch):
-    """A Batch whose candidates got weights: weights (B, M) of the M candidate measurements, rounds and mu (B,).
+@dataclass(frozen=True)
+class Surrogate:
+    """A robust loss made convex by mu, as weights of the ratio s = r^2 / c^2.
 
     Args:
-        problem: the weighted problem that was solved last.
+        first: mu from the largest ratio.
+        weight: w(s, mu) = d rho_mu / d r^2.
+        later: the next mu.
+        done: whether the weights (G,) have settled, from the new ones, those before and mu.
+        last: mu at which rho_mu is rho, or near enough.
     """
 
-    weights: Floats
-    rounds: Ints
-    mu: Floats
-    problem: Problem
+    first: Callable[[float], float]
+    weight: Callable[[Floats, float], Floats]
+    later: Callable[[float], float]
+    done: Callable[[Floats, Floats, float], bool]
+    last: float
 
-    __repr__ = short_repr
+
+SURROGATES = {
+    "truncated": Surrogate(
+        lambda worst: 1.0 / max(2.0 * worst - 1.0, EASY),
+        lambda s, mu: np.clip(np.sqrt(mu * (mu + 1.0) / np.maximum(s, 1e-30)) - mu, 0.0, 1.0),
+        lambda mu: mu * RATE,
+        lambda new, old, mu: bool(((new == old) & ((new == 0.0) | (new == 1.0))).all()),
+        1e6,
+    ),
+    "geman-mcclure": Surrogate(
+        lambda worst: max(2.0 * worst, 1.0),
+        lambda s, mu: np.square(mu / (s + mu)),
+        lambda mu: max(mu / RATE, 1.0),
+        lambda new, old, mu: mu == 1.0 and bool((np.abs(new - old) <= SETTLED).all()),
+        1.0,
+    ),
+}
+"""Of Yang et al.: min(r^2, c^2) as mu grows from c^2 / (2 r_max^2 - c^2), r^2 / (1 + r^2/c^2) as it falls to 1."""
+
+
+def surrogate_of(loss: str, threshold: float) -> Surrogate:
+    """The surrogate of a loss; InputError if there is none, or if the threshold is no probability in (0, 1)."""
+    one_of("loss", loss, SURROGATES)
+    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
+        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
+        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
+    return SURROGATES[loss]
 
 
 def solve_gnc(
@@ -66,9 +100,10 @@ def solve_gnc(
     until the weights no longer change, truncated ones at 0 or 1. It needs no good start, but inlier groups that agree
     better than the others: a majority of consistent outliers wins, and so does an error that all share.
 
-    start="known" begins with the known inliers alone, which candidates join where they are predicted (`compatible`),
-    and then alternates with rho itself. Long drives with wrong loop closures need that: the first least squares over
-    all of them bends the whole drive. Robots that only candidates join are placed by those that agree most.
+    start="known" begins with the known inliers alone, which candidates join where they are predicted
+    (`loop_closures.py`), and then alternates with rho itself. Long drives with wrong loop closures need that: the first
+    least squares over all of them bends the whole drive. Robots that only candidates join are placed by those that
+    agree most.
 
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
@@ -103,119 +138,40 @@ def solve_gnc(
     (0.5, array([1., 1., 0.]))
     """
     if instance("problem", problem, Problem).batch is not None:
-        hint = "Pick one with problem.pick(0), or use solve_gnc_batch."
-        raise InputError("problem", repr(problem), "must be a single realisation", hint)
-    each: list[Solution] = []
+        raise InputError("problem", repr(problem), "must be a single realisation", "Pick one with problem.pick(0).")
+    marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
+    one_of("start", start, get_args(Start))
+    bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()
 
     def inner(weighted: Problem) -> Floats:
-        each.append(solve(weighted.pick(0), backend, throw=False, **options))
-        return each[-1].x[None]
+        each.append(solve(weighted, backend, throw=False, **options))
+        return each[-1].x
 
-    marked = mark(problem, candidates, groups)
-    one_of("start", start, get_args(Start))
-    end = _sharpen(problem, marked, loss, threshold, inner, start)
-    weighted = reweigh(problem, marked, end.weight, end.x).pick(0)
-    final = solve(weighted, backend, throw=throw and bool(end.settled[0]), **options)
-    extras = {"weights": end.weight[0, marked.group], "rounds": int(end.rounds[0]), "mu": float(end.mu[0])}
-    extras |= {"joined": end.joined} if end.joined else {}
+    rounds = 0
+    if start == "known":
+        known = known_start(problem, marked, bound, inner)
+        x, weight, rounds, mu = known.x, known.weight, known.rounds, surrogate.last
+        extras |= {"joined": known.joined} if known.joined else {}
+    else:
+        x, weight = inner(problem), np.ones(len(bound))
+        mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
+    settled = False
+    for _ in range(ROUNDS):
+        new = surrogate.weight(squares(problem, marked, x) / bound, mu)
+        settled, weight = surrogate.done(new, weight, mu), new
+        if settled:
+            break
+        x, mu, rounds = inner(reweigh(problem, marked, weight, x)), surrogate.later(mu), rounds + 1
+    final = solve(reweigh(problem, marked, weight, x), backend, throw=throw and settled, **options)
+    extras |= {"weights": weight[marked.group], "rounds": rounds, "mu": float(mu)}
     solution = replace(
         final,
         extras=final.extras | extras,
         iterations=sum(s.iterations for s in (*each, final)),
         build_seconds=sum(s.build_seconds for s in (*each, final)),
         solve_seconds=sum(s.solve_seconds for s in (*each, final)),
-        status=final.status if end.settled[0] else Status.MAX_ITERATIONS,
+        status=final.status if settled else Status.MAX_ITERATIONS,
     )
-    if throw and not end.settled[0]:
+    if throw and not settled:
         raise SolveError(solution)
     return solution
-
-
-def solve_gnc_batch(
-    problem: Problem,
-    candidates: Candidates,
-    loss: str = "truncated",
-    threshold: float = 0.99,
-    groups: npt.ArrayLike | None = None,
-    backend: str | Backend = "gauss-newton",
-    **options: Any,
-) -> GNCBatch:
-    """All realisations as `solve_gnc` solves each; one leaves the batch when its weights have settled.
-
-    Args:
-        problem: with a batch axis B (a single problem is a batch of one).
-        candidates: as in `solve_gnc`, and so are loss, threshold and groups.
-        backend: of `solve_batch`, and so are the options.
-
-    Raises:
-        InputError: as `solve_gnc`.
-    """
-
-    def inner(weighted: Problem) -> Floats:
-        return solve_batch(weighted, backend, **options).x
-
-    marked = mark(problem, candidates, groups)
-    end = _sharpen(problem, marked, loss, threshold, inner)
-    weighted = reweigh(problem, marked, end.weight, end.x)
-    last = solve_batch(weighted, backend, **options)
-    return GNCBatch(
-        last.x,
-        last.covariance,
-        last.cost,
-        last.iterations,
-        last.converged & end.settled,
-        last.again,
-        end.weight[:, marked.group],
-        end.rounds,
-        end.mu,
-        weighted,
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class _End:
-    """x (B, n, ambient), weight (B, G), mu, rounds and settled (B,) of the last round of each realisation; `joined` as
-    of Known."""
-
-    x: Floats
-    weight: Floats
-    mu: Floats
-    rounds: Ints
-    settled: Bools
-    joined: tuple[dict[str, Any], ...]
-
-
-def _sharpen(
-    problem: Problem,
-    marked: Marked,
-    loss: str,
-    threshold: float,
-    inner: Callable[[Problem], Floats],
-    start: Start = "all",
-) -> _End:
-    """The alternation, in which `inner` solves the weighted least squares of the realisations that still change."""
-    surrogate, bound = surrogate_of(loss, threshold), bounds(problem, marked, threshold)
-    before, joined = 0, tuple[dict[str, Any], ...]()
-    if start == "known":
-        known = compatible(problem, marked, bound, inner)
-        x, weight, before, joined = known.x, known.weight, known.rounds, known.joined
-        ratio, mu = squares(problem, marked, x) / bound, np.array([surrogate.last])
-    else:
-        x = inner(problem)
-        bound = np.broadcast_to(bound, (len(x), bound.shape[1]))
-        ratio = squares(problem, marked, x) / bound
-        mu, weight = surrogate.first(ratio.max(axis=1)), np.ones_like(ratio)
-    rounds, active = np.full(len(x), before), np.arange(len(x))
-    for _ in range(ROUNDS):
-        new = surrogate.weight(ratio, mu[active, None])
-        going = ~surrogate.done(new, weight[active], mu[active])
-        weight[active] = new
-        active = active[going]
-        if not len(active):
-            break
-        part = problem.pick(active)
-        x[active] = inner(reweigh(part, marked, weight[active], x[active]))
-        ratio = squares(part, marked, x[active]) / bound[active]
-        mu[active] = surrogate.later(mu[active])
-        rounds[active] += 1
-    return _End(x, weight, mu, rounds, ~np.isin(np.arange(len(x)), active), joined)

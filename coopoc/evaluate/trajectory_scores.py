@@ -1,0 +1,278 @@
+"""Scores of trajectories that anyone estimated, against a truth: APE, RPE, RT-LE, NEES, intervals and remarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+
+from ..arrays import Floats, Ints, checked, instance, named, number
+from ..errors import InputError
+from ..plugins import one_of, suggestion
+from ..short_repr import short_repr
+from .alignment import Alignment, Unit, absolute_error, align, ends, relative_error
+from .statistics import Interval, mean_interval
+
+Aligned = Literal["none", "each", "team"]
+UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
+LENGTHS = {1e-3: "km", 1e2: "cm", 1e3: "mm", 1 / 0.3048: "feet"}
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Where one vehicle was, or was thought to be.
+
+    Args:
+        t: (T,) s, increasing.
+        position: (T, 3) m.
+        rotation: (T, 3, 3), body to frame, or None.
+        covariance: (T, 3, 3) m^2, of an estimate, or None.
+    """
+
+    t: Floats
+    position: Floats
+    rotation: Floats | None = None
+    covariance: Floats | None = None
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        count = len(checked("t", self.t, "(T,)", (-1,)))
+        shapes = {"t": (count,), "position": (count, 3), "rotation": (count, 3, 3), "covariance": (count, 3, 3)}
+        for name, shape in shapes.items():
+            if name in ("t", "position") or getattr(self, name) is not None:
+                axes = str(("T", *shape[1:])).replace("'", "")
+                object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well one vehicle was estimated.
+
+    Args:
+        vehicle: its name.
+        poses: that were compared.
+        missed: poses of the estimate without a truth in time.
+        rt_le_m: root of the mean squared error as it stands, with its interval over blocks of time.
+        ape_m: the same after the alignment.
+        ape_max_m: largest error after the alignment.
+        rpe_m: root of the mean squared relative error, None without rotations or in a drive shorter than its delta.
+        nees: mean of e^T P^-1 e, 3 if consistent (2 where heights claim no variance), None without covariances.
+        remarks: signs of another unit, clock or scale, a sentence each.
+    """
+
+    vehicle: str
+    poses: int
+    missed: int
+    rt_le_m: Interval
+    ape_m: Interval
+    ape_max_m: float
+    rpe_m: float | None
+    nees: float | None
+    remarks: tuple[str, ...] = field(default=())
+
+
+def scores(
+    estimates: Mapping[str, Path],
+    truths: Mapping[str, Path],
+    *,
+    aligned: Aligned = "none",
+    max_diff: float = 0.01,
+    offset: float = 0.0,
+    delta: float = 1.0,
+    unit: Unit = "steps",
+    blocks: int = 20,
+) -> list[Score]:
+    """One row for each vehicle of the estimates.
+
+    Args:
+        estimates: by vehicle.
+        truths: by vehicle; one truth for one estimate needs no common name.
+        aligned: "none" compares in the frame given; "each" aligns every vehicle by itself (evo's `-a`); "team" moves
+            all by one motion, which keeps where they are to each other.
+        max_diff: s, how far stamps that belong together may be apart.
+        offset: s, added to the estimates' stamps.
+        delta: of the relative error.
+        unit: of `delta`.
+        blocks: of time, over which intervals are drawn: errors of one drive are correlated, its blocks hardly.
+
+    Raises:
+        InputError: a vehicle without a truth, stamps that do not meet, positions that leave the alignment open.
+
+    Source: APE and RPE after Sturm et al., IROS 2012; NEES after Bar-Shalom et al. 2001, section 5.4.
+
+    >>> t = np.arange(40) / 10
+    >>> true = Path(t, np.column_stack([t, np.sin(t), 0 * t]))
+    >>> (row,) = scores({"a": Path(t, true.position + [0.3, 0.4, 0.0])}, {"a": true})
+    >>> round(row.rt_le_m.mean, 6)
+    0.5
+    """
+    one_of("aligned", aligned, ("none", "each", "team"))
+    one_of("unit", unit, get_args(Unit))
+    hint = "Give vehicle -> Path."
+    for side, paths in (("estimates", estimates), ("truths", truths)):
+        if not named(side, paths, hint):
+            raise InputError(side, "none", "must be at least one", hint)
+        for name, path in paths.items():
+            instance(f"{side}[{name!r}]", path, Path)
+    blocks = number("blocks", blocks, 2, kind=int, allowed=">= 2")
+    alone = len(estimates) == len(truths) == 1
+    true_of = {name: _truth(name, truths, alone) for name in estimates}
+    pairs = {}
+    for name, path in estimates.items():
+        i, j = associated(path.t, true_of[name].t, max_diff, offset)
+        pairs[name] = _at(path, i), _at(true_of[name], j)
+    team = None
+    if aligned == "team":
+        team = align(*(np.concatenate([pair[k].position for pair in pairs.values()]) for k in (0, 1)))
+    rows = []
+    for name, (estimate, truth) in pairs.items():
+        motion = team or (align(estimate.position, truth.position) if aligned == "each" else None)
+        moved = estimate if motion is None else _moved(estimate, motion)
+        raw = np.linalg.norm(estimate.position - truth.position, axis=1)
+        error = np.linalg.norm(moved.position - truth.position, axis=1)
+        relative = None
+        stamps = estimates[name].t + offset, true_of[name].t
+        found = remarks(stamps, (estimate.position, truth.position), max_diff)
+        if len(ends(estimate.position, delta, unit)) < 2:
+            found = (*found, f"no relative error: the drive is shorter than {delta:g} {unit}.")
+        elif estimate.rotation is not None and truth.rotation is not None:
+            both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
+            relative = float(np.sqrt(np.square(relative_error(*both, delta, unit)).mean()))
+        missed = len(estimates[name].t) - len(raw)
+        spread = (rms_interval(raw, blocks), rms_interval(error, blocks), float(error.max()))
+        rows.append(Score(name, len(raw), missed, *spread, relative, _nees(moved, truth), found))
+    return rows
+
+
+def rms_interval(error: Floats, blocks: int = 20) -> Interval:
+    """Root of the mean square of errors (T,) m with its 95 % interval by a bootstrap over blocks of time.
+
+    >>> rms_interval(np.full(100, 2.0)).mean
+    2.0
+    """
+    count = min(blocks, len(error))
+    squares = np.array([np.mean(part**2) for part in np.array_split(error, count)])
+    rms = float(np.sqrt(np.mean(error**2)))
+    if count < 2:
+        return Interval(rms, np.nan, np.nan, count)
+    found = mean_interval(squares)
+    return Interval(rms, float(np.sqrt(max(found.low, 0.0))), float(np.sqrt(found.high)), count)
+
+
+def _truth(name: str, truths: Mapping[str, Path], alone: bool) -> Path:
+    """The truth of that name, or the only one."""
+    if name not in truths and not alone:
+        hint = suggestion(name, truths, "Name the files, or the ids in them, alike.")
+        raise InputError("vehicle", repr(name), f"has no truth among {', '.join(truths)}", hint)
+    return truths.get(name) or next(iter(truths.values()))
+
+
+def _at(path: Path, k: Ints) -> Path:
+    rotation = None if path.rotation is None else path.rotation[k]
+    return Path(path.t[k], path.position[k], rotation, None if path.covariance is None else path.covariance[k])
+
+
+def _moved(path: Path, motion: Alignment) -> Path:
+    turn, cov = motion.rotation, path.covariance
+    turned = None if cov is None else turn @ cov @ turn.T
+    rotation = None if path.rotation is None else turn @ path.rotation
+    return Path(path.t, motion.apply(path.position), rotation, turned)
+
+
+def _nees(estimate: Path, truth: Path) -> float | None:
+    if estimate.covariance is None:
+        return None
+    gap = truth.position - estimate.position
+    flat = estimate.covariance[:, 2, 2].max(initial=0.0) == 0.0
+    size = 2 if flat else 3
+    solved = np.linalg.solve(estimate.covariance[:, :size, :size], gap[:, :size, None])[..., 0]
+    return float((gap[:, :size] * solved).sum(axis=1).mean())
+
+
+def associated(estimate: Floats, truth: Floats, max_diff: float = 0.01, offset: float = 0.0) -> tuple[Ints, Ints]:
+    """Indices (n,), (n,) of stamps that belong together: for each of the shorter list the nearest of the longer.
+
+    Args:
+        estimate: (M,) s, increasing.
+        truth: (K,) s, increasing.
+        max_diff: s, stamps further apart than this belong to nothing.
+        offset: s, added to the estimate's stamps.
+
+    Raises:
+        InputError: no stamps belong together.
+
+    Source: the association of evo (`sync.associate_trajectories`), which gives the same pairs.
+
+    >>> associated(np.array([0.0, 0.1, 0.2]), np.array([0.101, 0.2]))
+    (array([1, 2]), array([0, 1]))
+    """
+    x, y = checked("estimate", estimate, "(M,)", (-1,)), checked("truth", truth, "(K,)", (-1,))
+    max_diff, x = number("max_diff", max_diff), x + number("offset", offset, -np.inf)
+    swap = len(x) > len(y)
+    short, long = (y, x) if swap else (x, y)
+    after = np.searchsorted(long, short).clip(max=len(long) - 1)
+    nearest = np.where(np.abs(long[after - 1] - short) <= np.abs(long[after] - short), after - 1, after) % len(long)
+    kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff)
+    if not len(kept):
+        spans = f"{span(x)} and {span(y)}"
+        hint = "Check the unit of the stamps, the clocks (offset) and the rates (max_diff)."
+        raise InputError("stamps", spans, f"must agree within {max_diff:g} s somewhere", hint)
+    pair = (kept.astype(np.int64), nearest[kept].astype(np.int64))
+    return (pair[1], pair[0]) if swap else pair
+
+
+def span(t: Floats) -> str:
+    """First and last stamp with all their digits.
+
+    >>> span(np.array([0.1, 1311868230.5]))
+    '0.1..1311868230.5 s'
+    """
+    return f"{t[0].item()!r}..{t[-1].item()!r} s" if len(t) else "no stamps"
+
+
+def remarks(stamps: tuple[Floats, Floats], positions: tuple[Floats, Floats], max_diff: float) -> tuple[str, ...]:
+    """What a reader should know before believing the scores, a sentence each.
+
+    Args:
+        stamps: (M,), (K,) s of the whole estimate and the whole truth.
+        positions: (n, 3), (n, 3) m of both where they are compared.
+        max_diff: s, how far stamps that belong together were allowed to be apart.
+
+    >>> import numpy as np
+    >>> t = np.arange(9.0)
+    >>> remarks((1000 * t, t), (np.zeros((1, 3)), np.zeros((1, 3))), 0.01)[0]
+    '1 of 9 stamps meet within 0.01 s: 0.0..8000.0 s and 0.0..8.0 s; the estimate looks like ms.'
+    """
+    return tuple(text for text in (_stamps(stamps, len(positions[0]), max_diff), _scale(*positions)) if text)
+
+
+def _stamps(stamps: tuple[Floats, Floats], met: int, max_diff: float) -> str:
+    count = min(map(len, stamps))
+    if 2 * met >= count:
+        return ""
+    long, true = (float(t[-1] - t[0]) for t in stamps)
+    looks = "another clock (offset), or rates that do not meet (max_diff)?"
+    for factor, unit in UNITS.items():
+        if 0.5 * factor < long / max(true, 1e-12) < 2 * factor:
+            looks = f"the estimate looks like {unit}."
+        if 0.5 * factor < true / max(long, 1e-12) < 2 * factor:
+            looks = f"the truth looks like {unit}."
+    return f"{met} of {count} stamps meet within {max_diff:g} s: {span(stamps[0])} and {span(stamps[1])}; {looks}"
+
+
+def _scale(estimate: Floats, truth: Floats) -> str:
+    """A scale that takes most of the error of the best rigid motion away, as a monocular camera or another unit has."""
+    try:
+        factor = float(align(estimate, truth, scale=True).scale)
+    except InputError:  # a straight drive, or a standing one: its frame is open, and so is its scale
+        return ""
+    rigid, free = (float(absolute_error(estimate, truth, scale=scale).rmse) for scale in (False, True))
+    if not factor or abs(factor - 1) < 0.05 or free > rigid / 2:
+        return ""
+    unit = next((f", as if it were in {unit}" for size, unit in LENGTHS.items() if abs(factor * size - 1) < 0.1), "")
+    return (
+        f"divided by {1 / factor:.3g}, its aligned error falls from {rigid:.3g} to {free:.3g} m: another scale{unit}."
+    )

@@ -1,0 +1,162 @@
+"""Trajectories: poses over time, in TUM (`t x y z qx qy qz qw`) and KITTI (12 numbers of [R | t] by rows) files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import InitVar, dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..arrays import Floats, frozen
+from ..errors import InputError
+from ..file_names import given_path
+from ..plugins import one_of
+from ..short_repr import short_repr
+from .values import UNIT, read_table, to_orientation, to_rotation, to_text
+
+ORTHONORMAL = 1e-3
+"""Largest entry of |R R^T - I| of a matrix that was merely rounded."""
+KITTI = "r11 r12 r13 t1 r21 r22 r23 t2 r31 r32 r33 t3"
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """T poses of one body in one frame.
+
+    Args:
+        stamps: (T,) s, increasing, or None where the file has none.
+        position: (T, 3) m.
+        rotation: (T, 3, 3), body to frame.
+        place: row -> where it came from, for messages; readers pass the line of the file.
+
+    Raises:
+        InputError: shapes, a number that is not finite, stamps that do not increase, or a matrix that is no rotation:
+            not orthonormal to within 1e-3, or a reflection.
+
+    >>> len(Trajectory(None, np.zeros((4, 3)), np.tile(np.eye(3), (4, 1, 1))))
+    4
+    """
+
+    stamps: Floats | None
+    position: Floats
+    rotation: Floats
+    place: InitVar[Callable[[int], str] | None] = None
+
+    __repr__ = short_repr
+
+    def __post_init__(self, place: Callable[[int], str] | None) -> None:
+        for field in ("position", "rotation", *(() if self.stamps is None else ("stamps",))):
+            object.__setattr__(self, field, frozen(getattr(self, field)))
+        _check(self, place or "pose {}".format)
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
+    count = len(poses)
+    for field, shape in {"stamps": (count,), "position": (count, 3), "rotation": (count, 3, 3)}.items():
+        array = getattr(poses, field)
+        if array is not None and array.shape != shape:
+            raise InputError(field, f"shape {array.shape}", f"must have shape {shape}", "One row per pose.")
+    stamps = np.arange(count) if poses.stamps is None else poses.stamps
+    bad = np.flatnonzero(
+        ~np.isfinite(np.column_stack([stamps, poses.position, poses.rotation.reshape(count, 9)])).all(1)
+    )
+    if len(bad):
+        raise InputError(place(bad[0]), poses.position[bad[0]], "must be finite numbers", "Remove the pose.")
+    late = 1 + np.flatnonzero(np.diff(stamps) <= 0)
+    if len(late):
+        found = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
+        twice = stamps[late[0]] == stamps[late[0] - 1]
+        hint = 'Remove the repeated pose, or read with repeats="drop".' if twice else "Sort the poses by time."
+        raise InputError(f"{place(late[0])}, column t", found, "must increase", hint)
+    off = np.abs(poses.rotation @ poses.rotation.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(poses.rotation) < 0))
+    if len(bad):
+        raise InputError(
+            place(bad[0]),
+            f"rotation {poses.rotation[bad[0]].round(6).tolist()}",
+            f"must be orthonormal to within {ORTHONORMAL:g}, with determinant 1",
+            "Check the order of the numbers.",
+        )
+
+
+def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse") -> Trajectory:
+    """Trajectory of a TUM file: unit quaternions with the scalar last; lines that start with # are comments.
+
+    Args:
+        path: s, m; a quaternion whose length is within 1 % of 1 was rounded and is normalised.
+        repeats: what happens to a pose whose stamp is that of the pose before: "refuse" raises, "drop" leaves it out.
+
+    Raises:
+        InputError: with the line, another number of words, one that is no finite number, stamps that do not increase, a
+            quaternion of another length; a file without a pose.
+
+    Source: the tools of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "a.tum"
+    >>> write_tum(Trajectory([0.0, 0.1], np.ones((2, 3)), np.tile(np.eye(3), (2, 1, 1))), file)
+    >>> read_tum(file).stamps
+    array([0. , 0.1])
+    """
+    one_of("repeats", repeats, ("refuse", "drop"))
+    path = given_path(path)
+    lines, table = read_table(path, "t x y z qx qy qz qw")
+    off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > UNIT)
+    if len(off):
+        raise InputError(
+            f"{path.name}: line {lines[off[0]]}",
+            f"quaternion {table[off[0], 4:].tolist()}",
+            f"must have length 1 to within {UNIT:g}",
+            "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
+        )
+    if repeats == "drop":
+        first = np.append(True, np.diff(table[:, 0]) != 0)
+        lines, table = lines[first], table[first]
+    rotation = to_rotation(table[:, 4:])
+    return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
+
+
+def write_tum(poses: Trajectory, path: str | Path) -> None:
+    """Write `t x y z qx qy qz qw`, qw >= 0: stamps and positions come back bit by bit, rotations to rounding.
+
+    Raises:
+        InputError: a trajectory without stamps.
+    """
+    if poses.stamps is None:
+        raise InputError("stamps", None, "TUM needs a stamp for every pose", "Give them, or write KITTI.")
+    table = np.column_stack([poses.stamps, poses.position, to_orientation(poses.rotation)])
+    Path(path).write_text("\n".join([*to_text(table), ""]))
+
+
+def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:
+    """Trajectory of a KITTI file.
+
+    Args:
+        path: lines r11 r12 r13 t1 r21 ... t3; m.
+        times: file with one stamp per line, s.
+
+    Raises:
+        InputError: with the line, another number of words, one that is no finite number, a matrix that is no rotation;
+            a file without a pose, or another number of stamps.
+
+    Source: the KITTI odometry benchmark (Geiger, Lenz, Urtasun, CVPR 2012).
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "a.txt"
+    >>> _ = file.write_text("1 0 0 5 0 1 0 6 0 0 1 7\\n")
+    >>> read_kitti(file).position
+    array([[5., 6., 7.]])
+    """
+    path = given_path(path)
+    lines, table = read_table(path, KITTI)
+    stamps = None if times is None else read_table(Path(times), "t")[1][:, 0]
+    if stamps is not None and len(stamps) != len(table):
+        allowed = f"must be {len(table)}, one per pose of {path.name}"
+        raise InputError("times", f"{len(stamps)} stamps", allowed, "Check that both files belong together.")
+    poses = table.reshape(-1, 3, 4)
+    return Trajectory(stamps, poses[..., 3], poses[..., :3], place=lambda row: f"{path.name}: line {lines[row]}")

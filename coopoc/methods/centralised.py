@@ -1,0 +1,141 @@
+"""Centralised whole-fleet methods: the Kalman filter of all vehicles in one state, and the whole-drive smoother."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from tqdm import tqdm
+
+from ..arrays import Floats
+from ..errors import InputError
+from ..world.recording import Recording, check_recording
+from ..world.v2x import Message
+from .noise_model import NoiseModel
+from .options import check_options
+from .track import Track
+from .whole_fleet import CENTRE, UPLOAD, Answer, fleet_track
+
+if TYPE_CHECKING:
+    from ..kernels.fleets.graph import Assumed, Measured, Pairs
+
+NOT_CAUSAL = "not causal: every estimate depends on the whole drive"
+BEARINGS = (
+    "most ranges are missing: bearings alone are taken at believed distances, whose errors they share, and covariances "
+    "are too small; joint and the batch smoother hold"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class CentralFilter:
+    """Kalman filter of all vehicles in information form, causal: the optimum of the same measurements.
+
+    Lambda = P^-1 + blkdiag(GNSS^-1) + B blkdiag(W_e) B^T over every pair e of the fleet, B its incidence matrix and W_e
+    the information of range and angles, linearised where prediction and measurement agree: to four digits the
+    accuracy of a converted update followed by an exact Gauss-Newton step, at one solution a step. Cost O(n^3) of the n
+    vehicles of a connected component, over others or at earlier steps: between components, covariances are zero.
+
+    A relative measurement reaches the centre if a message gets through between the two vehicles, either way. Bytes are
+    those of the way to the centre and back.
+
+    Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
+    """
+
+    noise_model: NoiseModel | str = "nominal"
+    name: str = "central-filter"
+    cooperative: bool = True
+    message: Message = UPLOAD
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
+
+        def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
+            from ..kernels.fleets.central import run_filter
+            from ..kernels.fleets.graph import of_runs
+
+            runs = len(measured.active)
+            together = runs if share_covariance(measured, pairs, assumed) else 1
+            x, cov = np.empty(measured.gnss.shape), np.empty((*measured.gnss.shape, 3))
+            for run in tqdm(range(0, runs, together), desc=self.name, unit="run", delay=2.0):
+                some = slice(run, run + together)
+                x[some], cov[some] = run_filter(*of_runs(measured, pairs, assumed, some))
+            return Answer(x, cov, None, notes)
+
+        relative = check_recording(recording).relative[0]
+        alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
+        notes = (CENTRE, BEARINGS) if 2 * alone.sum() > len(alone) else (CENTRE,)
+        return fleet_track(self, self.noise_model, recording, egos, solve, central=True)
+
+
+def share_covariance(measured: Measured, pairs: Pairs, assumed: Assumed) -> bool:
+    """Whether the covariance is the same in all runs: unit noise, and the same measurements and messages."""
+    constant = len(assumed.std) == 0 and len(assumed.process) == len(assumed.fix) == 1
+    if not constant or (measured.relative[..., 0] < 0).any() or (measured.relative[..., 1:] == 0).any():
+        return False
+    alike = (measured.active, pairs.alive, np.isnan(measured.gnss))
+    return all(bool((each == each[:1]).all()) for each in alike)
+
+
+@dataclass(frozen=True, eq=False)
+class BatchSmoother:
+    """argmin of sum |x_t - x_{t-1} - dt u_t|^2_Q + sum |z - x|^2_GNSS + sum |h(x_j - x_i) - y|^2 over fleet and drive.
+
+    The converted measurements make a linear problem; from its solution one exact Gauss-Newton step on range and angles
+    is enough on average. Steps with the same factors, each a tenth of its cost, follow until none moves a position by
+    `settle`: then it is the most probable drive. A step that raises the cost is halved, and the next one linearised
+    anew: where angles are noisy and fixes poor, a whole step may leave by kilometres. Time makes the normal
+    equations block-tridiagonal with blocks of 3N x 3N, and motion noise is diagonal, so that one sweep eliminates step
+    after step,
+
+        S_t = J_t + D,   J_{t+1} = D S_t^-1 J_t + F_{t+1},   D = diag(1 / q),
+
+    and one sweep back gives positions and their marginal covariances, Sigma_t = S_t^-1 + S_t^-1 D Sigma_{t+1} D S_t^-1.
+
+    Not causal: a reference for what the drive holds. O(T (3N)^3) and T (3N)^2 numbers per sweep, one run at a time:
+    60 vehicles and 900 steps take 230 MB. A measurement counts if a message gets through between the two, however late.
+
+    Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
+        exact_steps: Gauss-Newton steps after the linear solution.
+        settle: m, the largest step to stop at; inf stops after those.
+    """
+
+    noise_model: NoiseModel | str = "nominal"
+    exact_steps: int = 1
+    settle: float = 1e-3
+    name: str = "batch-smoother"
+    cooperative: bool = True
+    message: Message = UPLOAD
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        if self.exact_steps < 0:
+            raise InputError("exact_steps", self.exact_steps, "must be a whole number >= 0", "Use 1; 0 is linear only.")
+        if not self.settle > 0:
+            raise InputError("settle", f"{self.settle} m", "must be > 0", "Use 1e-3, or infinity for no further steps.")
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
+
+        def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
+            from ..kernels.fleets.graph import of_runs, own_filters
+            from ..kernels.fleets.smoother import run_factors, smooth
+
+            steps = self.exact_steps if len(assumed.std) else 0
+            x, lost = own_filters(measured, assumed).reshape(measured.gnss.shape), 0
+            cov: Floats = np.empty((*x.shape, 3))
+            with tqdm(total=len(x) * (1 + steps) * len(x[0]), desc=self.name, unit="step", delay=2.0) as bar:
+                for run in range(len(x)):
+                    factors = run_factors(*of_runs(measured, pairs, assumed, slice(run, run + 1)))
+                    x[run], cov[run], small = smooth(x[run], factors, steps, self.settle, bar.update)
+                    lost += not small
+            note = (f"{lost} of {len(x)} runs did not settle within {self.settle:g} m",) if lost else ()
+            return Answer(x, cov, 0, (NOT_CAUSAL, CENTRE, *note))
+
+        return fleet_track(self, self.noise_model, recording, egos, solve, central=True)

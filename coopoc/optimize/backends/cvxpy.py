@@ -1,0 +1,39 @@
+"""cvxpy: Shor's semidefinite relaxation, rounded and refined; the extras hold its bound."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from ...arrays import Floats
+from ..backend import Backend, Capabilities, Solver, SolverResult
+from ..convex.qcqp import TERMS
+from ..convex.relaxation import shor
+from ..model.problem import Problem
+
+
+def prepare(structure: Problem, refine: bool = True) -> Solver:
+    """Solver of a structure.
+
+    Args:
+        structure: a problem whose structure counts.
+        refine: from the rounded point to a minimum, by Newton's steps and gauss-newton; without it the answer is the
+            relaxation's own.
+    """
+    return partial(_relaxed, refine)
+
+
+def _relaxed(refine: bool, problem: Problem, x: Floats) -> SolverResult:
+    """The relaxation's point; x is not looked at."""
+    found = shor(problem, refine)
+    end = (found.x, 0) if found.solution is None else (found.solution.x, found.solution.iterations)
+    extras = {"lower_bound": found.lower_bound, "rank_gap": found.rank_gap, "rounded_cost": found.cost}
+    return SolverResult(*end, extras=extras | {"refined": refine})
+
+
+BACKEND = Backend(
+    "cvxpy",
+    prepare,
+    "convex relaxation: Shor's SDP with a lower bound",
+    "cvxpy",
+    Capabilities(kinds=tuple(TERMS), losses=()),
+)

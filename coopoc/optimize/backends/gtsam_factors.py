@@ -1,0 +1,359 @@
+"""GTSAM's own factors with exactly our objective, by kind, and problems as its graphs and values.
+
+The error e of a GTSAM class below gives our whitened residual, or one of the same length, as S e; S goes into its noise
+model and the loss into a robust one. What is not here GTSAM weighs in another way: its bearing in space lives in the
+tangent plane of a direction, and range, azimuth and inclination in the world frame it does not have. A point is a
+Point2/3, a pose a Pose2/3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
+from itertools import chain
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ...arrays import Floats
+from ..model.factor import Factor
+from ..model.linear import linearise
+from ..model.losses import Loss
+from ..model.problem import Problem
+from ..model.space import Space, exp, log
+
+POINT, POSE = False, True
+Names: TypeAlias = Mapping[tuple[bool, ...], str]
+"""GTSAM's class by which of the nodes are poses."""
+SAME = 1e-12
+"""Share by which two weights may differ and count as equal."""
+ESTIMATORS = {
+    "huber": "Huber",
+    "cauchy": "Cauchy",
+    "geman-mcclure": "GemanMcClure",
+    "truncated": "TruncatedLeastSquares",
+}
+"""GTSAM's names of our losses; their values and weights are the same."""
+
+
+class Part(NamedTuple):
+    """A GTSAM class that states a factor, or those of its residuals that `root` keeps.
+
+    Attributes:
+        names: of the class, by which of the nodes are poses.
+        arguments: by measurement what the class takes between keys and noise model.
+        root: (M or 1, k, k) S, square root of the information of its k errors.
+    """
+
+    names: Names
+    arguments: Callable[[], Iterable[tuple[Any, ...]]]
+    root: Floats
+
+
+Form: TypeAlias = list[Part] | str
+"""The parts of a factor, or why it has none."""
+
+
+def forms(problem: Problem) -> list[Form]:
+    """Of each factor of a single problem its parts in GTSAM, or why it has none."""
+    return [_form(problem, factor) for factor in problem.factors]
+
+
+def _form(problem: Problem, factor: Factor) -> Form:
+    if factor.kind not in FORMS:
+        return "GTSAM has no such factor"
+    kinds, form = [(POINT,) * factor.nodes.shape[1]], FORMS[factor.kind]
+    if problem.poses:
+        kinds = sorted(set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist())))
+        form = _displacement_of_poses if factor.kind == "displacement" and all(map(all, kinds)) else form
+    shared = factor.std is not None and len(factor.std) == 1
+    parts = form(factor, factor.root[:1] if shared else factor.root, problem.dimension)
+    if isinstance(parts, str):
+        return parts
+    if len(parts) > 1 and factor.loss is not None:
+        return "it takes two factors in GTSAM, which no robust loss can join"
+    lacking = [row for row in kinds for part in parts if row not in part.names and row[::-1] not in part.names]
+    if lacking:
+        return f"GTSAM has none from {' to '.join('a pose' if turns else 'a point' for turns in lacking[0])}"
+    return parts
+
+
+def pose_of(d: int, x: Floats) -> Any:
+    """gtsam.Pose2 or Pose3 of a pose (ambient,)."""
+    import gtsam
+
+    if d == 2:
+        return gtsam.Pose2(x[0], x[1], np.arctan2(x[4], x[2]))
+    return gtsam.Pose3(gtsam.Rot3(x[3:].reshape(3, 3)), x[:3])
+
+
+def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
+    return lambda: ((pose_of(d, each),) for each in x)
+
+
+def _position(factor: Factor, W: Floats, d: int) -> Form:
+    names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
+    return [Part(names, lambda: zip(factor.z, strict=True), W)]
+
+
+def _displacement(factor: Factor, W: Floats, d: int) -> Form:
+    return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda: zip(factor.z, strict=True), W)]
+
+
+def _displacement_of_poses(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's chord T_i - Z T_j with Z = (-z, I), whose translation is minus our residual."""
+    root = np.zeros((len(W), (d + 1) ** 2, (d + 1) ** 2))
+    root[:, -d - 1 : -1, -d - 1 : -1] = W
+    z = Space(d, has_rotation=True).join(-factor.z)
+    return [Part({(POSE, POSE): f"FrobeniusLeftBetweenFactorPose{d}"}, _poses(d, z), root)]
+
+
+def _range(factor: Factor, W: Floats, d: int) -> Form:
+    """A speed is a range over dt."""
+    dt = factor.constants if factor.kind == "speed" else np.ones((len(W), 1))
+    assert dt is not None
+    names: Names = {
+        (POINT, POINT): f"RangeFactor{d}",
+        (POSE, POINT): f"RangeFactor{d}D",
+        (POSE, POSE): f"RangeFactorPose{d}",
+    }
+    return [Part(names, lambda: zip((factor.z * dt)[:, 0], strict=True), W / dt[:, :, None])]
+
+
+def _bearing(factor: Factor, W: Floats, d: int) -> Form:
+    """Of a bearing alone, or of range and bearing; GTSAM's order is the other, in which a diagonal W stays one."""
+    if d == 3 and factor.kind == "bearing":
+        return "GTSAM's bearing in space has no forward axis"
+    if d == 3:
+        return "GTSAM weighs a bearing in space by its tangent plane, not by azimuth and inclination"
+    name = "Bearing" if factor.kind == "bearing" else "BearingRange"
+
+    def arguments() -> Iterable[tuple[Any, ...]]:
+        import gtsam
+
+        return ((gtsam.Rot2(angle), *far) for *far, angle in factor.z)
+
+    names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
+    return [Part(names, arguments, W[:, ::-1, ::-1])]
+
+
+def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
+    return _chord(W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d)
+
+
+def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's chord T_j - T_i Z for the translation, its geodesic for the rotation alone."""
+    if _coupled(W, d):
+        return "its std must not couple position and rotation"
+    chord = _chord(W[:, :d, :d], {0: np.arange(d)}, factor.z, d)
+    if isinstance(chord, str):
+        return chord
+    size, first = (3, 2) if d == 2 else (6, 0)
+    root = np.zeros((len(W), size, size))
+    root[:, first : first + size - d, first : first + size - d] = W[:, d:, d:]
+    return [*chord, Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
+
+
+def _relative_log(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's errors in space are those of the rotation first."""
+    root = W if d == 2 else np.roll(W, -d, axis=2)
+    return [Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
+
+
+def _relative_chordal(factor: Factor, W: Floats, d: int) -> Form:
+    columns = {0: np.arange(d), **{1 + k: d + k + d * np.arange(d) for k in range(d)}}
+    return _chord(W, columns, factor.z, d)
+
+
+def _chord(W: Floats, columns: dict[int, Any], z: Floats, d: int) -> Form:
+    """GTSAM's T_j - T_i Z is R_i times our residual, column by column: each must have one std and no correlation.
+
+    Args:
+        columns: our residuals of the translation (0) and of each column of the rotation (1 + k).
+        z: (M, ambient) poses.
+    """
+    information = np.swapaxes(W, -1, -2) @ W
+    weight = np.zeros((len(W), (d + 1) ** 2))
+    expected = np.zeros_like(information)
+    for column, rows in columns.items():
+        own = information[:, rows[0], rows[0]]
+        weight[:, (d + 1) * ((column - 1) % (d + 1)) + np.arange(d)] = own[:, None]
+        expected[:, rows, rows] = own[:, None]
+    scale = np.sqrt(np.einsum("mii->mi", information))
+    if (np.abs(information - expected) > SAME * scale[:, :, None] * scale[:, None, :]).any():
+        return "it needs one std in all directions of the body" + (" and of each axis" if len(columns) > 1 else "")
+    root = np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1])
+    return [Part({(POSE, POSE): f"FrobeniusBetweenFactorPose{d}"}, _poses(d, z), root)]
+
+
+def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
+    if _coupled(W, d):
+        return "its std must not couple position and rotation"
+    turned = Space(d, has_rotation=True).rotation(factor.z)
+
+    def rotations() -> Iterable[tuple[Any, ...]]:
+        import gtsam
+
+        return ((gtsam.Rot2(float(log(turn)[0])) if d == 2 else gtsam.Rot3(turn),) for turn in turned)
+
+    root = W[:, :d, :d] @ np.swapaxes(turned, -1, -2)
+    return [
+        Part({(POSE,): f"PoseTranslationPrior{d}D"}, lambda: zip(factor.z[:, :d], strict=True), root),
+        Part({(POSE,): f"PoseRotationPrior{d}D"}, rotations, W[:, d:, d:]),
+    ]
+
+
+def _chordal_prior(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's errors are the columns of T - Z, ours its translation and then the rows of its rotation."""
+    side = d + 1
+    rows, cols = np.divmod(np.arange(d * d), d)
+    theirs = np.concatenate([side * d + np.arange(d), side * cols + rows])
+    root = np.zeros((len(W), side**2, side**2))
+    root[:, : W.shape[1], theirs] = W
+    name = f"FrobeniusPriorPose{d}"
+    return [Part({(POSE,): name}, lambda: ((pose_of(d, z).matrix(),) for z in factor.z), root)]
+
+
+def _coupled(W: Floats, d: int) -> bool:
+    """Whether position and rotation are correlated."""
+    coupled = max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max())
+    return bool(coupled > SAME * np.abs(W).max())
+
+
+FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
+    "position": _position,
+    "displacement": _displacement,
+    "range": _range,
+    "speed": _range,
+    "bearing": _bearing,
+    "body_spherical": _bearing,
+    "relative_position": _relative_position,
+    "relative_pose": _relative_pose,
+    "relative_pose_log": _relative_log,
+    "relative_pose_chordal": _relative_chordal,
+    "pose": _pose_prior,
+    "pose_chordal": _chordal_prior,
+}
+"""(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
+
+
+def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None = None) -> Any:
+    """The gtsam.NonlinearFactorGraph of the factors that have parts (see `forms`), and of the nodes that are fixed.
+
+    Args:
+        keys: GTSAM's names of the nodes, default their indices.
+    """
+    import gtsam
+
+    graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
+    keys = range(len(posed)) if keys is None else keys
+    for factor, form in zip(problem.factors, parts, strict=True):
+        for part in () if isinstance(form, str) else form:
+            models = _models(part.root, factor)
+            for nodes, given, model in zip(factor.nodes.tolist(), part.arguments(), models, strict=True):
+                if tuple([posed[i] for i in nodes]) not in part.names:
+                    nodes = nodes[::-1]  # such as a range from a point to a pose
+                made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
+                if model is not None:
+                    graph.add(made(*(keys[i] for i in nodes), *given, model))
+    for i in problem.fixed:
+        assert problem.x0 is not None
+        name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
+        graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, problem.x0[i], posed[i])))
+    return graph
+
+
+def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) -> Any:
+    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their keys."""
+    import gtsam
+
+    found = gtsam.Values()
+    for key, node, turns in zip(keys, x, posed, strict=True):
+        found.insert(key, _node(space.dimension, node, turns))
+    return found
+
+
+def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Sequence[int]) -> Floats:
+    """x (n, ambient) of the nodes in gtsam.Values, which holds no others."""
+    from gtsam import utilities
+
+    d, x, rank = space.dimension, np.empty((len(posed), space.ambient)), np.argsort(keys)
+    turns = np.array(posed, dtype=bool)[rank]
+    points, poses = rank[~turns], rank[turns]
+    if len(points):
+        x[points] = space.join(getattr(utilities, f"extractPoint{d}")(found))
+    if len(poses) and d == 2:
+        rows = utilities.extractPose2(found)
+        x[poses] = space.join(rows[:, :2], exp(rows[:, 2:]))
+    elif len(poses):
+        rows = utilities.extractPose3(found)
+        x[poses] = space.join(rows[:, 9:], rows[:, :9].reshape(-1, 3, 3))
+    return x
+
+
+def which_turn(problem: Problem) -> list[bool]:
+    """Of each node whether it is a pose."""
+    poses = set(problem.poses)
+    return [i in poses for i in range(len(problem.names))]
+
+
+def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
+    """Of each node of x (n, ambient) the (dof, own) matrix T with our step = T GTSAM's, which has `own` numbers.
+
+    GTSAM moves a pose in its body's directions, in space with the rotation first; we move its position in the world's.
+    A covariance of GTSAM's becomes T C T^T, a derivative by our step times T is one by GTSAM's.
+
+    >>> from coopoc.optimize import pose
+    >>> tangent(Space(2, has_rotation=True), [True], pose([[5.0, 1.0]], np.pi / 2))[0].round(3) + 0.0
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
+    """
+    d, still, found = space.dimension, np.eye(space.dof, space.dimension), []
+    for turns, rotation in zip(posed, space.rotation(x), strict=True):
+        matrix = np.eye(space.dof)
+        matrix[:d, :d] = rotation
+        found.append(still if not turns else matrix if d == 2 else np.roll(matrix, space.angles, axis=1))
+    return found
+
+
+def linearised(problem: Problem, which: Sequence[int], x: Floats, keys: Sequence[int]) -> list[Any]:
+    """The factors `which` as gtsam.LinearContainerFactors, linear around x (n, ambient) for good."""
+    import gtsam
+
+    jacobian: Any = gtsam.JacobianFactor
+    factors, posed = [problem.factors[f] for f in which], which_turn(problem)
+    linear, found = linearise(problem.space, factors, None, x[None]), []
+    turn, at = tangent(problem.space, posed, x), values(problem.space, posed, x, keys)
+    for factor, residual, jacobians in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+        unit = gtsam.noiseModel.Unit.Create(factor.size)
+        wide = [np.broadcast_to(jacobian[0], (len(factor.nodes), *jacobian.shape[2:])) for jacobian in jacobians]
+        for k in np.flatnonzero(factor.informative).tolist():
+            blocks = [(keys[i], jacobian[k] @ turn[i]) for i, jacobian in zip(factor.nodes[k], wide, strict=True)]
+            found.append(gtsam.LinearContainerFactor(jacobian(*chain(*blocks), -residual[0, k], unit), at))
+    return found
+
+
+def _node(d: int, x: Floats, turns: bool) -> Any:
+    return pose_of(d, x) if turns else x[:d]
+
+
+def _models(root: Floats, factor: Factor) -> list[Any]:
+    """A noise model per measurement of roots (M or 1, k, k), one object for equal ones; None: it has no information."""
+    size, loss = root.shape[-1], factor.loss
+    return [_model(row.tobytes(), size, loss) for row in root] * (len(factor.nodes) if len(root) == 1 else 1)
+
+
+@lru_cache(maxsize=1024)
+def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
+    """Of one measurement, kept for the next equal ones; what GTSAM itself takes for diagonal may have entries below."""
+    import gtsam
+
+    noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)
+    if not root.any():
+        return None
+    model: Any = noise.Gaussian.SqrtInformation(root, not np.tril(root, -1).any())
+    if loss is None:
+        return model
+    shape = getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale)
+    return noise.Robust.Create(shape, model)

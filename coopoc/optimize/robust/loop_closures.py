@@ -1,0 +1,320 @@
+"""Loop closures by gating and consensus: candidates join known inliers where these predict them, as a start of GNC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ...errors import InputError
+from ..algebra.sparse import sparse
+from ..descent.trust_region import arrive
+from ..model.linear import linearise
+from ..model.part import restricted, rows_among, taken
+from ..model.problem import Problem
+from ..model.space import carried
+from ..starts.initial import initial_guess
+from ..starts.walk import along_poses, parts
+from .candidates import Marked, reweigh, squares
+
+ROUNDS = 100
+"""About 15 are needed: half of those that fit join in each."""
+CHANCES = 2
+"""Times that a candidate may join: one that a wrong neighbour has pushed out comes back once that is gone."""
+CURVED = 10.0
+"""Times its bound up to which a d^2 is checked by a solve: predictions along a drive are linear, and its arc is not."""
+TRIED = 10
+"""Of these, the least certain predictions first."""
+STEPS = 20
+"""Of such a solve; a loop that fits needs fewer."""
+TOLERANCE = 1e-3
+"""m or rad, a step that ends it."""
+HYPOTHESES = 20
+"""Placements of a pair of bodies, spread over its candidates, and as many of those that contradict the best: where
+60 % of the candidates are wrong, 20 of them hold no right one in 4 of 100,000 cases."""
+AGREEING = 2
+"""Candidates that must agree, the placement's own included: one alone proves nothing."""
+HELD = -1
+"""The body of what known inliers join to the world: to fixed nodes, or to nodes that are measured alone."""
+HINT = 'Name fewer measurements as candidates, or use start="all".'
+
+
+@dataclass(frozen=True, eq=False)
+class KnownStart:
+    """Where the known inliers lead.
+
+    Args:
+        x: (n, ambient) nodes.
+        weight: (G,) of the candidates.
+        rounds: that it took.
+        joined: for each body that candidates joined to another, how many agreed.
+    """
+
+    x: Floats
+    weight: Floats
+    rounds: int
+    joined: tuple[dict[str, Any], ...]
+
+
+def known_start(problem: Problem, marked: Marked, bound: Floats, inner: Callable[[Problem], Floats]) -> KnownStart:
+    """Candidates join where the others predict them: first within what known inliers hold together, then between.
+
+    A candidate fits where d^2 = r^T (J P J^T + cov)^-1 r is within its bound, P the covariance of its nodes given all
+    that has joined. Of those that fit the half that is predicted best, by log det(J P J^T + cov), joins in each round,
+    so that a loop is judged by what little the odometry of its own length has drifted. One whose residual leaves the
+    bound leaves, and when it leaves again stays rejected. Of a group the d^2 are added, as if independent. Where none
+    fits, the least certain are solved for: the cost must grow by no more than half the bound.
+
+    A body that known inliers leave free, such as a robot that only others see, is solved in a frame of its own. Each of
+    some candidates between two bodies then places one of them; the placement that predicts most of the other candidates
+    is taken, the pair with most agreement first, and the rounds go on.
+
+    Args:
+        problem: a single one.
+        marked: the candidates.
+        bound: (G,) c^2.
+        inner: solves a weighted problem.
+
+    Raises:
+        InputError: known inliers that do not hold a body in itself, or candidates that do not decide where it is.
+
+    References:
+        Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4: the
+        gate of a predicted measurement. Olson, Agarwal, IJRR 2013, and Mangelson et al., ICRA 2018, on graphs.
+        Fischler, Bolles, Random Sample Consensus, 1981.
+    """
+    search, rounds, joined = _Search(problem, marked, bound), 0, list[dict[str, Any]]()
+    while True:
+        body = search.bodies()
+        whole = pinned(problem, body)
+        rounds += search.grow(whole, body, inner)
+        if whole is problem:
+            return KnownStart(search.x, search.weight, rounds, tuple(joined))
+        joined.append(search.join(search.bodies()))
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """A hypothesis of how two bodies stand to each other.
+
+    Args:
+        bodies: HELD or the first node of one, and the first node of the other, which moves.
+        group: of candidates that places it.
+        move: (2, ambient) a pose of the other before and after.
+        fits: (G,) candidates between them that agree, itself included.
+        misfit: sum of their d^2.
+        count: candidates between them.
+        rival: most that agree with a placement that does not fit, and not with this one.
+    """
+
+    bodies: tuple[int, int]
+    group: int
+    move: Floats
+    fits: Bools
+    misfit: float
+    count: int
+    rival: int = 0
+
+    @property
+    def agree(self) -> int:
+        """How many candidates agree."""
+        return int(self.fits.sum())
+
+    def described(self, problem: Problem) -> dict[str, Any]:
+        """For `Solution.extras`; bodies by the names of their first nodes."""
+        to, body = ("world" if k == HELD else problem.names[k] for k in self.bodies)
+        return {"body": body, "to": to, "agree": self.agree, "rival": self.rival, "candidates": self.count}
+
+
+class _Search:
+    """What has been decided: x (n, ambient), each free body in a frame of its own; weight (G,) of the candidates that
+    have joined; left (G,) how often each has left."""
+
+    def __init__(self, problem: Problem, marked: Marked, bound: Floats) -> None:
+        self.problem, self.marked, self.bound = problem, marked, bound
+        self.weight, self.left = np.zeros(len(bound)), np.zeros(len(bound), dtype=np.int64)
+        self.x = along_poses(reweigh(problem, marked, self.weight, initial_guess(problem)[0]))
+
+    def bodies(self) -> Ints:
+        """(n,) the body of each node, HELD or its first pose (if it has none, its first node)."""
+        problem = self.problem
+        measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
+        pairs = [nodes for nodes in measured if nodes.shape[1] == 2]
+        part = parts(len(problem.names), np.concatenate([np.empty((0, 2), np.int64), *pairs]))
+        alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
+        nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
+        first = nodes[np.unique(part[nodes], return_index=True)[1]]
+        first[part[np.concatenate([problem.fixed, *alone]).astype(np.int64)]] = HELD
+        return np.asarray(first[part])
+
+    def ends(self, body: Ints) -> Ints:
+        """(M, 2) bodies that each candidate joins, ascending; HELD is one of those of a measurement of a single
+        node."""
+        found = np.full((len(self.marked.row), 2), HELD)
+        for k in np.unique(self.marked.factor):
+            here = self.marked.factor == k
+            nodes = self.problem.factors[k].nodes[self.marked.row[here]]
+            found[here, 2 - nodes.shape[1] :] = body[nodes]
+        return np.sort(found, axis=1)
+
+    def grow(self, problem: Problem, body: Ints, inner: Callable[[Problem], Floats]) -> int:
+        """Rounds of a pinned problem until no more candidates join within the bodies."""
+        marked, bound, weight, left, ends = self.marked, self.bound, self.weight, self.left, self.ends(body)
+        judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
+        sparse(problem, least=0)  # is kept as long as the problem is, so that all rounds share its analysis
+        chances, rounds = 1, 0
+        while rounds < ROUNDS:
+            self.x, rounds = inner(reweigh(problem, marked, weight, self.x)), rounds + 1
+            leaving = judged & (weight > 0) & (squares(problem, marked, self.x) > bound)
+            left[leaving], weight[leaving] = left[leaving] + 1, 0.0
+            distance, volume = predicted(problem, marked, weight, self.x)
+            others = judged & (weight == 0) & (left < chances)
+            fits = others & (distance <= bound)
+            if fits.any():
+                weight[fits & (volume <= np.median(volume[fits]))] = 1.0
+            elif chances < CHANCES:
+                chances = CHANCES
+            else:
+                some = np.flatnonzero(others & (distance <= CURVED * bound))
+                some = some[np.argsort(-volume[some], kind="stable")][:TRIED]
+                if not any(self._explained(problem, group) for group in some.tolist()):
+                    break
+        return rounds
+
+    def _explained(self, problem: Problem, group: int) -> bool:
+        """Whether twice the cost grows by no more than the bound where a group joins, which it then does.
+
+        Where the model is linear that growth is d^2. Far along a drive whose heading has become uncertain it is less.
+        """
+        costs = []
+        for joins in (0.0, 1.0):
+            self.weight[group] = joins
+            system = sparse(reweigh(problem, self.marked, self.weight, self.x), least=0)
+            assert system is not None
+            costs.append(system.cost(arrive(system, self.x, STEPS, TOLERANCE).x if joins else self.x))
+        good = 2.0 * (costs[1] - costs[0]) <= self.bound[group]
+        self.weight[group] = float(good)
+        return bool(good)
+
+    def join(self, body: Ints) -> dict[str, Any]:
+        """Take the placement with which most candidates agree, over all pairs of bodies, and describe it."""
+        problem, marked, between = self.problem, self.marked, self.ends(body)
+        first = np.unique(marked.group, return_index=True)[1]
+        own = between[first]  # of each group
+        poses = np.array([factor.kind.startswith("relative_pose") for factor in problem.factors])
+        alike = marked.sums((between != own[marked.group]).any(axis=1)) == 0
+        groups = np.flatnonzero(alike & poses[marked.factor[first]] & (own[:, 0] != own[:, 1]) & (self.left < CHANCES))
+        pairs, which, count = np.unique(own[groups], axis=0, return_inverse=True, return_counts=True)
+        best, undecided = None, list[str]()
+        for p in np.argsort(-count, kind="stable").tolist():
+            if best is not None and count[p] <= best.agree:
+                break
+            found = self._vote(body, (int(pairs[p, 0]), int(pairs[p, 1])), groups[which.ravel() == p])
+            if found.agree < AGREEING or found.agree <= found.rival:
+                sentence = "of {candidates} between {body} and {to} {agree} agree, {rival} otherwise"
+                undecided.append(sentence.format(**found.described(problem)))
+            elif best is None or found.agree > best.agree:
+                best = found
+        if best is None:
+            free = [problem.names[k] for k in np.unique(body[body != HELD])]
+            what = "; ".join(undecided[:3]) or f"nothing between {', '.join(free[:3])} and the others"
+            allowed = "must join what known inliers leave free, two and more that agree"
+            raise InputError("candidates", what, allowed, HINT)
+        self.x, self.weight[best.group] = self._placed(body, best), 1.0
+        return best.described(problem)
+
+    def _placed(self, body: Ints, placement: Placement) -> Floats:
+        """(n, ambient) nodes with the second body moved."""
+        x, moving = self.x.copy(), body == placement.bodies[1]
+        x[moving] = carried(self.problem.space, x[moving], *placement.move)
+        return x
+
+    def _vote(self, body: Ints, bodies: tuple[int, int], groups: Ints) -> Placement:
+        """The placement of a pair with which most of its candidates (groups of relative poses) agree, and its rival."""
+        problem, marked, used = self.problem, self.marked, np.isin(body, bodies)
+        rows = rows_among(problem, used)
+        part = restricted(pinned(problem, body[body == bodies[0]]), used, self.x, rows)
+        inside = _among(marked, rows)
+        sparse(part, least=0)  # is kept as long as the part is, so that all placements share its analysis
+
+        def placement(group: int) -> Placement:
+            first, weight = int(np.flatnonzero(marked.group == group)[0]), self.weight.copy()
+            factor, row = problem.factors[marked.factor[first]], marked.row[first]
+            (i, j), z, space = factor.nodes[row], factor.z[row], problem.space
+            origin = space.join(np.zeros(space.dimension))
+            if body[j] == bodies[1]:
+                move = np.stack([self.x[j], carried(space, z, origin, self.x[i])])
+            else:
+                move = np.stack([self.x[i], carried(space, origin, z, self.x[j])])
+            guess = Placement(bodies, group, move, np.zeros(len(self.bound), dtype=bool), 0.0, len(groups))
+            weight[group] = 1.0
+            distance, _ = predicted(part, inside, weight, self._placed(body, guess)[used])
+            fits = guess.fits.copy()
+            fits[groups] = distance[groups] <= self.bound[groups]
+            fits[group] = True
+            return replace(guess, fits=fits, misfit=float(distance[fits].sum()))
+
+        def spread(some: Ints) -> list[Placement]:
+            chosen = np.linspace(0, len(some) - 1, min(HYPOTHESES, len(some))).round().astype(np.int64)
+            return [placement(group) for group in some[np.unique(chosen)].tolist()]
+
+        def leading(tried: list[Placement]) -> Placement:
+            return max(tried, key=lambda each: (each.agree, -each.misfit))
+
+        tried = spread(groups)
+        others = [*np.flatnonzero(leading(tried).fits), *(each.group for each in tried)]
+        tried += spread(np.setdiff1d(groups, others))
+        best = leading(tried)
+        rivals = [each.fits & ~best.fits for each in tried if not best.fits[each.group]]
+        return replace(best, rival=max((int(fits.sum()) for fits in rivals), default=0))
+
+
+def pinned(problem: Problem, body: Ints) -> Problem:
+    """The problem with the first node of each free body fixed; itself if there is none."""
+    first = np.unique(body[body != HELD]).tolist()
+    return problem.replace_unchecked(fixed=(*problem.fixed, *first)) if first else problem
+
+
+def _among(marked: Marked, rows: list[Ints]) -> Marked:
+    """The candidates among some rows of each factor, of a problem that has these alone; groups keep their numbers."""
+    number = np.cumsum([len(own) > 0 for own in rows]) - 1
+    kept = np.flatnonzero([r in rows[k] for k, r in zip(marked.factor, marked.row, strict=True)])
+    row = [np.searchsorted(rows[k], r) for k, r in zip(marked.factor[kept], marked.row[kept], strict=True)]
+    return Marked(number[marked.factor[kept]], np.array(row, dtype=np.int64), marked.group[kept])
+
+
+def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats]:
+    """d^2 and log det(J P J^T + cov), in units of cov, of each group (G,), given what has a weight (G,) at x.
+
+    Raises:
+        InputError: that leaves nodes free.
+    """
+    system = sparse(reweigh(problem, marked, weight, x), least=0)
+    if system is None or not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
+        raise InputError("candidates", repr(problem), "must leave known inliers that hold all nodes", HINT)
+    distance, volume = np.zeros(len(marked.row)), np.zeros(len(marked.row))
+    for k in np.unique(marked.factor):
+        here = marked.factor == k
+        factor = taken(problem.factors[k], marked.row[here])
+        with np.errstate(all="ignore"):
+            linear = linearise(problem.space, [factor], None, x[None])
+        shape = (len(factor.nodes), factor.size, problem.space.dof)
+        J = np.concatenate([np.broadcast_to(own[0], shape) for own in linear.by_node([factor])[0]], axis=2)
+        r = linear.residual[0][0]
+        # an angle between nodes that coincide has no derivative
+        lost = ~np.isfinite(r).all(axis=1) | ~np.isfinite(J).all(axis=(1, 2))
+        r, J = np.where(lost[:, None], 0.0, r), np.where(lost[:, None, None], 0.0, J)
+        number = system.entries.number[factor.nodes].reshape(len(J), -1)
+        row, column = np.broadcast_arrays(number[:, :, None], number[:, None])
+        free = (row >= 0) & (column >= 0)
+        P = np.zeros(row.shape)
+        P[free] = system.cholesky.inverse(row[free], column[free])
+        S = J @ P @ np.swapaxes(J, 1, 2) + np.eye(factor.size)
+        squared = np.einsum("mk,mk->m", r, np.linalg.solve(S, r[..., None])[..., 0])
+        distance[here] = np.where(lost, np.inf, squared)
+        volume[here] = np.linalg.slogdet(S)[1]
+    sums = [np.asarray(np.bincount(marked.group, each, len(weight)), np.float64) for each in (distance, volume)]
+    return sums[0], sums[1]

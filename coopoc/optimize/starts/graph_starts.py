@@ -1,0 +1,196 @@
+"""Starts of a graph: chained odometry, a spanning tree, linear solves, and one that grows with the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ...errors import InputError
+from ...formats.graph import Graph
+from ..algebra.sparse import sparse
+from ..descent.trust_region import arrive
+from ..model.part import restricted
+from ..model.problem import Problem
+from ..model.space import Space, carried
+from .linear import linear_start
+from .walk import Moves, Roots, trilaterate, walk
+
+NUDGE = 0.01
+"""Share of a range by which ends in one place are moved apart."""
+STAGE = 25
+"""Poses of the longest robot that the growing start adds at a time, at least."""
+STAGES = 60
+"""At most, unless odometry turns by more than DRIFT in one."""
+MOST_STAGES = 200
+"""Whatever the odometry."""
+DRIFT = 0.5
+"""rad, standard deviation by which odometry may turn in a stage: beyond it a stage begins in no basin."""
+STEPS = 5
+"""Of each stage."""
+TOLERANCE = 1e-2
+"""m or rad, a step at which a stage has arrived for the purpose."""
+HOLDING = 2
+"""Ranges per dimension from which a point is placed by them."""
+
+
+def chained(graph: Graph, apart: bool = False) -> Floats:
+    """(n, ambient): each robot's poses along its own relative poses, from a pose with a prior, else from its first
+    vertex in the file; where the file has none, or `apart`, from a place on a ring."""
+    return _landmarks(graph, *_walked(graph, _own(graph), _roots(graph, apart)))
+
+
+def tree(graph: Graph) -> Floats:
+    """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
+    between robots too; what it does not join hangs on as in `chained`."""
+    every = np.ones(len(graph.relative_pose), dtype=bool)
+    return _landmarks(graph, *_walked(graph, every, _roots(graph, False)))
+
+
+def file(graph: Graph) -> Floats:
+    """(n, ambient): the vertices as they are.
+
+    Raises:
+        InputError: a vertex without a position.
+    """
+    unknown = ~np.isfinite(graph.position).all(axis=1)
+    if unknown.any():
+        name = graph.names[int(np.flatnonzero(unknown)[0])]
+        raise InputError("start", "'file'", f"needs a position of {name} in the file", 'Use start="odometry".')
+    return Space(graph.dimension, has_rotation=True).join(graph.position, graph.rotation)
+
+
+STARTS: dict[str, Callable[[Graph], Floats]] = {
+    "odometry": chained,
+    "apart": lambda graph: chained(graph, apart=True),
+    "file": file,
+    "tree": tree,
+    "linear": lambda graph: linear_start(graph, chained(graph)),
+}
+
+
+def contenders(graph: Graph) -> tuple[str, ...]:
+    """The starts that may differ on a graph, cheapest first: without loops all are chained odometry."""
+    edges = graph.relative_pose.nodes
+    loops = len(edges) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
+    moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
+    if loops <= moved - 1:
+        return ("odometry",)
+    own = int(_own(graph).sum())
+    closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
+    return ("odometry", "tree", "linear") if closed else ("odometry", "linear")
+
+
+def separated(graph: Graph, x0: Floats) -> Floats:
+    """x0 with ends of a range that lie in one place moved apart by a share NUDGE of it, each in another direction:
+    there a range has no direction."""
+    position, (i, j) = x0[:, : graph.dimension], graph.ranges.nodes.T
+    distance = graph.ranges.distance
+    rows = np.flatnonzero(np.linalg.norm(position[j] - position[i], axis=1) < 1e-9 * distance)
+    angle = 2.4 * np.arange(len(rows))
+    position[j[rows], :2] += NUDGE * distance[rows, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return x0
+
+
+def _own(graph: Graph) -> Bools:
+    """(M,) which relative poses join poses of one robot."""
+    edges, letter = graph.relative_pose.nodes, np.array([ord(name[0]) for name in graph.names])
+    return np.asarray(letter[edges[:, 0]] == letter[edges[:, 1]])
+
+
+def _roots(graph: Graph, apart: bool) -> list[tuple[int, Floats, Floats]]:
+    """Poses with a prior at that, then each robot's first."""
+    priors, found = graph.pose_prior, []
+    if not apart:
+        found = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
+    robots = [places for places in graph.robots.values() if len(places)]
+    around = float(graph.ranges.distance.mean()) if len(graph.ranges) else 1.0
+    for k, places in enumerate(robots):
+        first, angle = int(places[0]), 2.0 * np.pi * k / len(robots)
+        if not apart and np.isfinite(graph.position[first]).all():
+            found.append((first, graph.position[first], graph.rotation[first]))
+        else:
+            at = np.zeros(graph.dimension)
+            at[:2] = around * np.cos(angle), around * np.sin(angle)
+            found.append((first, at, np.eye(graph.dimension)))
+    return found
+
+
+def _walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
+    """The walk along the `used` relative poses, whose length is their variance."""
+    edges = graph.relative_pose
+    length = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12 if len(edges) else np.empty(0)
+    moves = Moves(edges.nodes[used], edges.position[used], edges.rotation[used], length[used])
+    return walk(len(graph.names), graph.dimension, moves, roots)
+
+
+def _landmarks(graph: Graph, position: Floats, rotation: Floats, known: Bools) -> Floats:
+    """Nodes with the points at their priors, where a pose sees them, or by ranges."""
+    points = graph.point_prior
+    position[points.nodes[:, 0]], known[points.nodes[:, 0]] = points.position, True
+    for (i, j), at in zip(graph.relative_point.nodes.tolist(), graph.relative_point.position, strict=True):
+        if not known[j]:
+            position[j], known[j] = position[i] + rotation[i] @ at, True
+    for j in np.flatnonzero(~known & ~graph.is_pose).tolist():
+        others, ranges = _ranged(graph, j, known)
+        if len(others):
+            position[j] = trilaterate(position[others], ranges)
+        known[j] = True
+    return Space(graph.dimension, has_rotation=True).join(position, rotation)
+
+
+def _ranged(graph: Graph, point: int, known: Bools) -> tuple[Ints, Floats]:
+    """The known nodes to which a point has ranges, and these."""
+    rows = np.flatnonzero((graph.ranges.nodes == point).any(axis=1))
+    others = graph.ranges.nodes[rows].sum(axis=1) - point
+    return others[known[others]], graph.ranges.distance[rows[known[others]]]
+
+
+def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
+    """Nodes (n, ambient) and iterations: each stage solves the measurements among the poses so far.
+
+    A stage begins at the answer of the one before, which it continues by the relative poses of the problem's x0, so
+    that odometry drifts little. Points join when they are seen or have a prior, as x0 has them, or where enough ranges
+    place them, and anew whenever these have doubled: few may have placed them on the wrong side.
+
+    References:
+        Kaess et al., iSAM, T-RO 2008: an estimate that follows the measurements in time.
+    """
+    assert problem.x0 is not None
+    space, x, n = problem.space, problem.x0.copy(), len(graph.names)
+    solved, ranges, iterations = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64), 0
+    count = _stages(graph)
+    for stage in range(count):
+        used = np.zeros(n, dtype=bool)
+        for places in graph.robots.values():
+            new = places[: int(np.ceil((stage + 1) / count * len(places)))]
+            used[new] = True
+            old = new[solved[new]]
+            if len(old) and len(old) < len(places):
+                x[places[len(old) :]] = carried(space, problem.x0[places[len(old) :]], problem.x0[old[-1]], x[old[-1]])
+        joins = np.zeros(n, dtype=bool)
+        for edges in (graph.relative_point, graph.point_prior):
+            if len(edges):
+                joins[edges.nodes[:, -1][used[edges.nodes[:, 0]] | ~graph.is_pose[edges.nodes[:, 0]]]] = True
+        for point in np.flatnonzero(~graph.is_pose & ~joins).tolist():
+            others, distance = _ranged(graph, point, used)
+            joins[point] = len(others) >= HOLDING * space.dimension + 1
+            if joins[point] and len(others) >= 2 * ranges[point]:
+                x[point, : space.dimension] = trilaterate(x[others, : space.dimension], distance)
+                ranges[point] = len(others)
+        solved = used | joins
+        part = restricted(problem, solved, x)
+        if (system := sparse(part, least=0)) is not None:
+            end = arrive(system, np.array(part.x0), STEPS, TOLERANCE)
+            x[solved], iterations = end.x, iterations + end.iterations
+    return x, iterations
+
+
+def _stages(graph: Graph) -> int:
+    """How many stages: STAGES, or as many as odometry needs to turn by no more than DRIFT in each."""
+    longest = max(len(places) for places in graph.robots.values())
+    turns = graph.relative_pose.covariance[:, graph.dimension :, graph.dimension :]
+    variance = np.median(np.einsum("mii->m", turns) / turns.shape[-1]) if len(turns) else 0.0
+    drifting = min(longest * variance / DRIFT**2, MOST_STAGES)
+    return max(min(longest // STAGE, max(STAGES, int(drifting))), 1)

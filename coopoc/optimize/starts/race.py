@@ -1,0 +1,120 @@
+"""The choice among starts: a few steps from each, cheapest first; the lowest goes on, or one that grows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from ...arrays import Floats, frozen
+from ..algebra.sparse import keep, sparse
+from ..descent.trust_region import Arrival, arrive
+from ..model.problem import Problem
+from ..model.search import Search
+
+STEPS = 12
+"""Of each start at first; a good one has nearly arrived by then."""
+ROUNDS = ((3.0, 25), (1.25, 200))
+"""Those whose cost is within the first number of the least go on by as many steps as the second says, of several with
+the same cost the cheapest alone."""
+SAME = 1e-3
+"""Share by which costs may differ and count as the same minimum: the cheaper start then stays."""
+TOLERANCE = 1e-3
+"""m or rad, a step at which a start has arrived for the purpose."""
+EXCESS = 5.0
+"""Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
+MORE = 50
+"""Steps before it is judged."""
+
+
+def race(
+    problem: Problem,
+    starts: Mapping[str, Callable[[], Floats]],
+    growing: Callable[[Problem], tuple[Floats, int]] | None = None,
+) -> tuple[Problem, Search]:
+    """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
+
+    A start from which no step was refused and no promise failed by half, and that leads to a cost which the assumed
+    noise explains, ends the search. Others are tried where the first had trouble, and all whose costs are near
+    the least go on (ROUNDS). Where the noise does not explain the end, the steps to it had trouble and no second start
+    led there, the growing start is tried, too: stated noise that is ten times too small costs a few more starts and not
+    that. A problem that is not large takes the first.
+
+    Args:
+        problem: at any start.
+        starts: name -> x0 (n, ambient), cheapest first.
+        growing: problem -> x0 and iterations of a start that is tried last, "incremental".
+    """
+    system, tried, taken = sparse(problem), {}, 0
+    limit, straight = np.inf, set[str]()
+    if system is not None:
+        mean, variance = expected(problem, system.size)
+        limit = mean + EXCESS * np.sqrt(variance)
+    for name, start in starts.items():
+        x = start()
+        if system is None:
+            return problem.replace_unchecked(x0=frozen(x)), Search(name)
+        end = arrive(system, x, STEPS, TOLERANCE)
+        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
+        if smooth(end):
+            if tried[name][0] <= limit:
+                return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
+            straight |= {name} if end.converged else set()
+    assert system is not None
+    reached = {name: cost for name, (cost, _) in tried.items()}
+    least = min(reached.values())
+    for within, steps in ROUNDS:
+        if all(cost <= (1.0 + SAME) * least for cost, _ in tried.values()):
+            break
+        tried = _distinct(tried)
+        close = {name: x for name, (cost, x) in tried.items() if cost <= within * least}
+        if len(close) > 1:
+            ends = {name: arrive(system, x, steps, TOLERANCE) for name, x in close.items()}
+            tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
+            taken += sum(end.iterations for end in ends.values())
+            reached |= {name: cost for name, (cost, _) in tried.items()}
+            least = min(reached.values())
+    name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
+    alone = sum(cost <= (1.0 + SAME) * least for cost in reached.values()) == 1
+    if growing is not None and alone and name not in straight and system.cost(x) > limit:
+        end = arrive(system, x, MORE, TOLERANCE)
+        x, taken = end.x, taken + end.iterations
+        if system.cost(x) > limit:
+            grown, steps = growing(problem)
+            end = arrive(system, grown, MORE, TOLERANCE)
+            taken += steps + end.iterations
+            name, x = ("incremental", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
+    return keep(problem, problem.replace_unchecked(x0=frozen(x))), Search(name, taken)
+
+
+def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:
+    """Those whose cost differs from that of every one before, which is cheaper."""
+    found: dict[str, tuple[float, Floats]] = {}
+    for name, (cost, x) in tried.items():
+        if all(abs(cost - other) > SAME * min(cost, other) for other, _ in found.values()):
+            found[name] = cost, x
+    return found
+
+
+def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
+    """Mean and variance of the cost at its minimum under the noise that it assumes.
+
+    Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation matrix count as the
+    angles that they hold; in the plane kappa |R_j - R_i R_ij|_F^2 is twice the square of the angle's error over its
+    variance, and adds 1 and 2.
+    """
+    d, angles = problem.dimension, problem.space.angles
+    matrices = [f for f in problem.factors if f.kind in ("pose_chordal", "relative_pose_chordal")]
+    spare = sum(len(f.nodes) * f.size for f in problem.factors)
+    spare -= (d * d - angles) * sum(len(f.nodes) for f in matrices) + unknowns
+    turns = sum(len(f.nodes) for f in matrices) - len({*problem.poses} - {*problem.fixed})
+    twice = max(turns, 0) if d == 2 and matrices else 0
+    mean = 0.5 * (max(spare, 0) + twice)
+    return mean, mean + twice
+
+
+def smooth(end: Arrival) -> bool:
+    """Whether all promises came true by half and more, without damping; that an exact Hessian was not positive definite
+    is no trouble, since J^T J goes on."""
+    _, damping, share = end.record.T
+    return bool(not damping.any() and (np.abs(share[np.isfinite(share)] - 1.0) < 0.5).all())
