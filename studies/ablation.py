@@ -126,7 +126,12 @@ STUDY = lineup.study(
     figures={
         "choices": curves(
             [
-                Panel({v: {"value": v} for v in (0, 1, 2, 5, 10)}, {"choice": ["window", "lag", "horizon"]}, "", "Window, lag or horizon [steps]"),
+                Panel(
+                    {v: {"value": v} for v in (0, 1, 2, 5, 10)},
+                    {"choice": ["window", "lag", "horizon"]},
+                    "",
+                    "Window, lag or horizon [steps]",
+                ),
                 Panel({v: {"value": v} for v in (1, 2, 3, 5, 10, 30)}, {"choice": "rounds"}, "", "Rounds of messages"),
             ],
             [{"method": method} for method, choice in CHOICES if choice != "exact step"],

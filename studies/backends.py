@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.solution import Status
 from coopoc.optimize.solve import solve
 from coopoc.optimize.starts.initial import initial_guess
-from coopoc.study.numbers import Number, Where, across, mean, present
+from coopoc.study.numbers import Number, Where, across, present
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel, look
 from coopoc.world.recording import Recording
@@ -111,11 +110,6 @@ def _solved(problem: Problem, backend: str) -> Row:
     }
 
 
-def _share(results: Results, where: Where, value: str) -> str | None:
-    share = mean(results, where, value)
-    return None if share is None else f"{100 * share:.0f} %"
-
-
 def _column(value: str, number: Callable[[Any], Any], agreed: bool = False) -> Number:
     """A number of a column over all solves of a backend, or over those that ended where the referee does."""
 
@@ -124,6 +118,10 @@ def _column(value: str, number: Callable[[Any], Any], agreed: bool = False) -> N
         return None if kept is None else number(results.select(kept)[value])
 
     return column
+
+
+def _percent(values: Any) -> str:
+    return f"{100 * values.mean():.0f} %"
 
 
 _median = {name: _column(name, lambda values: float(values.median())) for name in ("solve_ms", "whole_ms")}
@@ -173,8 +171,8 @@ STUDY = lineup.study(
         "agreement": _table(
             {
                 "Solves": _column("gap_m", len),
-                "At a minimum": partial(_share, value="solved"),
-                "The referee's": partial(_share, value="same"),
+                "At a minimum": _column("solved", _percent),
+                "The referee's": _column("same", _percent),
                 "Farthest [µm]": _column("gap_m", lambda gaps: f"{1e6 * gaps.max():.2g}", agreed=True),
                 "Cost differs": _column("cost_gap", lambda gaps: f"{gaps.abs().max():.0e}", agreed=True),
                 "Lower": _column("cost_gap", lambda gaps: int((gaps < -1e-6).sum())),
@@ -200,6 +198,7 @@ STUDY = lineup.study(
             ],
             [{"method": backend} for backend in BACKENDS],
             "Milliseconds of one solve() from its first guess, checks and covariance included, median.",
+            at={"runs": 1},
             number=_median["whole_ms"],
             ylabel="Time [ms]",
             log=True,

@@ -65,7 +65,9 @@ def _figure(results: Results) -> Plot | None:
         panel.axvline(3.0, color="black", linewidth=0.9)
         for row, pair in enumerate(ran):
             each = np.nanmean(results.values("nees", of(*pair)), axis=1)
-            panel.plot(each, np.full(len(each), row), **{**strokes({"method": pair[0]}), "linestyle": "none"}, alpha=0.8)
+            panel.plot(
+                each, np.full(len(each), row), **{**strokes({"method": pair[0]}), "linestyle": "none"}, alpha=0.8
+            )
         plain_log(panel.xaxis)
         labels = [look(method).label + ("" if known in USUAL else f", {known}") for method, known in ran]
         panel.set(yticks=range(len(ran)), yticklabels=labels, ylim=(len(ran) - 0.4, -0.6), xlabel="NEES, one per ego")

@@ -179,7 +179,7 @@ STUDY = lineup.study(
         "rt_le": curves(
             [_panel(loss) for loss in LOSSES],
             [*(of(*line) for line in LINES[:-1]), *(of(*line, loss=0.0) for line in BOUNDS)],
-            "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs. LKF-SA lies far above.",
+            "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs. LKF-SA is far above.",
             INPUTS,
             BOUND,
             number=_interval,

@@ -27,6 +27,7 @@ CASES = {name: dict(zip(scene.LASTING, shares, strict=True)) for name, shares in
 """Error models as selections."""
 NEIGHBOURS = (0, 2, 6, 10)
 KS = {f"K = {k}": {"max_neighbours": k} for k in NEIGHBOURS}
+X = {k: {"max_neighbours": k} for k in NEIGHBOURS}
 SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"), ("recursive", "trained"))
 SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("drift", "nominal"))
 """Nominal noise model: all but `drift` take the whole error of a fix as white, of the same variance."""
@@ -80,7 +81,10 @@ STUDY = lineup.study(
     },
     figures={
         "rms": curves(
-            [Panel({k: {"max_neighbours": k} for k in NEIGHBOURS}, c, name, "Neighbours K") for name, c in CASES.items()],
+            [
+                Panel({k: {"max_neighbours": k} for k in NEIGHBOURS}, c, name, "Neighbours K")
+                for name, c in CASES.items()
+            ],
             [of(*line) for line in (*SHARED, BOUND)],
             "rms over runs of RT-LE against the number of neighbours.",
             NOTE,

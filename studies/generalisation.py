@@ -48,7 +48,7 @@ def _each_fleet(results: Results, where: Where) -> list[float]:
 
 TEXT = (
     "rms RT-LE as a multiple of the oracle Kalman filter's in the same place and noise. Trained on {clients}; training "
-    "noise 1.5 m and 10 %, scenario 1: 1.8 m with a bias, 15 %; scenario 2: 3.5 m, 15 % unless stated."
+    "noise 1.5 m and 10 %, scenario 1: 1.8 m with a bias, 15 %; scenario 2: 3.5 m, 15 % unless stated. At home:"
 )
 HOME = {**at("town10", "scenario 2")}
 
@@ -92,9 +92,7 @@ STUDY = lineup.study(
     },
     figures={"multiples": multiples(METHODS[1:], NOISES, _each_fleet, "A mark per fleet.", TEXT, at=HOME)},
     findings=_findings,
-    limitations=(
-        "Fleets are SUMO traffic with white noise; a real car's odometry is in docs/streaming.md.",
-    ),
+    limitations=("Fleets are SUMO traffic with white noise; a real car's odometry is in docs/streaming.md.",),
     minutes=4,
     metrics={"rt_le_m": "lower"},
 )

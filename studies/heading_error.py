@@ -17,8 +17,8 @@ from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.pose_start import pose_start
 from coopoc.methods.track import Track
-from coopoc.study.provenance import revision
 from coopoc.study.numbers import Number, Where, across, mean, rms, sentence
+from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import Panel, look
 from coopoc.study.tables import Table, crossed

@@ -27,6 +27,7 @@ CHANNELS: dict[str, tuple[str, dict[float, dict[str, Any]]]] = {
     "lost in runs of 10": ("%", IN_RUNS),
 }
 """What happens to messages -> its unit, and channel by how much of it."""
+LABELS = {"s": "Latency [s]", "%": "Lost [%]"}
 NOTE = (
     "K = 6. The moving horizon puts a late message at its true time; the others bring it forward with the velocity "
     "that came with it. What is older than 1 s is forgotten."
@@ -94,7 +95,10 @@ STUDY = lineup.study(
     },
     figures={
         "rt_le": curves(
-            [Panel(by, title=how, xlabel="Latency [s]" if unit == "s" else "Lost [%]") for how, (unit, by) in CHANNELS.items()],
+            [
+                Panel(by, title=how, xlabel="Latency [s]" if unit == "s" else "Lost [%]")
+                for how, (unit, by) in CHANNELS.items()
+            ],
             [{"method": method} for method in METHODS[1:]],
             "RT-LE against latency and loss; dashed: the bound of a perfect channel.",
             NOTE,

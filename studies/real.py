@@ -19,8 +19,8 @@ from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.learned.pose_noise import PoseTask, fit_pose_noise
 from coopoc.methods.pose_filter import PoseFilter
 from coopoc.methods.track import Track
-from coopoc.study.provenance import revision
 from coopoc.study.numbers import Where, across, difference, interval, mean, present, ran, sentence
+from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import Panel, look, words
 from coopoc.study.tables import Table, crossed, pivot

@@ -48,7 +48,9 @@ def _table(text: str, value: str, decimals: int) -> Any:
         return mean(results, at(**where), value)
 
     columns: dict[str, Number] = across(number, {f"{100 * s:g} % spoofed": {"spoofed_share": s} for s in SHARES})
-    rows = [((k, look(method).label), {"method": method, "max_neighbours": k}) for k in NEIGHBOURS for method in METHODS]
+    rows = [
+        ((k, look(method).label), {"method": method, "max_neighbours": k}) for k in NEIGHBOURS for method in METHODS
+    ]
     return selections(("K", "Method"), rows, columns, text, NOTE, decimals=decimals)
 
 

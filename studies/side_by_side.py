@@ -92,9 +92,7 @@ STUDY = lineup.study(
         "innovation": _table(
             "RMS innovation of the fixes [m] against K: how well a method predicts the next fix.", "innovation_m"
         ),
-        "nis": _table(
-            "NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False
-        ),
+        "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False),
         "bytes": _table("Received per ego [B/s].", "bytes_per_second", best=None, intervals=False, decimals=0),
     },
     figures={"rt_le": _figure},

@@ -115,7 +115,9 @@ def bound(task: Task, information: str) -> float:
         whole = fleet_bound(fleet, sensors, v2x)
         bounds: list[Floats] = [whole[:, ego] for ego in task.columns]
     else:
-        bounds = [posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0)) for ego in task.columns]
+        bounds = [
+            posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0)) for ego in task.columns
+        ]
     return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
 
 

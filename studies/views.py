@@ -88,20 +88,23 @@ def selections(
     return view
 
 
-def curves(panels: Sequence[Panel], lines: Sequence[Where], *texts: str, **options: Any) -> FigureView:
+def curves(
+    panels: Sequence[Panel], lines: Sequence[Where], *texts: str, at: Where | None = None, **options: Any
+) -> FigureView:
     """A number over a parameter, as `coopoc.study.figures.curves`.
 
     Args:
         panels: of the figure.
         lines: selection of each line.
         texts: of the caption.
+        at: parameters that the caption names beside the settings.
         options: of `coopoc.study.figures.curves`.
     """
 
     def view(results: Results) -> Plot | None:
         from coopoc.study import figures
 
-        return figures.curves(results, panels, lines, scene.caption(results, *texts), **options)
+        return figures.curves(results, panels, lines, scene.caption(results, *texts, **(at or {})), **options)
 
     return view
 

@@ -127,7 +127,7 @@ def test_a_command_parses_and_names_what_exists(
     if name == "train" and given:
         assert plugins.find("coopoc.recipes", given["recipe"])
     if name == "benchmark":
-        from coopoc.studies.bench_cards import method, simulated
+        from coopoc.studies.benchmark import method, simulated
 
         assert all(method(one) for one in given.get("methods", ()) if simulated(one))
 

@@ -157,9 +157,7 @@ def compare(
     first, second = (_groups(frame, labels) for frame in frames)
     paired = one.settings.get("seed") == two.settings.get("seed")
     shared = [key for key in first if key in second]
-    changes = [
-        _change(dict(zip(labels, key, strict=True)), first[key], second[key], value, paired) for key in shared
-    ]
+    changes = [_change(dict(zip(labels, key, strict=True)), first[key], second[key], value, paired) for key in shared]
     how = "paired by ego, run and training seed" if paired else "not paired, as the noise seeds differ"
     caption = f"{words(value)} in A = {folders[0]} and B = {folders[1]}; B - A with its 95 % interval, {how}."
     notes = _notes(changes, len(first.keys() ^ second.keys()))

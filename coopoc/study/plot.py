@@ -1,4 +1,4 @@
-"""Plot: a figure with its caption, saved as the same bytes for the same numbers; axes, lines and legends of one style."""
+"""Plot: a figure with its caption, saved as the same bytes for the same numbers; axes, lines and legends."""
 
 from __future__ import annotations
 

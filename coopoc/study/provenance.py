@@ -23,7 +23,7 @@ import numpy as np
 
 from ..errors import InputError
 
-_LIBRARIES = "numpy scipy numba torch gtsam casadi cvxpy osqp pandas pyarrow joblib matplotlib".split()
+_LIBRARIES = ("numpy", "scipy", "numba", "torch", "gtsam", "casadi", "cvxpy", "osqp", "pandas", "pyarrow", "joblib")
 
 
 def environment() -> dict[str, str]:
@@ -90,71 +90,73 @@ def code_of(function: Callable[..., Any]) -> str:
     >>> len(code_of(code_of))
     20
     """
-    reached: dict[Any, str] = {}
-    _reach(function, reached)
-    return hashlib.sha256("\n".join(sorted(reached.values())).encode()).hexdigest()[:20]
+    texts: set[str] = set()
+    _reach(function, texts, [])
+    return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:20]
 
 
-def _reach(thing: Any, reached: dict[Any, str]) -> None:
+def _reach(thing: Any, texts: set[str], seen: list[Any]) -> None:
     """Add the text of a value and of what it names: source of functions and classes, contents of constants."""
-    if isinstance(thing, str | int | float | bool | None | bytes):
-        reached[repr(thing)] = repr(thing)
-        return
     if isinstance(thing, functools.partial):
         thing = [thing.func, thing.args, thing.keywords]
     if callable(thing):
         thing = inspect.unwrap(thing)
-    if id(thing) in reached:
-        return
-    reached[id(thing)] = ""
-    if isinstance(thing, Mapping):
-        thing = list(thing.items())
-    if isinstance(thing, list | tuple | set | frozenset):
-        for each in thing:
-            _reach(each, reached)
-    elif isinstance(thing, np.ndarray):
-        reached[id(thing)] = repr(thing.tolist())
-    elif isinstance(thing, FunctionType | type):
-        reached[id(thing)] = f"{thing.__module__} {thing.__qualname__}"
-        for each in _named(thing, reached):
-            _reach(each, reached)
-    elif not isinstance(thing, ModuleType):
-        _reach([type(thing), {} if callable(thing) else getattr(thing, "__dict__", {})], reached)
+    if isinstance(thing, str | int | float | bool | None | bytes):
+        texts.add(repr(thing))
+    elif not any(thing is other for other in seen):
+        seen.append(thing)
+        if isinstance(thing, Mapping):
+            thing = list(thing.items())
+        if isinstance(thing, list | tuple | set | frozenset):
+            for each in thing:
+                _reach(each, texts, seen)
+        elif isinstance(thing, np.ndarray):
+            texts.add(repr(thing.tolist()))
+        elif isinstance(thing, FunctionType | type):
+            for each in _named(thing, texts):
+                _reach(each, texts, seen)
+        elif not isinstance(thing, ModuleType):
+            _reach([type(thing), {} if callable(thing) else getattr(thing, "__dict__", {})], texts, seen)
 
 
-def _named(thing: FunctionType | type, reached: dict[Any, str]) -> Iterator[Any]:
+def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:
     """What a function or a class names in its package, after its own source was added; nothing without source."""
     module = sys.modules.get(thing.__module__)
     package = getattr(module, "__package__", "") or thing.__module__
-    if module is None or package.partition(".")[0] in (*sys.stdlib_module_names, *sys.builtin_module_names):
+    if module is None or package.partition(".")[0] in sys.stdlib_module_names:
         return
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(thing)))
     except (OSError, TypeError, SyntaxError):  # a lambda within an expression, or no file
         code = getattr(thing, "__code__", None)
-        reached[id(thing)] += f" {code and (code.co_code, code.co_names)}"
+        texts.add(f"{thing.__qualname__} {code and (code.co_code, code.co_names)}")
         return
     for node in ast.walk(tree):
         if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(node):
             node.body = node.body[1:] or [ast.Pass()]
-    reached[id(thing)] = ast.unparse(tree)
-    local = inspect.getclosurevars(thing).nonlocals if isinstance(thing, FunctionType) else {}
-    names: dict[str, Any] = {**vars(module), **local}
+    texts.add(ast.unparse(tree))
+    names: dict[str, Any] = dict(vars(module))
+    if isinstance(thing, FunctionType):
+        names |= inspect.getclosurevars(thing).nonlocals
+
+    def within(name: str) -> bool:
+        return f"{name}.".startswith(f"{package}.")
+
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom):
             home = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            if f"{home}.".startswith(f"{package}."):
+            if within(home):
                 source = importlib.import_module(home)
-                names |= {a.asname or a.name: getattr(source, a.name, None) for a in node.names}
+                names |= {alias.asname or alias.name: getattr(source, alias.name, None) for alias in node.names}
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
             owner = names.get(node.value.id)
-            if isinstance(owner, ModuleType) and f"{owner.__name__}.".startswith(f"{package}."):
+            if isinstance(owner, ModuleType) and within(owner.__name__):
                 yield getattr(owner, node.attr, None)
         elif isinstance(node, ast.Name) and node.id in names:
             value = names[node.id]
-            home = getattr(value, "__module__", package) or package
-            yield value if f"{home}.".startswith(f"{package}.") else f"{home}.{getattr(value, '__qualname__', '')}"
+            home = getattr(value, "__module__", None) or package
+            yield value if within(home) else f"{home}.{getattr(value, '__qualname__', '')}"
 
 
 def _processor() -> str:

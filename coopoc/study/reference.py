@@ -167,7 +167,9 @@ def table(changes: Sequence[Change], everything: bool = False) -> Table | None:
     """The numbers that have moved, or all; None if there are none."""
     shown = [change for change in changes if everything or change.verdict != "within noise"]
     columns = [*dict.fromkeys(name for change in shown for name in change.at), "metric"]
-    text = f"{summary(changes)} A number may move by a share of it and, where runs differ, by {SIGMA:g} standard errors."
+    text = (
+        f"{summary(changes)} A number may move by a share of it and, where runs differ, by {SIGMA:g} standard errors."
+    )
     return change_table(shown, ("Reference", "Now"), text, columns, 4) if shown else None
 
 

@@ -65,8 +65,6 @@ TERMS = {
 _TERM = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(TERMS, key=len, reverse=True)))})(?![\w-])")
 
 
-
-
 def report(
     folders: Sequence[str | Path],
     out: str | Path,
@@ -232,7 +230,14 @@ def printed(page: str) -> bytes:
         out = folder / "page.pdf"
         # --no-sandbox: as root, as in a container, Chromium refuses to start without it, and the page is our own;
         # a profile of its own: a browser that is already open would take the page and print nothing
-        flags = "--headless --disable-gpu --no-pdf-header-footer --no-first-run --disable-extensions --no-sandbox".split()
+        flags = [
+            "--headless",
+            "--disable-gpu",
+            "--no-pdf-header-footer",
+            "--no-first-run",
+            "--disable-extensions",
+            "--no-sandbox",
+        ]
         places = [f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={out}", (folder / "page.html").as_uri()]
         try:
             done = subprocess.run([program, *flags, *places], capture_output=True, text=True, timeout=180)
