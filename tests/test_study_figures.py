@@ -157,7 +157,7 @@ def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, su
 
 def test_a_front_joins_what_no_cheaper_method_beats(results: Results) -> None:
     axes = figures.pareto(results, where={"method": ["joint", "gnss"]}).figure.axes[0]
-    marks, front, level = axes.lines
+    level, marks, front = axes.lines
     means = (
         results.frame.query("method == 'joint' and max_neighbours > 0").groupby("bytes_per_second")["rt_le_m"].mean()
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -66,10 +67,13 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
             if (plot := made(name, view)) is not None:
                 shown["figures"].append({"name": name, "caption": plot.save(folder / "figures" / name)})
             bar.update()
-    for kind, listed in shown.items():  # files of views that an earlier run made show other numbers
-        for path in (folder / kind).glob("*.*"):
-            if path.stem not in {view["name"] for view in listed}:
-                path.unlink()
+    with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers
+        before = views(folder)
+        for kind, listed in shown.items():
+            old = {view["name"] for view in before[kind]} - {view["name"] for view in listed}
+            for path in (folder / kind).glob("*.*"):
+                if path.stem in old:
+                    path.unlink()
     content = {
         **shown,
         "findings": {**(made("findings", study.found) or {}), **_reference(study, results)},
