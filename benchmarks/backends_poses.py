@@ -10,7 +10,7 @@ import numpy as np
 from backends_star import Job, Row
 
 import coopoc as co
-from coopoc.methods.pose_piece import Drive, pose_piece
+from coopoc.methods.poses.pose_factors import PoseRun, pose_subgraph
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
 from oracles.pose_smoother import by_hand
@@ -36,17 +36,17 @@ def convoy(steps: int) -> co.Recording:
 def pose_lag(steps: int = 150) -> Job:
     """Poses, fixes, compasses, ranges and bearings, a lag of fifty steps; the loop's numbers are made beforehand."""
     recording, smoother = convoy(steps), co.PoseSmoother(LAG)
-    drive = Drive(recording, 0, NOISE, np.full((len(recording.ids), 4), np.nan), np.array(smoother.spread))
+    drive = PoseRun(recording, 0, NOISE, np.full((len(recording.ids), 4), np.nan), np.array(smoother.spread))
     known: dict[str, Any] = {}
     parts = []
-    for step, found in enumerate(smoother.follow(recording)):
-        parts.append(pose_piece(drive, step, known))
+    for step, found in enumerate(smoother.estimates(recording)):
+        parts.append(pose_subgraph(drive, step, known))
         marks = dict(zip(parts[-1].names, parts[-1].x0, strict=True))  # type: ignore[arg-type]
         known |= {name: x for name, x in marks.items() if "@" not in name}
         known |= dict(zip(found.names, found.x, strict=True))
 
     def mine() -> Any:
-        return np.stack([found.x[:, :2] for found in smoother.follow(recording)])
+        return np.stack([found.x[:, :2] for found in smoother.estimates(recording)])
 
     def hand() -> Any:
         return by_hand(parts, LAG, recording.dt)

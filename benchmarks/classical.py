@@ -23,10 +23,9 @@ from tabulate import tabulate
 from timing import medians, timed
 
 import coopoc as co
-from coopoc.kernels.stars.joint_filter import follow
-from coopoc.methods.cooperative_map import Windows
-from coopoc.methods.star import POSITION, assumptions, measurements
-from coopoc.methods.window import dead_reckoned
+from coopoc.kernels.stars.joint_filter import run_filter
+from coopoc.methods.sliding_window import Windows, dead_reckoned
+from coopoc.methods.star import assumptions, measurements
 from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.starts.initial import converted
@@ -152,7 +151,7 @@ def filter_rows(recording: co.Recording) -> list[Row]:
         return Row(words, solves, call, away, away < 1e-9)
 
     def kernel(refine: bool) -> Any:
-        return follow(measured, assumed, refine, None, POSITION)[0]
+        return run_filter(measured, assumed, refine)[0]
 
     def all_steps(method: co.JointFilter) -> Any:
         return method(recording, [0]).x[:, :, 0]

@@ -101,8 +101,6 @@ def method_cases() -> Iterator[Case]:
     others = {
         "drift, time-correlated errors": (DriftFilter(), seen(fleet, drifting, False), "joint, plain"),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
-        "kalman-variational": (co.VariationalKalman(), recording, "kalman, plain"),
-        "fixed-lag, smoothed": (co.FixedLagSmoother(smoothed=True), recording, "fixed-lag, plain"),
         "cooperative gain, newest fix": (CooperativeGain(NoiseNet(), sums=False), recording, "joint, plain"),
         "cooperative gain, sums": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
     }

@@ -61,7 +61,6 @@ def graph() -> Call:
 
 OTHERS: dict[str, Callable[[], Call]] = {
     "pose filter, solo": lambda: pose("solo"),
-    "pose filter, star": lambda: pose("star"),
     "pose filter, fleet": lambda: pose("fleet"),
     "solve of a graph": graph,
 }

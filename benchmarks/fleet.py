@@ -28,7 +28,7 @@ from timing import medians
 
 import coopoc as co
 from coopoc.kernels.solo import FixNoise
-from coopoc.methods.kalman import drive_of, filtered
+from coopoc.methods.kalman import solo_filter
 from coopoc.world import exchange, sensing
 from coopoc.world.spherical import to_vector
 from coopoc.world.v2x import NO_MESSAGE
@@ -362,8 +362,7 @@ def growth(sizes: Sequence[tuple[int, int]]) -> str:
 
 def solo(recording: co.Recording) -> np.ndarray:
     """Positions of all vehicles by the solo filter's kernel."""
-    seen = drive_of(recording, KNOWN, range(len(recording.ids)))
-    return filtered(seen, FixNoise(KNOWN.gnss_variance))[0]
+    return solo_filter(recording, range(len(recording.ids)), KNOWN, FixNoise(KNOWN.gnss_variance))[0]
 
 
 def solo_rows(recording: co.Recording) -> list[Row]:

@@ -1,4 +1,4 @@
-"""Pose filters, alone and of a star of ten neighbours, beside filterpy's extended Kalman filter on the same work.
+"""Pose filters, alone and with ten neighbours in one state, beside filterpy's extended Kalman filter on the same work.
 
     OMP_NUM_THREADS=1 python benchmarks/poses.py               # a Markdown table on stdout, half a minute
 
@@ -18,9 +18,7 @@ from tabulate import tabulate
 from timing import medians, timed
 
 import coopoc as co
-from coopoc.methods import pose_unit
-from coopoc.methods.pose_begin import body_of, first_poses
-from coopoc.world.inbox import inbox
+from coopoc.methods.poses.pose_inputs import body_of, first_poses
 from coopoc.world.spherical import wrap
 
 ROUNDS, STEPS, RUNS = 5, 101, 10
@@ -45,10 +43,9 @@ def ring(neighbours: int) -> co.Recording:
 
 def ours(recording: co.Recording) -> Callable[[], Any]:
     """The kernel over all runs; poses (R, T, 4) of the ego."""
-    method, box = co.PoseFilter(exact=False), inbox(recording, 0, co.PoseFilter().message)
-    members, begin = pose_unit.star(recording, 0, box), first_poses(recording, None, [0])
-    place = pose_unit.places_of(members, 0)
-    return lambda: method.follow(recording, members, box.link, begin)[0][:, place]
+    method, members = co.PoseFilter(exact=False), list(range(len(recording.ids)))
+    begin, links = first_poses(recording, None, members), np.arange(len(recording.links))
+    return lambda: method.run_filter(recording, members, links, begin)[0][:, :, 0]
 
 
 def filterpys(recording: co.Recording, run: int) -> Any:

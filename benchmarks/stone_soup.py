@@ -19,10 +19,9 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, IteratedKalmanUpdater, KalmanUpdater
 
-from coopoc.kernels.stars.joint_filter import follow
-from coopoc.methods.cooperative_map import CooperativeMAP, Windows
-from coopoc.methods.star import POSITION, assumptions, measurements
-from coopoc.methods.window import dead_reckoned
+from coopoc.kernels.stars.joint_filter import run_filter
+from coopoc.methods.sliding_window import CooperativeMAP, Windows, dead_reckoned
+from coopoc.methods.star import assumptions, measurements
 from coopoc.optimize import Problem, solve_batch
 from coopoc.world.inbox import inbox
 from coopoc.world.spherical import spherical, wrap
@@ -125,7 +124,7 @@ def joint_filter() -> Job:
     job = "joint filter, linear"
     return Job(
         [
-            Row(job, "kernel", RUNS * STEPS, lambda: follow(measured, assumed, False, None, POSITION)[0]),
+            Row(job, "kernel", RUNS * STEPS, lambda: run_filter(measured, assumed, False)[0]),
             Row(job, "Stone Soup, KalmanUpdater", 2 * STEPS, lambda: np.stack([followed(d) for d in drives])),
         ],
         right,

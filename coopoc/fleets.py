@@ -44,11 +44,11 @@ def load_recording(path: str | Path, **options: Any) -> Recording:
 
 
 def read_log(path: str | Path, **options: Any) -> Any:
-    """`coopoc.data.log.Log` of one's own measurements: recording, truth (None without one), summary.
+    """`coopoc.data.log.read.Log` of one's own measurements: recording, truth (None without one), summary.
 
     Args:
         path: as in `load_recording`.
-        options: of the reader, see `coopoc.data.log.read_log`.
+        options: of the reader, see `coopoc.data.log.read.read_log`.
 
     Raises:
         InputError: as `load_recording`.

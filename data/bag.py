@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,33 +11,31 @@ import numpy as np
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.plugins import unknown
 
-from .log_rows import Rows, rows_of
-from .log_summary import Tally
+from .log.units import Rows, Tally, rows_of
 
-SUFFIXES = (".bag", ".mcap", ".db3")
 READ = {
     "sensor_msgs/msg/NavSatFix": "fix",
     "nav_msgs/msg/Odometry": "odometry",
     "sensor_msgs/msg/Imu": "imu",
     "geometry_msgs/msg/PoseStamped": "pose",
 }
-POSES = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped")
 TRUTH = ("truth", "ground_truth", "groundtruth")
-Row = tuple[float, str, str, float, float]
-"""Time s, vehicle, kind, value and standard deviation of a number."""
+WHEELS = "yaw_rate of odometry"
+Number = tuple[str, float, float]
+"""Kind, value and standard deviation."""
 
 
-def is_bag(path: Path) -> bool:
-    """Whether a path is a bag: a file of ROS 1 or MCAP, or a folder of ROS 2.
-
-    >>> is_bag(Path("drive.bag"))
-    True
-    """
-    return path.suffix.lower() in SUFFIXES or (path / "metadata.yaml").is_file()
-
-
-def read_bag(path: Path, tally: Tally, ignore: Sequence[str] = (), truth: str = "") -> tuple[Rows, Rows | None]:
-    """Rows of the measurements in a bag, and those of the truth, if a topic is named after it.
+def read_bag(
+    path: Path,
+    tally: Tally,
+    *,
+    columns: Mapping[str, str],
+    kinds: Mapping[str, str],
+    ignore: Sequence[str],
+    truth: str,
+    actual: list[Rows],
+) -> Rows:
+    """Rows of the measurements in a bag.
 
     The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part. NavSatFix
     gives latitude, longitude, height; Odometry the speed and yaw rate of its twist (its pose has a frame of its own and
@@ -49,95 +47,87 @@ def read_bag(path: Path, tally: Tally, ignore: Sequence[str] = (), truth: str = 
     Args:
         path: of the bag.
         tally: counts what is not read.
+        columns: of tables, as is `kinds`: refused.
+        kinds: of tables.
         ignore: topics and kinds that are left out.
         truth: topic of the truth.
+        actual: takes the rows of the truth, if there are any.
 
     Raises:
         InputError: no bag, none of these messages, or no such topic.
         MissingLibraryError: rosbags is not installed.
     """
+    import pandas as pd
+
+    if columns or kinds:
+        hint = 'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".'
+        raise InputError("columns, kinds", path.name, "are of tables, and this is a bag", hint)
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
-    rows: list[Row] = []
-    true: list[Row] = []
+    rows: list[tuple[Any, ...]] = []
     folder = path.parent if path.suffix == ".db3" else path
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            topics = sorted({c.topic for c in reader.connections})
+            topics = {c.topic: c.msgtype in READ and c.topic not in ignore for c in reader.connections}
             for topic in filter(None, [truth, *(one for one in ignore if one.startswith("/"))]):
                 if topic not in topics:
-                    raise unknown(f"{path.name}: topic", topic, topics)
-            wanted = [c for c in reader.connections if c.msgtype in READ and c.topic not in ignore]
-            for connection in reader.connections:
-                if connection not in wanted:
-                    tally.unused(f"{path.name}: topic {connection.topic} ({connection.msgtype})", connection.msgcount)
-            for connection, _, raw in reader.messages(connections=wanted) if wanted else ():
-                parts = connection.topic.strip("/").split("/")
+                    raise unknown(f"{path.name}: topic", topic, sorted(topics))
+            wanted = [c for c in reader.connections if topics[c.topic]]
+            for c in reader.connections:
+                if not topics[c.topic]:
+                    tally.unused(f"{path.name}: topic {c.topic} ({c.msgtype})", c.msgcount)
+            for c, _, raw in reader.messages(connections=wanted) if wanted else ():
+                parts = c.topic.strip("/").split("/")
+                true = c.topic == truth or any(part.lower() in TRUTH for part in parts)
+                message: Any = reader.deserialize(raw, c.msgtype)
+                numbers = _numbers(READ[c.msgtype], message, true)
+                if not numbers and READ[c.msgtype] == "fix":
+                    tally.refuse("fixes that the receiver calls invalid", 1, f"{path.name}: {c.topic}")
+                t = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
                 name = parts[0] if len(parts) > 1 else path.stem
-                message: Any = reader.deserialize(raw, connection.msgtype)
-                actual = connection.topic == truth or any(part.lower() in TRUTH for part in parts)
-                kind = "actual" if actual and connection.msgtype in POSES else READ[connection.msgtype]
-                found = _rows(kind, name, message, tally, f"{path.name}: {connection.topic}")
-                (true if actual else rows).extend(row for row in found if row[2].partition(" of ")[0] not in ignore)
+                kept = (one for one in numbers if one[0].partition(" of ")[0] not in ignore)
+                rows.extend((true, t, name, kind, value, std if std > 0 else np.nan) for kind, value, std in kept)
     except InputError:
         raise
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
-        found_text = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-        raise InputError(path.name, found_text, "must be a ROS bag", "Record it again, or reindex it.") from None
-    if not rows:
-        kinds = ", ".join(kind.rpartition("/")[2] for kind in READ)
-        raise InputError(path.name, "0 messages", f"must hold {kinds}", "Check the topics with: ros2 bag info.")
-    return _as_rows(path, _one_yaw_rate(rows)), _as_rows(path, true) if true else None
+        given = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise InputError(path.name, given, "must be a ROS bag", "Record it again, or reindex it.") from None
+    gyros = {row[2] for row in rows if row[3] == "yaw_rate"}
+    rows = [row for row in rows if row[3] != WHEELS or row[2] not in gyros]
+    frame = pd.DataFrame(rows, columns=["true", "t", "vehicle", "kind", "value", "std"]).replace({WHEELS: "yaw_rate"})
+    measured, known = (frame[frame["true"] == true].reset_index(drop=True) for true in (False, True))
+    if not len(measured):
+        kinds_read = ", ".join(kind.rpartition("/")[2] for kind in READ)
+        raise InputError(path.name, "0 messages", f"must hold {kinds_read}", "Check the topics with: ros2 bag info.")
+    actual.extend(rows_of(known.set_index(known.index + 1), path.name) for _ in range(len(known) > 0))
+    return rows_of(measured.set_index(measured.index + 1), path.name)
 
 
-def _rows(kind: str, name: str, m: Any, tally: Tally, place: str) -> list[Row]:
-    t = m.header.stamp.sec + m.header.stamp.nanosec * 1e-9
+def _numbers(kind: str, m: Any, true: bool) -> list[Number]:
+    """What a message holds; its pose where it is the truth's."""
+    if kind == "pose" or (kind == "odometry" and true):
+        pose = getattr(m.pose, "pose", m.pose)
+        numbers = [(axis, float(getattr(pose.position, axis)), np.nan) for axis in "xyz"]
+        yaw = _yaw(pose.orientation) if true else None
+        return numbers + ([] if yaw is None else [("heading", yaw, np.nan)])
     if kind == "fix":
         if m.status.status < 0 or not np.isfinite([m.latitude, m.longitude]).all():
-            tally.refuse("fixes that the receiver calls invalid", 1, place)
             return []
-        std = _deviations(m.position_covariance, 3) if m.position_covariance_type else np.full(3, np.nan)
-        values = [("latitude", m.latitude, std[1]), ("longitude", m.longitude, std[0])]
-        values += [("height", m.altitude, std[2])] if np.isfinite(m.altitude) else []
-        return [(t, name, what, float(value), float(s)) for what, value, s in values]
+        east, north, up = _deviations(m.position_covariance, 3) if m.position_covariance_type else np.full(3, np.nan)
+        values = (("latitude", m.latitude, north), ("longitude", m.longitude, east), ("height", m.altitude, up))
+        return [(what, float(value), float(std)) for what, value, std in values if np.isfinite(value)]
     if kind == "odometry":
-        std = _deviations(m.twist.covariance, 6)
-        twist = m.twist.twist
-        speed, turn = twist.linear.x, twist.angular.z
-        return [(t, name, "speed", float(speed), std[0]), (t, name, "yaw_rate of odometry", float(turn), std[5])]
-    if kind == "imu":
-        std, turn = _deviations(m.orientation_covariance, 3), _deviations(m.angular_velocity_covariance, 3)
-        out = (
-            [(t, name, "yaw_rate", float(m.angular_velocity.z), turn[2])]
-            if m.angular_velocity_covariance[0] >= 0
-            else []
-        )
-        if m.orientation_covariance[0] >= 0 and _yaw(m.orientation) is not None:
-            out.append((t, name, "heading", float(_yaw(m.orientation) or 0.0), std[2]))
-        return out
-    pose = getattr(m.pose, "pose", m.pose)
-    p, yaw = pose.position, _yaw(pose.orientation) if kind == "actual" else None
-    headings = [] if yaw is None else [(t, name, "heading", yaw, np.nan)]
-    return [
-        (t, name, axis, float(value), np.nan) for axis, value in zip("xyz", (p.x, p.y, p.z), strict=True)
-    ] + headings
-
-
-def _one_yaw_rate(rows: list[Row]) -> list[Row]:
-    """The yaw rate of an Imu goes before that of the same vehicle's odometry."""
-    gyros = {name for _, name, kind, _, _ in rows if kind == "yaw_rate"}
-    kept = [row for row in rows if row[2] != "yaw_rate of odometry" or row[1] not in gyros]
-    return [(t, name, kind.partition(" of ")[0], value, std) for t, name, kind, value, std in kept]
-
-
-def _as_rows(path: Path, rows: list[Row]) -> Rows:
-    t, name, kind, value, std = zip(*rows, strict=True)
-    deviation = np.where(np.array(std) > 0, np.array(std, dtype=float), np.nan)
-    number = np.arange(1, len(rows) + 1)
-    return rows_of(path.name, np.array(t), list(name), list(kind), np.array(value), number, std=deviation)
+        std, twist = _deviations(m.twist.covariance, 6), m.twist.twist
+        return [("speed", float(twist.linear.x), std[0]), (WHEELS, float(twist.angular.z), std[5])]
+    numbers, yaw = [], _yaw(m.orientation)
+    if m.angular_velocity_covariance[0] >= 0:
+        numbers.append(("yaw_rate", float(m.angular_velocity.z), _deviations(m.angular_velocity_covariance, 3)[2]))
+    if m.orientation_covariance[0] >= 0 and yaw is not None:
+        numbers.append(("heading", yaw, _deviations(m.orientation_covariance, 3)[2]))
+    return numbers
 
 
 def _deviations(covariance: Any, size: int) -> Any:

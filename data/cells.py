@@ -1,111 +1,83 @@
-"""Cells of CSV, Parquet and Excel tables: every row has the header's columns, every number is one, every id a name."""
+"""Reading a table once: CSV, Parquet or Excel as a frame of named columns, whose numbers, times and names are checked.
+
+Every table is read here; fleets (`fleet_files`), logs (`log.tables`) and trajectories (`score_files`) are its uses. The
+index of a frame is the row in the file, from 1, so that an error names it whatever part of the frame is at hand.
+"""
 
 from __future__ import annotations
 
 import csv
+import re
 import zipfile
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Bools, Floats
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.formats.values import LARGEST
+from coopoc.plugins import suggestion, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TEXT = ("must be a table with a header and cells between commas, semicolons or tabs", "Export it again as CSV.")
+TABLES = (".csv", ".parquet", ".xlsx")
 COLUMNS, CELLS, UNPACKED = 5000, 20_000_000, 2**30
 """Most columns of a table, most cells of a spreadsheet, and most bytes of one when it is unpacked."""
+USUAL = {
+    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "car_id", "agent_id"),
+    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "peer", "anchor", "receiver", "landmark"),
+    "t": ("time", "timestamp", "stamp", "time_s", "seconds", "sec", "datetime", "utc", "rostime"),
+    "value": ("measurement", "val", "data"),
+    "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
+}
+"""Headers that others give to the columns."""
 
 
 def read_frame(path: Path, *text: str) -> pd.DataFrame:
-    """Table of a .parquet, .xlsx or (any other ending) CSV file; `text` as in `read_csv`."""
-    read = {".parquet": read_parquet, ".xlsx": read_xlsx}.get(path.suffix)
-    return read(path) if read else read_csv(path, *text)
+    """Table of a .parquet, .xlsx or (any other ending) CSV file.
 
-
-def read_csv(path: Path, *text: str) -> pd.DataFrame:
-    """Table of a CSV file whose columns `text`, if it has them, are kept as they are written: "007" stays "007".
-
-    Between semicolons or tabs, as spreadsheets write them in half of Europe, decimal commas are numbers, too.
+    Args:
+        path: of the file; CSV between commas, or between semicolons or tabs with decimal commas.
+        text: columns of a CSV file that are kept as they are written: "007" stays "007".
 
     Raises:
-        InputError: one column, no header, two columns of one name, or a row that is longer than the header.
-    """
-    import pandas as pd
-
-    separator, header = _checked_rows(path)
-    keep: Any = {name: str.strip for name in header if name.strip() in text}
-    form: Any = {"sep": separator, "decimal": "." if separator == "," else ",", "encoding": "utf-8-sig"}
-    if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
-        form |= {"float_precision": "round_trip"}  # the default became exact in 3.1
-    try:
-        frame: pd.DataFrame = pd.read_csv(path, skipinitialspace=True, converters=keep, index_col=False, **form)
-    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeError, ValueError, OverflowError) as error:
-        raise InputError(path.name, _line(error), *TEXT) from None
-    return frame.rename(columns=lambda name: str(name).strip())
-
-
-def read_parquet(path: Path) -> pd.DataFrame:
-    """Table of a Parquet file.
-
-    Raises:
-        InputError: a file that is damaged or no Parquet.
-    """
-    import pandas as pd
-    from pyarrow import ArrowException
-
-    try:
-        return pd.read_parquet(path)
-    except (ArrowException, OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(path.name, _line(error), "must be a Parquet table", "Write the file again.") from None
-
-
-def read_xlsx(path: Path) -> pd.DataFrame:
-    """Table of the first sheet of an Excel file.
-
-    Raises:
-        InputError: no spreadsheet, or one that grows beyond CELLS cells.
+        InputError: a damaged file, one column, no header, two columns of one name, or a row longer than the header.
         MissingLibraryError: openpyxl is not installed.
     """
     import pandas as pd
 
+    suffix = path.suffix.lower()
     try:
-        from openpyxl import load_workbook
-    except ImportError:
-        raise MissingLibraryError("openpyxl", "reading a spreadsheet", "'coopoc[excel]'") from None
-    rows: list[tuple[Any, ...]] = []
-    size = 0
-    try:
-        with zipfile.ZipFile(path) as packed:
-            if sum(part.file_size for part in packed.infolist()) > UNPACKED:
-                raise _too_large(path, f"more than {UNPACKED >> 20} MB unpacked")
-        book = load_workbook(path, read_only=True, data_only=True)
-        sheet = book.worksheets[0]
-        sheet.reset_dimensions()  # what the file claims to be its size may be anything
-        for row in sheet.iter_rows(values_only=True):
-            size += len(row) + 1
-            if size > CELLS:
-                raise _too_large(path, f"more than {CELLS:,} cells")
-            rows.append(row)
-        book.close()
-    except InputError:
+        if suffix == ".parquet":
+            frame = pd.read_parquet(path).reset_index(drop=True)
+        else:
+            frame = _read_xlsx(path) if suffix == ".xlsx" else _read_csv(path, text)
+    except (InputError, MissingLibraryError):
         raise
-    except Exception as error:  # of zlib, zipfile, expat, openpyxl: a damaged file meets them all
-        raise InputError(path.name, _line(error), "must be an .xlsx spreadsheet", "Export it again.") from None
-    rows = [row for row in rows if any(cell is not None for cell in row)]
-    if not rows:
-        raise InputError(path.name, "0 rows", "must have a header and rows", "Export it again.")
-    width = max(map(len, rows))
-    header = [
-        f"column {k}" if h is None else str(h) for k, h in enumerate([*rows[0], *[None] * (width - len(rows[0]))])
-    ]
-    _check_header(path.name, header)
-    return pd.DataFrame([[*row, *[None] * (width - len(row))] for row in rows[1:]], columns=header)
+    except Exception as error:  # of pandas, Arrow, zlib, expat, openpyxl: a damaged file meets them all
+        raise _no_table(path, next(iter(str(error).splitlines()), type(error).__name__)[:200]) from None
+    frame.columns = pd.Index([str(name).strip() for name in frame.columns])
+    _check_header(path, list(frame.columns))
+    frame.index += 1
+    return frame
+
+
+def headers(path: Path) -> list[str]:
+    """Column names of a table; none where the file cannot be read: `read_frame` names the fault."""
+    try:
+        if path.suffix.lower() == ".csv":
+            return [name.strip() for name in _first_lines(path)[1]]
+        if path.suffix.lower() == ".parquet":
+            from pyarrow.parquet import read_schema
+
+            return [str(name) for name in read_schema(path).names]
+        return list(read_frame(path).columns)
+    except Exception:  # of Arrow, csv, openpyxl
+        return []
 
 
 def numeric(frame: pd.DataFrame, column: str, file: str) -> Floats:
@@ -120,15 +92,17 @@ def numeric(frame: pd.DataFrame, column: str, file: str) -> Floats:
         values = pd.to_numeric(given, errors="coerce").to_numpy(dtype=float)
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
         values = np.array([_number(cell) for cell in given])
-    bad = np.flatnonzero(~(np.abs(values) <= LARGEST))
-    if len(bad):
-        raise InputError(
-            f"{file}: row {bad[0] + 1}, column {column}",
-            str(given.iloc[int(bad[0])])[:60],
-            "must be a finite number",
-            "Interpolate the value, or remove the row: a missing row means that the vehicle is absent.",
-        )
+    _refuse(given, ~(np.abs(values) <= LARGEST), file, "must be a finite number")
     return values
+
+
+def optional(frame: pd.DataFrame, column: str, file: str) -> Floats:
+    """A column of numbers in which cells may be empty; NaN where they are, or where there is no such column."""
+    out = np.full(len(frame), np.nan)
+    if column in frame.columns:
+        there = filled(frame[column])
+        out[there] = numeric(frame[there], column, file)
+    return out
 
 
 def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
@@ -142,8 +116,8 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
 
     given = frame[column]
     kind = getattr(given.dtype, "kind", "O")
-    words = kind == "O" or isinstance(given.dtype, pd.StringDtype)
-    if words and len(given) and not pd.to_numeric(given, errors="coerce").notna().any():
+    text = kind == "O" or isinstance(given.dtype, pd.StringDtype)
+    if text and len(given) and not pd.to_numeric(given, errors="coerce").notna().any():
         dates = pd.to_datetime(given, errors="coerce", format="ISO8601", utc=True)
         if dates.notna().all():
             given, kind = dates, "M"
@@ -153,10 +127,7 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
         except InputError as error:
             allowed = "must be seconds, or a date as 2024-05-01T12:00:00Z"
             raise InputError(error.field, error.value, allowed, "Mend the cell, or remove the row.") from None
-    missing = np.flatnonzero(given.isna().to_numpy())
-    if len(missing):
-        where = f"{file}: row {missing[0] + 1}, column {column}"
-        raise InputError(where, "empty", "must be a time", "Fill it in, or remove the row.")
+    _refuse(given, given.isna().to_numpy(), file, "must be a time")
     if kind == "m":
         return np.asarray(given.dt.total_seconds(), dtype=float)
     utc = pd.to_datetime(given, utc=True)
@@ -165,55 +136,149 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
 
 def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
     """A column of names; InputError with the row of the first empty cell."""
-    given = frame[column]
-    bad = np.flatnonzero((given.isna() | (given.astype(str).str.strip() == "")).to_numpy())
-    if len(bad):
-        raise InputError(f"{file}: row {bad[0] + 1}, column {column}", "empty", "must be a name", "Fill it in.")
-    return [str(v).strip() for v in given.tolist()]
+    _refuse(
+        frame[column].astype(object).where(filled(frame[column]), "empty"),
+        ~filled(frame[column]),
+        file,
+        "must be a name",
+    )
+    return [str(value).strip() for value in frame[column].tolist()]
 
 
-def separator_of(header: str) -> str:
-    """What separates the cells of a CSV file, by its first line: a comma, else a semicolon, else a tab.
+def filled(cells: pd.Series[Any]) -> Bools:
+    """(L,) True where a cell holds something."""
+    return np.asarray(cells.notna() & (cells.astype(str).str.strip() != ""))
 
-    >>> separator_of("t;vehicle;x;y")
-    ';'
+
+def named_columns(
+    frame: pd.DataFrame, columns: Mapping[str, str], known: Sequence[str], needed: Sequence[str], file: str
+) -> pd.DataFrame:
+    """The frame with our names of its columns.
+
+    Args:
+        frame: of `read_frame`.
+        columns: our name -> header in the file, where they differ.
+        known: our names.
+        needed: those that must be there.
+        file: named in errors.
+
+    Raises:
+        InputError: a key of `columns` that is not known, a header that stands for two names, or a missing column.
     """
-    return next((mark for mark in ",;\t" if mark in header), ",")
+    for key in columns:
+        if key not in known:
+            raise unknown(f"{file}: key of columns", key, known, 'Give columns={"t": "name in the file"}.')
+    given = [str(header) for header in frame.columns]
+    frame = frame.rename(columns={header: key for key, header in columns.items()})
+    for key in columns:
+        if (frame.columns == key).sum() > 1:
+            allowed = f"is not the only column {key} then: the file has one of that name"
+            raise InputError(f"{file}: columns[{key!r}]", repr(columns[key]), allowed, "Rename or remove one of them.")
+    for key in needed:
+        if columns.get(key, key) not in given:
+            raise missing_column(file, columns.get(key, key), given, f"columns {', '.join(needed)} are needed", key)
+    return frame
 
 
-def _checked_rows(path: Path) -> tuple[str, list[str]]:
-    """What separates the cells of a CSV file, and its header; no row has more cells."""
+def missing_column(file: str, column: str, given: Sequence[str], allowed: str, key: str = "") -> InputError:
+    """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
+    key = key or column
+    usual = [header for header in given if header.lower() in USUAL.get(key, ())]
+    header = usual[0] if usual else "..."
+    hint = f'Add it, or pass columns={{"{key}": "{header}"}}.'
+    if usual:
+        hint = f"Did you mean {header}? {hint}"
+    allowed = f"{allowed}; the file has {', '.join(given)}"
+    return InputError(f"{file}: column {column}", "missing", allowed, suggestion(column, given, hint))
+
+
+def _read_csv(path: Path, text: Sequence[str]) -> pd.DataFrame:
+    import pandas as pd
+
+    separator, header, first = _first_lines(path)
+    _check_header(path, header)
+    if len(first) > len(header):  # the only row that pandas does not compare with the header
+        raise _too_wide(path, 1, len(first), len(header))
+    form: dict[str, Any] = {"sep": separator, "decimal": "." if separator == "," else ",", "names": header}
+    form["converters"] = {name: str.strip for name in header if name.strip() in text}
+    if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
+        form["float_precision"] = "round_trip"  # the default became exact in 3.1
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            separator = separator_of(file.readline())
-            file.seek(0)
-            rows = csv.reader(file, skipinitialspace=True, delimiter=separator)
-            header = next(rows, [])
-            _check_header(path.name, header)
-            count = 0
-            for row in rows:
-                count += bool(row)
-                if len(row) > len(header):
-                    raise InputError(
-                        f"{path.name}: row {count}",
-                        f"{len(row)} cells under {len(header)} names",
-                        "must have one cell per name in the header",
-                        "Name every column in the header; between commas, write decimal points and quote text.",
-                    )
-    except (csv.Error, UnicodeError) as error:
-        raise InputError(path.name, _line(error), *TEXT) from None
-    return separator, header
+        return pd.read_csv(path, header=0, index_col=False, skipinitialspace=True, encoding="utf-8-sig", **form)
+    except pd.errors.ParserError as error:
+        wide = re.search(r"fields in line (\d+), saw (\d+)", str(error))
+        raise _too_wide(path, int(wide[1]) - 1, int(wide[2]), len(header)) if wide else error from None
 
 
-def _check_header(file: str, header: list[str]) -> None:
+def _first_lines(path: Path) -> tuple[str, list[str], list[str]]:
+    """Separator of a CSV file, its header, and its first row."""
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        line = file.readline(100_000)
+        separator = next((mark for mark in ",;\t" if mark in line), ",")
+        file.seek(0)
+        rows = csv.reader(file, skipinitialspace=True, delimiter=separator)
+        return separator, next(rows, []), next(filter(None, rows), [])
+
+
+def _read_xlsx(path: Path) -> pd.DataFrame:
+    """First sheet of a spreadsheet, unless it grows beyond CELLS: what it claims to be its size may be anything."""
+    import pandas as pd
+
+    try:
+        from openpyxl import load_workbook
+    except ImportError:
+        raise MissingLibraryError("openpyxl", "reading a spreadsheet", "'coopoc[excel]'") from None
+    with zipfile.ZipFile(path) as packed:
+        if sum(part.file_size for part in packed.infolist()) > UNPACKED:
+            raise _no_table(path, f"more than {UNPACKED >> 20} MB unpacked")
+    book = load_workbook(path, read_only=True, data_only=True)
+    sheet = book.worksheets[0]
+    sheet.reset_dimensions()
+    rows, size = [], 0
+    for row in sheet.iter_rows(values_only=True):
+        size += len(row) + 1
+        if size > CELLS:
+            raise _no_table(path, f"more than {CELLS:,} cells")
+        if any(cell is not None for cell in row):
+            rows.append(row)
+    book.close()
+    if not rows:
+        raise InputError(path.name, "0 rows", "must have a header and rows", "Export it again.")
+    width = max(map(len, rows))
+    header, *body = [[*row, *[None] * (width - len(row))] for row in rows]
+    return pd.DataFrame(body, columns=[f"column {k}" if name is None else name for k, name in enumerate(header)])
+
+
+def _check_header(path: Path, header: Sequence[str]) -> None:
     if len(header) < 2:
-        raise InputError(file, repr("".join(header))[:80], *TEXT)
+        raise _no_table(path, repr("".join(header))[:80])
     if len(header) > COLUMNS:
-        raise InputError(file, f"{len(header)} columns", f"must be at most {COLUMNS}", "Write one row per instant.")
-    twice = [name for name, count in Counter(name.strip() for name in header).items() if count > 1]
-    if twice:
+        allowed = f"must be at most {COLUMNS}"
+        raise InputError(path.name, f"{len(header)} columns", allowed, "Write one row per instant.")
+    name, count = Counter(name.strip() for name in header).most_common(1)[0]
+    if count > 1:
         allowed = "must name one column only"
-        raise InputError(f"{file}: header", f"{twice[0][:40]!r} twice", allowed, "Rename or remove the other one.")
+        raise InputError(f"{path.name}: header", f"{name[:40]!r} twice", allowed, "Rename or remove the other one.")
+
+
+def _refuse(cells: pd.Series[Any], wrong: Bools, file: str, allowed: str) -> None:
+    """InputError that names the first wrong cell."""
+    bad = np.flatnonzero(wrong)
+    if len(bad):
+        given = str(cells.iloc[int(bad[0])])[:60].strip() or "empty"
+        hint = "Mend the cell, or remove the row: a missing row means that there was no measurement."
+        raise InputError(f"{file}: row {cells.index[bad[0]]}, column {cells.name}", given, allowed, hint)
+
+
+def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
+    hint = "Name every column in the header; between commas, write decimal points and quote text."
+    given = f"{cells} cells under {names} names"
+    return InputError(f"{path.name}: row {row}", given, "must have one cell per name in the header", hint)
+
+
+def _no_table(path: Path, given: str) -> InputError:
+    allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet or Excel"
+    return InputError(path.name, given, allowed, "Export it again as CSV, without empty rows and columns.")
 
 
 def _number(cell: object) -> float:
@@ -221,13 +286,3 @@ def _number(cell: object) -> float:
         return float(str(cell)) if str(cell).isascii() and "_" not in str(cell) else np.nan
     except ValueError:
         return np.nan
-
-
-def _too_large(path: Path, size: str) -> InputError:
-    hint = "Export the table as CSV, without empty rows and columns."
-    return InputError(path.name, size, "must be a table of at most that size", hint)
-
-
-def _line(error: BaseException) -> str:
-    """First line of a message."""
-    return next(iter(str(error).splitlines()), type(error).__name__)[:200]

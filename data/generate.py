@@ -1,41 +1,118 @@
-"""make: a Recipe and a folder of OpenDRIVE maps -> a fleet and its card."""
+"""Generator of fleets: a Recipe and OpenDRIVE maps -> netconvert, routes, SUMO, smoothing -> a fleet and its card."""
 
 from __future__ import annotations
 
+import importlib.util
+import subprocess
 import tempfile
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
-from coopoc.arrays import number
-from coopoc.errors import InputError
+from coopoc.errors import InputError, MissingLibraryError
 from coopoc.one_file import from_file, in_file
-from coopoc.plugins import unknown
+from coopoc.plugins import suggestion, unknown
 from coopoc.world.fleet import Fleet
 
-from . import store, traffic
-from .cards import Card, card_of
-from .fcd import read_fcd
-from .recipes import RECIPES, Recipe
-from .smooth import smooth
+from . import fleet_store
+from .assemble import smooth
+from .fleet_files import read_fcd
 
-DROVE, JUMPED = "recipe", "acceleration"
-"""Fields of the errors that another seed may avoid."""
+Streets = dict[str, tuple[str, ...]]
+VEHICLE_LENGTH = 4.6
+"""Metres from bumper to bumper of every generated vehicle."""
+DRIVER = 'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="0.8" minGap="2"'
+"""Krauss' model: m/s^2, s and m as in dense city traffic; dawdling changes once a second, not at every 0.1 s."""
+JUMP = 8.0
+"""m/s^2, less than the grip of a dry road."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Settings of a SUMO run, and the part of it that is kept: everything that decides the numbers of a fleet.
+
+    Args:
+        name: name of the fleet; vehicles are called name-00, name-01, ...
+        map: OpenDRIVE file in the folder of maps.
+        vehicles: number of vehicles N.
+        steps: steps that are kept, one number for all or one per vehicle (absent, NaN, afterwards).
+        seed: of routes, top speeds and SUMO.
+        top_speed: (low, high) m/s, each vehicle's own top speed is uniform between them.
+        warmup: seconds that are driven before the first kept step.
+        platoon: vehicles that share one random route and start on the same edge.
+        start: SUMO's departPos: "random_free" spreads a platoon over its first edge, "last" queues it.
+        lights: True: netconvert guesses junctions with traffic lights, actuated; False: junctions of equal rank.
+        turn_acceleration: m/s^2 of lateral acceleration that limits the speed in turns of junctions.
+        tours: routes that are repeated instead of random ones, for the first vehicles: edge ids with spaces between.
+        dawdle: Krauss' sigma in 0..1, how irregularly a driver keeps the speed.
+        dt: sampling interval, s.
+        cutoff: Hz, half-power frequency of the smoother.
+
+    Raises:
+        InputError: a number that no drive can have.
+
+    >>> Recipe("tiny", "Town10HD.xodr", vehicles=2, steps=20, seed=1).lengths
+    (20, 20)
+    """
+
+    name: str
+    map: str
+    vehicles: int
+    steps: int | tuple[int, ...]
+    seed: int
+    top_speed: tuple[float, float] = (8.0, 11.0)
+    warmup: float = 60.0
+    platoon: int = 1
+    start: str = "random_free"
+    lights: bool = True
+    turn_acceleration: float = 3.0
+    tours: tuple[str, ...] = ()
+    dawdle: float = 0.5
+    dt: float = 0.1
+    cutoff: float = 0.5
+
+    def __post_init__(self) -> None:
+        for field in ("vehicles", "platoon", "turn_acceleration", "dt", "cutoff"):
+            if not getattr(self, field) > 0:
+                raise InputError(field, getattr(self, field), "must be > 0", f"Give the recipe a positive {field}.")
+        if not 0 < self.top_speed[0] <= self.top_speed[1]:
+            raise InputError("top_speed", self.top_speed, "must be 0 < low <= high m/s", "Order the two speeds.")
+        if len(self.lengths) != self.vehicles or min(self.lengths) < 2:
+            allowed = f"must be one number >= 2, or {self.vehicles} of them"
+            raise InputError("steps", self.steps, allowed, "One entry per vehicle.")
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Kept steps of each vehicle."""
+        return (self.steps,) * self.vehicles if isinstance(self.steps, int) else tuple(self.steps)
+
+    @property
+    def duration(self) -> float:
+        """s, with the warm-up."""
+        return self.warmup + max(self.lengths) * self.dt
+
+
+TOWN10, TOWN04 = "Town10HD.xodr", "Town04.xodr"
+CLOCKWISE, ANTICLOCKWISE = "10 0 3 2 1 8 -4 -5 -6 -7 17", "-17 7 6 5 4 -8 -1 -2 -3 -0 -10"
+CLIENTS = {"top_speed": (10.7, 10.7), "lights": False, "dawdle": 0.6, "tours": (CLOCKWISE, ANTICLOCKWISE)}
+RECIPES: dict[str, Recipe] = {
+    recipe.name: recipe
+    for recipe in (
+        Recipe("town10", TOWN10, 60, 900, 16, platoon=6),
+        Recipe("town10-validation", TOWN10, 60, 900, 32, platoon=6),
+        Recipe("town10-clients", TOWN10, 4, (1550, 4600, 1450, 1420), 50, **CLIENTS),  # type: ignore[arg-type]
+        Recipe("town04", TOWN04, 60, 900, 5, (11.0, 13.5), platoon=10, start="last"),
+    )
+}
+"""Of the bundled fleets."""
 
 
 def make(
-    recipe: str | Recipe,
-    map_folder: str | Path,
-    out_folder: str | Path,
-    seed: int | None = None,
-    *,
-    tries: int = 1,
-    **changes: Any,
-) -> Card:
+    recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path, seed: int | None = None
+) -> fleet_store.Card:
     """Drive a recipe in SUMO and write <name>.npz and <name>.json; the same seed gives the same bytes.
 
     Args:
@@ -43,86 +120,57 @@ def make(
         map_folder: holds the OpenDRIVE file that the recipe names (CARLA's maps: MIT licence, not part of the package).
         out_folder: is created if needed; files of the same name are replaced.
         seed: instead of the recipe's.
-        tries: how many seeds are tried, one after the other, until one gives a fleet.
-        changes: other fields of the recipe, such as map, cutoff, vehicles.
 
     Raises:
-        InputError: an unknown recipe, a missing map; with the last seed, a vehicle that could not drive or that jumps.
+        InputError: an unknown recipe, a missing map; a vehicle that could not drive or that jumps: take another seed.
         MissingLibraryError: eclipse-sumo is not installed.
     """
-    chosen = replace(_recipe(recipe), **changes)
+    chosen = _recipe(recipe)
     chosen = chosen if seed is None else replace(chosen, seed=seed)
-    number("tries", tries, 1, 10_000, kind=int, allowed=">= 1", hint="Give the number of seeds.")
-    out = Path(out_folder)
+    fleet, out = simulate(chosen, Path(map_folder)), Path(out_folder)
     out.mkdir(parents=True, exist_ok=True)
-    for last in range(tries - 1, -1, -1):
-        try:
-            fleet = simulate(chosen, Path(map_folder))
-            break
-        except InputError as error:
-            if error.field not in (DROVE, JUMPED) or not last:
-                raise
-            chosen = replace(chosen, seed=chosen.seed + 1)
-    store.save(fleet, out / f"{chosen.name}.npz")
-    card = card_of(fleet, chosen, _command(recipe, chosen, map_folder, changes))
+    fleet_store.save(fleet, out / f"{chosen.name}.npz")
+    command = "coopoc.data.generate.make(Recipe(**card['recipe']), MAPS, OUT), in Python"
+    if not isinstance(recipe, Recipe):
+        command = f"coopoc data make {recipe} --maps {map_folder} --seed {chosen.seed}"
+    card = fleet_store.card_of(fleet, chosen.name, chosen.map, asdict(chosen), list(chosen.lengths), command)
     (out / f"{chosen.name}.json").write_text(card.to_json())
     return card
 
 
-def _command(recipe: str | Recipe, made: Recipe, map_folder: str | Path, changes: Mapping[str, Any]) -> str:
-    """The line that makes the fleet again."""
-    if isinstance(recipe, Recipe):
-        return "coopoc.data.generate.make(Recipe(**card['recipe']), MAPS, OUT), in Python"
-    more = "".join(f" --{name.replace('_', '-')} {value}" for name, value in changes.items())
-    return f"coopoc data make {recipe} --maps {map_folder} --seed {made.seed}{more}"
-
-
 def simulate(recipe: Recipe, map_folder: Path) -> Fleet:
     """The quantised fleet of a recipe: map, routes, SUMO, centres of the vehicles, smoothing, velocities."""
-    with tempfile.TemporaryDirectory() as folder, _progress(recipe) as bar:
+    with tempfile.TemporaryDirectory() as folder:
         network, routes, fcd = (Path(folder) / f for f in ("net.xml", "routes.xml", "fcd.xml"))
-        traffic.build_network(map_folder / recipe.map, recipe, network)
-        traffic.write_routes(recipe, *traffic.read_streets(network), routes)
-        _advance(bar, f"{recipe.name}: SUMO")
-        traffic.drive(recipe, network, routes, fcd)
-        _advance(bar, f"{recipe.name}: reading")
-        raw = read_fcd(fcd, vehicle_length=traffic.VEHICLE_LENGTH)
-        _advance(bar, f"{recipe.name}: smoothing")
-        fleet = _finish(raw, recipe)
-        bar.update()
-    return fleet
-
-
-def _finish(raw: Fleet, recipe: Recipe) -> Fleet:
-    ids = sorted(raw.ids)
-    steps = max(recipe.lengths)
+        _build_network(map_folder / recipe.map, recipe, network)
+        _write_routes(recipe, *_read_streets(network), routes)
+        _drive(recipe, network, routes, fcd)
+        raw = read_fcd(fcd, vehicle_length=VEHICLE_LENGTH)
+    ids, steps = sorted(raw.ids), max(recipe.lengths)
     position = raw.select(ids).position[:steps]
     if len(ids) < recipe.vehicles or len(position) < steps or np.isnan(position).any():
-        raise InputError(
-            DROVE,
-            f"{recipe.name}, seed {recipe.seed}",
-            f"must drive {recipe.vehicles} vehicles through all steps",
-            f"{len(ids)} departed; try more seeds (--tries 20), fewer --vehicles, smaller platoons or more warm-up.",
-        )
+        allowed = f"must drive {recipe.vehicles} vehicles through all steps"
+        hint = f"{len(ids)} departed; try another --seed, fewer vehicles, smaller platoons or more warm-up."
+        raise InputError("recipe", f"{recipe.name}, seed {recipe.seed}", allowed, hint)
     position = smooth(position, recipe.dt, recipe.cutoff)
     for column, last in enumerate(recipe.lengths):
         position[last:, column] = np.nan
     t = np.arange(steps) * recipe.dt
-    fleet = store.quantise(Fleet(tuple(ids), t, position, position, name=recipe.name))
-    _refuse_jumps(fleet)
+    fleet = fleet_store.quantise(Fleet(tuple(ids), t, position, position, name=recipe.name))
+    acceleration = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2) / fleet.dt
+    if np.nanmax(acceleration) > JUMP:
+        step, column = np.unravel_index(np.nanargmax(acceleration), acceleration.shape)
+        given = f"{acceleration[step, column]:.1f} m/s^2 of {fleet.ids[column]} at step {step}"
+        raise InputError("acceleration", given, f"must stay below {JUMP} m/s^2", "Try another --seed or lower cutoff.")
     return fleet
 
 
-def _refuse_jumps(fleet: Fleet, limit: float = 8.0) -> None:
-    acceleration = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2) / fleet.dt
-    if np.nanmax(acceleration) > limit:
-        step, column = np.unravel_index(np.nanargmax(acceleration), acceleration.shape)
-        raise InputError(
-            JUMPED,
-            f"{acceleration[step, column]:.1f} m/s^2 of {fleet.ids[column]} at step {step}",
-            f"must stay below {limit} m/s^2",
-            "Try more seeds (--tries 20), or a lower cutoff (--cutoff 0.3).",
-        )
+def program(name: str) -> Path:
+    """Path of one of SUMO's programs; MissingLibraryError if eclipse-sumo is not installed."""
+    spec = importlib.util.find_spec("sumo")
+    if spec is None or spec.origin is None:
+        raise MissingLibraryError("eclipse-sumo", "making a fleet", "'coopoc[sumo]'")
+    return Path(spec.origin).parent / "bin" / name
 
 
 def _recipe(recipe: str | Recipe) -> Recipe:
@@ -138,10 +186,107 @@ def _recipe(recipe: str | Recipe) -> Recipe:
     return RECIPES[recipe]
 
 
-def _progress(recipe: Recipe) -> tqdm[Any]:
-    return tqdm(total=4, desc=f"{recipe.name}: map", leave=False)
+def _build_network(map_file: Path, recipe: Recipe, out: Path) -> None:
+    """Write the SUMO network of an OpenDRIVE map, in the frame of the map, elevation kept.
+
+    The map has signals but no programmes, and netconvert misreads the signals' places: lights are guessed, or left out.
+    """
+    if not map_file.is_file():
+        hint = "Point --maps at the folder of CARLA's .xodr files."
+        raise InputError("map", map_file, "must be an OpenDRIVE file", hint)
+    options = {
+        "opendrive": map_file,
+        "output-file": out,
+        "offset.disable-normalization": "true",
+        "opendrive.curve-resolution": 0.5,
+        "junctions.internal-link-detail": 20,
+        "junctions.limit-turn-speed": recipe.turn_acceleration,
+        "tls.discard-loaded": "true",
+        "tls.guess": str(recipe.lights).lower(),
+        "tls.default-type": "actuated",
+        "precision": 6,
+    }
+    _run("netconvert", options)
 
 
-def _advance(bar: tqdm[Any], stage: str) -> None:
-    bar.update()
-    bar.set_description(stage)
+def _read_streets(network: Path) -> tuple[Streets, dict[str, float]]:
+    """Successors and length (m) of every edge from which every other one can be reached."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    root = ElementTree.parse(network).getroot()
+    length = {e.attrib["id"]: float(e[-1].attrib["length"]) for e in root.iter("edge") if e.get("function") is None}
+    links = sorted({(c.attrib["from"], c.attrib["to"]) for c in root.iter("connection") if c.get("dir") != "t"})
+    links = [(a, b) for a, b in links if a in length and b in length]
+    order = {edge: k for k, edge in enumerate(length)}
+    rows, columns = np.array([[order[a], order[b]] for a, b in links]).T
+    graph = coo_array((np.ones(len(links)), (rows, columns)), shape=(len(order), len(order)))
+    labels = connected_components(graph, connection="strong")[1]
+    largest = np.bincount(labels).argmax()
+    kept = [edge for edge, k in order.items() if labels[k] == largest]
+    streets = {edge: tuple(b for a, b in links if a == edge and b in kept) for edge in kept}
+    return streets, {edge: length[edge] for edge in kept}
+
+
+def _write_routes(recipe: Recipe, streets: Streets, length: dict[str, float], out: Path) -> None:
+    """Write one SUMO vehicle per line: a tour that is repeated, or a random walk that a platoon shares."""
+    rng = np.random.default_rng(recipe.seed)
+    distance = recipe.top_speed[1] * recipe.duration + 500.0
+    lines, route = ["<routes>"], list[str]()
+    for vehicle in range(recipe.vehicles):
+        if vehicle < len(recipe.tours):
+            route = recipe.tours[vehicle].split()
+            if wrong := [edge for edge in route if edge not in length]:
+                hint = suggestion(wrong[0], length, "Take ids from the file netconvert writes.")
+                raise InputError("tours", wrong, "must be edges of the network", hint)
+            route *= int(np.ceil(distance / sum(length[edge] for edge in route)))
+        elif (vehicle - len(recipe.tours)) % recipe.platoon == 0:
+            route = _walk(streets, length, distance, rng)
+        name, fastest = f"{recipe.name}-{vehicle:02d}", rng.uniform(*recipe.top_speed)
+        size = f'length="{VEHICLE_LENGTH}" maxSpeed="{fastest:.3f}" sigma="{recipe.dawdle}"'
+        begin = f'depart="0" departPos="{recipe.start}" departLane="random"'
+        lines.append(f'<vType id="{name}" {size} {DRIVER}/>')
+        lines.append(f'<vehicle id="{name}" type="{name}" {begin}><route edges="{" ".join(route)}"/></vehicle>')
+    out.write_text("\n".join([*lines, "</routes>\n"]))
+
+
+def _walk(streets: Streets, length: dict[str, float], distance: float, rng: np.random.Generator) -> list[str]:
+    edges = sorted(streets)
+    share = np.array([length[e] for e in edges])
+    route = [edges[rng.choice(len(edges), p=share / share.sum())]]
+    while distance > 0:
+        route.append(streets[route[-1]][rng.integers(len(streets[route[-1]]))])
+        distance -= length[route[-1]]
+    return route
+
+
+def _drive(recipe: Recipe, network: Path, routes: Path, out: Path) -> None:
+    """Run SUMO over the warm-up and the kept steps and write positions of the front bumper, angle and slope.
+
+    Teleporting is switched off: a vehicle that is stuck stays stuck. Collisions are left to the car-following model.
+    """
+    options = {
+        "net-file": network,
+        "route-files": routes,
+        "end": f"{recipe.duration:.3f}",
+        "step-length": recipe.dt,
+        "seed": recipe.seed,
+        "precision": 6,
+        "fcd-output": out,
+        "fcd-output.attributes": "x,y,z,angle,slope,speed",
+        "device.fcd.begin": recipe.warmup,
+        "lanechange.duration": 3,
+        "time-to-teleport": -1,
+        "ignore-junction-blocker": 5,
+        "collision.action": "none",
+        "no-step-log": "true",
+        "xml-validation": "never",
+    }
+    _run("sumo", options)
+
+
+def _run(name: str, options: Mapping[str, object]) -> None:
+    words = [f"--{key}={value}" for key, value in options.items()]
+    done = subprocess.run([program(name), *words], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise InputError(name, done.stderr.strip()[-400:], "must run without an error", "Check the map and the recipe.")

@@ -1,7 +1,8 @@
-"""Reader of UTIAS MR.CLAM: up to five real robots with wheel odometry, range and bearing, and Vicon truth."""
+"""UTIAS MR.CLAM: real robots with wheel odometry, range and bearing, and Vicon truth -> Recording in the world."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,17 +11,31 @@ import numpy as np
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
+from coopoc.formats.values import LARGEST, read_table, read_words
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
+from coopoc.world.frames import midway, turned
+from coopoc.world.links import Links
+from coopoc.world.recording import Recording
+from coopoc.world.sensing import observe, schedule
+from coopoc.world.sensors import Sensors
 from coopoc.world.spherical import wrap
+from coopoc.world.v2x import V2X
 
-from . import mrclam_files as files
-from .nearest import steps_of
-from .rows import backward_difference, interpolate
-from .scale import check_size
+from .assemble import backward_difference, check_size, check_time, interpolate
+from .planar import PLANE_STD, first_of_each, nearest, steps_of
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
+SUBJECTS = 5
+"""Subjects 1 to 5 are robots, those beyond are landmarks."""
+TURN = 2 * np.pi + 1e-6
+GNSS_STD = 0.3
+"""m, simulated on x and y."""
+ODOMETRY_STD = 0.015
+"""m/s per axis, of the odometry velocity against Vicon: 0.014-0.018 over the five robots of set 6."""
+STATED_STD, LEAST_STD = (0.095, 0.007), 1e-4
+"""m, rad, of a folder without measurements between robots; and the least that is believed."""
 PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8) 2011"
 
 
@@ -65,56 +80,16 @@ class MrclamLog:
     landmarks: Floats
     sightings: Floats
     unknown: int
-    absent: int = 0
+    absent: int
 
     __repr__ = short_repr
-
-
-@dataclass(frozen=True, eq=False)
-class Innovations:
-    """Residuals of the real measurements against Vicon: range (M,) m, bearing (M,) rad."""
-
-    range: Floats
-    bearing: Floats
-
-    @property
-    def range_std(self) -> float:
-        """m, robust: 1.4826 times the median absolute deviation."""
-        return robust_std(self.range)
-
-    @property
-    def bearing_std(self) -> float:
-        """rad, robust."""
-        return robust_std(self.bearing)
-
-    def rows(self) -> list[dict[str, float | str]]:
-        """Table: quantity, measurements, median, robust std, the value stated for the set, share beyond 5 std."""
-        stated = (("range", "m", self.range, 0.095), ("bearing", "rad", self.bearing, 0.007))
-        return [
-            {
-                "quantity": name,
-                "unit": unit,
-                "measurements": len(r),
-                "median": float(np.median(r)),
-                "robust_std": robust_std(r),
-                "stated_std": value,
-                "beyond_5_std": float(np.mean(np.abs(r - np.median(r)) > 5 * robust_std(r))),
-            }
-            for name, unit, r, value in stated
-        ]
-
-
-def innovations(log: MrclamLog) -> Innovations:
-    """Measured minus true range and bearing, where Vicon saw both robots."""
-    seen = np.isfinite(log.true_range)
-    return Innovations((log.range - log.true_range)[seen], wrap(log.bearing - log.true_bearing)[seen])
 
 
 def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP) -> MrclamLog:
     """Read RobotN_Groundtruth, _Odometry, _Measurement (of the robots that are there) and Barcodes.dat.
 
     The fleet covers the interval in which every robot has truth and odometry. Gaps of truth up to `max_gap` are
-    interpolated.
+    interpolated. The second column of a measurement is a barcode, though the header of the file says subject.
 
     Args:
         folder: with the .dat files.
@@ -122,59 +97,46 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         max_gap: s without truth that is interpolated; in longer gaps a robot is absent.
 
     Raises:
-        InputError: a missing file; with the line, words that are not numbers, times out of order, and what
-            `mrclam_files.measurements` refuses; robots that share no interval; dt <= 0.
+        InputError: a missing file; with the line, words that are not numbers, times out of order, angles beyond a turn,
+            a range that is not positive, a barcode that stands twice, a robot that measures itself; robots that share
+            no interval; dt <= 0.
 
     Source: Leung, Halpern, Barfoot, Liu, IJRR 30(8) 2011.
     """
     if not dt > 0:
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
     folder = given_path(folder)
-    numbers = files.robots(folder)
-    truths = [files.truth(folder, n) for n in numbers]
-    wheels = [files.odometry(folder, n) for n in numbers]
+    named = [re.fullmatch(r"Robot([1-9])_Groundtruth\.dat", file.name) for file in folder.glob("Robot*")]
+    numbers = sorted(int(match[1]) for match in named if match) or [1]
+    truths = [_read(folder / f"Robot{n}_Groundtruth.dat", "time x y heading", strictly=True) for n in numbers]
+    wheels = [_read(folder / f"Robot{n}_Odometry.dat", "time speed turn_rate") for n in numbers]
+    for table in truths:
+        table[:, 3] = np.unwrap(table[:, 3])
     start, end = max(a[0, 0] for a in truths + wheels), min(a[-1, 0] for a in truths + wheels)
     if not end - start >= dt:
-        allowed = "must share an interval with truth and odometry"
-        raise InputError("folder", folder.name, f"the robots' files {allowed}", "Check the times in the .dat files.")
-    rows = sum(map(len, truths + wheels))
-    check_size((end - start) / dt, len(numbers), rows, dt, folder.name)
+        allowed = "the robots' files must share an interval with truth and odometry"
+        raise InputError("folder", folder.name, allowed, "Check the times in the .dat files.")
+    check_size((end - start) / dt, len(numbers), sum(map(len, truths + wheels)), dt, folder.name)
     t = dt * np.arange(int((end - start) / dt) + 1)
     poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], axis=1)
     odometry = np.stack([_step_means(a[:, 0] - start, a[:, 1:], t) for a in wheels], axis=1)
-    found = files.measurements(folder, numbers)
-    seen = found.rows - [start, 0, 0, 0, 0]
-    step, _ = steps_of(seen[:, 0], dt, len(t))
-    marks, sightings = files.landmarks(folder), found.landmarks - [start, 0, 0, 0, 0]
-    row = {subject: k for k, subject in enumerate(marks[:, 0].tolist())}
-    sightings[:, 2] = [row.get(subject, -1) for subject in sightings[:, 2].tolist()]
-    true_range, true_bearing, heading = _true(seen, truths, start, max_gap)
-    return MrclamLog(
-        fleet=_fleet(folder, numbers, t, poses),
-        heading=poses[..., 2],
-        speed=odometry[..., 0],
-        turn_rate=odometry[..., 1],
-        time=seen[:, 0],
-        step=step,
-        observer=seen[:, 1].astype(np.int64),
-        subject=seen[:, 2].astype(np.int64),
-        range=seen[:, 3],
-        bearing=seen[:, 4],
-        true_range=true_range,
-        true_bearing=true_bearing,
-        observer_heading=heading,
-        landmarks=marks,
-        sightings=sightings,
-        unknown=found.unknown,
-        absent=found.absent,
-    )
-
-
-def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, poses: Floats) -> Fleet:
+    file = folder / "Landmark_Groundtruth.dat"
+    marks = _read(file, "subject x y x_std y_std")[:, :3] if file.is_file() else np.empty((0, 3))
+    table = _measurements(folder, numbers)
+    table[:, 0] -= start
+    subject = table[:, 2]
+    place = {number: k for k, number in enumerate(numbers)}
+    others = table[np.isin(subject, numbers)]
+    observer, other = others[:, 1].astype(np.int64), np.array([place[n] for n in others[:, 2]], dtype=np.int64)
+    sightings = table[subject > SUBJECTS]
+    row = {number: k for k, number in enumerate(marks[:, 0].tolist())}
+    sightings[:, 2] = [row.get(number, -1) for number in sightings[:, 2].tolist()]
+    exact = np.stack([interpolate(a[:, 0] - start, a[:, 1:], others[:, 0], max_gap) for a in truths])
+    here, there = exact[observer, np.arange(len(others))], exact[other, np.arange(len(others))]
+    dx, dy = (there - here)[:, :2].T
+    position = np.dstack([poses[..., :2], 0 * poses[..., 0]])
     ids = tuple(f"robot{n}" for n in numbers)
-    xy = poses[..., :2]
-    position = np.concatenate([xy, np.where(np.isnan(xy[..., :1]), np.nan, 0.0)], axis=2)
-    return Fleet(
+    fleet = Fleet(
         ids,
         t,
         position,
@@ -184,6 +146,107 @@ def _fleet(folder: Path, numbers: tuple[int, ...], t: Floats, poses: Floats) -> 
         licence="none stated: read, not redistributed",
         heading=poses[..., 2],
     )
+    return MrclamLog(
+        fleet=fleet,
+        heading=poses[..., 2],
+        speed=odometry[..., 0],
+        turn_rate=odometry[..., 1],
+        time=others[:, 0],
+        step=steps_of(others[:, 0], dt, len(t))[0],
+        observer=observer,
+        subject=other,
+        range=others[:, 3],
+        bearing=others[:, 4],
+        true_range=np.hypot(dx, dy),
+        true_bearing=wrap(np.arctan2(dy, dx) - here[:, 2]),
+        observer_heading=here[:, 2],
+        landmarks=marks,
+        sightings=sightings,
+        unknown=int((subject == 0).sum()),
+        absent=int(((subject > 0) & (subject <= SUBJECTS)).sum()) - len(others),
+    )
+
+
+def innovations(log: MrclamLog) -> tuple[Floats, Floats]:
+    """Measured minus true range m and bearing rad, where Vicon saw both robots."""
+    seen = np.isfinite(log.true_range)
+    return (log.range - log.true_range)[seen], wrap(log.bearing - log.true_bearing)[seen]
+
+
+def recording(log: MrclamLog, v2x: V2X, *, runs: int = 1, seed: int = 0) -> Recording:
+    """Recording of the real drive: runs differ only in the simulated GNSS, everything else was measured.
+
+    velocity = v (cos th, sin th, 0) with wheel speed v and Vicon's heading th in the middle of the step (after a gap of
+    Vicon: at its end); relative = (measured range, measured bearing + Vicon's heading, pi/2). Of several measurements
+    of one robot in a step the one nearest to the step's instant is kept; at most K <= 4 neighbours, nearest first by
+    measured range.
+
+    Args:
+        log: of read_mrclam.
+        v2x: K, radius and channel.
+        runs: R.
+        seed: of GNSS and channel.
+    """
+    acting = Sensors(gnss_std=(GNSS_STD, GNSS_STD, 0.0), velocity_std_ratio=0.0)
+    both = zip(innovations(log), STATED_STD, strict=True)
+    stds = [max(robust_std(r), LEAST_STD) if len(r) else std for r, std in both]
+    known = Sensors(
+        gnss_std=(GNSS_STD, GNSS_STD, PLANE_STD),
+        velocity_std_ratio=0.0,
+        velocity_floor=ODOMETRY_STD,
+        range_std=stds[0],
+        azimuth_std=stds[1],
+        inclination_std=PLANE_STD,
+        min_range=0.0,
+    )
+    fixes = observe(log.fleet, acting, V2X(max_neighbours=0), runs=runs, seed=seed, assumed=known).gnss
+    index, lost_in_gaps, repeated = kept(log, v2x)
+    links = Links(log.step[index], log.observer[index], log.subject[index])
+    azimuth = log.bearing[index] + log.observer_heading[index]
+    azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
+    relative = np.column_stack([log.range[index], azimuth, np.full(len(index), np.pi / 2)])
+    broadcasts, arrival = schedule(log.fleet, links, v2x, runs, seed)
+    velocity = turned(log.speed[..., None] * [1.0, 0.0, 0.0], midway(log.heading))
+    return Recording(
+        ids=log.fleet.ids,
+        t=log.fleet.t,
+        gnss=fixes,
+        velocity=np.broadcast_to(np.where(log.fleet.present[..., None], velocity, np.nan), fixes.shape),
+        links=links,
+        relative=np.broadcast_to(relative, (runs, *relative.shape)),
+        broadcasts=broadcasts,
+        arrival=arrival,
+        sensors=known,
+        v2x=v2x,
+        observers=tuple(range(len(log.fleet.ids))),
+        notes=(
+            f"GNSS is simulated, {GNSS_STD:g} m on x and y: there is none indoors; z = 0 is taken as known",
+            "range, bearing and wheel odometry are real",
+            "world azimuth and direction of travel use Vicon's heading, which is truth",
+            "inclination was not measured: pi/2 by the constraint z = 0",
+            "assumed standard deviations were measured against Vicon",
+            f"{repeated} repeated measurements within a step and {lost_in_gaps} in gaps of Vicon are left out",
+        ),
+    )
+
+
+def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> tuple[Ints, int, int]:
+    """Measurements that become links, by step, observer and range; numbers left out in gaps and as repetitions.
+
+    Args:
+        log: of read_mrclam.
+        v2x: K and radius.
+        gaps: whether those in gaps of Vicon stay.
+    """
+    present, inside = log.fleet.present, log.step >= 0
+    visible = present[log.step, log.observer] & present[log.step, log.subject] & np.isfinite(log.observer_heading)
+    index = np.flatnonzero(inside & (visible | gaps))
+    late = np.abs(log.time - log.fleet.t[log.step])[index]
+    unique = index[nearest(late, log.step[index], log.observer[index], log.subject[index])]
+    near = unique[log.range[unique] <= v2x.radius]
+    near = near[np.lexsort((log.range[near], log.observer[near], log.step[near]))]
+    chosen = near[first_of_each(v2x.max_neighbours, log.step[near], log.observer[near])]
+    return chosen, int((inside & ~visible).sum()), len(index) - len(unique)
 
 
 def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
@@ -194,9 +257,54 @@ def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
     return np.vstack([mean[:1], mean])
 
 
-def _true(seen: Floats, truths: list[Floats], start: float, max_gap: float) -> tuple[Floats, Floats, Floats]:
-    poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], seen[:, 0], max_gap) for a in truths])
-    rows = np.arange(len(seen))
-    here, there = poses[seen[:, 1].astype(int), rows], poses[seen[:, 2].astype(int), rows]
-    dx, dy = (there - here)[:, :2].T
-    return np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2]), here[:, 2]
+def _measurements(folder: Path, numbers: list[int]) -> Floats:
+    """(M, 5) unix time s, observer (column), subject (0: in no list), range m, bearing rad, by time."""
+    file = folder / "Barcodes.dat"
+    codes = _read(file, "subject barcode")
+    for column, what in ((1, "barcode"), (0, "subject")):
+        twice = np.ones(len(codes), dtype=bool)
+        twice[np.unique(codes[:, column], return_index=True)[1]] = False
+        _refuse(file, twice, f"must give each {what} once", "Remove the line that repeats it.")
+    _refuse(file, (codes != np.rint(codes)).any(axis=1), "must have whole numbers", "Unpack the set again.")
+    subject_of = {code: subject for subject, code in codes.tolist()}
+    parts = []
+    for column, robot in enumerate(numbers):
+        file = folder / f"Robot{robot}_Measurement.dat"
+        table = _read(file, "time barcode range bearing")
+        subject = np.array([subject_of.get(code, 0) for code in table[:, 1].tolist()])
+        hint = "Check Barcodes.dat, or remove the line."
+        _refuse(file, subject == robot, "must be another's: a robot does not measure itself", hint)
+        _refuse(file, table[:, 2] <= 0, "must have a range > 0 m", "Remove the line.")
+        parts.append(np.column_stack([table[:, 0], np.full(len(table), column), subject, table[:, 2:]]))
+    rows = np.vstack(parts)
+    return rows[np.argsort(rows[:, 0], kind="stable")]
+
+
+def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
+    """(M, C) numbers of a file; a column time increases, the last column, an angle or its rate, is within a turn."""
+    import pandas as pd
+
+    if not file.is_file():
+        hint = "Point at a folder MRCLAM_DatasetN with its .dat files."
+        raise InputError("folder", file.parent, f"has no {file.name}", hint)
+    try:
+        table = pd.read_csv(file, sep=r"\s+", comment="#", header=None, dtype=float).to_numpy()
+    except (ValueError, OverflowError):  # those of pandas for text, empty files and bytes among them
+        table = np.empty((0, 0))
+    if table.shape[1:] != (len(form.split()),) or not (np.abs(table) <= LARGEST).all():
+        table = read_table(file, form)[1]  # slow; names the line
+    if form.startswith("time"):
+        check_time(table[:, 0], file.name)
+        gap = np.diff(table[:, 0], prepend=-np.inf)
+        order = f"must {'increase' if strictly else 'not decrease'} in time from line to line"
+        _refuse(file, gap <= 0 if strictly else gap < 0, order, "Mend or remove the stamp that is out of order.")
+        angle = f"must have a {form.rpartition(' ')[2]} within a turn (a second), in rad"
+        _refuse(file, np.abs(table[:, -1]) > TURN, angle, "Convert degrees to radians.")
+    return np.array(table)
+
+
+def _refuse(file: Path, wrong: Floats, allowed: str, hint: str) -> None:
+    """InputError with the first line that is wrong."""
+    if wrong.any():
+        line, words = list(read_words(file))[int(np.argmax(wrong))]
+        raise InputError(f"{file.name}: line {line}", " ".join(words)[:80], allowed, hint)

@@ -1,4 +1,4 @@
-"""load: a bundled name or a path -> Fleet. The core finds it through the entry point group `coopoc.datasets`."""
+"""load_fleet, load_log: a bundled name, a file or a folder -> Fleet or Log, by the registry of formats."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import inspect
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +18,19 @@ from coopoc.one_file import in_file
 from coopoc.plugins import find, names, suggestion, unknown
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
+from coopoc.world.storage import is_recording, read_recording
+from coopoc.world.v2x import V2X
 
-from . import store
-from .cards import Card
-from .carla import read_carla
-from .fcd import read_fcd
-from .log import Log
-from .mrclam import read_mrclam
-from .part import parted
-from .recordings import format_of
-from .recordings import load_log as load_log
-from .recordings import recorder as real_recorder
-from .rows import assemble
-from .source import split
-from .table import NEEDED, VELOCITY, read_table, write_table
-from .tum import read_tum, tum_files, write_tum
+from . import fleet_store
+from .assemble import assemble
+from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table, write_tum
+from .fleet_store import Card
+from .graphs import read_graph_log
+from .log.links import under
+from .log.read import Log, is_log, read_log, steps_in_words
+from .log.units import Summary
+from .mrclam import read_mrclam, recording
+from .source import parted, split
 
 
 @dataclass(frozen=True)
@@ -51,31 +50,52 @@ class Dataset:
     def load(self) -> Fleet:
         """The fleet, with name, source and licence of its card."""
         card = self.card()
-        fleet = store.load(self.path)
+        fleet = fleet_store.load(self.path)
         return replace(fleet, name=card.name, source=card.source, licence=card.map_licence)
 
 
-REAL = ("mrclam", "log", "recording")
-"""Formats that hold real measurements."""
 FLEETS = Path(__file__).parent / "fleets"
 DATASETS: Mapping[str, Dataset] = {
-    "town04": Dataset(FLEETS / "town04.npz"),
-    "town10": Dataset(FLEETS / "town10.npz"),
-    "town10-clients": Dataset(FLEETS / "town10-clients.npz"),
-    "town10-validation": Dataset(FLEETS / "town10-validation.npz"),
+    name: Dataset(FLEETS / f"{name}.npz") for name in ("town04", "town10", "town10-clients", "town10-validation")
 }
 """Bundled fleets; the names are written out so that a list of them imports nothing."""
 
-READERS: Mapping[str, Callable[..., Fleet]] = {
+
+def _mrclam_log(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
+    log = read_mrclam(path, dt=dt, max_gap=max_gap)
+    seen = recording(log, V2X(max_neighbours=max(len(log.fleet.ids) - 1, 0), radius=float("inf")))
+    counts = {
+        "landmarks (coopoc run real takes them)": len(log.sightings),
+        "robots without odometry, measurements or truth": log.absent,
+        "barcodes in no list": log.unknown,
+    }
+    refused = {f"measurements of {what}": (number, "") for what, number in counts.items() if number}
+    vehicles = dict.fromkeys(log.fleet.ids, "wheel odometry, range and bearing, Vicon")
+    read = {"measurements between robots": len(log.range)}
+    summary = Summary(path.name, steps_in_words(seen), vehicles, read, refused, {}, seen.notes)
+    return Log(seen, log.fleet, summary, False)
+
+
+def _stored_log(path: Path) -> Log:
+    seen, truth = read_recording(path)
+    vehicles, grid = dict.fromkeys(seen.ids, "recorded"), f"{steps_in_words(seen)}, {seen.runs} runs"
+    return Log(seen, truth, Summary(path.name, grid, vehicles, {"links": len(seen.links)}, {}, {}, seen.notes), True)
+
+
+LOGS: Mapping[str, Callable[..., Log]] = {
+    "mrclam": _mrclam_log,
+    "pyfg": read_graph_log,
+    "recording": _stored_log,
+    "log": read_log,
+}
+"""Formats of real measurements -> reader; one of several files or endings belongs to `log.read.READERS`."""
+DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "table": read_table,
     "tum": read_tum,
     "fcd": read_fcd,
-    "carla": read_carla,
-    "mrclam": lambda path, **options: read_mrclam(path, **options).fleet,
-    "fleet": lambda path: store.load(path, path.stem),
-    "log": lambda path, **options: _truth(path, load_log(path, **options)),
-    "recording": lambda path: _truth(path, load_log(path)),
+    "fleet": lambda path: fleet_store.load(path, path.stem),
 }
+"""Formats of drives -> reader."""
 
 
 def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
@@ -84,9 +104,9 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     Args:
         name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
-            CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
+            CSV, Parquet or Excel, TUM, SUMO FCD, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
             (`load_log`). Options may stand behind a question mark, as in "drive.csv?dt=0.1&columns=t:time".
-        format: one of READERS, instead of the one found from name and contents.
+        format: one of DRIVES or LOGS, instead of the one found from name and contents.
         options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness; of all, since and
             until, s after the first step, of the part that is kept.
 
@@ -96,50 +116,62 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
-    name, given = split(name_or_path)
-    options = {**given, **options}
-    part = {option: options.pop(option, None) for option in ("since", "until")}
-    fleet: Fleet = parted(_whole(name, options.pop("format", format), options), **part)
-    return fleet
-
-
-def _whole(name: str, format: str | None, options: dict[str, Any]) -> Fleet:
-    """The fleet of a name, from its first step to its last."""
-    if format is None and (in_file(name) or name in names("coopoc.datasets")):
-        return _resampled(_made(find("coopoc.datasets", name), name), **options)
+    name, options, part = _split(name_or_path, {"format": format, **options})
+    chosen = options.pop("format", None)
+    if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
+        made: Fleet = parted(_resampled(_made(find("coopoc.datasets", name), name), **options), **part)
+        return made
     path = Path(name)
     if not path.exists():
-        raise InputError(
-            "data",
-            repr(name),
-            f"must be one of {', '.join(names('coopoc.datasets'))} or the path of a file or folder",
-            suggestion(
-                name,
-                names("coopoc.datasets"),
-                "List the bundled fleets with coopoc data list, or check the path.",
-            ),
-        )
-    chosen = detect(path, options.get("columns")) if format is None else format
-    if chosen not in READERS:
-        raise unknown("format", chosen, READERS, "Or leave it out.")
-    try:
-        return READERS[chosen](path, **options)
-    except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
-            raise
-        reader = read_mrclam if chosen == "mrclam" else READERS[chosen]
-        known = list(inspect.signature(reader).parameters)[1:]
-        wrong = next((name for name in options if name not in known), "")
-        hint = suggestion(wrong, known, str(error))
-        raise InputError("options", sorted(options), f"not all known to the {chosen} reader", hint) from None
-
-
-def _made(found: Any, name: str) -> Fleet:
-    """A Fleet, what loads one as a Dataset does, or what makes one when it is called."""
-    fleet = found if isinstance(found, Fleet) else found.load() if hasattr(found, "load") else found()
-    if not isinstance(fleet, Fleet):
-        raise InputError("data", repr(name), f"gives a {type(fleet).__name__}, no Fleet", "Return coopoc.Fleet(...).")
+        known = names("coopoc.datasets")
+        allowed = f"must be one of {', '.join(known)} or the path of a file or folder"
+        hint = suggestion(name, known, "List the bundled fleets with coopoc data list, or check the path.")
+        raise InputError("data", repr(name), allowed, hint)
+    chosen = chosen or detect(path, options.get("columns"))
+    if chosen in LOGS:
+        truth = _read(LOGS[chosen], path, options).truth
+        if truth is None:
+            hint = "Add a table truth.csv to its folder, pass truth=, or take co.load_recording."
+            raise InputError(path.name, "no truth", "is a log without one: there is nothing to score against", hint)
+    elif chosen in DRIVES:
+        truth = _read(DRIVES[chosen], path, options)
+    else:
+        raise unknown("format", chosen, (*DRIVES, *LOGS), "Or leave it out.")
+    fleet: Fleet = parted(truth, **part)
     return fleet
+
+
+def load_log(name_or_path: str | Path, **options: Any) -> Log:
+    """Log of a file or folder of measurements.
+
+    Args:
+        name_or_path: tables, NMEA and bags (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of
+            `save_recording`; options may stand behind a question mark, as in "drive?dt=0.1".
+        options: of the reader; of all, since and until, s after the first step, of the part that is kept.
+
+    Raises:
+        InputError: no such path, an unknown option, or a file with a fault.
+    """
+    name, options, part = _split(name_or_path, options)
+    log: Log = _read(LOGS.get(_real(Path(name)), read_log), Path(name), options)
+    return log.part(**part)
+
+
+def recorder(name_or_path: str | Path) -> Callable[..., Recording] | None:
+    """For data with real measurements: (v2x, *, runs, seed) -> Recording; None where `observe` has to simulate them.
+
+    >>> recorder("town10") is None
+    True
+    """
+    chosen = kind_of(name_or_path)
+    if chosen not in LOGS:
+        return None
+    if chosen == "mrclam":  # the only one with a part that is simulated
+        name, options, part = _split(name_or_path, {})
+        log_of_all = _read(read_mrclam, Path(name), options)
+        return lambda *args, **draws: parted(recording(log_of_all, *args, **draws), **part)
+    log = load_log(name_or_path)
+    return partial(under, log.recording, logged=log.messages)
 
 
 def kind_of(name_or_path: str | Path) -> str:
@@ -154,31 +186,8 @@ def kind_of(name_or_path: str | Path) -> str:
     return str(options.get("format") or detect(Path(name), options.get("columns")))
 
 
-def _truth(path: Path, log: Log) -> Fleet:
-    if log.truth is None:
-        raise InputError(
-            path.name,
-            "no truth",
-            "is a log without one: there is nothing to score against",
-            "Add a table truth.csv to its folder, pass truth=, or take co.load_recording.",
-        )
-    return log.truth
-
-
-def recorder(name_or_path: str | Path, *, format: str | None = None) -> Callable[..., Recording] | None:
-    """For data with real measurements: (v2x, *, runs, seed) -> Recording; None where `observe` has to simulate them.
-
-    >>> recorder("town10") is None
-    True
-    """
-    chosen = format or kind_of(name_or_path)
-    return real_recorder(name_or_path, chosen) if chosen in REAL else None
-
-
 def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
-    """Format of a file or folder by its name and, for CSV and folders, by its contents.
-
-    A CSV file is CARLA's if it has yaw and velocities, whose frame must be found out, or many columns of other names.
+    """Format of a file or folder by its name and, for tables and folders, by its contents.
 
     Args:
         path: of the file or folder.
@@ -187,32 +196,14 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     >>> detect(Path("drive.parquet"))
     'table'
     """
-    if path.is_dir():
-        if (path / "Barcodes.dat").is_file():
-            return "mrclam"
-        if format_of(path) and not any(path.glob("*.tum")):
-            return "log"
-        if tum_files(path):
-            return "tum"
-    if path.suffix == ".npz":
-        return format_of(path) or "fleet"
-    if format_of(path, columns):
-        return "log"
-    known = {".parquet": "table", ".xml": "fcd", ".xlsx": "carla", ".tum": "tum", ".txt": "tum"}
-    if path.suffix == ".csv":
-        with path.open(encoding="utf-8-sig", errors="replace") as file:
-            header = [word.strip().strip('"').lower() for word in file.readline().split(",")]
-        framed = {"yaw", *VELOCITY} <= set(header) or (len(header) >= 14 and not set(NEEDED) <= set(header))
-        return "carla" if framed else "table"
-    if path.suffix not in known:
-        raise InputError(
-            "data",
-            path.name,
-            "must end in .csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag, .pyfg or .npz, or be a folder of TUM, "
-            "MR.CLAM or log files",
-            f"Pass format= one of {', '.join(READERS)}.",
-        )
-    return known[path.suffix]
+    ending = {".parquet": "table", ".csv": "table", ".xlsx": "table", ".xml": "fcd", ".npz": "fleet"}
+    ending |= dict.fromkeys((".tum", ".txt"), "tum")
+    found = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ending.get(path.suffix))
+    if found is None:
+        endings = ".csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag, .pyfg or .npz"
+        allowed = f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files"
+        raise InputError("data", path.name, allowed, f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.")
+    return found
 
 
 def list_datasets() -> list[dict[str, Any]]:
@@ -221,33 +212,15 @@ def list_datasets() -> list[dict[str, Any]]:
     >>> [row["name"] for row in list_datasets()][:2]
     ['town04', 'town10']
     """
-    cards = [dataset.card() for dataset in DATASETS.values()]
-    return [
-        {
-            "name": card.name,
-            "map": card.map,
-            "vehicles": card.vehicles,
-            "steps": card.steps,
-            "dt_s": card.dt,
-            "mean_speed_m_s": card.speed["mean"],
-            "mean_neighbours": card.neighbours["mean"],
-            "licence": card.map_licence,
-            "sha256": card.sha256,
-        }
-        for card in cards
-    ]
+    return [dataset.card().row() for dataset in DATASETS.values()]
 
 
-def convert(
-    name_or_path: str | Path, out: str | Path, dt: float | None = None, *, format: str | None = None, **options: Any
-) -> Fleet:
-    """Load a fleet, resample it if dt is given, write it, and return it as it was written.
+def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:
+    """Load a fleet, write it, and return it as it was written.
 
     Args:
         name_or_path: as in `load_fleet`.
         out: .csv or .parquet file, or a folder (no suffix) for one TUM file per vehicle.
-        dt: s, resample.
-        format: of the source, if it is not detected.
         options: of the reader.
 
     Raises:
@@ -256,9 +229,49 @@ def convert(
     path = given_path(out)
     if path.suffix not in (".csv", ".parquet", ""):
         raise InputError("out", path.name, "must end in .csv or .parquet, or be a folder for TUM files", "Rename it.")
-    fleet = load_fleet(name_or_path, format=format, **options, **({} if dt is None else {"dt": dt}))
+    fleet = load_fleet(name_or_path, **options)
     path.parent.mkdir(parents=True, exist_ok=True)
     (write_table if path.suffix else write_tum)(fleet, path)
+    return fleet
+
+
+def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
+    """Format of real measurements, "" for anything else."""
+    if (path / "Barcodes.dat").is_file():
+        return "mrclam"
+    if path.suffix == ".npz":
+        return "recording" if is_recording(path) else ""
+    if path.suffix == ".pyfg":
+        return "pyfg"
+    tum = path.is_dir() and any(path.glob("*.tum"))
+    return "log" if not tum and is_log(path, columns) else ""
+
+
+def _split(name_or_path: str | Path, options: dict[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Name, options of the reader, and the part that is kept."""
+    name, given = split(name_or_path)
+    given |= {key: value for key, value in options.items() if key != "format" or value is not None}
+    return name, given, {key: given.pop(key, None) for key in ("since", "until")}
+
+
+def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
+    """What a reader returns; InputError for an option that it does not have."""
+    known = [name for name in inspect.signature(read).parameters if name not in ("path", "folder")]
+    if "options" in known:
+        known[known.index("options") :] = ["dt", "max_gap", "any_scale"]
+    for name in options:
+        if name not in known:
+            raise unknown("option", name, known or ["(none)"], suggestion(name, known, "Leave it out."))
+    if not path.exists():
+        raise InputError("data", str(path), "must be the path of a file or folder", "Check the path.")
+    return read(path, **options)
+
+
+def _made(found: Any, name: str) -> Fleet:
+    """A Fleet, what loads one as a Dataset does, or what makes one when it is called."""
+    fleet = found if isinstance(found, Fleet) else found.load() if hasattr(found, "load") else found()
+    if not isinstance(fleet, Fleet):
+        raise InputError("data", repr(name), f"gives a {type(fleet).__name__}, no Fleet", "Return coopoc.Fleet(...).")
     return fleet
 
 
@@ -268,13 +281,6 @@ def _resampled(fleet: Fleet, dt: float | None = None, **others: Any) -> Fleet:
     if dt is None:
         return fleet
     step, column = np.nonzero(fleet.present)
-    return assemble(
-        [fleet.ids[c] for c in column],
-        fleet.t[step],
-        fleet.position[step, column],
-        dt=dt,
-        file=fleet.name,
-        name=fleet.name,
-        source=f"{fleet.source}, resampled at {dt:g} s",
-        licence=fleet.licence,
-    )
+    labels = {"name": fleet.name, "source": f"{fleet.source}, resampled at {dt:g} s", "licence": fleet.licence}
+    ids = [fleet.ids[c] for c in column]
+    return assemble(ids, fleet.t[step], fleet.position[step, column], dt=dt, file=fleet.name, **labels)

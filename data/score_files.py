@@ -16,7 +16,7 @@ from coopoc.errors import InputError
 from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.formats.values import read_words, to_rotation
 
-from .cells import numeric, read_frame, seconds, words
+from .cells import named_columns, numeric, read_frame, seconds, words
 from .source import split
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ Aligned = Literal["none", "each", "team"]
 Unit = Literal["steps", "m"]
 
 COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
+SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 QUATERNION = ("qx", "qy", "qz", "qw")
 
 
@@ -58,32 +59,27 @@ def read_paths(name: str) -> dict[str, Path]:
 def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
     from coopoc.evaluate.trajectory_scores import Path
 
-    frame = read_frame(file, columns.get("id", "id")).rename(columns={header: key for key, header in columns.items()})
-    for column in ("t", "x", "y"):
-        if column not in frame.columns:
-            headers = ", ".join(map(str, frame.columns))
-            hint = f'Name it behind the file: "{file.name}?columns={column}:HEADER".'
-            raise InputError(f"{file.name}: column {column}", "missing", f"must be there; the file has {headers}", hint)
-    t = seconds(frame, "t", file.name)
-    ids = words(frame, "id", file.name) if "id" in frame.columns else [file.stem] * len(frame)
-    heights = numeric(frame, "z", file.name) if "z" in frame.columns else np.zeros(len(frame))
-    at = np.column_stack([numeric(frame, "x", file.name), numeric(frame, "y", file.name), heights])
-    turned = covariance = None
-    if set(QUATERNION) <= set(frame.columns):
-        turned = to_rotation(np.column_stack([numeric(frame, column, file.name) for column in QUATERNION]))
-    if set(COVARIANCE) <= set(frame.columns):
-        xx, xy, xz, yy, yz, zz = (numeric(frame, column, file.name) for column in COVARIANCE)
-        covariance = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=-1).reshape(-1, 3, 3)
-    found = {}
-    for name in dict.fromkeys(ids):
-        rows = np.flatnonzero(np.array(ids, dtype=object) == name)
-        rows = rows[np.argsort(t[rows], kind="stable")]
-        twice = np.flatnonzero(np.diff(t[rows]) == 0)
-        if len(twice):
-            where, stamp = f"{file.name}: row {rows[twice[0] + 1] + 1}", f"{t[rows[twice[0]]].item()!r} s"
-            raise InputError(where, stamp, f"is there twice for {name}", "Leave one of them out.")
-        parts = (None if part is None else part[rows] for part in (turned, covariance))
-        found[name] = Path(t[rows], at[rows], *parts)
+    frame = read_frame(file, columns.get("id", "id"))
+    known = ("id", "t", "x", "y", "z", *QUATERNION, *COVARIANCE)
+    frame = named_columns(frame, columns, known, ("t", "x", "y"), file.name)
+    frame = frame.assign(t=seconds(frame, "t", file.name))
+    frame["id"] = words(frame, "id", file.name) if "id" in frame.columns else file.stem
+    twice = frame.duplicated(["id", "t"])
+    if twice.any():
+        row = frame[twice].iloc[0]
+        where, allowed = f"{file.name}: row {row.name}", f"is there twice for {row['id']}"
+        raise InputError(where, f"{float(row['t'])!r} s", allowed, "Leave one of them out.")
+
+    def numbers(rows: Any, *wanted: str) -> Any:
+        return np.column_stack([numeric(rows, name, file.name) for name in wanted])
+
+    found, given = {}, set(frame.columns)
+    for name, rows in frame.groupby("id", sort=False):
+        rows = rows.sort_values("t", kind="stable")
+        at = numbers(rows.assign(z=rows.get("z", 0.0)), "x", "y", "z")
+        turned = to_rotation(numbers(rows, *QUATERNION)) if set(QUATERNION) <= given else None
+        covariance = numbers(rows, *COVARIANCE)[:, SYMMETRIC] if set(COVARIANCE) <= given else None
+        found[str(name)] = Path(rows["t"].to_numpy(dtype=float), at, turned, covariance)
     return found
 
 

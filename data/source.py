@@ -1,13 +1,22 @@
-"""A data set and how to read it in one word: "drive.csv?dt=0.1&max_gap=2&columns=t:time,id:car"."""
+"""A data set, how to read it and which part of it in one word: "drive.csv?dt=0.1&columns=t:time,id:car&since=300"."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
+from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
+
+ROUNDING = 1e-9
+"""Share of a step by which a time may miss one."""
 
 
 def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
@@ -32,8 +41,49 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
         if not (key and equals and value) or key in options:
             hint = 'Write NAME?option=value&option=value, such as "drive.csv?dt=0.1".'
             raise InputError("data", repr(text), "must give each option behind ? one value", hint)
-        options[key] = _value(key, value)
+        read, allowed, example = READ.get(key, (str, "", ""))
+        try:
+            options[key] = read(value)
+        except ValueError:
+            raise InputError(key, repr(value), f"must be {allowed}", f"Write {key}={example}.") from None
     return name, options
+
+
+def steps(t: Floats, since: float = 0.0, until: float = np.inf) -> tuple[int, int]:
+    """First step and last + 1 of those that are at least `since` and less than `until` s after the first one.
+
+    Raises:
+        InputError: fewer than two steps.
+
+    >>> steps(np.array([7.0, 7.5, 8.0, 8.5]), until=1.0)
+    (0, 2)
+    """
+    first, last = np.searchsorted(t - t[0], np.array([since, until]) - ROUNDING * (t[1] - t[0]))
+    if not last - first >= 2:
+        given, length = f"since {since:g} s until {until:g} s", f"{t[-1] - t[0]:g} s"
+        raise InputError("since, until", given, f"must leave two steps of the {length}", "Count from the first step.")
+    return int(first), int(last)
+
+
+def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:
+    """The part of a Fleet or a Recording from `since` to `until` s after its first step; of a Recording a note names
+    it. Without both it is the whole."""
+    if since is None and until is None:
+        return data
+    begin, end = since or 0.0, np.inf if until is None else until
+    part: Fleet | Recording = data.between(*steps(data.t, begin, end))
+    if isinstance(part, Recording):
+        note = f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s"
+        return replace(part, notes=(*part.notes, note))
+    return part
+
+
+def pairs(text: str, mark: str = ":") -> dict[str, str]:
+    """Names and values, as "t:time,id:car"; ValueError for anything else."""
+    found = [[word.strip() for word in pair.partition(mark)] for pair in text.split(",")]
+    if not all(map(all, found)):
+        raise ValueError(text)
+    return {name: value for name, _, value in found}
 
 
 def _exists(text: str) -> bool:
@@ -43,29 +93,12 @@ def _exists(text: str) -> bool:
         return False
 
 
-def _value(key: str, value: str) -> Any:
-    read, allowed, example = READ.get(key, (str, "", ""))
-    try:
-        return read(value)
-    except ValueError:
-        raise InputError(key, repr(value), f"must be {allowed}", f"Write {key}={example}.") from None
-
-
-def _pairs(text: str) -> dict[str, str]:
-    pairs = [pair.partition(":") for pair in text.split(",")]
-    if not all(name and colon and other for name, colon, other in pairs):
-        raise ValueError
-    return {name.strip(): other.strip() for name, _, other in pairs}
-
-
 def _seconds(text: str) -> dict[str, float]:
-    return {name: float(value) for name, value in _pairs(text).items()}
+    return {name: float(value) for name, value in pairs(text).items()}
 
 
 def _flag(text: str) -> bool:
-    if text.lower() not in ("true", "false"):
-        raise ValueError
-    return text.lower() == "true"
+    return bool(["false", "true"].index(text.lower()))
 
 
 def _list(text: str) -> tuple[str, ...]:
@@ -77,17 +110,11 @@ def _place(text: str) -> tuple[float, float, float]:
     return latitude, longitude, height
 
 
-SI = (float, "a number of SI units", "0.1")
 READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
-    "dt": SI,
-    "max_gap": SI,
-    "since": SI,
-    "until": SI,
-    "vehicle_length": SI,
-    "vehicles": (int, "a whole number", "4"),
+    **dict.fromkeys(("dt", "max_gap", "since", "until", "vehicle_length"), (float, "a number of SI units", "0.1")),
     "any_scale": (_flag, "true or false", "true"),
-    "columns": (_pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
-    "kinds": (_pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
+    "columns": (pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
+    "kinds": (pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
     "clock": (_seconds, "vehicle:seconds pairs", "blue:0.35"),
     "ignore": (_list, "words between commas", "imu,lidar"),
     "origin": (_place, "latitude, longitude and height", "48.14,11.58,520"),

@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from coopoc import Fleet, load_fleet
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.learned.checkpoint import read_card
 
 APP = Path(__file__).parent / "flower"

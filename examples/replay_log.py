@@ -27,7 +27,7 @@ import coopoc as co
 from coopoc.arrays import Floats
 from coopoc.formats.trajectories import read_kitti
 from coopoc.learned import load_method
-from coopoc.methods.adaptive import ASSUMED
+from coopoc.methods.kalman import ASSUMED
 from coopoc.world.noise import stream
 
 GNSS_STD = 2.5
@@ -111,7 +111,6 @@ FILTERS: dict[str, Callable[[], Any]] = {
     "Kalman, GNSS known, 10 % of speed": lambda: co.Kalman(known(SPEED)).start(),
     "adaptive, 10 % of axis": lambda: co.AdaptiveKalman(AXIS).start(),
     "adaptive, 10 % of speed": lambda: co.AdaptiveKalman(SPEED).start(),
-    "variational, 10 % of speed": lambda: co.VariationalKalman(SPEED).start(),
     "OKF": lambda: load_method("okf").start(),
     "FedKalmanNet": lambda: load_method("fedkalmannet").start(),
     "Recursive gain": lambda: load_method("recursive").start(),

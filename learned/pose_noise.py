@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from coopoc.arrays import Floats, number
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import pose_covariance, pose_nees
-from coopoc.methods.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.track import Track
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording

@@ -14,8 +14,8 @@ from coopoc.errors import InputError
 from coopoc.evaluate.bounds import fleet_pose_bound
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.joint_filter import JointFilter
-from coopoc.methods.pose_filter import PoseFilter
-from coopoc.methods.pose_start import pose_start
+from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
 from coopoc.study.numbers import Number, Where, across, mean, rms, sentence
 from coopoc.study.provenance import revision

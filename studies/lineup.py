@@ -16,9 +16,9 @@ from coopoc.evaluate.innovations import innovation_columns
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.scores import BYTES, rows_of, scored
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.cooperative_map import CooperativeMAP
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.sliding_window import CooperativeMAP
 from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study

@@ -10,18 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.data.log import Log
-from coopoc.data.log_body_clocks import GATE
-from coopoc.data.log_links import under
-from coopoc.data.log_poses import begin_of, together
+from coopoc.data.log.check import GATE, begin_of, together
+from coopoc.data.log.links import under
+from coopoc.data.log.read import Log
 from coopoc.data.mrclam import MrclamLog, read_mrclam
-from coopoc.data.mrclam_calibration import Calibration, calibrate
-from coopoc.data.mrclam_poses import pose_recording, surveyed
+from coopoc.data.mrclam_poses import Calibration, calibrate, pose_recording, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
 from coopoc.errors import InputError
-from coopoc.methods.pose_filter import SPREAD
-from coopoc.methods.pose_start import pose_start
+from coopoc.methods.poses.pose_filter import SPREAD
+from coopoc.methods.poses.pose_start import pose_start
 from coopoc.study.study import Params
 from coopoc.world.fleet import Fleet
 from coopoc.world.links import Links
@@ -200,7 +198,7 @@ def _log(data: str) -> tuple[MrclamLog | Log, str]:
     name, kind = split(data)[0], kind_of(data)
     if kind == "mrclam":
         return read_mrclam(Path(name)), "throughout"
-    if kind not in ("log", "recording"):
+    if kind not in ("log", "pyfg", "recording"):
         hint = "Check it; a log may hold what vehicles measured (docs/your_data.md), a folder a set of MR.CLAM."
         raise InputError("data", repr(data), "must be the path of measurements, not only of drives", hint)
     log = load_log(data)
@@ -221,5 +219,4 @@ def _calibration(data: str, until: float) -> Calibration:
 def _begin(data: str, gate: float) -> tuple[Floats | None, str]:
     log = _part(data)
     assert isinstance(log, Log)
-    moving = [k for k in range(len(log.recording.ids)) if k not in log.recording.landmarks]
-    return begin_of(log, moving, gate)
+    return begin_of(log, gate)

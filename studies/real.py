@@ -17,7 +17,7 @@ from coopoc.evaluate.innovations import fix_innovations
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.learned.pose_noise import PoseTask, fit_pose_noise
-from coopoc.methods.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.track import Track
 from coopoc.study.numbers import Where, across, difference, interval, mean, present, ran, sentence
 from coopoc.study.provenance import revision

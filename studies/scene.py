@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from coopoc.arrays import Bools
-from coopoc.data.log import Log
-from coopoc.data.log_links import under
+from coopoc.data.log.links import under
+from coopoc.data.log.read import Log
 from coopoc.data.registry import kind_of, load_fleet, load_log, recorder
 from coopoc.data.source import split
 from coopoc.errors import InputError
@@ -60,7 +60,7 @@ def _log(data: str) -> Log | None:
     Raises:
         InputError: one in body frames.
     """
-    if kind_of(data) not in ("log", "recording"):
+    if kind_of(data) not in ("log", "pyfg", "recording"):
         return None
     log = load_log(data)
     if log.recording.body is not None:

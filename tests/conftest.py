@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from coopoc import Fleet, load_fleet
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 
 collect_ignore = ["fuzz"]
 """Its programs need atheris; what they found is replayed by test_data_fuzz.py."""

@@ -1,29 +1,20 @@
-"""Noise-adaptive filters: what they estimate, what they fall back to, and the optimum that one of them climbs."""
+"""The noise-adaptive Kalman filter: what it estimates, and what it falls back to."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
-from conftest import callable_part
-from scipy import optimize, special, stats
+from scipy import stats
 
 from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
-from coopoc.kernels.solo import revised
-from coopoc.methods.adaptive import ASSUMED, AdaptiveKalman
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.variational import VariationalKalman
+from coopoc.methods.kalman import ASSUMED, AdaptiveKalman
 
-BOTH = [AdaptiveKalman(), VariationalKalman()]
-FOREVER = [AdaptiveKalman(window=np.inf), VariationalKalman(rho=1.0)]
-
-
-def named(method: AdaptiveKalman | VariationalKalman) -> str:
-    return method.name
+DEFAULT, FOREVER = AdaptiveKalman(), AdaptiveKalman(window=np.inf)
 
 
 def drive(steps: int = 900) -> Fleet:
@@ -37,20 +28,18 @@ def seen(std: tuple[float, float, float], runs: int, seed: int = 0, steps: int =
     return observe(drive(steps), Sensors(gnss_std=std), V2X(max_neighbours=0), runs=runs, seed=seed)
 
 
-@pytest.mark.parametrize("method", FOREVER, ids=named)
-def test_the_estimate_converges_within_its_chi_square_error(method) -> None:
+def test_the_estimate_converges_within_its_chi_square_error() -> None:
     """After T fixes a variance is known to sqrt(2 / T); 60 runs show mean and spread, per axis."""
     std, runs = (1.5, 2.5, 3.5), 60
-    found = method.gnss_std(seen(std, runs))[:, -1, 0] ** 2 / np.square(std)
+    found = FOREVER.gnss_std(seen(std, runs))[:, -1, 0] ** 2 / np.square(std)
     assert_known(found, runs)
 
 
-@pytest.mark.parametrize("method", FOREVER, ids=named)
-def test_motion_is_not_taken_for_noise_of_the_fixes(method) -> None:
+def test_motion_is_not_taken_for_noise_of_the_fixes() -> None:
     """The same where a step of motion, 0.1 m, is half as noisy as a fix: the start at the truth, as 5 fixes of 2.5 m
     would count more than all that follow."""
     std, runs = (0.2, 0.2, 0.2), 60
-    sure = replace(method, assumed=replace(ASSUMED, gnss_std=std))
+    sure = replace(FOREVER, assumed=replace(ASSUMED, gnss_std=std))
     assert_known(sure.gnss_std(seen(std, runs))[:, -1, 0] ** 2 / np.square(std), runs, slack=1.5)
 
 
@@ -63,85 +52,51 @@ def assert_known(found: Floats, runs: int, slack: float = 1.1) -> None:
     assert (found.std(axis=0, ddof=1) < slack * high * error).all()
 
 
-@pytest.mark.parametrize("method", FOREVER, ids=named)
-def test_a_known_variance_gives_kalman(method) -> None:
+def test_a_known_variance_gives_kalman() -> None:
     recording = seen((3.5, 3.5, 3.5), runs=3, steps=200)
-    sure = replace(method, assumed=recording.sensors, prior_weight=np.inf)
+    sure = replace(FOREVER, assumed=recording.sensors, prior_weight=np.inf)
     ours, theirs = sure(recording), Kalman("nominal")(recording)
     np.testing.assert_allclose(ours.x, theirs.x, atol=1e-12)
     np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", BOTH, ids=named)
-def test_a_jump_of_the_noise_is_followed(method) -> None:
+def test_a_jump_of_the_noise_is_followed() -> None:
     """From 1.5 to 3.5 m in the middle of the drive, and back: the mean of 100 runs forgets as 0.99^fixes."""
     low, high = seen((1.5,) * 3, runs=100), seen((3.5,) * 3, runs=100, seed=1)
     for first, then, before, after in ((low, high, 1.5, 3.5), (high, low, 3.5, 1.5)):
         gnss = np.concatenate([first.gnss[:, :450], then.gnss[:, 450:]], axis=1)
-        found = np.mean(method.gnss_std(replace(first, gnss=gnss)) ** 2, axis=(0, 2, 3))
+        found = np.mean(DEFAULT.gnss_std(replace(first, gnss=gnss)) ** 2, axis=(0, 2, 3))
         assert np.sqrt(found[449]) == pytest.approx(before, rel=0.03)
         for fixes in (50, 100, 200, 400):
             expected = after**2 + (before**2 - after**2) * 0.99**fixes
             assert np.sqrt(found[449 + fixes]) == pytest.approx(np.sqrt(expected), rel=0.06)
 
 
-@pytest.mark.parametrize("method", BOTH, ids=named)
 @pytest.mark.parametrize("std", [1.5, 3.5])
-def test_one_set_of_defaults_is_as_good_as_knowing_the_noise(method, std: float) -> None:
+def test_one_set_of_defaults_is_as_good_as_knowing_the_noise(std: float) -> None:
     """Within 1 % of the filter that knows the variances, and its NEES in the band, at 1.5 and 3.5 m."""
     recording = seen((std,) * 3, runs=60)
-    track, known = method(recording), Kalman("nominal")(recording)
+    track, known = DEFAULT(recording), Kalman("nominal")(recording)
     assert rt_le(track, drive()).mean() < 1.01 * rt_le(known, drive()).mean()
     assert nees_inside(track, drive())[0] >= 0.95
     assert 2.7 < nees(track, drive()).mean() < 3.3
     assert track.notes == ("assumes velocity noise of 10 % of each axis, at least 0.02 m/s",)
 
 
-@pytest.mark.parametrize("method", BOTH, ids=named)
-def test_on_traffic_it_comes_near_the_filter_that_knows(method) -> None:
+def test_on_traffic_it_comes_near_the_filter_that_knows() -> None:
     """Two bundled vehicles in scenario 2, where a filter that believes the 1.5 m of the training is clearly worse."""
     fleet = load_fleet("town10-validation").select([0, 12])
     recording = observe(fleet, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=20)
     score = [
         rt_le(m(recording, [0, 1]), fleet).mean()
-        for m in (method, Kalman("nominal"), Kalman(NoiseModel.nominal(Sensors())))
+        for m in (DEFAULT, Kalman("nominal"), Kalman(NoiseModel.nominal(Sensors())))
     ]
     assert score[0] < 1.01 * score[1]
     assert score[0] < 0.97 * score[2]
 
 
-def evidence(z: float, p: float, r: float, weight: float, new: float, q: tuple[float, float, float]) -> float:
-    """Evidence bound of q(x) = N(m, exp(v)), q(r) = IG(new / 2, exp(b)) for z ~ N(x, r), x ~ N(0, p), r ~ IG prior.
-
-    E 1/r = alpha / beta and E log r = log beta - digamma(alpha); entropies by scipy.stats.
-    """
-    m, variance, beta = q[0], np.exp(q[1]), np.exp(q[2])
-    alpha, alpha0, beta0 = new / 2, weight / 2, weight * r / 2
-    log_r, inverse = np.log(beta) - special.digamma(alpha), alpha / beta
-    fit = -0.5 * log_r - 0.5 * inverse * ((z - m) ** 2 + variance) - 0.5 * (m**2 + variance) / p
-    prior = -(alpha0 + 1) * log_r - beta0 * inverse
-    spread = stats.norm(m, np.sqrt(variance)).entropy() + stats.invgamma(alpha, scale=beta).entropy()
-    return float(fit + prior + spread)
-
-
-@pytest.mark.parametrize("z", [0.3, 4.0, 12.0])
-@pytest.mark.parametrize("rho", [1.0, 0.9])
-def test_the_fixed_point_maximises_the_evidence_bound(z: float, rho: float) -> None:
-    """scipy's optimiser over mean, variance and beta ends where the iterations end."""
-    p, r, weight = 2.0, 5.0, 8.0
-    method = VariationalKalman(rho=rho, iterations=200)
-    noise, new = callable_part(revised)((0.0, 0.0, p, r, weight), z, 0.0, method.fixes)
-    bound = partial(evidence, z, p, r, rho * weight, new)
-    best = optimize.minimize(lambda q: -bound(q), [z / 2, 0.0, 2.0], method="BFGS", options={"gtol": 1e-8})
-    gain = p / (p + noise)
-    assert np.exp(best.x[2]) / (new / 2) == pytest.approx(noise, rel=1e-5)
-    assert best.x[0] == pytest.approx(gain * z, rel=1e-5)
-    assert np.exp(best.x[1]) == pytest.approx((1 - gain) * p, rel=1e-5)
-
-
-@pytest.mark.parametrize("method", BOTH, ids=named)
-def test_steps_without_a_fix_teach_nothing(method) -> None:
-    stream = method.start()
+def test_steps_without_a_fix_teach_nothing() -> None:
+    stream = DEFAULT.start()
     draw = np.random.default_rng(0)
     for _ in range(20):
         stream.step(draw.normal(0, 3, 3), np.zeros(3), 0.1)
@@ -158,12 +113,11 @@ def test_steps_without_a_fix_teach_nothing(method) -> None:
     np.testing.assert_allclose(grown, 5 * (0.1 * ASSUMED.assumed_velocity_std(np.array([9.0, 0, 0]))) ** 2)
 
 
-@pytest.mark.parametrize("method", BOTH, ids=named)
-def test_late_fixes_do_not_count_as_noisy(method) -> None:
+def test_late_fixes_do_not_count_as_noisy() -> None:
     """Motion since a late fix is not taken for GNSS noise, even where it is as large: 0.3 m, all fixes 0.5 s late."""
     std, runs, late = (0.3, 0.3, 0.3), 8, 5
     recording, found = seen(std, runs), []
-    start = replace(method, assumed=replace(ASSUMED, gnss_std=std))
+    start = replace(DEFAULT, assumed=replace(ASSUMED, gnss_std=std))
     for run in range(runs):
         stream = start.start()
         for t in range(late, 900):
@@ -173,10 +127,9 @@ def test_late_fixes_do_not_count_as_noisy(method) -> None:
     assert np.sqrt(np.mean(found)) == pytest.approx(0.3, rel=0.05)
 
 
-@pytest.mark.parametrize("method", FOREVER, ids=named)
-def test_a_known_variance_gives_kalman_with_late_and_missing_fixes(method) -> None:
+def test_a_known_variance_gives_kalman_with_late_and_missing_fixes() -> None:
     sensors, draw = Sensors(), np.random.default_rng(4)
-    ours = replace(method, assumed=sensors, prior_weight=np.inf).start()
+    ours = replace(FOREVER, assumed=sensors, prior_weight=np.inf).start()
     theirs = Kalman(NoiseModel.nominal(sensors)).start()
     for stream in (ours, theirs):
         stream.step(np.zeros(3), np.zeros(3), 0.1)
@@ -188,20 +141,17 @@ def test_a_known_variance_gives_kalman_with_late_and_missing_fixes(method) -> No
             np.testing.assert_allclose(a, b, atol=1e-12)
 
 
-def test_they_are_in_the_catalogue_and_ignore_knowledge() -> None:
-    for method in BOTH:
-        assert METHODS[method.name]("identity").name == method.name
-        assert METHODS[method.name]("nominal").assumed == ASSUMED  # type: ignore[attr-defined]
+def test_it_is_in_the_catalogue_and_ignores_the_noise_model() -> None:
+    assert METHODS["kalman-adaptive"]("nominal").assumed == ASSUMED  # type: ignore[attr-defined]
 
 
 def test_bad_settings_are_named() -> None:
+    recording = seen((2.0,) * 3, runs=1, steps=5)
     for field, make in {
         "prior_weight": lambda: AdaptiveKalman(prior_weight=0.0),
         "window": lambda: AdaptiveKalman(window=-1.0),
-        "rho": lambda: VariationalKalman(rho=1.1),
-        "iterations": lambda: VariationalKalman(iterations=0),
-        "velocity_floor": lambda: AdaptiveKalman(Sensors(velocity_floor=0.0))(seen((2.0,) * 3, runs=1, steps=5)),
-        "x0": lambda: VariationalKalman(x0=np.zeros((2, 3)))(seen((2.0,) * 3, runs=1, steps=5)),
+        "velocity_floor": lambda: AdaptiveKalman(Sensors(velocity_floor=0.0))(recording),
+        "x0": lambda: AdaptiveKalman(x0=np.zeros((2, 3)))(recording),
     }.items():
         with pytest.raises(InputError, match=f"^{field} = "):
             make()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.data.recordings import load_log
+from coopoc.data.registry import load_log
 from coopoc.errors import InputError
 from coopoc.studies import benchmark, pose_drives, tasks
 from coopoc.studies.tasks import TASKS, VALIDATION, VERSION

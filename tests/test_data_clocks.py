@@ -10,9 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
-from coopoc.data.log_poses import check_poses
+from coopoc.data.log.check import check
+from coopoc.data.log.read import read_log
 from coopoc.errors import InputError
 
 NAMES = ("tug", "barge", "pilot")
@@ -97,7 +96,7 @@ def bodily(folder: Path, late: float, truth_late: float = 0.0) -> tuple[str, ...
     log = pd.concat([log, *rates], ignore_index=True)
     log.assign(t=log.t + late * (log.vehicle == "barge")).to_csv(folder / "measurements.csv", index=False)
     truth.assign(t=truth.t + truth_late).to_csv(folder / "truth.csv", index=False)
-    return tuple(check_poses(read_log(folder, frame="body")).warnings)
+    return tuple(check(read_log(folder, frame="body")).warnings)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.5, -0.6])
@@ -114,18 +113,6 @@ def test_other_clocks_of_the_truth_and_of_a_time_zone_are_named_in_body_frames(t
     assert [float(late) for late in found] == pytest.approx([0.7] * 3, rel=0.1)
     with pytest.raises(InputError, match=r"all vehicles are there\. barge: is there while no other .*'barge': 3600"):
         bodily(tmp_path, 3600.0)
-
-
-def test_stamps_that_go_back_in_a_file_are_told(tmp_path: Path) -> None:
-    log, _ = tables(3)
-    log.loc[log.index[3000:3400], "t"] -= 30
-    log.to_csv(tmp_path / "log{0}.csv", index=False)
-    assert "stamps go back in a file (24 times, first: log{0}.csv: row 3001, by 29.8 s)" in str(
-        read_log(tmp_path).summary
-    )
-    log, _ = tables(3)
-    log.sort_values(["vehicle", "kind"], kind="stable").to_csv(tmp_path / "log{0}.csv", index=False)
-    assert "go back" not in str(read_log(tmp_path).summary)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ import pytest
 from logs import NOISE, drive, long, seen, write
 
 import coopoc as co
-from coopoc.data.geodetic import to_enu
-from coopoc.data.log import read_log
+from coopoc.data.log.frames import to_enu
+from coopoc.data.log.read import read_log
 from coopoc.evaluate.metrics import nees
 from coopoc.methods.catalogue import METHODS
 
@@ -240,18 +240,6 @@ def test_methods_run_while_others_come_and_go(tmp_path: Path, name: str) -> None
     rec = read_log(write(frame[~away], tmp_path / "log.csv")).recording
     track = METHODS[name]("nominal")(rec, ["car1"])
     assert float(co.rt_le(track, drive(4)).mean()) < 2.2
-
-
-def test_ranges_alone_run_through_the_cooperative_methods(tmp_path: Path) -> None:
-    """A UWB log: fixes at 1 Hz, odometry and ranges; no angle, no message. Ranges help each kind of method."""
-    fleet = drive(4, gap=24.0)
-    frame = thinned(long(seen(fleet), messages=False))
-    frame = frame[~frame["kind"].isin(["azimuth", "inclination"])]
-    rec = read_log(write(frame, tmp_path / "log.csv")).recording
-    alone = replace(rec, relative=np.full_like(rec.relative, np.nan))
-    for method in (co.JointFilter(), co.CooperativeMAP(window=5), co.MovingHorizon(), METHODS["drift"]("nominal")):
-        with_ranges, without = (float(co.rt_le(method(one, [1]), fleet).mean()) for one in (rec, alone))
-        assert with_ranges < without, method.name
 
 
 def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +14,10 @@ from matplotlib.figure import Figure
 
 import coopoc as co
 from coopoc.cli import main
-from coopoc.data import log_picture
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
-from coopoc.data.registry import kind_of, load_fleet, load_log
+from coopoc.data.log import picture as log_picture
+from coopoc.data.log.check import check
+from coopoc.data.log.read import read_log
+from coopoc.data.registry import kind_of, load_fleet
 from coopoc.evaluate.innovations import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.world.storage import digest, read_recording, save_recording
 
@@ -69,35 +67,6 @@ def test_errors_are_averaged_where_the_truth_is_known(folders: Path, tmp_path: P
     assert co.rt_le(track, log.truth).item() == pytest.approx(np.sqrt(np.square(gap).sum(axis=1).mean()))
 
 
-def test_a_study_scores_vehicles_where_they_are(folders: Path, tmp_path: Path) -> None:
-    """The row of a vehicle that was away is the root mean square over its two stretches; a log has no bound."""
-    settings = {**FEW, "data": str(folders / "with"), "egos": ["car1", "car2"]}
-    rows = co.run_study("side_by_side", tmp_path, settings=settings, progress=False).frame
-    rec, fleet = co.load_recording(folders / "with"), load_fleet(folders / "with")
-    errors = []
-    for start, stop in rec.stretches("car2"):
-        track = co.Kalman()(rec.between(start, stop), ["car2"])
-        errors.append(np.linalg.norm(track.x[0, :, 0] - fleet.position[start:stop, 2], axis=-1))
-    assert len(errors) == 2
-    wanted = np.sqrt(np.mean(np.concatenate(errors) ** 2))
-    got = rows.query("method == 'kalman' and ego == 'car2' and max_neighbours == 0")["rt_le_m"]
-    assert got.tolist() == pytest.approx([wanted])
-    mean = rows.groupby(["method", "max_neighbours"])["rt_le_m"].mean()
-    assert mean["joint", 2] < mean["kalman", 2] < mean["gnss", 2]
-    assert mean["bound"].isna().all()
-
-
-def test_vehicles_whose_truth_comes_and_goes_fail_no_cell(folders: Path, tmp_path: Path) -> None:
-    """The default methods, of which the bound refused an ego that was absent at some steps."""
-    shutil.copytree(folders / "with", tmp_path / "gaps")
-    known = truth(drive(4, gap=15.0))
-    write(known[known["t"] >= known.groupby("vehicle")["t"].transform("min") + 3], tmp_path / "gaps" / "truth.csv")
-    settings = {"data": str(tmp_path / "gaps"), "max_neighbours": "2", "egos": "car1,car2"}
-    results = co.run_study("side_by_side", tmp_path, settings=settings, progress=False)
-    assert not results.failed
-    assert results.frame.groupby("method")["rt_le_m"].count().drop("bound").eq(2).all()
-
-
 def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> None:
     settings = {**FEW, "data": str(folders / "without")}
     results = co.run_study("side_by_side", tmp_path, settings=settings, progress=False)
@@ -109,23 +78,6 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     assert 0.8 < rows.query("method == 'kalman'")["nis"].mean() < 1.2
     tables = sorted(file.stem for file in (tmp_path / "side_by_side").rglob("*.md"))
     assert {"innovation", "nis"} <= set(tables)
-
-
-@pytest.mark.slow
-def test_a_recording_is_a_setting(folders: Path, tmp_path: Path) -> None:
-    log = load_log(folders / "with")
-    paths = []
-    for data in (log, (log.recording, log.truth), log.recording):
-        results = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": data}, progress=False)
-        paths.append(results.settings["data"])
-        assert not results.failed
-    assert paths[0] == paths[1] != paths[2]
-    again = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": paths[0]}, progress=False)
-    by_path = co.run_study("side_by_side", tmp_path, settings={**FEW, "data": str(folders / "with")}, progress=False)
-    one, other = (r.frame.query("method == 'joint' and max_neighbours == 2")["rt_le_m"] for r in (again, by_path))
-    assert one.tolist() == pytest.approx(other.tolist())
-    with pytest.raises(co.InputError, match="must be a name or a path, or a Recording"):
-        co.run_study("side_by_side", tmp_path, settings={"data": log.truth})
 
 
 def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:
@@ -195,7 +147,7 @@ def test_a_picture_without_innovations_says_so(tmp_path: Path) -> None:
     first = frame["t"] == frame["t"].min()
     log = read_log(write(frame[first | ~frame["kind"].isin(["x", "y", "z"])], tmp_path / "log.csv"))
     axes = Figure().add_subplot()
-    log_picture._fixes(axes, log.recording, check(log))
+    log_picture.innovations(axes, check(log))
     assert [text.get_text() for text in axes.texts] == ["no vehicle has a fix after its first"]
 
 
@@ -259,14 +211,6 @@ def test_columns_of_a_log_make_a_table_one(tmp_path: Path, ending: str) -> None:
     assert kind_of(tmp_path / "a.parquet") == "log"
 
 
-def test_velocities_clockwise_from_north_are_found(tmp_path: Path) -> None:
-    frame = long(seen(drive(4, gap=15.0)), messages=False)
-    x, y = (frame["kind"] == "vx").to_numpy(), (frame["kind"] == "vy").to_numpy()
-    swapped = frame.assign(kind=np.where(x, "vy", np.where(y, "vx", frame["kind"])))
-    warnings = check(read_log(write(swapped, tmp_path / "log.csv"))).warnings
-    assert any("anticlockwise of the odometry" in warning for warning in warnings)
-
-
 def test_the_commands_take_a_log_and_options(
     folders: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -289,30 +233,6 @@ def test_the_commands_take_a_log_and_options(
     assert "1 ego of with" in out
     assert "speed" in shell("data", "show", str(folders / "with"))[1]
     assert shell("data", "check", "nowhere")[0] == 2
-
-
-def test_a_gap_of_a_csv_does_not_stop_a_study(tmp_path: Path) -> None:
-    """One missing instant of each vehicle, in a file of drives whose measurements are simulated."""
-    fleet = drive(3, steps=60)
-    frame = truth(fleet).rename(columns={"vehicle": "id"})
-    gone = (frame.index % 61) == 60
-    write(frame[~gone], tmp_path / "drive.csv")
-    settings = {"data": str(tmp_path / "drive.csv"), "method": "kalman,joint", "max_neighbours": "0,2", "runs": 2}
-    results = co.run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False)
-    assert not results.failed
-    assert results.frame["rt_le_m"].notna().all()
-
-
-def test_a_part_of_a_recording_is_one(folders: Path) -> None:
-    rec = co.load_recording(folders / "with")
-    part = rec.between(20, 80)
-    np.testing.assert_array_equal(part.gnss, rec.gnss[:, 20:80])
-    kept = (rec.links.step >= 20) & (rec.links.step < 80)
-    np.testing.assert_array_equal(part.links.step + 20, rec.links.step[kept])
-    np.testing.assert_array_equal(part.relative, rec.relative[:, kept])
-    late = replace(rec, arrival=rec.arrival + 30)
-    assert (late.between(20, 80).arrival < 60).all()
-    assert rec.stretches("car2", shortest=100) == ()
 
 
 def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import coopoc as co
-from coopoc.data.log import read_log
-from coopoc.data.recordings import load_log
+from coopoc.data.log.read import read_log
+from coopoc.data.registry import load_log
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
 GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(
@@ -98,10 +98,10 @@ def test_a_mistake_is_named_as_the_page_says(tmp_path: Path, mistake: str) -> No
 def test_all_unknown_kinds_are_named_at_once(tmp_path: Path) -> None:
     text = "t,car,kind,value\n0,red,gyro,0.1\n0,red,v2x,1\n0,red,gyro,0.1\n"
     (tmp_path / "log.csv").write_text(text)
-    with pytest.raises(co.InputError, match=r"'gyro'.*\{\"gyro\": \.\.\.\}.*--kinds.*Unknown too: 'v2x'\."):
+    with pytest.raises(co.InputError, match=r"'gyro'.*\{\"gyro\": \.\.\.\}.*Unknown too: 'v2x'\."):
         co.read_log(tmp_path / "log.csv", columns={"vehicle": "car"})
     (tmp_path / "log.csv").write_text(text.replace("t,", "stamp,", 1))
-    with pytest.raises(co.InputError, match=r"\(--columns t=stamp\)"):
+    with pytest.raises(co.InputError, match=r"columns=\{\"t\": \"stamp\"\}"):
         co.read_log(tmp_path / "log.csv")
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from coopoc.data.mrclam import MrclamLog, innovations, read_mrclam
-from coopoc.data.mrclam_recording import recording
+from coopoc.arrays import robust_std
+from coopoc.data.mrclam import MrclamLog, innovations, read_mrclam, recording
 from coopoc.data.registry import load_fleet
 from coopoc.errors import InputError
 from coopoc.world.v2x import V2X
@@ -26,12 +25,10 @@ def log() -> MrclamLog:
 @present
 def test_real_measurements_have_the_stated_noise(log: MrclamLog) -> None:
     """Published value for this set, found independently of this reader: 0.095 m and 0.007 rad, robust."""
-    residual = innovations(log)
-    assert residual.range_std == pytest.approx(0.095, abs=0.0015)
-    assert residual.bearing_std == pytest.approx(0.007, abs=0.0006)
-    rows = residual.rows()
-    assert [row["stated_std"] for row in rows] == [0.095, 0.007]
-    assert all(0.001 < float(row["beyond_5_std"]) < 0.05 for row in rows), "rare outliers"
+    for residual, std, error in zip(innovations(log), (0.095, 0.007), (0.0015, 0.0006), strict=True):
+        assert robust_std(residual) == pytest.approx(std, abs=error)
+        outliers = np.abs(residual - np.median(residual)) > 5 * robust_std(residual)
+        assert 0.001 < outliers.mean() < 0.05, "rare"
 
 
 @present
@@ -65,13 +62,6 @@ def test_odometry_with_vicons_heading_dead_reckons(log: MrclamLog) -> None:
         truth = log.fleet.position[1:, robot] - log.fleet.position[0, robot]
         assert np.linalg.norm(path - truth, axis=1).max() < 1.5
         assert np.linalg.norm(truth, axis=1).max() > 2.0
-
-
-@present
-def test_velocity_is_known_wherever_a_robot_is(log: MrclamLog) -> None:
-    """Also at the first step after a gap, whose beginning Vicon did not see."""
-    known = np.isfinite(recording(log, V2X(max_neighbours=0)).velocity[0]).all(axis=-1)
-    np.testing.assert_array_equal(known, log.fleet.present)
 
 
 @present
@@ -118,24 +108,6 @@ def test_fewer_neighbours_are_the_nearest_ones_and_zero_is_none(log: MrclamLog) 
     assert {(step, observer): metres for step, observer, metres in kept} == nearest
 
 
-@present
-def test_a_missing_or_broken_file_is_named(tmp_path: Path) -> None:
-    for file in FOLDER.glob("*.dat"):
-        shutil.copy(file, tmp_path / file.name)
-    (tmp_path / "Robot3_Odometry.dat").chmod(0o644)
-    (tmp_path / "Robot3_Odometry.dat").write_text("# Time v w\n1.0 2.0 fast\n")
-    with pytest.raises(InputError, match=r"Robot3_Odometry\.dat"):
-        read_mrclam(tmp_path)
-    (tmp_path / "Robot3_Odometry.dat").unlink()
-    with pytest.raises(InputError, match=r"has no Robot3_Odometry\.dat"):
-        read_mrclam(tmp_path)
-
-
-def test_dt_must_be_positive() -> None:
-    with pytest.raises(InputError, match="must be > 0"):
-        read_mrclam(FOLDER, dt=-1)
-
-
 def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:
     """Robots that drive side by side for 3 s at unix time, 1 m apart, and measure the next one."""
     folder.mkdir(exist_ok=True)
@@ -171,16 +143,16 @@ def test_a_robot_without_files_is_counted(tmp_path: Path) -> None:
 
 
 BAD = {
-    "a stamp that is late": ("Robot1_Groundtruth.dat", 10, "1248272573.9 0 0 0", r"lines 11 and 12, column time"),
-    "a stamp that repeats": ("Robot1_Groundtruth.dat", 10, "1248272273.6 0 0 0", r"lines 10 and 11, column time"),
-    "odometry backwards": ("Robot2_Odometry.dat", 10, "1248272272.8 1 0", r"Robot2_Odometry\.dat: lines 10 and 11"),
+    "a stamp that is late": ("Robot1_Groundtruth.dat", 10, "1248272573.9 0 0 0", r"line 12 = .*must increase in time"),
+    "a stamp that repeats": ("Robot1_Groundtruth.dat", 10, "1248272273.6 0 0 0", r"line 11 = .*must increase in time"),
+    "odometry backwards": ("Robot2_Odometry.dat", 10, "1248272272.8 1 0", r"Robot2_Odometry\.dat: line 11 = "),
     "a measurement backwards": ("Robot2_Measurement.dat", 9, "1248272272.8 10 1 0", r"must not decrease"),
     "itself": ("Robot2_Measurement.dat", 1, "1248272273.0 20 1 0", r"line 2 = .*a robot does not measure itself"),
     "a negative range": ("Robot2_Measurement.dat", 1, "1248272273.0 10 -1 0", r"line 2 = .*must have a range > 0 m"),
     "degrees": ("Robot2_Measurement.dat", 1, "1248272273.0 10 1 90", r"line 2 = .*within a turn"),
     "a barcode twice": ("Barcodes.dat", 3, "9 20", r"Barcodes\.dat: line 4 = 9 20: must give each barcode once"),
     "a subject twice": ("Barcodes.dat", 3, "2 77", r"Barcodes\.dat: line 4 = 2 77: must give each subject once"),
-    "half a barcode": ("Barcodes.dat", 3, "9 7.5", r"whole number as barcode"),
+    "half a barcode": ("Barcodes.dat", 3, "9 7.5", r"must have whole numbers"),
     "a word": ("Robot1_Odometry.dat", 5, "1248272273.2 fast 0", r"Robot1_Odometry\.dat: line 6 = .* fast 0"),
     "a word too few": ("Robot1_Odometry.dat", 5, "1248272273.2 1", r"Robot1_Odometry\.dat: line 6 = "),
     "underscores": ("Robot1_Odometry.dat", 5, "1248272273.2 1_0 0", r"line 6 = 1248272273\.2 1_0 0"),

@@ -14,7 +14,7 @@ import pytest
 from logs import drive
 
 import coopoc as co
-from coopoc.data.log import read_log
+from coopoc.data.log.read import read_log
 
 
 def sentence(text: str) -> str:

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from test_security import Page
 
 import coopoc as co
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
-from coopoc.data.log_picture import draw
+from coopoc.data.log.check import check
+from coopoc.data.log.picture import draw
+from coopoc.data.log.read import read_log
 from coopoc.optimize import Problem, solve
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
@@ -80,7 +80,7 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
         csv.writer(file).writerows([("t", "vehicle", "kind", "value"), *rows])
     log = read_log(tmp_path / "log.csv")
     figures = [co.Kalman()(rec, [0]).plot(fleet=fleet).figure, rec.plot().figure, solution.plot().figure, studied]
-    texts = [*map(words, figures), draw(log, check(log), tmp_path / "log.svg").read_text()]
+    texts = [*map(words, figures), draw(check(log), tmp_path / "log.svg").read_text()]
     shown = re.sub(r"[\s_]+", "", "".join(c for c in name if c.isalnum() or c in " _="))[:6]
     for text in texts:
         assert "<script" not in text

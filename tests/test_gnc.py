@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
-from coopoc import CooperativeMAP, InputError
+from coopoc import InputError
 from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
 from coopoc.optimize.robust.gnc import SURROGATES
 
@@ -140,8 +140,6 @@ LOST = PAIR.add("range", ("a", "b"), 1.0, std=1.0, loss=Loss("huber", 1.0))
         (lambda: solve_gnc(PAIR, [0], loss="huber"), "loss"),
         (lambda: solve_gnc(PAIR, [0], threshold=11.3), "threshold"),
         (lambda: solve_gnc(replace(PAIR, x0=np.zeros((2, 2, 3))), [0]), "problem"),
-        (lambda: CooperativeMAP(robust="tukey"), "loss"),
-        (lambda: CooperativeMAP(robust="truncated", threshold=1.0), "threshold"),
     ],
 )
 def test_wrong_input_says_what_to_do(make, field: str) -> None:

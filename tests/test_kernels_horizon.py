@@ -14,10 +14,9 @@ from oracles.moving_horizon import Drive, moving_horizon
 from test_kernels_window import CHANNELS, S2
 
 from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, observe
-from coopoc.methods import moving_horizon as module
-from coopoc.methods.fixed_lag import FixedLagSmoother
-from coopoc.methods.moving_horizon import MovingHorizon
+from coopoc.methods import sliding_window as module
 from coopoc.methods.noise_model import resolve
+from coopoc.methods.sliding_window import FixedLagSmoother, MovingHorizon
 from coopoc.world.inbox import inbox
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
@@ -30,9 +29,8 @@ METHODS = [
     MovingHorizon(horizon=4, noise_model=FITTED),
     FixedLagSmoother(lag=0),
     FixedLagSmoother(lag=3),
-    FixedLagSmoother(lag=3, smoothed=True),
     FixedLagSmoother(lag=3, exact=False),
-    FixedLagSmoother(lag=2, noise_model="identity", smoothed=True),
+    FixedLagSmoother(lag=2, noise_model="identity"),
 ]
 Smoother = MovingHorizon | FixedLagSmoother
 
@@ -40,8 +38,7 @@ Smoother = MovingHorizon | FixedLagSmoother
 def label(method: Smoother) -> str:
     known = method.noise_model if isinstance(method.noise_model, str) else method.noise_model.name
     length = method.horizon if isinstance(method, MovingHorizon) else method.lag
-    late = "-smoothed" if getattr(method, "smoothed", False) else ""
-    return f"{method.name}-{length}-{known}{'' if method.exact else '-linear'}{late}"
+    return f"{method.name}-{length}-{known}{'' if method.exact else '-linear'}"
 
 
 def assert_is_the_oracle(recording: Recording, method: Smoother, ego: int, runs: range, near: float = 1e-7) -> None:
@@ -52,9 +49,9 @@ def assert_is_the_oracle(recording: Recording, method: Smoother, ego: int, runs:
     for run in runs:
         drive = Drive(recording, box, known, run, ego)
         if isinstance(method, MovingHorizon):
-            x, cov = moving_horizon(drive, method.horizon + 1, exact, module.SWEEPS if exact else 0)
+            x, cov = moving_horizon(drive, method.horizon + 1, exact, module.REPEATS if exact else 0)
         else:
-            x, cov = fixed_lag(drive, method.lag, exact, method.smoothed)
+            x, cov = fixed_lag(drive, method.lag, exact)
         for t, star in enumerate(drive.star):
             assert track.x[run, t, 0] == pytest.approx(x[ego, t], abs=near)
             assert track.covariance[run, t, 0] == pytest.approx(cov[t], abs=1e-7 * cov[t].max())
@@ -79,9 +76,7 @@ def test_messages_of_any_age_stand_where_the_oracle_has_them(formation: Fleet, l
     assert_is_the_oracle(recording, method, 0, range(0, 5, 4), 1e-6)
 
 
-@pytest.mark.parametrize(
-    "method", [MovingHorizon(horizon=5), FixedLagSmoother(lag=4), FixedLagSmoother(lag=4, smoothed=True)], ids=label
-)
+@pytest.mark.parametrize("method", [MovingHorizon(horizon=5), FixedLagSmoother(lag=4)], ids=label)
 def test_vehicles_that_appear_and_vanish_and_fixes_that_are_missing(crossing: Fleet, method: Smoother) -> None:
     position, velocity = crossing.position.copy(), crossing.velocity.copy()
     position[:4, 2:5], velocity[:4, 2:5] = np.nan, np.nan
@@ -123,7 +118,7 @@ def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet, make: type) -
 
 
 def test_windows_that_still_move_are_counted(monkeypatch: pytest.MonkeyPatch, crossing: Fleet) -> None:
-    monkeypatch.setattr(module, "SWEEPS", 0)
+    monkeypatch.setattr(module, "REPEATS", 0)
     recording, method = observe(crossing.between(0, 20), S2, V2X(max_neighbours=4), runs=2), MovingHorizon(horizon=4)
     assert "still moving" in method(recording, [0, 3]).notes[0]
     assert_is_the_oracle(recording, method, 0, range(1))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from oracles import solo as oracle
 
-from coopoc import GNSS, V2X, AdaptiveKalman, Fleet, NoiseModel, Recording, Sensors, VariationalKalman, observe
+from coopoc import GNSS, V2X, AdaptiveKalman, Fleet, NoiseModel, Recording, Sensors, observe
 from coopoc.kernels.solo import FixNoise
-from coopoc.methods.kalman import drive_of, filtered
+from coopoc.methods.kalman import solo_filter
 
 S2 = Sensors.paper_scenario2()
 
@@ -35,7 +35,7 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
     model = NoiseModel.identity() if noise == "identity" else NoiseModel.nominal(S2)
     q, r = np.broadcast_to(model.process_variance(seen), seen.gnss.shape), model.gnss_variance
     start = crossing.position[0] if known else None
-    x, p, _ = filtered(drive_of(seen, model, range(len(seen.ids))), FixNoise(r), start)
+    x, p, _ = solo_filter(seen, range(len(seen.ids)), model, FixNoise(r), start)
     for run, n, c in np.ndindex(3, 4, 3):
         series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
         mean, variance = oracle.kalman(*series, None if start is None else start[n, c])
@@ -44,19 +44,16 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
 
 
 @pytest.mark.parametrize("runs", [1, 3])
-def test_adaptive_and_variational(crossing: Fleet, runs: int) -> None:
-    seen = gaps(crossing, absent=False, runs=runs)
-    mean_rule, bayes = AdaptiveKalman(window=20.0), VariationalKalman(rho=0.95)
-    model = NoiseModel.nominal(mean_rule.assumed)
+def test_adaptive(crossing: Fleet, runs: int) -> None:
+    seen, method = gaps(crossing, absent=False, runs=runs), AdaptiveKalman(window=20.0)
+    model = NoiseModel.nominal(method.assumed)
     q, r = model.process_variance(seen), model.gnss_variance
-    for method, rule in ((mean_rule, (20.0,)), (bayes, (0.95, 3))):
-        track, std = method(seen, [2, 0]), method.gnss_std(seen, [2, 0])
-        for run, (e, n), c in ((a, b, c) for a in range(runs) for b in enumerate([2, 0]) for c in range(3)):
-            series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
-            textbook = oracle.adaptive if method is mean_rule else oracle.variational
-            mean, noise = textbook(*series, 5.0, *rule)
-            np.testing.assert_allclose(track.x[run, :, e, c], mean, rtol=1e-11, atol=1e-11)
-            np.testing.assert_allclose(std[run, :, e, c] ** 2, noise, rtol=1e-10)
+    track, std = method(seen, [2, 0]), method.gnss_std(seen, [2, 0])
+    for run, (e, n), c in ((a, b, c) for a in range(runs) for b in enumerate([2, 0]) for c in range(3)):
+        series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
+        mean, noise = oracle.adaptive(*series, 5.0, 20.0)
+        np.testing.assert_allclose(track.x[run, :, e, c], mean, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(std[run, :, e, c] ** 2, noise, rtol=1e-10)
 
 
 def test_gnss_holds_the_last_fix(crossing: Fleet) -> None:

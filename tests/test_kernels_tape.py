@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopoc.kernels.graphs.graph_tape import Tape, accumulate
-from coopoc.kernels.graphs.operations import Operation
+from coopoc.kernels.graphs.graph_tape import Operation, Tape, accumulate
 
 ca = pytest.importorskip("casadi")
 
 BINARY = {
-    *("ADD", "SUB", "MUL", "DIV", "ATAN2", "POW", "CONSTPOW", "FMIN", "FMAX", "FMOD", "REMAINDER", "HYPOT"),
+    *("ADD", "SUB", "MUL", "DIV", "ATAN2", "POW", "CONSTPOW", "FMIN", "FMAX", "REMAINDER"),
     *("LT", "LE", "EQ", "NE", "AND", "OR", "IF_ELSE_ZERO"),
 }
 UNARY = [one.name for one in Operation if one > Operation.ASSIGN and one.name not in BINARY]

@@ -32,7 +32,7 @@ ROOMS = {
     "optimize": [
         "model",
         "algebra",
-        "assessment",
+        "assess",
         "descent",
         "starts",
         "agents",

@@ -22,7 +22,7 @@ from torch import Tensor
 from coopoc import Fleet, InputError, load_fleet
 from coopoc.arrays import Floats
 from coopoc.cli import main
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import clients, federate, load
 from coopoc.learned.federation.history import Federation

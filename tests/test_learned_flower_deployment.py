@@ -25,7 +25,7 @@ import pytest
 import torch
 
 from coopoc import V2X, Fleet, observe
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.learned import federate, load
 from coopoc.learned.federation.history import Federation
 from coopoc.learned.federation.local import local_fit

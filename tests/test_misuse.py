@@ -51,7 +51,6 @@ METHODS: tuple[Any, ...] = (
     co.GNSS,
     co.Kalman,
     co.AdaptiveKalman,
-    co.VariationalKalman,
     co.JointFilter,
     co.LKFSA,
     co.MSMV,
@@ -114,7 +113,7 @@ def test_methods_refuse_options_and_recordings_of_the_wrong_kind(method: Any) ->
 
 
 def streams() -> Iterator[Any]:
-    yield from (co.Kalman("identity"), co.JointFilter("identity"), co.AdaptiveKalman(), co.VariationalKalman())
+    yield from (co.Kalman("identity"), co.JointFilter("identity"), co.AdaptiveKalman())
 
 
 @pytest.mark.parametrize("method", list(streams()), ids=lambda m: m.name)
@@ -149,7 +148,7 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     posed = {"fleet": FLEET, "sensors": co.Sensors(heading_std=0.1), "ego": 0, "v2x": CHANNEL, "information": "star"}
     swept(co.pose_bound, posed)
     swept(co.OwnMeasurement, {"velocity": [9.0, 0.0, 0.0], "yaw_rate": 0.1, "gnss": [0.0, 0.0, 0.0], "heading": 0.1})
-    swept(co.BodyMeasurement, {"id": "b", "relative": [9.0, 0.1, 1.57], "age": 0.0})
+    swept(co.LandmarkMeasurement, {"relative": [9.0, 0.1, 1.57], "place": [0.0, 0.0, 0.0]})
     swept(co.bound_rt_le, {"cov": np.eye(3)[None]})
     swept(co.paired_difference, {"a": [1.0, 2.0], "b": [2.0, 4.0], "level": 0.95, "resamples": 100, "seed": 0})
     swept(co.break_even, {"training": None, "online": None, "kind": "payload", "way": "per receiver"})

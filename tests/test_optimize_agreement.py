@@ -31,7 +31,7 @@ from coopoc.optimize import (
     solve_batch,
     solve_gnc,
 )
-from coopoc.optimize.backend import capability_table, require_backend
+from coopoc.optimize.backend import require_backend
 from coopoc.optimize.model.space import exp
 
 
@@ -213,10 +213,6 @@ def test_a_plug_in_solves_batches_outliers_and_every_snapshot() -> None:
     found, ours = (solve_gnc(wrong.pick(0), [0, 2], backend=b) for b in (PLUG_IN, "gauss-newton"))
     assert found.extras["weights"] == pytest.approx(ours.extras["weights"], abs=1e-9)
     assert found.x == pytest.approx(ours.x, abs=1e-6)
-
-
-def test_the_capabilities_of_the_documentation_are_the_declared_ones() -> None:
-    assert capability_table() in (Path(__file__).resolve().parents[1] / "docs" / "optimize.md").read_text()
 
 
 @pytest.mark.parametrize("backend", backends())

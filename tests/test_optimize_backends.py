@@ -16,7 +16,6 @@ from coopoc import V2X, Fleet, InputError, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Backend, Factor, Problem, SolverResult, Status, backends, solve, solve_batch
 from coopoc.optimize.backends import osqp_programme
 from coopoc.optimize.backends.casadi_ import METHODS
-from coopoc.optimize.backends.gauss_newton import linear_step
 from coopoc.optimize.starts.initial import converted, initial_guess
 from coopoc.world.recording import Recording
 
@@ -100,9 +99,10 @@ def test_where_plain_gauss_newton_overshoots_for_ever(backend: str) -> None:
     for seed in range(8):
         problem = star("range", seed, fix_std=4.0, height=0.02)
         assert solve(problem, backend, throw=False).status is Status.SOLVED
-        x, step = initial_guess(problem), linear_step(problem)
+        x = initial_guess(problem)[0]
         for _ in range(200):
-            dx = step(problem.linearise(x), np.zeros_like(x))
+            residual, J = problem.whiten(x)
+            dx = -np.linalg.solve((J.T @ J).toarray(), J.T @ residual).reshape(x.shape)
             x = x + dx
         cycling += np.abs(dx).max() > 1e-3
     assert cycling > 0

@@ -29,7 +29,7 @@ from coopoc.optimize import (
     pose,
     solve,
 )
-from coopoc.optimize.assessment.active import active_at
+from coopoc.optimize.assess.active import active_at
 from coopoc.world.recording import Recording
 
 INF = np.inf

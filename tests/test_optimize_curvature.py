@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from coopoc.optimize import MEASUREMENTS, Problem, SolveError, Status, backends, solve
-from coopoc.optimize.assessment.curvature import is_minimum
+from coopoc.optimize.assess.curvature import is_minimum
 
 
 def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 from random_graphs import random_graph
 
 from coopoc import InputError
-from coopoc.optimize import MEASUREMENTS, Problem, measurement, solve
+from coopoc.optimize import Problem, solve
 from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
 from coopoc.optimize.graphs import from_graph
 from coopoc.optimize.joint import joint_covariance
@@ -53,19 +53,6 @@ def test_joint_marginals_are_gtsams() -> None:
     for i, a in enumerate(keys):
         for j, b in enumerate(keys):
             assert joint[i, j] == pytest.approx(whole.at(a, b), rel=1e-6, abs=1e-12)
-
-
-def test_a_kind_without_a_tape_has_joint_covariances() -> None:
-    @measurement("distance_by_numpy_of_test", arity=2, components=("distance",), plane=(0,))
-    def formula(x: object, y: object, z: object, m: object = np) -> tuple[object]:
-        return (m.sqrt(x * x + y * y) if type(x).__module__ != "casadi.casadi" else 1 / 0,)
-
-    try:
-        problem, plain = ring("distance_by_numpy_of_test"), ring()
-        joint, expected = (joint_covariance(p, solve(p), [0, 7]) for p in (problem, plain))
-        assert joint == pytest.approx(expected, rel=1e-6)
-    finally:
-        del MEASUREMENTS["distance_by_numpy_of_test"]
 
 
 def test_what_has_no_covariance_is_refused() -> None:

@@ -241,12 +241,8 @@ def test_converted_measurement_has_the_rotated_covariance(recording: Recording) 
     assert cov == pytest.approx(vector_cov(measured, S2.relative_std), rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize("most", [0, 200], ids=["kernel", "casadi"])
-def test_a_start_is_the_least_squares_of_the_converted_vectors(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch, most: int
-) -> None:
+def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Recording) -> None:
     """Against NumPy's least squares with vectors d u and vector_cov; ranges and losses have no part in it."""
-    monkeypatch.setattr("coopoc.optimize.algebra.layout.DENSE", most)
     star = Problem.from_snapshot(recording, 20, 0)
     fixes, edges = star.factors
     problem = Problem(star.names, star.factors).add("range", (1, 2), 5.0, std=0.1)

@@ -13,7 +13,7 @@ from scipy.optimize import approx_fprime, least_squares
 from scipy.stats import chi2
 
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, solve, solve_gnc
-from coopoc.optimize.assessment.curvature import is_minimum
+from coopoc.optimize.assess.curvature import is_minimum
 
 M = gtsam.noiseModel.mEstimator
 GTSAMS = {"huber": M.Huber, "cauchy": M.Cauchy, "geman-mcclure": M.GemanMcClure, "truncated": M.TruncatedLeastSquares}

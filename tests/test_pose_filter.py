@@ -1,4 +1,4 @@
-"""Pose filters against a dense oracle, filterpy, GTSAM, the group's exponential, and the position filter."""
+"""Pose filters against a dense oracle, filterpy, GTSAM, and the position filter."""
 
 from __future__ import annotations
 
@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from oracles import pose_filter as oracle
-from scipy.linalg import expm
 
 import coopoc as co
-from coopoc.kernels.poses.pose_filter import PoseOptions, follow
-from coopoc.methods import pose_unit
+from coopoc.methods.poses.pose_inputs import pose_measurements, pose_noise, to_landmarks
 from coopoc.world.frames import in_world
-from coopoc.world.inbox import inbox
 
 NOISE = co.Sensors(
     gnss_std=(1.0, 1.0, 0.5),
@@ -57,88 +54,84 @@ def with_masts(fleet: co.Fleet) -> co.Fleet:
 
 @pytest.fixture(scope="module")
 def rough(crossing: co.Fleet) -> co.Recording:
-    marks = ["mast", "tower"]
-    return with_gaps(co.observe(with_masts(crossing), NOISE, LATE, runs=2, seed=4, frame="body", landmarks=marks))
+    """Vehicle 1 is away for a while, vehicle 2 comes late."""
+    position, velocity = crossing.position.copy(), crossing.velocity.copy()
+    for column, away in ((1, slice(25, 30)), (2, slice(0, 10))):
+        position[away, column] = velocity[away, column] = np.nan
+    fleet, marks = with_masts(replace(crossing, position=position, velocity=velocity)), ["mast", "tower"]
+    return with_gaps(co.observe(fleet, NOISE, LATE, runs=2, seed=4, frame="body", landmarks=marks))
 
 
-def unit_of(recording: co.Recording, kind: str) -> tuple[Any, Any]:
-    """Members and links of vehicle 0 or of the fleet."""
-    links, mine = recording.links, recording.links.of(0)
-    if kind == "star":
-        return pose_unit.star(recording, 0, inbox(recording, 0, co.PoseFilter().message)), mine
-    if kind == "solo":
-        return pose_unit.alone(recording, 0), mine[np.isin(links.neighbour[mine], recording.landmarks)]
-    return pose_unit.fleet(recording), np.arange(len(links))
-
-
-@pytest.mark.parametrize(("kind", "d", "passes"), [("solo", 6, 1), ("star", 4, 2), ("star", 6, 1), ("fleet", 6, 2)])
-def test_the_kernel_is_the_dense_oracle(rough: co.Recording, kind: str, d: int, passes: int) -> None:
-    """Gaps, losses, delays, members that come and go, landmarks, range only and bearing only."""
-    members, links = unit_of(rough, kind)
-    seen, noise = pose_unit.seen(rough, members, links), pose_unit.pose_noise(NOISE, rough.dt, np.inf)
-    begin, spread = np.full((2, 10, 4), np.nan), np.array([1.0, 1.0, 1.0, 0.1])
+@pytest.mark.parametrize(
+    ("kind", "lasting", "exact"), [("solo", True, False), ("fleet", False, True), ("fleet", True, False)]
+)
+def test_the_kernel_is_the_dense_oracle(rough: co.Recording, kind: str, lasting: bool, exact: bool) -> None:
+    """Gaps, losses, members that come and go, landmarks, range only and bearing only."""
+    mine = rough.links.of(0)
+    members = [0] if kind == "solo" else list(range(8))
+    links = to_landmarks(rough, mine) if kind == "solo" else np.arange(len(rough.links))
+    begin, spread = np.full((2, 10, 4), np.nan), (1.0, 1.0, 1.0, 0.1)
     begin[:, 0] = [*rough.gnss[0, 0, 0], 0.3]
-    options, memory = PoseOptions(d, passes, False, 0, 0), pose_unit.memory(int(np.diff(members.start).max()), d)
-    x, cov, _ = follow(seen, noise, begin, spread, options, memory)
+    method = co.PoseFilter(kind, lasting=lasting, exact=exact, spread=spread)  # type: ignore[arg-type]
+    x, cov, _ = method.run_filter(rough, members, links, begin)
+    measured, noise = pose_measurements(rough, members, links), pose_noise(NOISE, rough.dt, np.inf)
     for run in range(2):
-        wanted, covariance = oracle.pose_filter(seen, noise, begin, spread, options, run)
-        scale = np.sqrt(np.einsum("...ii->...i", covariance)) + 1e-3
-        assert np.abs((x[run] - wanted) / scale).max() < 1e-3  # derivatives of the oracle are numerical
-        assert np.abs((cov[run] - covariance) / (scale[..., None] * scale[..., None, :])).max() < 1e-3
+        first = begin[run, members], spread
+        wanted, covariance = oracle.pose_filter(measured, noise, first, 4 + 2 * lasting, 1 + exact, run)
+        scale, here = np.sqrt(np.einsum("...ii->...i", covariance)) + 1e-3, measured.active
+        assert (np.isfinite(x[run]).all(axis=-1) == here).all()
+        assert (np.abs(x[run] - wanted) / scale)[here].max() < 1e-3  # derivatives of the oracle are numerical
+        assert (np.abs(cov[run] - covariance) / (scale[..., None] * scale[..., None, :]))[here].max() < 1e-3
 
 
-@pytest.mark.parametrize("neighbours", [0, 2, 10])
-def test_with_a_perfect_heading_it_is_the_position_filter(formation: co.Fleet, neighbours: int) -> None:
-    """Same draws turned into the world by the exact compass: the position filter's RT-LE within 1 %."""
-    drive = formation.between(0, 200)
+@pytest.mark.parametrize("neighbours", [0, 3])
+def test_with_a_perfect_heading_it_is_the_position_filter(neighbours: int, formation: co.Fleet) -> None:
+    """Same draws turned into the world by the exact compass: the whole-fleet filter's RT-LE within 1 %."""
+    drive = formation.select(range(4)).between(0, 200)
     exact = co.Sensors(gnss_std=(3.5,) * 3, heading_std=0.0, yaw_rate_std=0.0, velocity_reading="speed")
-    body = co.observe(drive, exact, co.V2X(max_neighbours=neighbours), runs=8, frame="body", observers=[0])
-    here = co.rt_le(co.PoseFilter()(body), drive).mean()
-    there = co.rt_le(co.JointFilter()(in_world(body)), drive).mean()
+    body = co.observe(drive, exact, co.V2X(max_neighbours=neighbours), runs=8, frame="body")
+    here = co.rt_le(co.PoseFilter("fleet")(body), drive).mean()
+    there = co.rt_le(co.CentralFilter()(in_world(body)), drive).mean()
     assert here == pytest.approx(there, rel=0.01)
 
 
-def test_a_star_is_filterpys_extended_kalman_filter(formation: co.Fleet) -> None:
+def test_a_fleet_is_filterpys_extended_kalman_filter(formation: co.Fleet) -> None:
     """filterpy's predict and update with this model's derivatives, four members, 40 steps."""
     filterpy = pytest.importorskip("filterpy.kalman")
-    drive = formation.between(0, 40)
+    drive = formation.select(range(4)).between(0, 40)
     noise = replace(NOISE, speed_scale_std=0.0, yaw_rate_bias_std=0.0)
-    seen = co.observe(drive, noise, co.V2X(max_neighbours=3), frame="body", observers=[0])
-    track = co.PoseFilter(exact=False)(seen)
-    members, links = unit_of(seen, "star")
-    packed = pose_unit.seen(seen, members, links)
-    assert seen.body is not None
-    order = members.column[:4]
+    seen = co.observe(drive, noise, co.V2X(max_neighbours=3, radius=1e3), frame="body")
+    track = co.PoseFilter("fleet", exact=False)(seen)
+    packed = pose_measurements(seen, range(4), np.arange(len(seen.links)))
     ekf = filterpy.ExtendedKalmanFilter(16, 1)
-    ekf.x = np.concatenate([[*seen.gnss[0, 0, n], seen.body.heading[0, 0, n]] for n in order])
+    ekf.x = packed.own[0, 0, :, :4].flatten()
     ekf.P = np.diag([1e6, 1e6, 1e6, np.pi**2 / 3] * 4)
     for t in range(40):
-        assert set(members.column[4 * t : 4 * t + 4]) == set(order)
         if t:
             F, Q = np.eye(16), np.zeros((16, 16))
-            for k, n in enumerate(order):
-                u = np.append(seen.velocity[0, t, n], seen.body.yaw_rate[0, t, n])
-                b, state = slice(4 * k, 4 * k + 4), ekf.x[4 * k : 4 * k + 4]
+            for k in range(4):
+                u, b = packed.own[0, t, k, 4:], slice(4 * k, 4 * k + 4)
+                state = ekf.x[b].copy()
                 F[b, b] = oracle.jacobian(lambda s, u=u: oracle.motion(s, u, seen.dt), state)
                 G = oracle.jacobian(lambda v, s=state: oracle.motion(s, v, seen.dt), u)
                 q = np.append(np.maximum(0.1 * np.abs(u[:3]), 0.05) ** 2, 0.02**2)
                 Q[b, b], ekf.x[b] = G @ np.diag(q) @ G.T, oracle.motion(state, u, seen.dt)
             ekf.P = F @ ekf.P @ F.T + Q
-        for k, n in enumerate(order):
+        for k in range(4):
             H = np.zeros((4, 16))
             H[:, 4 * k : 4 * k + 4] = np.eye(4)
-            z = np.append(seen.gnss[0, t, n], seen.body.heading[0, t, n])
+            z = packed.own[0, t, k, :4].copy()
             z[3] = ekf.x[4 * k + 3] + oracle.wrapped(z[3] - ekf.x[4 * k + 3], True)
             ekf.update(z, lambda x, H=H: H, lambda x, H=H: H @ x, np.diag([1.0, 1.0, 0.25, 0.05**2]))
         mine = range(packed.first[t], packed.first[t + 1])
-        places = [list(order).index(seen.links.neighbour[links[k]]) for k in mine]
 
-        def h(x: Any, places: Any = places) -> Any:
-            return np.concatenate([oracle.spherical(x[:4], x[4 * p : 4 * p + 3]) for p in places])
+        def h(x: Any, pairs: Any = 4 * packed.ends[mine]) -> Any:
+            return np.concatenate([oracle.spherical(x[i : i + 4], x[j : j + 3]) for i, j in pairs])
 
-        z, angle = np.concatenate([packed.relative[0, k] for k in mine]), np.tile([False, True, True], 3)
+        z, angle = packed.relative[0, mine].ravel(), np.tile([False, True, True], len(mine))
         z = h(ekf.x) + oracle.wrapped(z - h(ekf.x), angle)
-        ekf.update(z, lambda x, h=h: oracle.jacobian(h, x), h, np.diag(np.tile(np.square([0.3, 0.03, 0.03]), 3)))
+        noises = np.diag(np.tile(np.square([0.3, 0.03, 0.03]), len(mine)))
+        ekf.update(z, lambda x, h=h: oracle.jacobian(h, x), h, noises)
         assert np.allclose(track.x[0, t, 0], ekf.x[:3], atol=1e-5)
         assert np.allclose(track.covariance[0, t, 0], ekf.P[:3, :3], rtol=1e-4, atol=1e-7)  # type: ignore[index]
 
@@ -205,40 +198,6 @@ def test_a_solo_filter_moves_and_updates_covariances_as_gtsam() -> None:
         found[2, 2] = track.heading_covariance[0, t, 0, 3]  # type: ignore[index]
         assert np.allclose(found, wanted[t], rtol=1e-6, atol=1e-9)
     assert track.heading[0, 1, 0] == pytest.approx(ekf.state().theta(), abs=1e-9)  # type: ignore[index]
-
-
-def test_the_invariant_filter_is_that_of_the_group() -> None:
-    """SciPy's matrix exponential: X' = Exp(K r) X, in the coordinates of the right-invariant error, over 12 steps."""
-    seen, start = landmark_only(), np.array([[0.1, -0.2, 0.0, 0.3], [0, 0, 0, 0]])
-    spread = (0.3, 0.2, 0.1, 0.4)
-    track = co.PoseFilter("solo", exact=False, invariant=True, begin=start, spread=spread)(seen)
-    assert seen.body is not None
-    state, place = start[0].copy(), np.array([3.0, 4.0, 0.0])
-
-    def coordinates(s: Any) -> Any:
-        """Of the error (dp - dth J p, dth) in those of (dp, dth)."""
-        return np.array([[1.0, 0.0, s[1]], [0.0, 1.0, -s[0]], [0.0, 0.0, 1.0]])
-
-    cov = coordinates(state) @ np.diag(np.square(spread))[np.ix_([0, 1, 3], [0, 1, 3])] @ coordinates(state).T
-    for t in range(12):
-        if t:
-            v = np.append(seen.velocity[0, t, 0], seen.body.yaw_rate[0, t, 0])
-            G = oracle.jacobian(lambda v, s=state: oracle.motion(s, v, 0.1), v)[[0, 1, 3]]
-            state = oracle.motion(state, v, 0.1)
-            G = coordinates(state) @ G
-            cov = cov + G @ np.diag(np.append(np.maximum(0.1 * np.abs(v[:3]), 0.05) ** 2, 0.02**2)) @ G.T
-        h = lambda s: oracle.spherical(s, place)[:2]  # noqa: E731
-        H = oracle.jacobian(h, state)[:, [0, 1, 3]] @ np.linalg.inv(coordinates(state))
-        K = cov @ H.T @ np.linalg.inv(H @ cov @ H.T + np.diag(np.square([0.3, 0.03])))
-        xi = K @ oracle.wrapped(seen.relative[0, t, :2] - h(state), np.array([False, True]))
-        cov = cov - K @ H @ cov
-        c, s = np.cos(state[3]), np.sin(state[3])
-        step = expm(np.array([[0, -xi[2], xi[0]], [xi[2], 0, xi[1]], [0, 0, 0]]))
-        pose = step @ np.array([[c, -s, state[0]], [s, c, state[1]], [0, 0, 1]])
-        state = np.array([pose[0, 2], pose[1, 2], state[2], state[3] + xi[2]])
-        back = np.linalg.inv(coordinates(state))
-        assert np.allclose(track.x[0, t, 0, :2], state[:2], atol=1e-6)
-        assert np.allclose(track.covariance[0, t, 0, :2, :2], (back @ cov @ back.T)[:2, :2], atol=1e-6)  # type: ignore[index]
 
 
 @pytest.mark.slow

@@ -39,10 +39,8 @@ def observed(fleet: co.Fleet, sensors: co.Sensors = WHITE, runs: int = 30, **mor
     ("method", "masts"),
     [
         (co.PoseFilter("solo"), 0),
-        (co.PoseFilter("solo", exact=False, invariant=True), 3),
-        (co.PoseFilter("star"), 0),
-        (co.PoseFilter("star"), 3),
         (co.PoseFilter("fleet"), 0),
+        (co.PoseFilter("fleet"), 3),
     ],
     ids=lambda value: getattr(value, "name", value),
 )
@@ -105,15 +103,6 @@ def test_range_alone_and_bearing_alone_help_and_both_help_more() -> None:
     assert max(ranges, bearings) < nothing
 
 
-def test_a_star_without_neighbours_is_a_solo_filter() -> None:
-    fleet = convoy(3, 40, masts=1)
-    seen = observed(fleet, runs=3, neighbours=0)
-    star, solo = (co.PoseFilter(unit)(seen, [1]) for unit in ("star", "solo"))
-    assert np.array_equal(star.x, solo.x)
-    assert np.array_equal(star.heading, solo.heading)  # type: ignore[arg-type]
-    assert (solo.received_bytes == 0).all()
-
-
 def test_the_gate_keeps_outliers_out() -> None:
     """Every twentieth range is 20 m too long; without outliers the gate changes next to nothing."""
     fleet = convoy(masts=2)
@@ -139,7 +128,7 @@ def test_turning_the_world_turns_the_estimate() -> None:
     turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     body = co.Body(seen.body.yaw_rate, seen.body.heading + angle)
     there = replace(seen, gnss=seen.gnss @ turn, body=body)
-    for unit in ("solo", "star", "fleet"):
+    for unit in ("solo", "fleet"):
         here, turned = (co.PoseFilter(unit)(one, [1]) for one in (seen, there))
         assert np.allclose(turned.x, here.x @ turn, atol=1e-6)
         assert np.allclose(np.exp(1j * (turned.heading - here.heading)), np.exp(1j * angle), atol=1e-7)  # type: ignore[operator]
@@ -151,7 +140,7 @@ def test_a_lost_message_is_a_measurement_less() -> None:
     for loss in (0.0, 0.5, 0.95):
         v2x = co.V2X(max_neighbours=3, radius=60.0, loss=loss)
         seen = co.observe(fleet, WHITE, v2x, runs=10, frame="body")
-        track = co.PoseFilter("star")(seen, [1, 2])
+        track = co.PoseFilter("fleet")(seen, [1, 2])
         errors.append(float(co.rt_le(track, fleet).mean()))
         assert 2.0 < co.pose_nees(track, fleet).mean() < 4.5
     assert errors == sorted(errors)
@@ -161,8 +150,7 @@ def test_a_lost_message_is_a_measurement_less() -> None:
     ("make", "words"),
     [
         (lambda r: co.PoseFilter("stars"), "unit"),
-        (lambda r: co.PoseFilter(fusion="naive"), "is for a fleet"),
-        (lambda r: co.PoseFilter(invariant=True), "solo vehicle"),
+        (lambda r: co.PoseFilter("solo", fusion="naive"), "is for a fleet"),
         (lambda r: co.PoseFilter(gate=0.5), "gate"),
         (lambda r: co.PoseFilter(spread=(1.0, 1.0, 1.0, 0.0)), "spread"),
         (lambda r: co.PoseFilter("solo", begin=np.zeros((2, 4)))(r), "begin"),
@@ -175,10 +163,3 @@ def test_a_lost_message_is_a_measurement_less() -> None:
 def test_mistakes_are_named(make: Any, words: str) -> None:
     with pytest.raises(co.InputError, match=words):
         make(observed(convoy(masts=1), runs=1))
-
-
-def test_neighbours_without_a_compass_are_named() -> None:
-    seen = observed(convoy(), replace(WHITE, compass=False), runs=1)
-    begin = np.zeros((5, 4))
-    with pytest.raises(co.InputError, match='unit="fleet"'):
-        co.PoseFilter(begin=begin)(seen)

@@ -10,8 +10,8 @@ import pytest
 from oracles.pose_smoother import by_hand
 
 import coopoc as co
-from coopoc.methods.pose_piece import Drive, pose_piece
-from coopoc.methods.pose_smoother import PoseSmoother
+from coopoc.methods.poses.pose_factors import PoseRun, pose_subgraph
+from coopoc.methods.poses.pose_smoother import PoseSmoother
 from coopoc.optimize import Problem, solve
 from coopoc.world.frames import true_heading
 
@@ -51,10 +51,10 @@ def recording(steps: int = 30, gaps: bool = True, runs: int = 1) -> tuple[co.Rec
 
 def pieces(seen: co.Recording, smoother: PoseSmoother) -> Iterator[Problem]:
     """Those that the smoother is fed with."""
-    drive = Drive(seen, 0, seen.sensors, np.full((len(seen.ids), 4), np.nan), np.array(smoother.spread))
+    drive = PoseRun(seen, 0, seen.sensors, np.full((len(seen.ids), 4), np.nan), np.array(smoother.spread))
     known: dict[str, np.ndarray] = {}
-    for step, found in enumerate(smoother.follow(seen)):
-        piece = pose_piece(drive, step, known)
+    for step, found in enumerate(smoother.estimates(seen)):
+        piece = pose_subgraph(drive, step, known)
         marks = zip(piece.names[len(piece.poses) :], piece.x0[len(piece.poses) :], strict=True)
         known = {name: x for name, x in known.items() if "@" not in name} | dict(marks)
         known |= dict(zip(found.names, found.x, strict=True))
@@ -88,7 +88,7 @@ def test_an_endless_lag_is_one_solve_of_all_that_was_measured() -> None:
         "body_spherical",
     }
     whole = solve(joined(parts))
-    *_, newest = smoother.follow(seen)
+    *_, newest = smoother.estimates(seen)
     place = [whole.names.index(name) for name in newest.names]
     assert newest.names == ("a@29", "b@29", "c@29")
     assert newest.x == pytest.approx(whole.x[place], abs=1e-5)  # Cholesky of odometry to 1e-3 m
@@ -99,7 +99,7 @@ def test_a_lag_gives_what_gtsams_smoother_gives() -> None:
     """GTSAM's own incremental fixed-lag smoother and factors, by a plain loop."""
     seen, _ = recording(60)
     smoother = PoseSmoother(1.55)
-    ours = np.array([found.x[:, :2] for found in smoother.follow(seen)])
+    ours = np.array([found.x[:, :2] for found in smoother.estimates(seen)])
     theirs = by_hand(list(pieces(seen, smoother)), 1.55, seen.dt)
     assert np.abs(ours - theirs).max() < 1e-9
 
@@ -148,12 +148,12 @@ def test_a_vehicle_may_join_and_leave() -> None:
         arrival=seen.arrival[:, there],
         broadcasts=broadcasts,
     )
-    names = [found.names for found in PoseSmoother().follow(part)]
+    names = [found.names for found in PoseSmoother().estimates(part)]
     assert [len(each) for each in names] == [2] * 5 + [3] * 10 + [2] * 5
     assert flat_error(PoseSmoother()(part, ["a"]), fleet).max() < 1.5
     heading[:, 5, 1] = np.nan
     with pytest.raises(co.InputError, match="b joins at step 5 without fix and compass"):
-        list(PoseSmoother().follow(replace(part, body=co.Body(rate, heading))))
+        list(PoseSmoother().estimates(replace(part, body=co.Body(rate, heading))))
 
 
 @pytest.mark.parametrize(

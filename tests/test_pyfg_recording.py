@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pandas as pd
 import pytest
 
 import coopoc as co
 from coopoc.data.commands import check as data_check
-from coopoc.data.pyfg_recording import graph_recording
-from coopoc.data.recording_graph import recording_graph, write_log_graph
-from coopoc.data.recordings import load_log
-from coopoc.formats import write_graph
+from coopoc.data.graphs import graph_recording
+from coopoc.data.registry import load_log
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.frames import body_motion
 
@@ -64,7 +61,7 @@ def test_the_command_says_what_was_read(shared: Path, tmp_path: Path, capsys: py
     data_check(str(shared / "pyfg" / "tiers.pyfg"), picture=tmp_path / "tiers.png")
     said = capsys.readouterr().out
     assert "read: 7092 ranges" in said
-    assert "residuals of the fleet's pose filter, throughout, from the truth's first poses" in said
+    assert "innovations against a filter of each vehicle alone, throughout, from the truth's first poses" in said
     assert "nothing looks wrong" in said
 
 
@@ -109,62 +106,6 @@ def circles(folder: Path) -> Path:
     columns = ["t", "vehicle", "kind", "partner", "value", "std"]
     pd.DataFrame(rows, columns=columns).to_csv(folder / "circles.csv", index=False)
     return folder / "circles.csv"
-
-
-def test_a_recording_is_written_and_read_again(tmp_path: Path) -> None:
-    log = co.read_log(circles(tmp_path), frame="body")
-    write_log_graph(log, tmp_path / "circles.pyfg")
-    again, rec = load_log(tmp_path / "circles.pyfg"), log.recording
-    moving = [k for k in range(len(rec.ids)) if k not in rec.landmarks]
-    back = again.recording
-    assert rec.body is not None
-    assert back.body is not None
-    np.testing.assert_allclose(back.velocity[0, 1:, :2], rec.velocity[0, 1:, moving].transpose(1, 0, 2), atol=1e-6)
-    np.testing.assert_allclose(back.body.yaw_rate[0, 1:, :2], rec.body.yaw_rate[0, 1:][:, moving], atol=1e-6)
-    assert len(back.links) == len(rec.links)
-    for one, other in ((rec, back), (back, rec)):
-        key = [
-            (int(step), one.relative[0, k, 0].round(6), np.nan_to_num(one.relative[0, k, 1], nan=9.0).round(6))
-            for k, step in enumerate(one.links.step)
-        ]
-        assert len(set(key)) == len(key)
-        assert set(key) == {
-            (int(step), other.relative[0, k, 0].round(6), np.nan_to_num(other.relative[0, k, 1], nan=9.0).round(6))
-            for k, step in enumerate(other.links.step)
-        }
-    assert back.sensors.range_std == pytest.approx(0.2, rel=1e-3)
-    assert back.sensors.azimuth_std == pytest.approx(0.02, rel=0.05)
-    assert back.sensors.yaw_rate_std == pytest.approx(0.02, rel=1e-3)
-    assert again.summary.refused == {"priors": (4, "")}
-
-
-def test_gtsam_reads_the_same_motions(tmp_path: Path) -> None:
-    """The file's edges of odometry at the file's own poses: what GTSAM's factors leave of closed circles."""
-    log = co.read_log(circles(tmp_path), frame="body")
-    rec, t = log.recording, np.arange(50) * 0.1
-    poses = np.full((50, len(rec.ids), 3), np.nan)
-    for name, r, w in (("red", 10.0, 0.5), ("blue", 16.0, 0.3)):
-        at = np.column_stack([r * np.cos(w * t), r * np.sin(w * t), w * t + np.pi / 2])
-        poses[:, rec.ids.index(name)] = at
-    graph = recording_graph(rec, poses)
-    write_graph(graph.stamped(np.nan), tmp_path / "circles.g2o")
-    factors, values = gtsam.readG2o(str(tmp_path / "circles.g2o"), False)
-    assert values.size() >= 100
-    assert factors.size() >= 98 + 100
-    assert factors.error(values) < 1.0  # a step is its chord: 1e-3 m of 0.5 m
-    backwards = recording_graph(rec, poses[::-1].copy())
-    write_graph(backwards.stamped(np.nan), tmp_path / "backwards.g2o")
-    factors, values = gtsam.readG2o(str(tmp_path / "backwards.g2o"), False)
-    assert factors.error(values) > 1e3
-
-
-def test_what_a_graph_cannot_hold_is_named(tmp_path: Path) -> None:
-    frame = pd.read_csv(circles(tmp_path))
-    frame[(frame["kind"] != "range") | (frame["partner"] != "tower")].to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(co.InputError, match=r"50 bearings without a range.*ignore"):
-        write_log_graph(co.read_log(tmp_path / "log.csv", frame="body"), tmp_path / "log.pyfg")
-    with pytest.raises(co.InputError, match="world frame"):
-        write_log_graph(co.read_log(tmp_path / "circles.csv"), tmp_path / "log.pyfg")
 
 
 def test_one_landmark_alone_gives_no_heading(tmp_path: Path) -> None:

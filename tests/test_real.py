@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.data import mrclam_calibration as calibration
 from coopoc.data.mrclam import MrclamLog, read_mrclam
-from coopoc.data.mrclam_calibration import Calibration, calibrate
-from coopoc.data.mrclam_poses import pose_recording
+from coopoc.data.mrclam_poses import Calibration, calibrate, grouped, pose_recording, summed
 from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_sensing import gauss_markov
 from coopoc.world.v2x import V2X
@@ -74,13 +72,13 @@ def test_thinning_leaves_the_first_part_and_the_robots(seen: co.Recording) -> No
 def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened() -> None:
     """Closed form: sums of n terms of an autoregression have variance n s^2 (1 + c) / (1 - c) (Bartlett 1946)."""
     normals = np.random.default_rng(0).standard_normal((200_000, 1))
-    assert calibration._summed(normals, 200) == pytest.approx(1.0, rel=0.05)
+    assert summed(normals, 200) == pytest.approx(1.0, rel=0.05)
     c = np.exp(-0.2)
     lasting = gauss_markov(normals, 0.2)
-    assert calibration._summed(lasting, 200) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
+    assert summed(lasting, 200) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
     t = np.arange(200_000) * 0.1
     robot = np.zeros(len(t), dtype=np.int64)
-    assert calibration._grouped(lasting[:, 0], robot, t) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
+    assert grouped(lasting[:, 0], robot, t) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
 
 
 def test_odometry_follows_its_log_late_and_turns_less(log: MrclamLog, known: Calibration) -> None:

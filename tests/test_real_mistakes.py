@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.data.log import read_log
-from coopoc.data.log_check import check
-from coopoc.data.recordings import load_log
+from coopoc.data.log.check import check
+from coopoc.data.log.read import read_log
+from coopoc.data.registry import load_log
 from coopoc.formats.g2o import write_g2o
 from coopoc.formats.pyfg import read_pyfg
 
@@ -79,19 +79,22 @@ def commas(folder: Path) -> None:
 
 
 CLAM: dict[str, tuple[Edit, str]] = {
-    "range and bearing swapped": (swapped("Measurement", 2, 3), r"^Robot1_Measurement.* must have a range > 0 m"),
+    "range and bearing swapped": (
+        swapped("Measurement", 2, 3),
+        r"^Robot1_Measurement.* must have a bearing within a turn",
+    ),
     "x and y swapped": (swapped("Groundtruth", 1, 2), r"robot1: fixes move -\d+ deg anticlockwise of the odometry"),
     "speed and yaw rate swapped": (swapped("Odometry", 1, 2), r"robot1: NIS is 9\.\d+, not 1"),
-    "decimal commas": (commas, r"^Robot1_Measurement.dat: line 1 = .* must hold 4 numbers a line"),
+    "decimal commas": (commas, r"^Robot1_Measurement.dat: line \d+ = .*must be time barcode range bearing"),
     "y flipped": (column("Groundtruth", 2, np.negative), r"robot1: fixes move \d+ deg anticlockwise"),
     "y and headings flipped": (
         both(column("Groundtruth", 2, np.negative), column("Groundtruth", 3, np.negative)),
         r"azimuths scatter by \d\d deg about the positions.*no axis is mirrored",
     ),
     "bearings clockwise": (column("Measurement", 3, np.negative), r"azimuths scatter by \d\d deg .*anticlockwise"),
-    "bearings in degrees": (column("Measurement", 3, np.degrees), r"^Robot1.*bearing within a turn, in rad"),
-    "headings in degrees": (column("Groundtruth", 3, np.degrees), r"^Robot1.*heading within a turn, in rad"),
-    "yaw rates in degrees": (column("Odometry", 2, np.degrees), r"^Robot\d_Odometry.*less than a turn a second"),
+    "bearings in degrees": (column("Measurement", 3, np.degrees), r"^Robot1.*bearing within a turn .*in rad"),
+    "headings in degrees": (column("Groundtruth", 3, np.degrees), r"^Robot1.*heading within a turn .*in rad"),
+    "yaw rates in degrees": (column("Odometry", 2, np.degrees), r"^Robot\d_Odometry.*turn_rate within a turn"),
     "ranges in feet": (column("Measurement", 2, lambda v: v / FOOT), r"ranges are 3\.\d+ times the .*in feet"),
     "positions in feet": (
         both(*(column("Groundtruth", k, lambda v: v / FOOT) for k in (1, 2))),

@@ -132,7 +132,7 @@ def test_tables_hold_vehicles_and_covariances(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,x\n0,1\n", r"a\.csv: column y = missing: must be there; the file has t, x"),
+        ("t,x\n0,1\n", r"a\.csv: column y = missing: columns t, x, y are needed; the file has t, x"),
         ("t,x,y\n0,1,2\n0,3,4\n", r"a\.csv: row 2 = 0.0 s: is there twice for a"),
         ("t,x,y\n0,1,two\n", r"row 1, column y"),
     ],

@@ -17,10 +17,9 @@ from filterpy.kalman import KalmanFilter
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.arrays import Bools, Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
-from coopoc.methods.adaptive import AdaptiveKalman
-from coopoc.methods.motion_history import MotionHistory
+from coopoc.methods.kalman import AdaptiveKalman
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
-from coopoc.methods.variational import VariationalKalman
+from coopoc.methods.stream import MotionHistory
 from coopoc.world.inbox import Inbox, inbox
 from coopoc.world.links import Links
 from coopoc.world.recording import Recording
@@ -35,7 +34,6 @@ SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
     "nominal": (Kalman("nominal"), Kalman(NoiseModel.nominal(S2)).start),
     "fitted": (Kalman(FITTED), Kalman(FITTED).start),
     "adaptive": (AdaptiveKalman(), AdaptiveKalman().start),
-    "variational": (VariationalKalman(), VariationalKalman().start),
     "okf": (OKF, OKF.start),
 }
 STARTS: dict[str, Callable[..., Any]] = {
@@ -319,7 +317,7 @@ def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str
     with pytest.raises(InputError, match=f"^{field} = "):
         one.step(**{"gnss": Z, "velocity": U, "dt": 0.1} | given)
     np.testing.assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
-    assert one.history.seen == other.history.seen
+    np.testing.assert_array_equal(one.history.rows, other.history.rows)
 
 
 def test_history_is_as_long_as_asked_for() -> None:
@@ -340,11 +338,11 @@ def test_the_motion_that_is_kept_is_its_integral() -> None:
     end, sums = np.append(0.0, np.cumsum(dt)), np.zeros((len(dt) + 1, 6))
     sums[1:] = np.cumsum(np.hstack([moved, variance]), axis=0)
     for k, step in enumerate(dt, start=1):
-        reach = history.reach(step)
         history.push(step, moved[k - 1], variance[k - 1])
-        assert history.seen == pytest.approx(reach) == pytest.approx(end[k] - end[k - len(history)])
-        assert history.seen == pytest.approx(end[k]) or history.seen - dt[k - len(history)] < 10.0 <= history.seen
-        for age in (0.0, 0.31 * history.seen, history.seen):
+        seen = history.rows[0, 2]
+        assert seen == pytest.approx(end[k] - end[k - len(history)])
+        assert seen == pytest.approx(end[k]) or seen - dt[k - len(history)] < 10.0 <= seen
+        for age in (0.0, 0.31 * seen, seen):
             since = sums[k] - [np.interp(end[k] - age, end, column) for column in sums.T]
             fix, late = history.forward([5.0, 0.0, -1.0], age)
             np.testing.assert_allclose([*(fix - [5.0, 0.0, -1.0]), *late], since, atol=1e-9)
@@ -414,9 +412,9 @@ def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
     command = [sys.executable, "-W", "error", ROOT / "examples" / "replay_log.py", *arguments, "--steps", "150"]
     out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert ("No log given" in out) == (log == "bundled")
-    rows = [line.split("  ") for line in out.splitlines() if line.startswith(("Kal", "adap", "vari", "OKF", "Fed"))]
+    rows = [line.split("  ") for line in out.splitlines() if line.startswith(("Kal", "adap", "OKF", "Fed"))]
     numbers = np.array([[float(word) for word in row[1:] if word.strip()] for row in rows])
-    assert numbers.shape == (7, 6)
+    assert numbers.shape == (6, 6)
     assert (numbers[:, :5] < 2.5 * np.sqrt(3)).all(), "better than the fixes, however bad the log is"
     assert (numbers[:, 5] > 50).all(), "steps per second"
 

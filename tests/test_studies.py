@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 import coopoc as co
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned.checkpoint import Checkpoint, load, save
 from coopoc.learned.method import LearnedGain

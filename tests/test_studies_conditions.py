@@ -14,7 +14,7 @@ from conftest import crossing_fleet, formation_fleet
 
 import coopoc as co
 from coopoc import InputError, Sensors, run_study
-from coopoc.data.table import write_table
+from coopoc.data.fleet_files import write_table
 from coopoc.evaluate.bounds import past_bound, posterior_bound
 from coopoc.learned.checkpoint import Checkpoint, save
 from coopoc.learned.nets.noise_net import NoiseNet

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import coopoc as co
-from coopoc.data.kinds import KINDS
+from coopoc.data.log.units import KINDS
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
 COOPOC = [sys.executable, "-W", "error", "-m", "coopoc.cli"]

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from ..methods.drift_state import Drift, drifting, require_white
+from ..methods.star import FORGOTTEN
 from ..world.axes import columns
 from ..world.fleet import Fleet
 from ..world.frames import body_motion, midway, true_heading, turned
@@ -366,21 +366,54 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
             bar.update()
 
 
+NO_ERROR = 1e-18
+"""m^2, variance of an error of the fixes that there is not."""
+
+
+def drifting(sensors: Sensors) -> bool:
+    """Whether fixes have time-correlated errors."""
+    return sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0
+
+
+def require_white(sensors: Sensors, what: str) -> None:
+    """InputError where fixes have time-correlated errors and `what` takes them as white."""
+    if drifting(sensors):
+        given = (sensors.gnss_drift_std, sensors.gnss_common_std)
+        hint = "Set them to 0, or take the filtering one."
+        raise InputError("gnss_drift_std, gnss_common_std", given, f"must be 0 for {what}", hint)
+
+
 def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> Iterator[tuple[int, Floats]]:
-    """Filtering bound (3n, 3n) where fixes have time-correlated errors, which the state then holds (`Drift`).
+    """Filtering bound (3n, 3n) where fixes have time-correlated errors: z = x + own + common + white noise.
+
+    The state holds position and own error of each member and the common error; an error is Gauss-Markov,
+    e_t = keep e_{t-1} + w.
 
     Args:
         stages: without the fixes, which do not see positions alone.
+        sensors: of the fixes.
+        dt: s.
     """
-    drift = Drift.of(sensors, dt)
-    cov: Floats = np.zeros((0, 0))
+    own, common = (max(std**2, NO_ERROR) for std in (sensors.gnss_drift_std, sensors.gnss_common_std))
+    keep, unit = float(np.exp(-dt / sensors.gnss_drift_time)), np.eye(3)
+    cov: Floats = common * unit
     for t, stage in enumerate(tqdm(stages, desc="bound", unit="step", delay=2.0)):
-        n, process = len(stage.members), np.diagonal(stage.process, axis1=1, axis2=2)
-        fix_matrix, weight = drift.fix_matrix(n), np.tile(1.0 / np.square(sensors.gnss_std), n)
-        information = np.linalg.inv(drift.carry(cov, stage.previous, process)) + (fix_matrix.T * weight) @ fix_matrix
-        information[: 3 * n, : 3 * n] += stage.gained
+        n = len(stage.members)
+        motion, noise = np.zeros((6 * n + 3, len(cov))), np.zeros(6 * n + 3)
+        motion[-3:, -3:], noise[-3:] = (keep * unit, common * (1 - keep**2)) if t else (unit, 0.0)
+        for k, before in enumerate(stage.previous):
+            position, error = slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)
+            noise[position], noise[error] = FORGOTTEN, own
+            if before >= 0:
+                motion[position, 6 * before : 6 * before + 3] = unit
+                motion[error, 6 * before + 3 : 6 * before + 6] = keep * unit
+                noise[position], noise[error] = np.diag(stage.process[k]), own * (1 - keep**2)
+        fixes = np.hstack([np.kron(np.eye(n), np.hstack([unit, unit])), np.tile(unit, (n, 1))])
+        weight, positions = np.tile(1.0 / np.square(sensors.gnss_std), n), _numbers(2 * np.arange(n), 3)
+        information = np.linalg.inv(motion @ cov @ motion.T + np.diag(noise)) + (fixes.T * weight) @ fixes
+        information[np.ix_(positions, positions)] += stage.gained
         cov = np.linalg.inv(information)
-        yield t, cov[: 3 * n, : 3 * n]
+        yield t, cov[np.ix_(positions, positions)]
 
 
 def _onward(cov: Floats, stage: Stage) -> Floats:

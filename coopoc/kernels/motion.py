@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats
+from ..arrays import Floats
 from .compiling.compile import compiled, inside
 
 ROUNDING = 1e-9
@@ -40,7 +41,7 @@ NO_MOTION_NOISE = MotionNoise(np.zeros(3), np.zeros(3), 0.0, 0.0, 0.0)
 
 
 @inside
-def process_variance(noise: MotionNoise, velocity: Any, dt: float) -> Any:
+def process_variance(noise: MotionNoise, velocity: Sequence[float] | Floats, dt: float) -> tuple[float, float, float]:
     """Variances m^2 of dt u on the three axes, of numbers or of vectors of them."""
     u, v, w = velocity[0], velocity[1], velocity[2]
     a, b, c = abs(u), abs(v), abs(w)
@@ -63,7 +64,7 @@ def process_variance(noise: MotionNoise, velocity: Any, dt: float) -> Any:
 
 
 @compiled
-def push(history: AnyArray, dt: float, moved: Any, variance: Any) -> None:
+def push(history: Floats, dt: float, moved: Floats, variance: Floats) -> None:
     """Add the newest step, and drop the oldest ones that are not needed to reach back as far as is asked for."""
     capacity = len(history) - 1
     first, count, seen = int(history[0, 0]), int(history[0, 1]), history[0, 2] + dt
@@ -79,7 +80,7 @@ def push(history: AnyArray, dt: float, moved: Any, variance: Any) -> None:
 
 
 @compiled
-def since(history: AnyArray, age: float, moved: AnyArray, variance: AnyArray) -> None:
+def since(history: Floats, age: float, moved: Floats, variance: Floats) -> None:
     """Motion (3,) m in the last `age` seconds and its variance (3,) m^2; of a step that is cut, its share."""
     capacity, left = len(history) - 1, age
     moved[:3], variance[:3] = 0.0, 0.0
@@ -92,23 +93,3 @@ def since(history: AnyArray, age: float, moved: AnyArray, variance: AnyArray) ->
             moved[c] += share * history[row, 1 + c]
             variance[c] += share * history[row, 4 + c]
         left -= history[row, 0]
-
-
-@compiled
-def bridge(x: AnyArray, variance: AnyArray, new: AnyArray, velocity: AnyArray, process: AnyArray, dt: float) -> None:
-    """Write dead reckoning where no fix is new: x + dt u m and its variance + q m^2, from the step before.
-
-    Args:
-        x: (R, T, N, 3) m, changed in place.
-        variance: (R, T, N, 3) m^2, changed in place.
-        new: (R, T, N).
-        velocity: (R, T, N, 3) m/s.
-        process: (R, T, N, 3) m^2.
-    """
-    for run in range(x.shape[0]):
-        for t in range(1, x.shape[1]):
-            for n in range(x.shape[2]):
-                if not new[run, t, n]:
-                    for i in range(3):
-                        x[run, t, n, i] = x[run, t - 1, n, i] + dt * velocity[run, t, n, i]
-                        variance[run, t, n, i] = variance[run, t - 1, n, i] + process[run, t, n, i]

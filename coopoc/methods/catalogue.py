@@ -6,24 +6,18 @@ from collections.abc import Callable, Mapping
 
 from ..one_file import in_file
 from ..plugins import find, names
-from .adaptive import AdaptiveKalman
+from .baselines import LKFSA, MSMV
 from .centralised import BatchSmoother, CentralFilter
-from .cooperative_map import CooperativeMAP
 from .covariance_intersection import CovarianceIntersection
 from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
-from .fixed_lag import FixedLagSmoother
-from .gnss import GNSS
 from .joint_filter import JointFilter
-from .kalman import Kalman
-from .lkf_sa import LKFSA
+from .kalman import GNSS, AdaptiveKalman, Kalman
 from .mds import MDS
-from .moving_horizon import MovingHorizon
-from .msmv import MSMV
 from .noise_model import NoiseModel
 from .qcqp_relaxation import QCQPRelaxation
+from .sliding_window import CooperativeMAP, FixedLagSmoother, MovingHorizon
 from .track import Method
-from .variational import VariationalKalman
 
 Factory = Callable[[NoiseModel | str], Method]
 """Noise model -> the method. A third party's entry point in `coopoc.methods` is one, too."""
@@ -32,7 +26,6 @@ METHODS: Mapping[str, Factory] = {
     "gnss": lambda noise_model: GNSS(),
     "kalman": lambda noise_model: Kalman(noise_model),
     "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
-    "kalman-variational": lambda noise_model: VariationalKalman(),
     "lkf-sa": lambda noise_model: LKFSA(noise_model),
     "lkf-sa-edge": lambda noise_model: JointFilter(noise_model, exact=False, name="lkf-sa-edge"),
     "msmv-r": lambda noise_model: MSMV(noise_model),

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from ..kernels.stars.intersection import follow
-from ..plugins import one_of
+from ..kernels.stars.intersection import run_filter
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
+from .baselines import solo_estimates
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
 from .options import check_options
-from .star import ACCELERATION_STD, estimates, measurements
+from .star import ESTIMATE_GROWTH, measurements
 from .track import Track
-
-Criterion = Literal["trace", "det"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +29,12 @@ class CovarianceIntersection:
     each other, which a GNSS error common to all would break. Because a used message may be used again, the newest one
     serves, brought forward with its velocity, until it is too old.
 
-    CI gains little where a neighbour knows the ego worse than the ego does: w is then 1.
+    The weight w makes the trace of the fused covariance least. CI gains little where a neighbour knows the ego worse
+    than the ego does: w is then 1.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         split: False for plain CI.
-        criterion: "trace" or "det" of the fused covariance, which the weight makes least.
 
     References:
         Julier, Uhlmann, General decentralized data fusion with covariance intersection, Handbook of Multisensor Data
@@ -49,14 +46,12 @@ class CovarianceIntersection:
 
     noise_model: NoiseModel | str = "nominal"
     split: bool = False
-    criterion: Criterion = "trace"
     name: str = "ci"
     cooperative: bool = True
     message: Message = ESTIMATE_AND_COV
 
     def __post_init__(self) -> None:
         check_options(self)
-        one_of("criterion", self.criterion, ("trace", "det"))
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.
@@ -66,12 +61,11 @@ class CovarianceIntersection:
         the weight would depend on the noise.
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
-        assumed, own = estimates(recording, known, columns, (1.0, 2.0), ACCELERATION_STD)
+        assumed, own = solo_estimates(recording, known, columns)
+        assumed = assumed._replace(growth=ESTIMATE_GROWTH)
 
-        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = follow(
-                measurements(recording, ego, box, own), assumed, self.split, self.criterion == "det"
-            )
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x, cov, theirs = run_filter(measurements(recording, ego, box, own), assumed, self.split)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
-        return follow_egos(self, recording, egos, drive, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, known.notes, missing=True)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..kernels.stars.drift import Drift
-from ..kernels.stars.joint_filter import follow
+from ..kernels.stars.drift import Drift, run_filter
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -17,8 +16,6 @@ from .noise_model import NoiseModel, resolve
 from .options import check_options
 from .star import assumptions, measurements
 from .track import Track
-
-POSITION_AND_DRIFT = (0.0,) * 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +51,8 @@ class DriftFilter:
         keep = float(np.exp(-recording.dt / sensors.gnss_drift_time))
         drift = Drift(float(sensors.gnss_drift_std**2), float(sensors.gnss_common_std**2), keep)
 
-        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            seen = measurements(recording, ego, box)
-            x, cov, neighbours = follow(seen, assumed, known.exact_relative, drift, POSITION_AND_DRIFT)
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, known.exact_relative, drift)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
-        return follow_egos(self, recording, egos, drive, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, known.notes, missing=True)

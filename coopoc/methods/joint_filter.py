@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
-from ..kernels.stars.joint_filter import follow
+from ..kernels.stars.joint_filter import run_filter
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
-from .noise_model import NoiseModel, resolve
+from .noise_model import NoiseModel, constant_noise, resolve
 from .options import check_options
-from .star import POSITION, assumptions, measurements
-from .star_stream import StarStream
-from .stream import alone
+from .star import assumptions, measurements
 from .track import Track
+
+if TYPE_CHECKING:
+    from .star_stream import StarStream
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,11 +53,11 @@ class JointFilter:
         known = resolve(self.noise_model, recording)
         assumed, refine = assumptions(recording, known), self.exact and known.exact_relative
 
-        def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = follow(measurements(recording, ego, box), assumed, refine, None, POSITION)
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, refine)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
-        return follow_egos(self, recording, egos, drive, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, known.notes, missing=True)
 
     def start(
         self,
@@ -84,5 +86,7 @@ class JointFilter:
         >>> float(x[0].round(3)), float(ego.neighbours["b"][0].round(3))  # 10 m apart by the fixes, 9 m as measured
         (0.333, 9.667)
         """
-        known = alone(self.noise_model)
+        from .star_stream import StarStream
+
+        known = constant_noise(self.noise_model)
         return StarStream(known, self.exact and known.exact_relative, x0, interval, history, max_age)

@@ -1,4 +1,4 @@
-"""The solo Kalman filter on position with measured velocity as input, over all runs and vehicles at once."""
+"""Solo methods: the raw fix, the Kalman filter on position, and the Kalman filter that estimates its GNSS noise."""
 
 from __future__ import annotations
 
@@ -12,14 +12,39 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.motion import MotionNoise
-from ..kernels.solo import Drive, FixNoise, drive
+from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
 from ..world.recording import Recording, check_recording
+from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
-from .noise_model import NoiseModel, resolve
+from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
 from .options import check_options
-from .stream import NO_VARIANCE, FilterStream, alone, motion_noise, process_noise
+from .stream import FilterStream
 from .track import Track
+
+ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
+"""Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
+
+
+@dataclass(frozen=True)
+class GNSS:
+    """The latest fix, x_t = z_t, with the assumed GNSS covariance; where there is none, the last one is held."""
+
+    name: str = "gnss"
+    cooperative: bool = False
+    message: Message = NO_MESSAGE
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent."""
+        began = time.perf_counter()
+        columns = check_recording(recording).columns(egos, missing=True)
+        fixes = recording.gnss[:, :, columns]
+        there = np.isfinite(fixes).all(axis=-1, keepdims=True)
+        newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)
+        x, missing = np.take_along_axis(fixes, newest, axis=1), 100 * (1 - there.mean())
+        notes = (f"holds the last fix where there is none: {missing:.0f} % of the steps",) if missing else ()
+        variance = np.broadcast_to(np.square(recording.sensors.gnss_std), x.shape)
+        return solo_track(recording, columns, x, variance, began, notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +77,8 @@ class Kalman:
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos, missing=True)
         known = resolve(self.noise_model, recording, relative=False)
-        x, p, _ = filtered(drive_of(recording, known, columns), FixNoise(known.gnss_variance), self.x0)
-        return axis_track(recording, columns, x, p, began)
+        x, p, _ = solo_filter(recording, columns, known, FixNoise(known.gnss_variance), self.x0)
+        return solo_track(recording, columns, x, p, began)
 
     def start(
         self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
@@ -72,11 +97,85 @@ class Kalman:
         >>> x.tolist(), covariance.trace()
         ([1.0, 2.0, 0.0], np.float64(3.0))
         """
-        known = alone(self.noise_model)
+        known = constant_noise(self.noise_model)
         return FilterStream(motion_noise(known, interval), FixNoise(known.gnss_variance), x0, history)
 
 
-def axis_track(
+@dataclass(frozen=True, eq=False)
+class AdaptiveKalman:
+    """Kalman filter whose GNSS variance r is estimated from its innovations, per axis.
+
+    With innovation v of variance p + r, p that of the prediction: r <- r + (v^2 - p - r) / n, n <- min(n + 1, window).
+    So r is the mean of v^2 - p over all fixes and `prior_weight` fixes of the assumed variance, and once there are
+    `window` it forgets exponentially. The process noise follows the measured velocity as in NoiseModel.nominal. A bias
+    that is there from the first fix on does not show in innovations.
+
+    A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in r
+    and a part from motion. When r is revised, the past is reread with it: a start at a fix that was believed too good,
+    or too bad, does no lasting harm.
+
+    Args:
+        assumed: velocity noise (ratio, reading per axis or speed, floor), and the GNSS std to start from.
+        prior_weight: fixes that this start counts for; inf keeps it for ever.
+        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        window: fixes; inf never forgets.
+
+    References:
+        Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
+        `town10-validation` (docs/methods.md).
+
+    >>> from coopoc import Fleet, observe
+    >>> fleet = Fleet(("a",), np.arange(400) / 10, np.zeros((400, 1, 3)), np.zeros((400, 1, 3)))
+    >>> seen = observe(fleet, Sensors(gnss_std=(3.5, 3.5, 3.5)), runs=50)
+    >>> bool(abs(AdaptiveKalman().gnss_std(seen)[:, -1].mean() - 3.5) < 0.1)
+    True
+    """
+
+    assumed: Sensors = ASSUMED
+    prior_weight: float = 5.0
+    x0: Floats | None = None
+    window: float = 100.0
+    name: str = "kalman-adaptive"
+    cooperative: bool = False
+    message: Message = NO_MESSAGE
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        for field in ("prior_weight", "window"):
+            if not (value := getattr(self, field)) > 0:
+                raise InputError(field, value, "must be > 0", "Use infinity for never.")
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
+        x, p, _ = solo_filter(recording, columns, NoiseModel.nominal(self.assumed), self._fixes, self.x0)
+        of = "each axis" if self.assumed.velocity_reading == "axis" else "the speed"
+        share, floor = 100 * self.assumed.velocity_std_ratio, self.assumed.velocity_floor
+        note = f"assumes velocity noise of {share:g} % of {of}, at least {floor:g} m/s"
+        return solo_track(recording, columns, x, p, began, (note,))
+
+    def start(
+        self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
+    ) -> FilterStream:
+        """Start the filter for one step at a time, as `Kalman.start`; `state.noise` is the estimated variance."""
+        return FilterStream(motion_noise(NoiseModel.nominal(self.assumed), interval), self._fixes, x0, history)
+
+    def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
+        """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
+        columns = check_recording(recording).columns(egos, missing=True)
+        known = NoiseModel.nominal(self.assumed)
+        noise = solo_filter(recording, columns, known, self._fixes, self.x0)[2]
+        assumed = np.broadcast_to(known.gnss_variance, (recording.runs, len(recording.t), len(egos), 3))
+        return np.sqrt(noise if noise.size else assumed)
+
+    @property
+    def _fixes(self) -> FixNoise:
+        return FixNoise(NoiseModel.nominal(self.assumed).gnss_variance, float(self.prior_weight), float(self.window))
+
+
+def solo_track(
     recording: Recording, columns: Sequence[int], x: Floats, p: Floats, began: float, notes: tuple[str, ...] = ()
 ) -> Track:
     """Track of a solo filter with the variances p (R, T, E, 3) m^2; it receives and sends nothing."""
@@ -85,31 +184,36 @@ def axis_track(
     return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes)
 
 
-def drive_of(recording: Recording, known: NoiseModel | MotionNoise, columns: npt.ArrayLike) -> Drive:
-    """What the solo filters of some vehicles run over, with the process noise of a noise model or of the velocity."""
-    process, motion = (NO_VARIANCE, known) if isinstance(known, MotionNoise) else process_noise(known, recording)
-    gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
-    return Drive(gnss, velocity, np.broadcast_to(process, gnss.shape), motion, np.asarray(columns), recording.dt)
-
-
-def filtered(seen: Drive, fixes: FixNoise, x0: Floats | None = None) -> tuple[Floats, Floats, Floats]:
+def solo_filter(
+    recording: Recording,
+    columns: npt.ArrayLike,
+    noise: NoiseModel | MotionNoise,
+    fixes: FixNoise,
+    x0: Floats | None = None,
+) -> tuple[Floats, Floats, Floats]:
     """Run a solo filter axis by axis: all covariances are diagonal, so that the three axes do not couple.
 
     Args:
-        seen: measurements, and which vehicles are filtered.
-        fixes: noise of the fixes, known or revised.
+        recording: of all vehicles.
+        columns: (E,) vehicles that are filtered.
+        noise: of the motion.
+        fixes: noise of the fixes, known or estimated.
         x0: (..., E, 3) m, exact at step 0; None starts at the first fix.
 
     Returns:
-        Position m, variance m^2, and believed variance of a fix m^2 (of no length where it is known), (R, T, E, 3).
+        Position m, variance m^2, and estimated variance of a fix m^2 (of no length where it is known), (R, T, E, 3).
 
     Raises:
         InputError: x0 of another shape.
     """
-    shape = *seen.gnss.shape[:2], len(seen.columns), 3
+    process, motion = (NO_VARIANCE, noise) if isinstance(noise, MotionNoise) else process_noise(noise, recording)
+    gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
+    columns = np.asarray(columns)
+    seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, gnss.shape), motion, columns, recording.dt)
+    shape = *gnss.shape[:2], len(columns), 3
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
     x, p = np.empty(shape), np.empty(shape)
     if x0 is not None:
         x[:, 0] = x0
-    return x, p, drive(seen, fixes, x0 is not None, np.arange(shape[2]), x, p)
+    return x, p, run_filter(seen, fixes, x0 is not None, x, p)

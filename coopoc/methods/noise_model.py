@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, checked, instance
+from ..arrays import Floats, checked, instance, number
 from ..errors import InputError
+from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
 from ..plugins import suggestion
 from ..short_repr import short_repr
 from ..world.axes import check_texts, texts
@@ -111,12 +113,6 @@ class NoiseModel:
             np.square(recording.dt * self.sensors.velocity_std(one, floor), out=variance[run])
         return variance
 
-    @property
-    def follows_measured_velocity(self) -> bool:
-        """Whether the process noise is constant or that of the measured velocity, so that `motion_noise` describes it;
-        if not, `process_variance` alone does."""
-        return type(self).process_variance is NoiseModel.process_variance and self.velocity is None
-
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
         return self.gnss_variance[None, None, None]
@@ -138,6 +134,7 @@ class NoiseModel:
         return vector_cov(relative, self.sensors.relative_std, self.sensors.min_range)
 
 
+NO_VARIANCE: Floats = np.zeros((1, 1, 1, 3))
 FINEST = 1e-5
 """Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
 beside 1 leaves the fixes six of double precision's sixteen digits."""
@@ -150,7 +147,7 @@ UNEVEN = 3e-7
 components: information that is large in one direction and small in another loses the small one's digits, too."""
 
 
-def resolve(noise_model: NoiseModel | str, recording: Recording, relative: bool = True) -> NoiseModel:
+def resolve(noise_model: NoiseModel | str, recording: Recording | None, relative: bool = True) -> NoiseModel:
     """A NoiseModel itself, or `identity` / `nominal` by name from the recording's sensors; none finer than FINEST, and
     no range finer than its direction allows (`_with_range_floor`).
 
@@ -230,6 +227,46 @@ def _resolvable(known: NoiseModel) -> NoiseModel:
     beside = f"finer ones beside a fix of {max(known.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
     return replace(known, sensors=replace(known.sensors, **raised), notes=(*known.notes, note))
+
+
+def constant_noise(noise_model: NoiseModel | str) -> NoiseModel:
+    """The noise model of a filter without a recording: "identity" or a NoiseModel of constant noise, which needs
+    none."""
+    model = noise_model if isinstance(noise_model, NoiseModel) else None
+    if noise_model == "nominal" or (model and (type(model) is not NoiseModel or model.velocity is not None)):
+        raise InputError(
+            "noise_model",
+            repr(model.name if model else noise_model),
+            "needs a recording, and a stream has none",
+            "Pass NoiseModel.nominal(Sensors(...)), a fitted NoiseModel or 'identity'.",
+        )
+    return resolve(noise_model, None)
+
+
+def motion_noise(known: NoiseModel, interval: float | None) -> MotionNoise:
+    """White motion noise as `known` assumes it of a recording with dt = `interval` s; None for the dt of each step."""
+    interval = 0.0 if interval is None else check_interval(interval)
+    if known.process_std is not None:
+        return MotionNoise(np.array(known.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
+    assert known.sensors is not None
+    ratio, of_speed = np.full(3, known.sensors.velocity_std_ratio), known.sensors.velocity_reading == "speed"
+    return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), interval)
+
+
+def process_noise(known: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
+    """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity.
+
+    It is that of the measured velocity where it is constant or follows it, else `process_variance` alone."""
+    if type(known).process_variance is NoiseModel.process_variance and known.velocity is None:
+        return NO_VARIANCE, motion_noise(known, None)
+    return np.ascontiguousarray(known.process_variance(recording)), NO_MOTION_NOISE
+
+
+def check_interval(interval: float) -> float:
+    """The interval, s; InputError unless it is finite and > 0."""
+    hint = "The dt that the noise belongs to."
+    checked: float = number("interval", interval, sys.float_info.min, allowed="finite and > 0", hint=hint)
+    return checked
 
 
 def _three(values: Floats) -> tuple[float, float, float]:

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Ints
 from ..optimize.convex.relaxation import shor
 from ..optimize.model.problem import Problem
 from ..optimize.solve import solve
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .bridge import bridge
 from .egos import Estimate, follow_egos
+from .mds import bridged_stars, bridging_note
 from .noise_model import NoiseModel, resolve
 from .options import check_options
-from .star import StarStep, star_steps
+from .star import StarStep
 from .track import Track
 
 
@@ -54,42 +54,38 @@ class QCQPRelaxation:
         Raises:
             MissingLibraryError: Clarabel is not installed.
         """
-        recording, known, notes = bridge(recording, resolve(self.noise_model, recording))
+        known = resolve(self.noise_model, recording)
         tight: list[bool] = []
 
-        def follow(ego: int, box: Inbox) -> Iterator[Estimate]:
-            for star in star_steps(recording, ego, box, known):
-                held = box.newest[:, box.start[star.step] : box.start[star.step + 1]] >= 0
-                held &= np.isfinite(star.relative[..., 0])
-                points, covariance = np.full_like(star.fix, np.nan), np.empty((recording.runs, 3, 3))
+        def run_ego(ego: int, box: Inbox) -> Iterator[Estimate]:
+            for star, sent in bridged_stars(recording, ego, known, self.message, box):
+                used = (sent >= 0) & np.isfinite(star.relative[..., 0])
+                points, covariance = np.full_like(star.position, np.nan), np.empty((recording.runs, 3, 3))
                 for run in range(recording.runs):
-                    members = np.concatenate([[0], 1 + np.flatnonzero(held[run])])
-                    points[run, members], covariance[run] = _locate(range_star(star, run, members, known), tight)
-                yield Estimate(star.step, points[:, 0], covariance, star.links, points[:, 1:])
+                    members = np.append(0, 1 + np.flatnonzero(used[run]))
+                    problem = range_star(star, run, members, known)
+                    if len(members) > 1:
+                        relaxed = shor(problem)
+                        assert relaxed.solution is not None
+                        solution = relaxed.solution
+                        tight.append(relaxed.tight)
+                    else:
+                        solution = solve(problem)
+                    points[run, members], covariance[run] = solution.x, solution.covariance[0]
+                yield Estimate(star.step, points[:, 0], covariance, star.link, points[:, 1:])
 
-        track = follow_egos(self, recording, egos, follow, missing=True)
-        return replace(track, notes=(f"{sum(tight)} of {len(tight)} relaxations were tight", *known.notes, *notes))
-
-
-def _locate(problem: Problem, tight: list[bool]) -> tuple[Floats, Floats]:
-    """Points (n, 3) and the ego's covariance (3, 3); whether the relaxation was tight is appended."""
-    if len(problem.names) == 1:
-        solution = solve(problem)
-    else:
-        relaxed = shor(problem)
-        assert relaxed.solution is not None
-        solution = relaxed.solution
-        tight.append(relaxed.tight)
-    return solution.x, solution.covariance[0]
+        track = follow_egos(self, recording, egos, run_ego, missing=True)
+        share = f"{sum(tight)} of {len(tight)} relaxations were tight"
+        return replace(track, notes=(share, *known.notes, *bridging_note(recording)))
 
 
 def range_star(star: StarStep, run: int, members: Ints, known: NoiseModel) -> Problem:
     """Fixes of these members and the ego's ranges to them in one run, the ego first; no angles."""
-    variance = np.broadcast_to(star.fix_variance, star.fix.shape)[run, members]
     problem = Problem(tuple(map(str, range(len(members)))), separator=(0,))
-    problem = problem.add("position", list(range(len(members))), star.fix[run, members], std=np.sqrt(variance))
+    std = np.sqrt(star.variance[run, members])
+    problem = problem.add("position", list(range(len(members))), star.position[run, members], std=std)
     if len(members) == 1:
         return problem
-    std = 1.0 if known.sensors is None else known.sensors.range_std
+    range_std = 1.0 if known.sensors is None else known.sensors.range_std
     pairs = [(0, j) for j in range(1, len(members))]
-    return problem.add("range", pairs, star.relative[run, members[1:] - 1, :1], std=std)
+    return problem.add("range", pairs, star.relative[run, members[1:] - 1, :1], std=range_std)

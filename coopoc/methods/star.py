@@ -1,103 +1,143 @@
-"""The star around one ego, step by step: its members, their places before, and their newest messages."""
+"""The star of an ego and its neighbours, step by step: their newest messages, brought forward, and what is measured."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..kernels.solo import FixNoise, drive
 from ..kernels.stars.messages import Assumptions, Measurements
 from ..kernels.stars.relative import components
-from ..world.inbox import Inbox
-from ..world.recording import Recording
-from ..world.spherical import to_vector
-from .kalman import drive_of
-from .noise_model import NoiseModel
-from .stream import process_noise
+from ..world.inbox import Inbox, inbox
+from ..world.recording import Recording, check_recording
+from ..world.v2x import FIX_AND_VELOCITY, Message
+from .noise_model import NoiseModel, process_noise, resolve
 
 FORGOTTEN = 1e6
 """m^2, prior variance of a vehicle that has just joined: nothing is known of it."""
 ACCELERATION_STD = 1.0
 """m/s^2, how fast a velocity may have changed since the message that carried it."""
-
-
+FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
+"""(a, b): after `age` steps a position has gained age (a age + b) times the variance of one step. A fix that is moved
+with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
 POSITION = (0.0,) * 3
 """A state that is a position: its size, for compiled code."""
 
 
 @dataclass(frozen=True, eq=False)
 class StarStep:
-    """Information of one ego at one step about the n members of its star, itself first.
+    """What an ego knows of the n members of its star at a step, itself first; R runs.
 
     Args:
         step: t.
+        member: (n,) columns.
         previous: (n,) index of each member in the previous star, -1 if it has just joined.
-        links: (n-1,) indices into the Recording's links.
-        relative: (R, n-1, 3) m, rad, rad.
-        vector: (R, n-1, 3) m, converted.
-        moved: (R, n, 3) m, dt times the latest velocity held.
-        process: (R or 1, n, 3) m^2 of that motion.
-        fix: (R, n, 3) m, GNSS brought forward to this step.
-        fix_variance: (R or 1, n, 3) m^2.
-        new_fix: (R, n) True where that fix is new.
+        link: (n-1,) indices into the Recording's links.
+        moved: (R, n, 3) m, dt times the newest velocity held, 0 for none.
+        process: (R, n, 3) m^2, variance of that motion.
+        position: (R, n, 3) m as broadcast, brought forward to this step; 0 if none is held.
+        variance: (R, n, 3) m^2 of it, infinite if none is held.
+        new: (R, n) True where that position counts: it has not been used before.
+        relative: (R, n-1, 3) range m, azimuth rad, inclination rad; NaN where not measured.
     """
 
     step: int
+    member: Ints
     previous: Ints
-    links: Ints
-    relative: Floats
-    vector: Floats
+    link: Ints
     moved: Floats
     process: Floats
-    fix: Floats
-    fix_variance: Floats
-    new_fix: Bools
+    position: Floats
+    variance: Floats
+    new: Bools
+    relative: Floats
 
 
-def star_steps(
-    recording: Recording, ego: int, box: Inbox, noise_model: NoiseModel, steps: range | None = None
+def stars(
+    recording: Recording,
+    ego: int | str,
+    noise_model: NoiseModel | str = "nominal",
+    message: Message = FIX_AND_VELOCITY,
+    *,
+    sent: tuple[Floats, Floats] | None = None,
+    growth: tuple[float, float] = FIX_GROWTH,
+    acceleration_std: float = ACCELERATION_STD,
 ) -> Iterator[StarStep]:
-    """The ego's star at every step, or as if only `steps` in a row had been, with the newest message of each
-    member.
+    """The ego's star at every step of a recording, all runs at once: start a cooperative filter here.
 
-    A fix sent `age` steps ago is brought forward with the velocity that came with it. A velocity that is used for the
-    n-th step in a row makes the same error n times, not n independent ones: the variance of the sum is n^2, so this
-    step adds (2n - 1) times the variance of one. Nothing is assumed of a member without messages.
+    The newest message that has arrived counts. Its velocity moves its sender until the next one; its position, sent
+    `age` steps ago, is brought forward with that velocity and used once. A velocity that serves for the n-th step in a
+    row makes the same error n times: the variance of the sum is n^2 of that of one step, so this step adds 2 n - 1 of
+    it. Nothing is known of a member without messages.
+
+    Args:
+        recording: measurements and messages.
+        ego: column or id.
+        noise_model: "identity", "nominal" or a NoiseModel.
+        message: what each vehicle broadcasts.
+        sent: (R, T, N, 3) m and m^2, estimates and variances that are sent in place of fixes.
+        growth: of the variance with the age.
+        acceleration_std: m/s^2, change of a velocity since it was sent.
+
+    >>> from coopoc import Fleet, Sensors, V2X, observe
+    >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
+    >>> [star.member.tolist() for star in stars(observe(fleet, Sensors(), V2X()), "a")]
+    [[0, 1], [0, 1]]
     """
-    variance, fixes = noise_model.process_variance(recording), noise_model.fix_variance(recording)
-    before, before_sent = np.array([], dtype=np.int64), np.empty((recording.runs, 0), dtype=np.int64)
-    uses = np.ones((recording.runs, 0), dtype=np.int64)
-    for t in range(len(recording.t)) if steps is None else steps:
-        span = slice(box.start[t], box.start[t + 1])
-        links = box.link[span]
-        members = np.concatenate([[ego], recording.links.neighbour[links]])
-        previous = np.array([_place(before, m) for m in members])
-        own = np.full((recording.runs, 1), t)
-        sent = np.concatenate([own, box.newest[:, span]], axis=1)
-        again = (previous >= 0) & (np.append(before_sent, own * 0 - 2, axis=1)[:, previous] == sent)
-        uses = np.where(again, np.append(uses, own, axis=1)[:, previous] + 1, 1)
-        motion = _prompt if (sent == t).all() else held_motion
-        moved, process, fix, fix_variance = motion(recording, variance, members, sent, uses, t)
-        relative = recording.relative[:, links]
-        there: Bools = np.asarray(np.isfinite(fix).all(axis=-1))
-        new_fix = np.concatenate([own >= 0, box.fresh[:, span]], axis=1) & there
-        fix = np.where(there[..., None], fix, 0.0)
+    known, ego = resolve(noise_model, recording), check_recording(recording).columns([ego], missing=True)[0]
+    box, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
+    q = np.broadcast_to(known.process_variance(recording), shape)
+    r = np.broadcast_to(known.fix_variance(recording), shape)
+    fixes, variances = sent or (recording.gnss, r)
+    variances = np.broadcast_to(variances, shape)
+    run, each = np.arange(recording.runs)[:, None], np.ones((recording.runs, 1), dtype=np.int64)
+    member, newest, uses = np.empty(0, np.int64), 0 * each[:, :0], 0 * each[:, :0]
+    for t in range(len(recording.t)):
+        here = slice(box.start[t], box.start[t + 1])
+        before, member = member, np.append(ego, recording.links.neighbour[box.link[here]])
+        same = np.pad(member[:, None] == before, ((0, 0), (0, 1)), constant_values=True)
+        previous = np.where(same[:, :-1].any(axis=1), same.argmax(axis=1), -1)
+        last, newest = np.append(newest, -2 * each, axis=1), np.append(t * each, box.newest[:, here], axis=1)
+        served = np.append(uses, each, axis=1)[:, previous]
+        uses = np.where((previous >= 0) & (last[:, previous] == newest), served + 1, 1)
+        held, s = newest >= 0, np.where(newest >= 0, newest, t)
+        age = (t - s)[..., None]
+        step_variance = q[run, s, member] + (dt**2 * age * acceleration_std) ** 2
+        moved = np.where(held[..., None], dt * recording.velocity[run, s, member], 0.0)
+        position, variance = fixes[run, s, member] + age * moved, variances[run, s, member]
+        variance = variance + age * (growth[0] * age + growth[1]) * step_variance
+        position[:, 0], variance[:, 0] = recording.gnss[:, t, ego], r[:, t, ego]
+        known_position: Bools = held & np.isfinite(position).all(axis=-1)
         yield StarStep(
             t,
+            member,
             previous,
-            links,
-            relative,
-            to_vector(relative),
+            box.link[here],
             moved,
-            process,
-            fix,
-            _when_sent(fixes, members, sent, t) + fix_variance,
-            new_fix,
+            np.where(held[..., None], (2 * uses - 1)[..., None] * step_variance, FORGOTTEN),
+            np.where(known_position[..., None], position, 0.0),
+            np.where(known_position[..., None], variance, np.inf),
+            np.append(each > 0, box.fresh[:, here], axis=1) & known_position,
+            recording.relative[:, box.link[here]],
         )
-        before, before_sent = members, sent
+
+
+def bridged(recording: Recording, known: NoiseModel) -> tuple[Floats, Floats]:
+    """All fixes (R, T, N, 3) m and their variances m^2, broadcastable to them; a missing one is the last one moved by
+    odometry, z_t = z_{t-1} + dt u_t, whose variance has grown by the process noise."""
+    x, variance = recording.gnss, np.ascontiguousarray(known.fix_variance(recording))
+    if recording.complete:
+        return x, variance
+    x, variance = x.copy(), np.broadcast_to(variance, x.shape).copy()
+    process, missing = np.broadcast_to(known.process_variance(recording), x.shape), np.isnan(x)
+    for t in range(1, x.shape[1]):
+        gap, moved = missing[:, t], recording.dt * recording.velocity[:, t]
+        x[:, t] = np.where(gap, x[:, t - 1] + moved, x[:, t])
+        variance[:, t] = np.where(gap, variance[:, t - 1] + process[:, t], variance[:, t])
+    x.flags.writeable = False  # as the fixes are, for the same compiled code
+    return x, variance
 
 
 def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
@@ -129,82 +169,13 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 
 
 def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
-    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity,
-    whose error the fix of `age` steps ago has made age times."""
+    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
+    velocity."""
     (process, motion), fixes = process_noise(known, recording), np.ascontiguousarray(known.fix_variance(recording))
     noise = relative_noise(known)
-    return Assumptions(process, fixes, fixes, (1.0, 0.0), *noise, FORGOTTEN, ACCELERATION_STD, motion)
-
-
-def estimates(
-    recording: Recording, known: NoiseModel, egos: Sequence[int], growth: tuple[float, float], acceleration: float
-) -> tuple[Assumptions, Floats]:
-    """Assumptions of a filter whose messages hold estimates, and these: the solo filters (R, T, N, 3) m of all vehicles
-    in the stars of some egos.
-
-    Args:
-        recording: of all vehicles.
-        known: the noise model.
-        egos: columns.
-        growth: as in `Assumptions`.
-        acceleration: m/s^2.
-    """
-    links, x, p = recording.links, np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)
-    members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    drive(drive_of(recording, known, members), FixNoise(known.gnss_variance), False, members, x, p)
-    grown = assumptions(recording, known)._replace(broadcast=p, growth=growth, acceleration=acceleration)
-    return grown, x
+    return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
 
 
 def relative_noise(known: NoiseModel) -> tuple[Floats, float]:
     """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
     return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
-
-
-def _prompt(
-    recording: Recording, variance: Floats, members: Ints, sent: Ints, uses: Ints, t: int
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Motion, its variance, fix and the variance added to it, when every message was sent at this step."""
-    row = variance[:, t if variance.shape[1] > 1 else 0]
-    process = row[:, members] if row.shape[1] > 1 else np.repeat(row, len(members), axis=1)
-    moved = recording.dt * recording.velocity[:, t, members]
-    return moved, process, recording.gnss[:, t, members], np.zeros((1, len(members), 1))
-
-
-def held_motion(
-    recording: Recording, variance: Floats, members: Ints, sent: Ints, uses: Ints, t: int
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """The same four from the newest message of each run and member, as old as it may be."""
-    held = (sent >= 0)[..., None]
-    at, age = np.where(sent >= 0, sent, t), (t - sent)[..., None]
-    runs = np.arange(recording.runs)[:, None]
-    velocity = recording.velocity[runs, at, members]
-    one_step = np.broadcast_to(variance, recording.velocity.shape)[runs, at, members]
-    one_step = one_step + (recording.dt**2 * age * ACCELERATION_STD) ** 2
-    moved = np.where(held, recording.dt * velocity, 0.0)
-    process = np.where(held, (2 * uses[..., None] - 1) * one_step, FORGOTTEN)
-    fix = recording.gnss[runs, at, members] + np.where(held, age * moved, 0.0)
-    return moved, process, fix, np.where(held, age**2 * one_step, 0.0)
-
-
-def _when_sent(variance: Floats, members: Ints, sent: Ints, t: int) -> Floats:
-    """(R or 1, n or 1, 3) assumed variance of each fix, broadcastable to (R, T, N, 3), when it was sent."""
-    if variance.shape[:3] == (1, 1, 1):
-        return np.asarray(variance[0])
-    runs = np.arange(len(sent))[:, None]
-    whole = np.broadcast_to(variance, (len(sent), *variance.shape[1:]))
-    return np.asarray(whole[runs, np.where(sent >= 0, sent, t), members])
-
-
-def rows(members: Ints) -> Ints:
-    """Rows of the members' three components in a stacked state.
-
-    >>> rows(np.array([0, 2])).tolist()
-    [0, 1, 2, 6, 7, 8]
-    """
-    return np.asarray(3 * members[:, None] + np.arange(3)).ravel()
-
-
-def _place(members: Ints, member: int) -> int:
-    where = np.flatnonzero(members == member)
-    return int(where[0]) if len(where) else -1

@@ -12,23 +12,25 @@ import numpy.typing as npt
 from ..arrays import Floats, Ints
 from ..errors import InputError
 from ..kernels.motion import NO_MOTION_NOISE
-from ..kernels.solo import ESTIMATE, HISTORY_FULL, NO_FIX_YET
+from ..kernels.solo import ESTIMATE, NO_FIX_YET
 from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.star_stream import (
     FIX,
+    LAST_AGE,
     MESSAGE,
     MESSAGE_AGE,
+    PREVIOUS,
     RELATIVE,
     VELOCITY,
+    WIDTH,
     Noise,
     packed,
     resized,
     stream_step,
 )
-from .motion_history import PLAIN, MotionHistory, check_step, fix_or_none, names_of, numbers, seconds, three
-from .noise_model import NoiseModel
-from .star import ACCELERATION_STD, FORGOTTEN, relative_noise
-from .stream import motion_noise
+from .noise_model import NoiseModel, motion_noise
+from .star import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, relative_noise
+from .stream import MotionHistory, fix_or_none, names_of, numbers, seconds, three
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +71,7 @@ class RelativeMeasurement:
 
 
 class StarStream:
-    """The joint filter, fed step by step: like `Stream`, with the neighbours that are measured at each step.
+    """The joint filter, fed step by step: like `FilterStream`, with the neighbours that are measured at each step.
 
     The neighbours measured now are in the star. Between messages a neighbour moves with the velocity of its newest one
     until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
@@ -95,49 +97,29 @@ class StarStream:
     ) -> None:
         motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
         assumed = Assumptions(
-            fixes, fixes, fixes, (1.0, 0.0), *relative_noise(known), FORGOTTEN, ACCELERATION_STD, NO_MOTION_NOISE
+            fixes, fixes, fixes, FIX_GROWTH, *relative_noise(known), FORGOTTEN, ACCELERATION_STD, NO_MOTION_NOISE
         )
-        self.max_age = seconds("max_age", max_age)
-        self._noise = packed(Noise(motion, assumed, float(max_age), refine))
-        self.history = MotionHistory(history)
-        self.slots: dict[str, int] = {}
-        self.members: list[str] = []
-        self._given, self._answer, self._free = np.zeros(12), np.zeros(12), list[int]()
+        self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
+        self._noise = packed(Noise(motion, assumed, self.max_age, refine))
+        self._members: dict[str, int] = {}
+        self._messages: dict[str, tuple[Floats, float]] = {}
+        self._time, self._size = 0.0, 0
+        self._given, self._answer = np.zeros(12), np.zeros(12)
         if x0 is not None:
             self._given[8:11], self._given[11] = three("x0", x0), 1.0
-        self._numbers: Floats = np.zeros(0)
-        self._index, self._last = np.zeros(2, np.int64), np.zeros((0, 5))
+        self._memory: Floats = np.zeros(0)
+        self._columns: Ints = np.zeros(0, np.int64)
         self._reserve(8)
 
     def _reserve(self, most: int) -> None:
-        """Room for `most` members of the star."""
-        size, place = self._index[:2].copy(), self._place
-        self._numbers = resized(self._numbers, size, most)
-        self._index = np.concatenate([[size[0], most], np.zeros(3 * most, np.int64), place])
-        self._inbox = np.zeros((most, 12))
-
-    @property
-    def _place(self) -> Ints:
-        return self._index[2 + 3 * self._index[1] :]
-
-    def _slot(self, name: str, names: Sequence[str]) -> int:
-        """A row for a vehicle that is not known, or no longer."""
-        if not self._free:
-            last, place = self._last, self._place
-            old = [n for n, k in self.slots.items() if last[k, 3] > self.max_age and place[k] < 0 and n not in names]
-            self._free = [self.slots.pop(n) for n in old]
-        if not self._free:
-            more = max(16, len(last))
-            self._free = list(range(len(last), len(last) + more))
-            self._last, self._index = np.pad(last, ((0, more), (0, 0))), np.append(self._index, np.full(more, -1))
-        slot = self.slots[name] = self._free.pop()
-        self._last[slot] = (0.0, 0.0, 0.0, np.inf, 0.0)
-        return slot
+        """Room for `most` members of the star, with the state and the information of the last one."""
+        self._memory = resized(self._memory, self._size, len(self._columns) // 3, most)
+        self._columns, self._rows = np.zeros(3 * most, np.int64), np.zeros((most, WIDTH))
 
     @property
     def neighbours(self) -> dict[str, Floats]:
         """Positions (3,) m of the neighbours in the star."""
-        return dict(zip(self.members, self._answer[12:].reshape(-1, 3).copy(), strict=True))
+        return dict(zip(self._members, self._answer[12:].reshape(-1, 3).copy(), strict=True))
 
     def step(
         self,
@@ -157,40 +139,45 @@ class StarStream:
             neighbours: the relative measurements of now, one for each neighbour.
 
         Raises:
-            InputError: as `Stream.step`; a neighbour that is given twice. The filter is then as it was before.
+            InputError: as `FilterStream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
-        names, given = names_of("neighbours", neighbours, RelativeMeasurement), self._given
-        if not (isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN):
-            check_step(gnss, velocity, dt, fix_age, self.history)
-        try:
-            if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
-                check_step(gnss, velocity, dt, fix_age, self.history)
-            given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-        except Exception:  # a class from elsewhere may raise anything
-            check_step(gnss, velocity, dt, fix_age, self.history)
-            raise
-        k = len(names)
-        if k >= self._index[1]:
-            self._reserve(2 * (k + 1))
-        for i, one in enumerate(neighbours):
-            self._inbox[i, :11] = one.row
-        slots = [self.slots.get(name, -1) for name in names]
-        if -1 in slots:
-            slots = [self._slot(name, names) if slot < 0 else slot for name, slot in zip(names, slots, strict=True)]
-        self._inbox[:k, 11] = slots
-        answer = np.empty(12 + 3 * k)
-        found = self._run(answer, k)
-        while found == HISTORY_FULL:
-            self.history.grow()
-            found = self._run(answer, k)
-        if found == NO_FIX_YET:
+        names = names_of("neighbours", neighbours, RelativeMeasurement)
+        self.history.write(self._given, gnss, velocity, dt, fix_age)
+        rows, answer = self._fill(names, neighbours), np.empty(12 + 3 * len(names))
+        memory, history = self._memory, self.history.reserve()
+        outcome = stream_step(self._given, rows, memory, self._columns, self._size, history, self._noise, answer)
+        if outcome not in (ESTIMATE, NO_FIX_YET):
+            self.history.check(gnss, velocity, dt, fix_age)
+        self._remember(names, rows, dt)
+        if outcome == NO_FIX_YET:
             return np.full(3, np.nan), None
-        if found != ESTIMATE:
-            check_step(gnss, velocity, dt, fix_age, self.history)
-        self.members, self._answer = names, answer
+        self._members, self._size, self._answer = {name: k for k, name in enumerate(names, 1)}, 1 + len(names), answer
         return answer[:3], answer[3:12].reshape(3, 3)
 
-    def _run(self, answer: Floats, k: int) -> int:
-        rows, inbox = self.history.rows, self._inbox[:k]
-        numbers, index, last = self._numbers, self._index, self._last
-        return int(stream_step(self._given, inbox, numbers, index, last, rows, self._noise, answer))
+    def _fill(self, names: list[str], neighbours: Sequence[RelativeMeasurement]) -> Floats:
+        """(k, WIDTH) the measurements, each with its vehicle's last message and index in the last star."""
+        if 3 * len(names) >= len(self._columns):
+            self._reserve(2 * (len(names) + 1))
+        rows = self._rows[: len(names)]
+        for row, name, measured in zip(rows, names, neighbours, strict=True):
+            row[:11] = measured.row
+            last, when = self._messages.get(name, NO_MESSAGE)
+            row[11:16], row[PREVIOUS] = last, self._members.get(name, -1)
+            row[LAST_AGE] += self._time - when
+        return rows
+
+    def _remember(self, names: list[str], rows: Floats, dt: float) -> None:
+        """Keep the last messages; forget vehicles whose messages are too old."""
+        self._time += dt
+        if len(self._messages) > 64 + 2 * len(names):
+            self._messages = {
+                name: (last, when)
+                for name, (last, when) in self._messages.items()
+                if last[3] + self._time - when <= self.max_age
+            }
+        for name, last in zip(names, rows[:, 11:16].copy(), strict=True):
+            self._messages[name] = last, self._time
+
+
+NO_MESSAGE = np.array([0.0, 0.0, 0.0, np.inf, 0.0]), 0.0
+"""Velocity m/s, age s and how long it has served, s, and when that was so."""

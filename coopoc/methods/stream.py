@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Sequence
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, number
-from ..errors import InputError
-from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
-from ..kernels.solo import ESTIMATE, GNSS, HISTORY_FULL, NO_FIX_YET, VELOCITY, FixNoise, packed, stream_step
+from ..arrays import Floats, number, plain
+from ..errors import InputError, shown
+from ..kernels.motion import ROUNDING, MotionNoise, push, since
+from ..kernels.solo import ESTIMATE, NO_FIX_YET, FixNoise, packed, stream_step
 from ..world.recording import Recording, check_recording
-from .motion_history import PLAIN, MotionHistory, check_step, three
-from .noise_model import NoiseModel, resolve
 from .track import Track
 
 State = TypeVar("State")
-NO_VARIANCE: Floats = np.zeros((1, 1, 1, 3))
 
 
 class Solo(Protocol[State]):
@@ -37,6 +34,69 @@ class Solo(Protocol[State]):
 
     def read(self, state: State) -> tuple[Floats, Floats | None]:
         """Position (..., 3) m and covariance (..., 3, 3) m^2, or None if it claims none."""
+
+
+class MotionHistory:
+    """The newest motions of a vehicle, `span` seconds or what there has been, for fixes that come late.
+
+    Args:
+        span: s.
+    """
+
+    def __init__(self, span: float) -> None:
+        self.rows: Floats = np.zeros((65, 7))
+        self.rows[0, 3] = seconds("history", span)
+
+    def __len__(self) -> int:
+        return int(self.rows[0, 1])
+
+    def reserve(self) -> Floats:
+        """The rows, with room for one more step."""
+        first, count, room = int(self.rows[0, 0]), len(self), len(self.rows) - 1
+        if count + 1 >= room:
+            rows = np.zeros((1 + 2 * room, 7))
+            rows[1 : 1 + count] = self.rows[1 + (first + np.arange(count)) % room]
+            rows[0] = self.rows[0]
+            rows[0, 0] = 0.0
+            self.rows = rows
+        return self.rows
+
+    def push(self, dt: float, moved: Floats, variance: Floats) -> None:
+        """Add a step: dt s, motion (3,) m, its variance (3,) m^2."""
+        push(self.reserve(), dt, moved, variance)
+
+    def forward(self, gnss: npt.ArrayLike | None, age: float) -> tuple[Floats, Floats]:
+        """A fix of `age` seconds ago moved to now, (3,) m, NaN for none, and the variance of that motion, (3,) m^2."""
+        fix, moved, late = fix_or_none(gnss), np.zeros(3), np.zeros(3)
+        if not np.isnan(fix).all():
+            since(self.rows, age, moved, late)
+        return fix + moved, late
+
+    def check(self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float) -> None:
+        """InputError if a stream cannot take this step."""
+        number("dt", dt, sys.float_info.min, allowed="finite and > 0", hint="Give the seconds since the last step.")
+        three("velocity", velocity)
+        if np.isnan(fix_or_none(gnss)).all():
+            return
+        later = MotionHistory(0.0)
+        later.rows = self.reserve().copy()
+        later.push(dt, np.zeros(3), np.zeros(3))
+        kept = later.rows[0, 2]
+        hint, allowed = "Leave such a fix out (None), or keep more: start(..., history=).", f"in 0..{kept:g} s"
+        number("fix_age", fix_age, -ROUNDING, kept + ROUNDING, allowed=f"{allowed}, the motion that is kept", hint=hint)
+
+    def write(
+        self, given: Floats, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float
+    ) -> None:
+        """Write fix, velocity, dt and age of the fix to the input of a kernel; InputError as `check`."""
+        simple = isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN
+        try:
+            if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+                self.check(gnss, velocity, dt, fix_age)
+            given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        except Exception:  # a class from elsewhere may raise anything
+            self.check(gnss, velocity, dt, fix_age)
+            raise
 
 
 class Stream(Generic[State]):
@@ -56,7 +116,7 @@ class Stream(Generic[State]):
         self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
     ) -> tuple[Floats, Floats | None]:
         """Position (3,) m and covariance (3, 3) m^2, as `FilterStream.step`; None if the filter claims none."""
-        check_step(gnss, velocity, dt, fix_age, self.history)
+        self.history.check(gnss, velocity, dt, fix_age)
         speed = np.asarray(velocity, dtype=float)
         moved, process = dt * speed, self.solo.process(speed, dt)
         self.history.push(dt, moved, process)
@@ -95,8 +155,7 @@ class FilterStream:
         self.history = MotionHistory(history)
         self._state, self._given, self._noise = np.full((3, 5), np.nan), np.zeros(8), packed(motion, fixes)
         if x0 is not None:
-            zero = np.zeros(3)
-            weight = np.full(3, fixes.weight)
+            zero, weight = np.zeros(3), np.full(3, fixes.weight)
             self._state[:] = np.stack([three("x0", x0), zero, zero, fixes.variance, weight], axis=1)
 
     @property
@@ -123,98 +182,95 @@ class FilterStream:
             InputError: another shape, dt <= 0, a number that is not finite, a fix older than the history; the filter is
                 then as it was before.
         """
-        given, answer = self._given, np.empty(12)
-        if not (isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN):
-            check_step(gnss, velocity, dt, fix_age, self.history)
-        try:
-            if np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
-                check_step(gnss, velocity, dt, fix_age, self.history)
-            given[GNSS], given[VELOCITY], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-        except Exception:  # a class from elsewhere may raise anything
-            check_step(gnss, velocity, dt, fix_age, self.history)
-            raise
-        found = stream_step(given, self._state, self.history.rows, self._noise, answer)
-        while found == HISTORY_FULL:
-            self.history.grow()
-            found = stream_step(given, self._state, self.history.rows, self._noise, answer)
-        if found == NO_FIX_YET:
+        self.history.write(self._given, gnss, velocity, dt, fix_age)
+        answer = np.empty(12)
+        outcome = stream_step(self._given, self._state, self.history.reserve(), self._noise, answer)
+        if outcome == NO_FIX_YET:
             return np.full(3, np.nan), None
-        if found != ESTIMATE:
-            check_step(gnss, velocity, dt, fix_age, self.history)
+        if outcome != ESTIMATE:
+            self.history.check(gnss, velocity, dt, fix_age)
         return answer[:3], answer[3:].reshape(3, 3)
 
 
-def alone(noise_model: NoiseModel | str) -> NoiseModel:
-    """The noise model of a filter without a recording: "identity" or a NoiseModel of constant noise, which needs
-    none."""
-    name = noise_model.name if isinstance(noise_model, NoiseModel) else noise_model
-    bound = isinstance(noise_model, NoiseModel) and (
-        type(noise_model) is not NoiseModel or noise_model.velocity is not None
-    )
-    if bound or noise_model == "nominal":
-        raise InputError(
-            "noise_model",
-            repr(name),
-            "needs a recording, and a stream has none",
-            "Pass NoiseModel.nominal(Sensors(...)), a fitted NoiseModel or 'identity'.",
-        )
-    return resolve(noise_model, None)  # type: ignore[arg-type]
+def solo_track_of(solo: Solo[State], recording: Recording, egos: Sequence[int | str], x0: Floats | None) -> Track:
+    """Track of a solo filter of one's own, from a known start x0 (..., E, 3) m or the first fix.
 
-
-def motion_noise(known: NoiseModel, interval: float | None) -> MotionNoise:
-    """White motion noise as `known` assumes it of a recording with dt = `interval` s; None for the dt of each step."""
-    interval = 0.0 if interval is None else check_interval(interval)
-    if known.process_std is not None:
-        return MotionNoise(np.array(known.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
-    assert known.sensors is not None
-    ratio, of_speed = np.full(3, known.sensors.velocity_std_ratio), known.sensors.velocity_reading == "speed"
-    return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), interval)
-
-
-def process_noise(known: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
-    """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity."""
-    if known.follows_measured_velocity:
-        return NO_VARIANCE, motion_noise(known, None)
-    return np.ascontiguousarray(known.process_variance(recording)), NO_MOTION_NOISE
-
-
-def check_interval(interval: float) -> float:
-    """The interval, s; InputError unless it is finite and > 0."""
-    hint = "The dt that the noise belongs to."
-    found: float = number("interval", interval, sys.float_info.min, allowed="finite and > 0", hint=hint)
-    return found
-
-
-def scan(solo: Solo[State], recording: Recording, columns: Sequence[int], x0: Floats | None) -> Iterator[State]:
-    """The T states (R, E, 3) of a solo filter over a recording, from a known start (..., E, 3) m or the first fix."""
-    if x0 is not None and np.shape(x0)[-2:] != (len(columns), 3):
-        raise InputError("x0", np.shape(x0), f"must end in (E, 3) = ({len(columns)}, 3)", "One start per ego.")
-    gnss, velocity = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
-    on_time = np.zeros(3)
-    state = solo.begin(gnss[:, 0], on_time) if x0 is None else solo.begin(np.broadcast_to(x0, gnss[:, 0].shape), None)
-    yield state
-    for t in range(1, gnss.shape[1]):
-        process = solo.process(velocity[:, t], recording.dt)
-        state = solo.advance(state, recording.dt * velocity[:, t], process, gnss[:, t], on_time)
-        yield state
-
-
-def solo_track(
-    solo: Solo[State], recording: Recording, egos: Sequence[int | str], x0: Floats | None, notes: tuple[str, ...] = ()
-) -> Track:
-    """Track of a solo filter, which receives and sends nothing; InputError if an ego is unknown or absent."""
+    Raises:
+        InputError: an ego that is unknown or absent; x0 of another shape.
+    """
     began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
-    found = [solo.read(state) for state in scan(solo, recording, columns, x0)]
-    x = np.stack([position for position, _ in found], axis=1)
-    claims = [covariance for _, covariance in found if covariance is not None]
-    free = np.zeros((recording.runs, len(columns)))
-    return Track(
-        recording.t,
-        tuple(columns),
-        x,
-        np.stack(claims, axis=1) if claims else None,
-        free,
-        free,
-        time.perf_counter() - began,
-        notes=notes,
-    )
+    gnss, velocity = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
+    if x0 is not None and np.shape(x0)[-2:] != gnss.shape[2:]:
+        raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {gnss.shape[2:]}", "One start per ego.")
+    on_time, dt = np.zeros(3), recording.dt
+    state = solo.begin(gnss[:, 0], on_time) if x0 is None else solo.begin(np.broadcast_to(x0, gnss[:, 0].shape), None)
+    estimates = [solo.read(state)]
+    for t in range(1, gnss.shape[1]):
+        process = solo.process(velocity[:, t], dt)
+        state = solo.advance(state, dt * velocity[:, t], process, gnss[:, t], on_time)
+        estimates.append(solo.read(state))
+    x = np.stack([position for position, _ in estimates], axis=1)
+    claims = [covariance for _, covariance in estimates if covariance is not None]
+    none = np.zeros((recording.runs, len(columns)))
+    cov = np.stack(claims, axis=1) if claims else None
+    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began)
+
+
+PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
+"""What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
+
+
+def three(field: str, value: npt.ArrayLike) -> Floats:
+    """(3,) finite numbers; InputError naming the field if they are not.
+
+    >>> three("velocity", [1, 2])
+    Traceback (most recent call last):
+    ...
+    coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers. Give east, north, up.
+    """
+    array = numbers(value)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
+    return array
+
+
+def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
+    """Names of the vehicles that a stream is given measurements of, each once.
+
+    Args:
+        field: name of the argument.
+        given: a sequence of measurements.
+        kind: their class.
+
+    Raises:
+        InputError: anything else, or a vehicle twice.
+    """
+    if not isinstance(given, Sequence) or not all(isinstance(each, kind) for each in given):
+        hint = f"Give a list of {kind.__name__}, empty for none."
+        raise InputError(field, shown(given), f"must hold {kind.__name__}s", hint)
+    names: list[str] = [each.id for each in given]
+    if len(set(names)) < len(names):
+        raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
+    return names
+
+
+def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
+    """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
+    given = np.full(3, np.nan) if gnss is None else numbers(gnss)
+    return given if given.shape == (3,) and np.isnan(given).all() else three(field, "none" if gnss is None else gnss)
+
+
+def seconds(field: str, value: float) -> float:
+    """A time that is finite and >= 0; InputError naming the field if it is not."""
+    checked: float = number(field, value, hint="Give seconds.")
+    return checked
+
+
+def numbers(value: npt.ArrayLike) -> Floats:
+    """As an array of floats; an empty one of what holds no numbers.
+
+    >>> numbers("east").size
+    0
+    """
+    given = plain(value)
+    return given.astype(float) if given.dtype.kind in "fiu" else np.empty(0)

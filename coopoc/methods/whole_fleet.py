@@ -13,7 +13,7 @@ from ..arrays import Bools, Floats, Ints
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
-from .contradiction import contradicted
+from .egos import contradicted
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 

@@ -44,7 +44,7 @@ A batched solver gets B realisations and starts (B, n, ambient), any other a sin
 
 @dataclass(frozen=True)
 class Capabilities:
-    """Which problems a backend can solve; `solve`, its errors and the table of the documentation are made from it.
+    """Which problems a backend can solve, as data: `solve` and its errors read it.
 
     Args:
         batched: the solver takes B realisations in one call; `solve_batch` calls any other once per realisation.
@@ -88,8 +88,8 @@ class Capabilities:
         ]
 
     def _can_hold(self, linear: bool, equality: bool) -> bool:
-        known = self.constraints == "all" or (self.constraints == "linear" and linear)
-        return known and (equality or self.inequalities)
+        held = self.constraints == "all" or (self.constraints == "linear" and linear)
+        return held and (equality or self.inequalities)
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,9 @@ def looped(solver: Solver) -> Solver:
 
     def each(problem: Problem, x: Floats) -> SolverResult:
         parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
-        found = [solver(part, start) for part, start in zip(parts, x, strict=True)]
-        iterations, infeasible = (np.array([getattr(f, name) for f in found]) for name in ("iterations", "infeasible"))
-        return SolverResult(np.stack([f.x for f in found]), iterations, infeasible, found[0].extras)
+        ends = [solver(part, start) for part, start in zip(parts, x, strict=True)]
+        iterations, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
+        return SolverResult(np.stack([end.x for end in ends]), iterations, infeasible.astype(bool), ends[0].extras)
 
     return each
 
@@ -193,22 +193,3 @@ def _checked(name: str) -> Backend:
         hint = "Give coopoc.Backend(name, prepare, purpose)."
         raise InputError("backend", repr(name), f"is a {type(found).__name__}, no Backend", hint)
     return found
-
-
-def capability_table() -> str:
-    """The capabilities of all backends as a Markdown table: the one of docs/optimize.md.
-
-    >>> print(capability_table().splitlines()[4][:40])
-    | `gauss-newton` | all | all | yes | non
-    """
-    head = "| backend | kinds | losses | poses | constraints | realisations |"
-    rows = [head, "|---|---|---|---|---|---|"]
-    for name, known in backends().items():
-        able = known.capabilities
-        kinds, losses = ("all" if given is None else ", ".join(given) or "none" for given in (able.kinds, able.losses))
-        equal = "" if able.inequalities or able.constraints == "none" else ", equalities only"
-        batch = "in one call" if able.batched else "one by one"
-        rows.append(
-            f"| `{name}` | {kinds} | {losses} | {'yes' if able.poses else 'no'} | {able.constraints}{equal} | {batch} |"
-        )
-    return "\n".join(rows)

@@ -10,16 +10,15 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
 from ..short_repr import short_repr
-from .algebra.arrowhead import Arrow, marginals, structure
-from .algebra.normal import normal_equations
-from .assessment.assess import bounded
+from .algebra.star import is_star, star_at
+from .assess.assess import INFLATION, assess
 from .backend import Backend, Options, require_backend
 from .model.problem import Problem
 from .solve import POSITION_TOLERANCE
 from .starts.initial import initial_guess, somewhere
 
 CHUNK = 40_000
-"""Blocks of 3x3 numbers that one chunk may hold, so that a batch stays in the cache."""
+"""Nodes of measurements that one chunk may hold, so that a batch stays in the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,24 +68,15 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
         hint = "Solve one realisation after the other: solve(problem.pick(run), ...)."
         raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", hint)
     solver = known.solver(problem, options)
-    scheme, frame = structure(problem)
     count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
-    per = max(
-        1, CHUNK // (sum(place.size for place in scheme.places) + frame.group.size * max(len(frame.separator), 1))
-    )
+    per = max(1, CHUNK // sum(factor.nodes.size for factor in problem.factors))
     parts = []
     for first in range(0, count, per):
         part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
         end = solver(part, (somewhere if part.linear else initial_guess)(part))
-        linear = part.linearise(end.x)
-        blocks, gradient = normal_equations(scheme, linear, [f.nodes for f in part.factors])
-        cov, left = _marginals(frame, blocks, gradient)
-        sound = bounded(scheme, blocks, cov)
-        if part.movable is not None:
-            cov *= part.movable[:, :, None] & part.movable[:, None, :]
-        cov[~sound] = np.nan
-        there = sound & (np.abs(left).max(axis=(1, 2)) <= reach)
-        parts.append((end.x, cov, linear.cost, end.iterations, there, np.zeros(len(sound), dtype=bool)))
+        cost, cov, left = (_checked_stars if is_star(part) else _checked)(part, end.x)
+        there = ~np.isnan(left) & (left <= reach)
+        parts.append((end.x, cov, cost, end.iterations, there, np.zeros(len(there), dtype=bool)))
     found = Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     other = None if found.converged.all() else known.fallback(problem, options)
     return found if other is None else _repeated(found, problem, known, other)
@@ -102,12 +92,21 @@ def _repeated(found: Batch, problem: Problem, backend: Backend, options: Options
     return found
 
 
-def _marginals(frame: Arrow, blocks: Floats, gradient: Floats) -> tuple[Floats, Floats]:
-    """Marginals and Gauss-Newton steps of the realisations, NaN where one is singular."""
-    try:
-        return marginals(frame, blocks, gradient)
-    except np.linalg.LinAlgError:
-        if len(blocks) == 1:
-            return np.full((*gradient.shape, blocks.shape[-1]), np.nan), np.full_like(gradient, np.nan)
-        each = [_marginals(frame, a[None], b[None]) for a, b in zip(blocks, gradient, strict=True)]
-        return np.concatenate([cov for cov, _ in each]), np.concatenate([dx for _, dx in each])
+def _checked(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """Cost, covariance and largest move of a Gauss-Newton step of each realisation; NaN where one is unobservable."""
+    singles = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+    each = [assess(single, at) for single, at in zip(singles, x, strict=True)]
+    cov = np.stack([one.covariance for one in each])
+    return np.array([one.cost for one in each]), cov, np.array([one.remaining for one in each])
+
+
+def _checked_stars(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """The same of stars, all at once."""
+    linear = problem.linearise(x)
+    star = star_at(problem, linear)
+    dx, marginals = star.solve()
+    cov = marginals()
+    inflation = np.einsum("bnii,bnii->bni", star.own, cov)
+    sound = ((inflation > 0) & (inflation < INFLATION)).all(axis=(1, 2))
+    cov[~sound], left = np.nan, np.abs(dx).max(axis=(1, 2))
+    return linear.cost, cov, np.where(sound, left, np.nan)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import time
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -65,33 +65,37 @@ def solve_file(
         began = time.perf_counter()
         problem = replace(problem, x0=staircase(problem, refine=False, seconds=seconds).x)
         problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
-    print(f"coopoc: {problem}", file=sys.stderr)
+    say(str(problem))
     solution = without_outliers(problem, backend) if outliers else solve(problem, backend, throw=False)
     summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
     summary |= {"misfit": (size := None if outliers else misfit(problem, solution))}
     if output is not None:
         output.write_text(json.dumps(summary | nodes(solution)) + "\n")
-        print(f"coopoc: the solution is in {output}", file=sys.stderr)
+        say(f"the solution is in {output}")
     print(json.dumps(summary, indent=1))
     if solution.status is not Status.SOLVED:
-        print(f"coopoc: {solution.status.value}", file=sys.stderr)
+        say(solution.status.value)
     for joint in solution.extras.get("joined", ()):
         if joint["rival"] >= AGREEING:
-            print(
-                "coopoc: {body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint),
-                file=sys.stderr,
-            )
+            say("{body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint))
     if size is not None and not 1 / UNLIKELY < size < UNLIKELY:
-        print(f"coopoc: residuals are {size:.2g} times what the file states. {MISTAKEN}", file=sys.stderr)
+        say(f"residuals are {size:.2g} times what the file states. {MISTAKEN}")
     return int(solution.status is not Status.SOLVED)
+
+
+def say(message: str) -> None:
+    """Print a message to stderr, beside the result on stdout."""
+    print(f"coopoc: {message}", file=sys.stderr)
 
 
 def known_inliers_first(graph: Graph, objective: Objective, start: Start) -> Problem:
     """The problem of a graph from where its known inliers lead, all but relative poses beside each robot's odometry."""
     problem = from_graph(graph, objective, "odometry")
     doubtful = [row for _, rows in loop_closures(problem) for row in rows]
-    known = graph.relative_pose.rows(np.setdiff1d(np.arange(len(graph.relative_pose)), doubtful))
-    began = from_graph(replace(graph, relative_pose=known), objective, start)
+    every = graph.relative_pose
+    kept = np.setdiff1d(np.arange(len(every)), doubtful)
+    known = {field.name: getattr(every, field.name)[kept] for field in fields(every)}
+    began = from_graph(replace(graph, relative_pose=replace(every, **known)), objective, start)
     return problem.replace_unchecked(x0=began.x0, search=began.search)
 
 
@@ -126,40 +130,29 @@ def misfit(problem: Problem, solution: Solution) -> float | None:
 
 def described(solution: Solution) -> dict[str, Any]:
     """Status, cost and times of a solution, without its nodes."""
-    return {
-        "status": solution.status.name,
-        "sentence": solution.status.value,
-        "backend": solution.backend,
-        "cost": solution.cost,
-        "gradient_norm": solution.gradient_norm,
-        "start": solution.extras.get("start"),
-        "iterations": solution.iterations,
-        "build_seconds": solution.build_seconds,
-        "solve_seconds": solution.solve_seconds,
-        "unobservable": list(solution.unobservable),
-    } | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}
+    named = ("backend", "cost", "gradient_norm", "iterations", "build_seconds", "solve_seconds")
+    found = {"status": solution.status.name, "sentence": solution.status.value}
+    found |= {name: getattr(solution, name) for name in named}
+    found |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}
+    return found | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}
 
 
 def nodes(solution: Solution) -> dict[str, Any]:
     """Positions m, rotation matrices and covariances (position m, then rotation rad) by name; NaN becomes null."""
-    at = zip(solution.names, solution.position, solution.rotation, solution.covariance, strict=True)
-    has_rotation = solution.space.has_rotation
-    return {
-        "nodes": {
-            name: {
-                "position": position.tolist(),
-                **({"rotation": rotation.tolist()} if has_rotation else {}),
-                "covariance": covariance.tolist() if np.isfinite(covariance).all() else None,
-            }
-            for name, position, rotation, covariance in at
-        }
-    }
+    found = {}
+    for name, x, covariance in zip(solution.names, solution.x, solution.covariance, strict=True):
+        node = {"position": solution.space.position(x).tolist()}
+        if solution.space.has_rotation:
+            node["rotation"] = solution.space.rotation(x).tolist()
+        found[name] = node | {"covariance": covariance.tolist() if np.isfinite(covariance).all() else None}
+    return {"nodes": found}
 
 
-def tiny() -> Problem:
-    """Two vehicles in 3-D with a fix each and the range, azimuth and inclination between them."""
+def tiny(kind: str = "spherical") -> Problem:
+    """Two vehicles in 3-D with a fix each and the range, azimuth and inclination between them, or the range alone."""
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
-    return problem.add("spherical", ("ego", "b"), [10.0, 0.05, 1.55], std=[0.5, 0.05, 0.05])
+    size = 3 if kind == "spherical" else 1
+    return problem.add(kind, ("ego", "b"), [10.0, 0.05, 1.55][:size], std=[0.5, 0.05, 0.05][:size])
 
 
 def check() -> int:
@@ -169,25 +162,19 @@ def check() -> int:
     """
     failed = 0
     print(f"{'backend':<14} {'constraints':<12} {'status':<10} {'cost':>12} {'differs [m]':>11} {'ms':>8}  measures")
-    for name, known in backends().items():
-        fixed = known.capabilities.constraints
-        if not known.installed:
-            print(f"{name:<14} {fixed:<12} not installed: pip install {known.library}")
+    for name, backend in backends().items():
+        fixed = backend.capabilities.constraints
+        if not backend.installed:
+            print(f"{name:<14} {fixed:<12} not installed: pip install {backend.library}")
             continue
-        problem, measures = (_ranges(), "range") if known.capabilities.lacking(tiny()) else (tiny(), "spherical")
-        expected = solve(problem)
+        kind = "range" if backend.capabilities.lacking(tiny()) else "spherical"
+        expected = solve(tiny(kind))
         began = time.perf_counter()
-        found = solve(problem, name, throw=False)
+        found = solve(tiny(kind), name, throw=False)
         took = 1e3 * (time.perf_counter() - began)
         off = float(np.abs(found.x - expected.x).max())
         good = found.status is Status.SOLVED and off < 1e-6
         failed += not good
-        print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}  {measures}")
-    print(f"coopoc: {len(backends())} backends, {failed} disagree with gauss-newton", file=sys.stderr)
+        print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}  {kind}")
+    say(f"{len(backends())} backends, {failed} disagree with gauss-newton")
     return int(failed > 0)
-
-
-def _ranges() -> Problem:
-    """The same vehicles with the range alone, for a relaxation."""
-    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
-    return problem.add("range", ("ego", "b"), 10.0, std=0.5)

@@ -13,10 +13,11 @@ from ..arrays import Floats, Ints, instance, listed, named, number
 from ..errors import InputError
 from ..plugins import suggestion
 from ..short_repr import short_repr
+from .algebra.sparse import sparse
 from .backend import require_backend
-from .backends.gauss_newton import linear_step
 from .backends.gtsam_factors import estimate, forms, graph_of, linearised, tangent, values, which_turn
-from .descent.descend import descend
+from .descent.descend import TOLERANCE
+from .descent.trust_region import arrive
 from .model.factor import Factor
 from .model.problem import Problem
 from .model.space import Space
@@ -214,7 +215,7 @@ class FixedLag:
         x = initial_guess(prior)
         if x0 is None and all(piece.factors[f].kind == "spherical" and piece.factors[f].loss is None for f in rest):
             return np.asarray(x[0])
-        return np.asarray(descend(prior, linear_step(prior), x, max_iterations=1).x[0])
+        return arrive(sparse(prior), x[0], 1, TOLERANCE).x
 
     def _advance(self, graph: Any, entering: Any, moments: dict[int, float]) -> None:
         try:

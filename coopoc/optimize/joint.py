@@ -9,7 +9,6 @@ import numpy as np
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from .algebra.cholesky import cholesky_of, with_still
 from .algebra.sparse import sparse
 from .model.nodes import several
 from .model.problem import Problem
@@ -52,7 +51,7 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
         allowed = f"must name each of {len(problem.names)} nodes once"
         raise InputError("nodes", f"{len(places)} nodes", allowed, "Leave out those that stand twice.")
     dof = problem.space.dof
-    number, solve_one = _solver(problem.replace_unchecked(separator=()), x)
+    number, solve_one = _solver(problem, x)
     wanted = number[places].ravel()
     moving = np.flatnonzero(wanted >= 0)
     whole = np.zeros((len(wanted), len(wanted)))
@@ -65,19 +64,8 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
 
 def _solver(problem: Problem, x: Floats) -> tuple[Ints, Callable[[Floats], Floats]]:
     """Which unknown a direction (n, dof) of a node is, -1 where it cannot move, and (u,) -> (J^T J)^-1 (u,)."""
-    free = InputError(
-        "problem", repr(problem), "must hold all nodes", "Measure what is free: see solution.unobservable."
-    )
-    if (system := sparse(problem, least=0)) is not None:
-        cholesky = system.cholesky
-        if not cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
-            raise free
-        return system.entries.number, cholesky.solve
-    J = problem.jacobian(problem.linearise(x[None]))
-    shape = len(problem.names), problem.space.dof
-    still = None if problem.movable is None else ~problem.movable
-    number = np.arange(shape[0] * shape[1]).reshape(shape)
-    factored = cholesky_of(with_still(J.T @ J, still))
-    if factored is None:
-        raise free
-    return number if still is None else np.where(still, -1, number), factored.solve
+    system = sparse(problem)
+    if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
+        hint = "Measure what is free: see solution.unobservable."
+        raise InputError("problem", repr(problem), "must hold all nodes", hint)
+    return system.entries.number, system.cholesky.solve

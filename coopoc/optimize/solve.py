@@ -11,10 +11,9 @@ import numpy as np
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from .algebra.sparse import sparse
-from .assessment.active import constraint_rows
-from .assessment.assess import Assessment, assess
-from .assessment.curvature import newton_decrease
-from .assessment.lagrangian import is_constrained_minimum
+from .assess.active import constraint_rows
+from .assess.assess import Assessment, assess
+from .assess.curvature import is_constrained_minimum, newton_decrease
 from .backend import Backend, Options, require_backend
 from .descent.descend import MAX_ITERATIONS
 from .model.fuse import fused
@@ -85,7 +84,8 @@ def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
     solved = time.perf_counter()
     x, iterations, infeasible = found.x[0], int(np.ravel(found.iterations)[0]), bool(np.ravel(found.infeasible)[0])
     truth = assess(problem, x)
-    violated = {"violated": truth.violated} if truth.violation > FEASIBLE or infeasible else {}
+    out = truth.active is not None and (truth.violation > FEASIBLE or infeasible)
+    violated = {"violated": truth.active.violated} if truth.active is not None and out else {}
     status = Status.INFEASIBLE if infeasible else _status(problem, x, truth)
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
@@ -133,7 +133,7 @@ def _start(problem: Problem) -> Floats:
     if problem.linear and not problem.constraints:
         return np.asarray(somewhere(problem)[0])
     start: Floats = initial_guess(problem)[0]
-    if (system := sparse(problem)) is not None and np.isfinite(system.quadratic(start, "gauss-newton")[1]).all():
+    if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
         return start
     with np.errstate(all="ignore"):
         linear = problem.linearise(start[None])

@@ -10,6 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from ..errors import InputError
 from ..file_names import file_name, given_path
 from ..plugins import unknown
 from . import reference, store

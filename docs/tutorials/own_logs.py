@@ -79,7 +79,7 @@ track.plot(every=60).figure
 # %% [markdown]
 # ## The same by commands
 #
-# `coopoc data check log.csv --columns t=zeit vehicle=auto` prints the summary, tests the units against the geometry and
+# `coopoc data check "log.csv?columns=t:zeit,vehicle:auto"` prints the summary, tests the units against the geometry and
 # draws a picture; `coopoc run side_by_side --data "log.csv?columns=t:zeit,vehicle:auto"` compares methods.
 #
 # If you have a truth, put it into a file `truth.csv` beside the log; then studies give errors and intervals.

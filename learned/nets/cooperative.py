@@ -11,10 +11,9 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.kernels.motion import NO_MOTION_NOISE
 from coopoc.methods.egos import Estimate, follow_egos
-from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.noise_model import NoiseModel, constant_noise
 from coopoc.methods.options import check_options
 from coopoc.methods.star import assumptions, measurements, relative_noise
-from coopoc.methods.stream import alone
 from coopoc.methods.track import Track
 from coopoc.world.inbox import Inbox
 from coopoc.world.recording import Recording
@@ -132,7 +131,7 @@ class CooperativeGain:
             return SumsStream(net_noise(self.noise), *relative_noise(NoiseModel.nominal(sensors or Sensors())))
         if sensors is not None:
             raise InputError("sensors", sensors, "are those of the NoiseModel", "Leave them out.")
-        return SumsStream(model_noise(alone(self.noise)), *relative_noise(alone(self.noise)))
+        return SumsStream(model_noise(constant_noise(self.noise)), *relative_noise(constant_noise(self.noise)))
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and their neighbours.

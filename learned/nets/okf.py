@@ -15,9 +15,10 @@ from coopoc.arrays import Floats, checked, instance
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
-from coopoc.methods.kalman import drive_of, filtered
+from coopoc.methods.kalman import solo_filter
+from coopoc.methods.noise_model import check_interval
 from coopoc.methods.options import check_options
-from coopoc.methods.stream import FilterStream, check_interval
+from coopoc.methods.stream import FilterStream
 from coopoc.methods.track import Track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
@@ -83,8 +84,8 @@ class OptimisedKF:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
-        seen = drive_of(recording, self._motion(0.0), columns)
-        x, variance, _ = filtered(seen, FixNoise(np.square(self.gnss_std)), self.x0)
+        fixes = FixNoise(np.square(self.gnss_std))
+        x, variance, _ = solo_filter(recording, columns, self._motion(0.0), fixes, self.x0)
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         return Track(recording.t, tuple(columns), x, variance[..., None] * np.eye(3), silent, silent, seconds)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from coopoc.arrays import Floats
 from coopoc.methods.options import check_options
-from coopoc.methods.stream import Stream, solo_track
+from coopoc.methods.stream import Stream, solo_track_of
 from coopoc.methods.track import Track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording
@@ -207,7 +207,7 @@ class RecursiveFilter:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos; `notes` count the runs that diverged from the fixes."""
-        track = solo_track(self._solo(), recording, egos, self.x0)
+        track = solo_track_of(self._solo(), recording, egos, self.x0)
         return replace(track, notes=tuple(divergence(track.x, recording, list(track.egos))))
 
     def _solo(self) -> SoloRecursive:

@@ -72,7 +72,7 @@ def follow(seen: Measurements, known: Assumptions, sums: bool) -> tuple[Floats, 
             for k in range(vehicles):
                 history.vehicle[lane, k, STEP] = -1.0
         for t in range(steps):
-            n = gather(star, seen, known, (first, last), t, old)
+            n = gather(star, seen, known, first, last, t, old)
             for lane in range(LANES):
                 run = min(first + lane, last)
                 if sums:
@@ -86,11 +86,11 @@ def follow(seen: Measurements, known: Assumptions, sums: bool) -> tuple[Floats, 
                         difference(star, history.vehicle[lane, star.member[k]], t, (k, lane, news))
                     set_information(star, history, known, (run, t), (k, lane, news, sums))
             rescale_prior(star, joint, history, n, old)
-            step(star, joint, known, True, None, (n, old), ROW)
+            step(star, joint, known, True, n, old)
             initialise(star, joint, n)
             for i in range(3 * n):
                 store(history.last_information, i, load(history.information, i, (0.0,)))
-            write(out, joint, (first, last, t, seen.start[t]), n, ROW)
+            write(out, joint, first, last, t, seen.start[t], n, ROW)
             old = n
     return out
 

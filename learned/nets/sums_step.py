@@ -17,7 +17,7 @@ from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.stars.joint import joint_in
 from coopoc.kernels.stars.joint_filter import step
 from coopoc.kernels.stars.messages import ROW, Assumptions, Star, star_in
-from coopoc.kernels.stars.star_stream import answered, see
+from coopoc.kernels.stars.star_stream import measure, write_answer
 from coopoc.methods.star import FORGOTTEN
 
 from .star_gain import (
@@ -119,7 +119,7 @@ def sums_step(
             difference(star, held.vehicle[lane, star.member[k]], t, (k, lane, news))
             set_information(star, held, known, (0, t), (k, lane, news, True))
     rescale_prior(star, joint, held, n, old)
-    step(star, joint, known, True, None, (n, old), ROW)
+    step(star, joint, known, True, n, old)
     initialise(star, joint, n)
     for i in range(3 * n):
         store(held.last_information, i, load(held.information, i, (0.0,)))
@@ -127,7 +127,7 @@ def sums_step(
     for k in range(n):
         place[star.member[k]] = k
     index[0] = n
-    answered(joint, n, answer)
+    write_answer(joint, n, answer)
     return True
 
 
@@ -142,7 +142,7 @@ def restart(own: AnyArray, t: int) -> None:
 @inner
 def receive(star: Star, held: SumsHistory, known: Assumptions, row: AnyArray, slot: int, k: int) -> None:
     """Copy the measurement of member k, and its message if one has come."""
-    see(star, row, known.relative_std, k)
+    measure(star, row, known.relative_std, k)
     if row[NEWS] > 0.0:
         for lane in range(LANES):
             for i in range(LAST - SUMS):

@@ -16,9 +16,8 @@ from torch import nn
 from coopoc.arrays import Floats, number
 from coopoc.errors import InputError
 from coopoc.kernels.stars.star_stream import resized
-from coopoc.methods.motion_history import fix_or_none, names_of, numbers, three
-from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.stream import motion_noise
+from coopoc.methods.noise_model import NoiseModel, motion_noise
+from coopoc.methods.stream import fix_or_none, names_of, numbers, three
 
 from .noise_step import new_memory, noise_step, packed
 from .star_gain import LAST
@@ -113,7 +112,7 @@ class SumsStream:
         place = np.append(self._index[3 + 3 * most_before :], np.full(vehicles - before, -1))
         self._history = new_history(vehicles, most, self._history, (before, most_before))
         if most > most_before:
-            self._numbers = resized(self._numbers, self._index[:2].copy(), most)
+            self._numbers = resized(self._numbers, int(self._index[0]), most_before, most)
         head = [self._index[0], most, self._index[2]]
         self._index = np.concatenate([head, np.zeros(3 * most), place]).astype(np.int64)
         self._inbox = np.zeros((most, ROW_SIZE))

@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from coopoc.evaluate.metrics import max_error, rt_le
-from coopoc.methods.gnss import GNSS
 from coopoc.methods.joint_filter import JointFilter
-from coopoc.methods.kalman import Kalman
+from coopoc.methods.kalman import GNSS, Kalman
 from coopoc.study.results import Results
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table, pivot

@@ -10,9 +10,8 @@ import pandas as pd
 from safetensors.torch import save as to_bytes
 
 from coopoc import read_graph
-from coopoc.data.log import read_log
-from coopoc.data.recordings import load_log
-from coopoc.data.registry import load_fleet
+from coopoc.data.log.read import read_log
+from coopoc.data.registry import load_fleet, load_log
 from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
@@ -63,7 +62,7 @@ NAMES = {"t": "time", "latitude": "lat", "longitude": "lon", "height": "alt"}
 READERS: Mapping[str, Reader] = {
     "csv": Reader({"a.csv": good.TABLE}, lambda d: load_fleet(d / "a.csv")),
     "csv resampled": Reader({"a.csv": good.TABLE}, lambda d: load_fleet(d / "a.csv", dt=0.1)),
-    "carla": Reader({"a.csv": good.CARLA}, lambda d: load_fleet(d / "a.csv", handedness="left")),
+    "carla": Reader({"a.csv": good.CARLA}, lambda d: load_fleet(d / "a.csv", handedness="left", dt=0.1)),
     "fcd": Reader({"a.xml": good.FCD}, lambda d: load_fleet(d / "a.xml")),
     "tum": Reader({"a.tum": good.TUM}, lambda d: load_fleet(d / "a.tum")),
     "tum poses": Reader({"a.tum": good.TUM}, lambda d: read_tum(d / "a.tum", repeats="drop")),

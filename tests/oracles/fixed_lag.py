@@ -7,6 +7,6 @@ from typing import Any
 from oracles.moving_horizon import Drive, moving_horizon
 
 
-def fixed_lag(drive: Drive, lag: int, exact: bool, smoothed: bool) -> Any:
-    """Points by (vehicle, step) and the ego's covariances: of the newest step, or `smoothed` of the oldest."""
-    return moving_horizon(drive, lag + 1, exact, 0, late=False, smoothed=smoothed)
+def fixed_lag(drive: Drive, lag: int, exact: bool) -> Any:
+    """Points by (vehicle, step) and the ego's covariances of the newest step."""
+    return moving_horizon(drive, lag + 1, exact, 0, late=False)

@@ -11,11 +11,10 @@ from scipy.stats import chi2
 from oracles.window import Row, descend
 
 
-def gnc(rows: Sequence[Row], relative: Any, x: Any, ego: int, threshold: float, truncated: bool) -> Any:
+def gnc(rows: Sequence[Row], relative: Any, x: Any, ego: int, threshold: float) -> Any:
     """Points, covariance and the weight of each vehicle's fixes, the ego's excepted.
 
     Truncated: w = sqrt(mu (mu + 1)) c / |r| - mu in [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round.
-    Geman-McClure: w = (mu c^2 / (r^2 + mu c^2))^2, mu from 2 r_max^2 / c^2 down to 1.
     """
     groups = sorted({g for _, _, g in rows if isinstance(g, int) and g != ego})
     weight, mu = dict.fromkeys(groups, 1.0), 0.0
@@ -34,16 +33,9 @@ def gnc(rows: Sequence[Row], relative: Any, x: Any, ego: int, threshold: float, 
                 count[g] += 3
         s = {g: square[g] / chi2.ppf(threshold, count[g]) for g in groups}
         worst = max(s.values())
-        if mu == 0.0:
-            mu = 1.0 / max(2.0 * worst - 1.0, 1e-6) if truncated else max(2.0 * worst, 1.0)
-        else:
-            mu = 1.4 * mu if truncated else max(mu / 1.4, 1.0)
-        if truncated:
-            new = {g: float(np.clip(np.sqrt(mu * (mu + 1.0) / max(s[g], 1e-30)) - mu, 0.0, 1.0)) for g in groups}
-            done = all(new[g] == weight[g] and new[g] in (0.0, 1.0) for g in groups)
-        else:
-            new = {g: (mu / (s[g] + mu)) ** 2 for g in groups}
-            done = mu == 1.0 and all(abs(new[g] - weight[g]) <= 1e-6 for g in groups)
+        mu = 1.0 / max(2.0 * worst - 1.0, 1e-06) if mu == 0.0 else 1.4 * mu
+        new = {g: float(np.clip(np.sqrt(mu * (mu + 1.0) / max(s[g], 1e-30)) - mu, 0.0, 1.0)) for g in groups}
+        done = all(new[g] == weight[g] and new[g] in (0.0, 1.0) for g in groups)
         weight = new
         if done:
             mu = -1.0

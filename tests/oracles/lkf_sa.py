@@ -15,33 +15,18 @@ from coopoc.world.spherical import to_vector
 from oracles.messages import Member
 
 
-def follow(
-    stars: list[list[Member]], known: NoiseModel, transition: str = "identity", membership: str = "keep"
-) -> tuple[Floats, Floats, list[Floats]]:
+def follow(stars: list[list[Member]], known: NoiseModel) -> tuple[Floats, Floats, list[Floats]]:
     """x (T, 3), variance (T, 3) and the neighbours (k, 3) at each step."""
     x, p, found = np.zeros((0, 3)), np.zeros((3, 0, 0)), []
     for star in stars:
-        before = [one.before for one in star]
-        if membership == "reset" and before != list(range(len(x))):
-            x, p = restart(x, star)
-        else:
-            x, p = predict(x, p, star, transition)
-            x, p = update(x, p, star, known)
+        x, p = predict(x, p, star)
+        x, p = update(x, p, star, known)
         found.append((x, p[:, 0, 0]))
     return np.array([x[0] for x, _ in found]), np.array([p for _, p in found]), [x[1:] for x, _ in found]
 
 
-def restart(x: Floats, star: list[Member]) -> tuple[Floats, Floats]:
-    """argmin |[L; I] x - z|^2 from nothing, and unit covariance."""
-    n, ego = len(star), star[0]
-    start = ego.position if ego.new or ego.before is None else x[ego.before] + ego.moved
-    x = np.array([start, *(start + to_vector(one.relative) for one in star[1:])])
-    x, _ = update(x, np.broadcast_to(FORGOTTEN * np.eye(n), (3, n, n)), star, NoiseModel.identity())
-    return x, np.broadcast_to(np.eye(n), (3, n, n))
-
-
-def predict(x: Floats, p: Floats, star: list[Member], transition: str) -> tuple[Floats, Floats]:
-    """Members that stay move; with "ones" each entry of their covariance is the sum of all."""
+def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
+    """Members that stay move; one that joins is where the ego measures it, with a flat prior."""
     n, pick = len(star), np.zeros((len(star), len(x)))
     new, q = np.zeros((n, 3)), np.full((n, 3), FORGOTTEN)
     for k, one in enumerate(star):
@@ -50,12 +35,7 @@ def predict(x: Floats, p: Floats, star: list[Member], transition: str) -> tuple[
         else:
             pick[k, one.before] = 1.0
             new[k], q[k] = x[one.before] + one.moved, one.process
-    stays, out = pick.sum(axis=1), []
-    for c in range(3):
-        spread = pick @ p[c] @ pick.T
-        spread = spread.sum() * np.outer(stays, stays) if transition == "ones" else spread
-        out.append(spread + np.diag(q[:, c]))
-    return new, np.array(out)
+    return new, np.array([pick @ p[c] @ pick.T + np.diag(q[:, c]) for c in range(3)])
 
 
 def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel) -> tuple[Floats, Floats]:

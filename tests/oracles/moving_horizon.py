@@ -92,10 +92,8 @@ class Drive:
         return relative_rows(self.recording, self.box, self.known, self.run, self.ego, x, t)
 
 
-def moving_horizon(
-    drive: Drive, length: int, exact: bool, sweeps: int, late: bool = True, smoothed: bool = False
-) -> Any:
-    """Points by (vehicle, step), and the ego's covariances (T, 3, 3), of the newest step, or `smoothed` of the oldest.
+def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bool = True) -> Any:
+    """Points by (vehicle, step), and the ego's covariances (T, 3, 3), of the newest step.
 
     Args:
         sweeps: most Gauss-Newton steps after the first, while a vector strays from where its measurement is linear.
@@ -136,10 +134,7 @@ def moving_horizon(
             gaps = [x[v, t] - x[drive.ego, t] - base.get((v, t), np.zeros(3)) for t in window for v in drive.star[t]]
             if not exact or np.abs(gaps).max() <= STRAYED:
                 break
-        place = {key: 3 * i for i, key in enumerate(x)}
-        oldest = range(max(now - length + 1, 0), (now if now == steps - 1 else now - length + 1) + 1)
-        for t in oldest if smoothed else (now,):
-            i = place[drive.ego, t]
-            covs[t] = cov[i : i + 3, i : i + 3]
-            found.update({(v, t): x[v, t] for v in drive.star[t]})
+        i = 3 * list(x).index((drive.ego, now))
+        covs[now] = cov[i : i + 3, i : i + 3]
+        found.update({(v, now): x[v, now] for v in drive.star[now]})
     return found, covs

@@ -43,89 +43,49 @@ def update(x, P, h, z, variance, angle, passes=1):  # type: ignore[no-untyped-de
     return at, (np.eye(len(x)) - K @ H) @ P
 
 
-def pose_filter(seen, noise, begin, spread, options, run):  # type: ignore[no-untyped-def]
-    """States (M, d) and covariances (M, d, d) of one run of a joint unit."""
-    d, out, covs, past = options.d, [], [], {}
-    ratio, floor, of_speed = noise.velocity
-    for t in range(len(seen.start) - 1):
-        now, prior, blocks, P_old, old = list(range(seen.start[t], seen.start[t + 1])), [], [], None, {}
-        if past:
-            newest = {seen.member[i]: seen.newest[run, i] for i in now}
-            old = {n: at for n, at in past["at"].items() if past["sent"][n] >= 0 or newest.get(n, -1) < 0}
-            P_old = past["P"]
-        for i in now:
-            n, sent = seen.member[i], seen.newest[run, i]
-            u = np.append(seen.own[run, sent, n, 4:7], seen.own[run, sent, n, 7])
-            if n not in old:
-                fix, compass = np.nan_to_num(seen.own[run, sent, n, :3]), np.nan_to_num(seen.own[run, sent, n, 3])
-                state = np.concatenate(
-                    [fix if sent >= 0 else [0, 0, 0], [compass if sent >= 0 else 0], np.zeros(d - 4)]
-                )
-                wide = np.array([FLAT] * 3 + [UNKNOWN] + list(noise.lasting[: d - 4]))
-                if t == 0:
-                    given = np.isfinite(begin[run, n])
-                    state[:4][given], wide[:4][given] = begin[run, n][given], np.square(spread)[given]
-                prior.append(state), blocks.append((np.eye(d), np.diag(wide), 1))
+def pose_filter(seen, noise, begin, d, passes, run):  # type: ignore[no-untyped-def]
+    """States (T, n, d) and covariances (T, n, d, d) of one run in one state, any numbers for members that are away."""
+    (steps, members), (ratio, floor, of_speed) = seen.active.shape, noise.velocity
+    out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
+    x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
+    for t in range(steps):
+        F, Q = [], []
+        for n in range(members):
+            own = seen.own[run, t, n]
+            if t and seen.active[t - 1, n] and seen.active[t, n]:
+                u, state = own[4:], x[n].copy()
+                size = np.full(3, np.linalg.norm(u[:3])) if of_speed else np.abs(u[:3])
+                q = np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate)
+                F.append(jacobian(lambda s, u=u: motion(s, u, seen.dt), state))
+                G = jacobian(lambda v, s=state: motion(s, v, seen.dt), u)
+                F[-1][4:] *= noise.keep
+                Q.append(G @ np.diag(q) @ G.T + np.diag(np.append(np.zeros(4), (1 - noise.keep**2) * lasting)))
+                x[n] = motion(state, u, seen.dt)
+                x[n, 4:] *= noise.keep
                 continue
-            uses = past["uses"][n] + 1 if past["sent"][n] == sent else 1
-            state = past["x"][n]
-            if sent < 0:
-                prior.append(state)
-                blocks.append((np.eye(d), np.diag([FLAT] * 3 + [UNKNOWN] + [0.0] * (d - 4)), uses))
-                continue
-            size = np.full(3, np.linalg.norm(u[:3])) if of_speed else np.abs(u[:3])
-            late = (seen.dt * (t - sent) * noise.acceleration) ** 2
-            q = (2 * uses - 1) * np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate) + [late, late, late, 0]
-            F = jacobian(lambda s, u=u: motion(s, u, seen.dt), state)
-            G = jacobian(lambda v, s=state: motion(s, v, seen.dt), u)
-            F[4:] *= noise.keep
-            moved = motion(state, u, seen.dt)
-            moved[4:] *= noise.keep
-            fresh = np.append(np.zeros(4), (1 - noise.keep**2) * np.array(noise.lasting))[:d]
-            prior.append(moved), blocks.append((F, G @ np.diag(q) @ G.T + np.diag(fresh), uses))
-        x, P = np.concatenate(prior), np.zeros((len(now) * d,) * 2)
-        for a, i in enumerate(now):
-            for b, j in enumerate(now):
-                if seen.member[i] in old and seen.member[j] in old:
-                    cross = P_old[old[seen.member[i]], :][:, old[seen.member[j]]]
-                    P[d * a : d * a + d, d * b : d * b + d] = blocks[a][0] @ cross @ blocks[b][0].T
-        P += block_diag(*[block[1] for block in blocks])
-        x, P = own(x, P, seen, noise, (run, t, d))
+            F.append(np.zeros((d, d)))
+            wide = np.array([FLAT] * 3 + [UNKNOWN] + list(lasting))
+            x[n] = np.append(np.nan_to_num(own[:4]), np.zeros(d - 4))
+            if t == 0:
+                given = np.isfinite(begin[0][n])
+                x[n, :4][given], wide[:4][given] = begin[0][n][given], np.square(begin[1])[given]
+            Q.append(np.diag(wide))
+        P = block_diag(*F) @ P @ block_diag(*F).T + block_diag(*Q)
+        flat = x.ravel()
+        for n in np.flatnonzero(seen.active[t]):
+            own, b = seen.own[run, t, n], d * n
+            if np.isfinite(own[3]):
+                flat, P = update(flat, P, lambda s, b=b: s[b + 3 : b + 4], own[3:4], [noise.heading], [True])
+            if np.isfinite(own[:3]).all():
+                flat, P = update(flat, P, lambda s, b=b: s[b : b + 3], own[:3], np.array(noise.fix), [False] * 3)
         links = range(seen.first[t], seen.first[t + 1])
-        known = [P[d * k, d * k] < FLAT / 2 for k in range(len(now))]
+        known = [P[d * k, d * k] < FLAT / 2 for k in range(members)]
         links = [k for k in links if known[seen.ends[k, 0]] and (seen.ends[k, 1] < 0 or known[seen.ends[k, 1]])]
         if len(links):
-            x, P = relative(x, P, seen, noise, (run, links, d), options.passes)
-        rows = {seen.member[i]: np.arange(d * k, d * k + d) for k, i in enumerate(now)}
-        for r in rows.values():
-            out.append(x[r]), covs.append(P[np.ix_(r, r)])
-        sent = {seen.member[i]: seen.newest[run, i] for i in now}
-        uses = {seen.member[i]: blocks[k][2] for k, i in enumerate(now)}
-        past = {"P": P, "at": rows, "x": {n: x[r] for n, r in rows.items()}, "sent": sent, "uses": uses}
-    return np.array(out), np.array(covs)
-
-
-def own(x, P, seen, noise, where):  # type: ignore[no-untyped-def]
-    """Compass and fix of every member whose message is new."""
-    run, t, d = where
-    for k, i in enumerate(range(seen.start[t], seen.start[t + 1])):
-        n, sent = seen.member[i], seen.newest[run, i]
-        if sent < 0 or not seen.fresh[run, i]:
-            continue
-        late, u, b = seen.dt * (t - sent), seen.own[run, sent, n, 4:7], d * k
-        w, compass, fix = seen.own[run, sent, n, 7], seen.own[run, sent, n, 3], seen.own[run, sent, n, :3]
-        if np.isfinite(compass):
-            variance = [noise.heading + late**2 * noise.yaw_rate]
-            x, P = update(x, P, lambda s, b=b: s[b + 3 : b + 4], np.array([compass + late * w]), variance, [True])
-        if np.isfinite(fix).all():
-            ratio, floor, of_speed = noise.velocity
-            q = np.maximum(ratio * (np.full(3, np.linalg.norm(u)) if of_speed else np.abs(u)), floor).max() ** 2
-
-            def before(s, b=b, u=u, late=late):  # type: ignore[no-untyped-def]
-                return s[b : b + 3] - late * motion(np.append(np.zeros(3), s[b + 3]), np.append(u, 0.0), 1.0)[:3]
-
-            x, P = update(x, P, before, fix, np.array(noise.fix) + late**2 * q, [False] * 3)
-    return x, P
+            flat, P = relative(flat, P, seen, noise, (run, links, d), passes)
+        x = flat.reshape(members, d).copy()
+        out[t], covs[t] = x, P.reshape(members, d, members, d)[np.arange(members), :, np.arange(members)]
+    return out, covs
 
 
 def relative(x, P, seen, noise, where, passes):  # type: ignore[no-untyped-def]

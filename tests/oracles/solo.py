@@ -1,4 +1,4 @@
-"""Kalman, running-mean adaptive and variational Bayes filters of one vehicle on one axis, as loops over time."""
+"""Kalman and running-mean adaptive filters of one vehicle on one axis, as loops over time."""
 
 from __future__ import annotations
 
@@ -34,27 +34,6 @@ def adaptive(z: Floats, u: Floats, q: Floats, r: float, dt: float, n: float, win
         if not np.isnan(z[t]):
             v, n = z[t] - x, min(n + 1, window)
             r = max(r + (v**2 - (a * r + b) - r) / n, 1e-4)
-            k = (a * r + b) / (a * r + b + r)
-            x, a, b = x + k * v, (1 - k) ** 2 * a + k**2, (1 - k) ** 2 * b
-        found.append((x, r))
-    mean, variance = np.array(found).T
-    return mean, variance
-
-
-def variational(
-    z: Floats, u: Floats, q: Floats, r: float, dt: float, n: float, rho: float, iterations: int
-) -> tuple[Floats, Floats]:
-    """Mean (T,) and beta / alpha (T,) of q(x) q(r), q(r) = IG(alpha, beta), alpha = n / 2 (Sarkka, Nummenmaa 2009)."""
-    x, a, b, found = z[0], 1.0, 0.0, [(z[0], r)]
-    for t in range(1, len(z)):
-        x, b = x + dt * u[t], b + q[t]
-        if not np.isnan(z[t]):
-            p, v, alpha, beta = a * r + b, z[t] - x, rho * n / 2, rho * n * r / 2
-            alpha, noise = alpha + 0.5, r
-            for _ in range(iterations):
-                k = p / (p + noise)
-                noise = max((beta + ((1 - k) ** 2 * v**2 + (1 - k) * p) / 2) / alpha, 1e-4)
-            n, r = 2 * alpha, noise
             k = (a * r + b) / (a * r + b + r)
             x, a, b = x + k * v, (1 - k) ** 2 * a + k**2, (1 - k) ** 2 * b
         found.append((x, r))

@@ -6,16 +6,25 @@ loop over a block of measurements within each operation leaves little of the cos
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, inside
-from .operations import Operation, piecewise, transcendental
+from ..compiling.compile import compiled, inside, part
 
 LANES = 32
 """Measurements side by side: the rows of a tape's slots then stay in the nearest cache."""
+
+
+Operation = IntEnum(
+    "Operation",
+    "INPUT OUTPUT CONST ASSIGN ADD SUB MUL DIV NEG INV SQRT SIN COS TAN ASIN ACOS ATAN ATAN2 EXP LOG LOG1P POW "
+    "CONSTPOW FABS SIGN FMIN FMAX REMAINDER LT LE EQ NE NOT AND OR IF_ELSE_ZERO",
+    start=0,
+)
+"""What a tape can hold; CasADi's names without "OP_"."""
 
 
 class Tape(NamedTuple):
@@ -104,3 +113,61 @@ def arithmetic(code: int, w: Floats, o: int, a: int, b: int) -> None:
     else:
         for i in range(LANES):
             w[o, i] = w[a, i]
+
+
+@part
+def transcendental(code: int, a: float, b: float) -> float:
+    """SIN to CONSTPOW."""
+    y = a
+    if code == Operation.SIN:
+        y = np.sin(a)
+    elif code == Operation.COS:
+        y = np.cos(a)
+    elif code == Operation.TAN:
+        y = np.tan(a)
+    elif code == Operation.ASIN:
+        y = np.arcsin(a)
+    elif code == Operation.ACOS:
+        y = np.arccos(a)
+    elif code == Operation.ATAN:
+        y = np.arctan(a)
+    elif code == Operation.ATAN2:
+        y = np.arctan2(a, b)
+    elif code == Operation.EXP:
+        y = np.exp(a)
+    elif code == Operation.LOG:
+        y = np.log(a)
+    elif code == Operation.LOG1P:
+        y = np.log1p(a)
+    elif code == Operation.POW or code == Operation.CONSTPOW:
+        y = a**b
+    return y
+
+
+@part
+def piecewise(code: int, a: float, b: float) -> float:
+    """FABS to IF_ELSE_ZERO: remainders, comparisons and logic, true as 1."""
+    y = 0.0
+    if code == Operation.FABS:
+        y = abs(a)
+    elif code == Operation.SIGN:
+        y = np.sign(a)
+    elif code == Operation.FMIN:
+        y = np.fmin(a, b)
+    elif code == Operation.FMAX:
+        y = np.fmax(a, b)
+    elif code == Operation.REMAINDER:
+        y = a - b * np.rint(a / b)
+    elif code == Operation.IF_ELSE_ZERO:
+        y = b if a != 0.0 else 0.0
+    elif (
+        (code == Operation.LT and a < b)
+        or (code == Operation.LE and a <= b)
+        or (code == Operation.EQ and a == b)
+        or (code == Operation.NE and a != b)
+        or (code == Operation.NOT and a == 0.0)
+        or (code == Operation.AND and a != 0.0 and b != 0.0)
+        or (code == Operation.OR and (a != 0.0 or b != 0.0))
+    ):
+        y = 1.0
+    return y

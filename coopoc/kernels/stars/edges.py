@@ -7,14 +7,14 @@ stands for a component that was not measured. A number is a float, or LANES runs
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
+from ...arrays import Floats
 from ..compiling.compile import inner
 from ..compiling.small import apply, choose_each, from_upper, scale, subtract
 from ..compiling.vectors import choose, plus
-from .relative import completed, converted, exact, vector
+from .relative import Numbers, completed, converted, exact, vector
 
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05
 """m; of the converted start, as in `coopoc.optimize.starts.initial`."""
@@ -25,14 +25,16 @@ Python's numba would compile a function once more."""
 
 
 @inner
-def edge(gap: Any, z: Any, assumed: Any, how: Any) -> Any:
+def edge(gap: Numbers, z: Numbers, std: Floats, least: float, how: int) -> tuple[Numbers, Numbers]:
     """E = J^T W J and eta = J^T W (z - h) at the vector `gap` m; without standard deviations E is the unit matrix.
 
     Args:
-        assumed: (3,) std m, rad, rad, of no length for unit matrices; m, the least range: the angles of a measurement
-            that is shorter have their standard deviations inflated.
+        gap: from the ego to the neighbour.
+        z: the measurement.
+        std: (3,) m, rad, rad, of no length for unit matrices.
+        least: m; the angles of a measurement that is shorter have their standard deviations inflated.
+        how: EXACT, AT_MEASUREMENT or AT_GAP.
     """
-    std, least = assumed
     z = z if how == AT_GAP else inflated(z, least)
     x, y, up = gap
     o, whole = 0.0 * z[0], 1e300 - (z[5] + z[6] + z[7])
@@ -54,7 +56,7 @@ def edge(gap: Any, z: Any, assumed: Any, how: Any) -> Any:
 
 
 @inner
-def inflated(z: Any, least: float) -> Any:
+def inflated(z: Numbers, least: float) -> Numbers:
     """The measurement, its angles' standard deviations inflated by least / range, up to half a turn."""
     wide = choose(1e300 - z[5], max(least / max(z[0], 1e-300), 1.0), 0.0 * z[0] + 1.0)
     s1, s2 = -max(-(wide * z[6]), -math.pi), -max(-(wide * z[7]), -math.pi)
@@ -62,7 +64,7 @@ def inflated(z: Any, least: float) -> Any:
 
 
 @inner
-def as_measured(z: Any) -> Any:
+def as_measured(z: Numbers) -> Numbers:
     """Information, upper triangle, of the converted vector where it was measured."""
     sa, ca, si, ci = z[1], z[2], z[3], z[4]
     d = max(z[0], LEAST_RANGE)

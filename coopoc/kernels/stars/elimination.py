@@ -7,9 +7,7 @@ numbers: the compiler takes d from their lengths. A number is a float, or LANES 
 
 from __future__ import annotations
 
-from typing import Any
-
-from ...arrays import AnyArray
+from ...arrays import Floats
 from ..compiling.compile import inner
 from ..compiling.small import (
     add_diagonal,
@@ -26,12 +24,13 @@ from ..compiling.small import (
     store,
     transpose,
 )
+from .relative import Numbers
 
 
 @inner
 def eliminate(
-    source: AnyArray, a: AnyArray, eta: AnyArray, n: int, stride: int, memory: AnyArray, block: Any, row: Any
-) -> Any:
+    source: Floats, a: Floats, eta: Floats, n: int, stride: int, memory: Floats, block: Numbers, row: Numbers
+) -> Numbers:
     """Factorise A = R^T D R: D^-1 R in `a` (which may be `source`), minus the inverse pivots on its diagonal, and
     D^-1 R^-T eta in place of eta.
 
@@ -61,7 +60,7 @@ def eliminate(
 
 
 @inner
-def substitute(factor: AnyArray, x: AnyArray, n: int, stride: int, block: Any, row: Any) -> None:
+def substitute(factor: Floats, x: Floats, n: int, stride: int, block: Numbers, row: Numbers) -> None:
     """Solution A^-1 eta in place of what `eliminate` left in eta."""
     for k in range(n - 1, -1, -1):
         v = load(x, k, row)
@@ -72,7 +71,7 @@ def substitute(factor: AnyArray, x: AnyArray, n: int, stride: int, block: Any, r
 
 @inner
 def predict(
-    a: AnyArray, n: int, stride: int, process: AnyArray, memory: AnyArray, block: Any, row: Any, keep: int = 0
+    a: Floats, n: int, stride: int, process: Floats, memory: Floats, block: Numbers, row: Numbers, keep: int = 0
 ) -> None:
     """Information (A^-1 + Q)^-1 in place of A, Q^-1 = diag(process): with infinite process noise (0) a block is
     forgotten, one after the other as a rank-d update. `memory` holds 2 n blocks.
@@ -104,7 +103,7 @@ def predict(
 
 
 @inner
-def rescale(a: AnyArray, n: int, stride: int, factors: AnyArray, block: Any, row: Any) -> None:
+def rescale(a: Floats, n: int, stride: int, factors: Floats, block: Numbers, row: Numbers) -> None:
     """G A G in place of A, G diagonal: the information of a Gaussian whose numbers are divided by `factors`."""
     for i in range(n):
         left = load(factors, i, row)

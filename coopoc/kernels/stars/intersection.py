@@ -1,166 +1,239 @@
-"""One ego's filter by covariance intersection, split or plain: `coopoc.methods.covariance_intersection`."""
+"""One ego's filter by (split) covariance intersection: `coopoc.methods.covariance_intersection`.
+
+Each source, the ego's own estimate and the pseudo-fixes of its neighbours, has a dependent and an independent
+covariance D and I. With s = w for the ego and 1 - w for all others its information is
+
+    L(s) = (D / s + I)^-1 = s K,  K = (D + s I)^-1,  L' = K D K,  L'' = -2 sym(K I L'),
+
+and w makes the trace of P = (F + sum of L)^-1 least, F the information that depends on nothing: the only minimum of a
+convex function, by Newton's method within brackets from the weight of the step before. LANES runs side by side.
+"""
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import AnyArray, Floats
-from ..compiling.compile import compiled, part
-from ..compiling.vectors import LANES
-from .fusion import DIAGONAL, NOTHING, PLACE, UNIT, Fusion, best_weight, describe, fuse, inverse3, plus, six, times
+from ...arrays import Floats
+from ..compiling.compile import as_written, inner, inside
+from ..compiling.small import (
+    add,
+    add_diagonal,
+    apply,
+    from_upper,
+    inverse,
+    load,
+    minus_product,
+    negate,
+    scale,
+    square,
+    store,
+    subtract,
+    times,
+    transpose,
+    zeros,
+)
+from ..compiling.vectors import LANES, choose
+from .joint_filter import Estimates
 from .messages import (
+    HELD,
     MOVED,
     NEW,
     NONE,
+    NOWHERE,
     POSITION,
     PROCESS,
+    RELATIVE,
+    ROW,
     VARIANCE,
     Assumptions,
     Measurements,
     Star,
     gather,
     largest,
-    position_or_nan,
     star_within,
+    write_ego,
 )
-from .relative import converted_cov, vector
+from .relative import Numbers, completed, converted_cov, direction, vector
+
+ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
+"""Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
+LEAST = 1e-9
+"""Least weight of the ego's own estimate: at zero nothing might be left to invert."""
 
 
-@compiled
-def follow(seen: Measurements, known: Assumptions, split: bool, least_det: bool) -> tuple[Floats, Floats, Floats]:
+class Fusion(NamedTuple):
+    """The estimate of the ego and what is fused with it at a step.
+
+    Attributes:
+        x: (3, LANES) m.
+        dependent: (9 most, LANES) m^2 of each source, the ego's first.
+        independent: (9 most, LANES) m^2.
+        gap: (3 most, LANES) m, from the ego to their pseudo-fixes.
+        used: (most, LANES) 1, or 0 for one without a message.
+        weight: (1, LANES) w.
+        cov: (9, LANES) m^2 of the fused estimate.
+        split: keep independent errors apart.
+    """
+
+    x: Floats
+    dependent: Floats
+    independent: Floats
+    gap: Floats
+    used: Floats
+    weight: Floats
+    cov: Floats
+    split: bool
+
+
+@as_written
+def run_filter(seen: Measurements, known: Assumptions, split: bool) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
         seen: `broadcast` holds every vehicle's own estimate.
         known: `broadcast` its variance m^2.
-        least_det: choose w for the least determinant of the fused covariance, instead of its trace.
+        split: keep independent errors apart.
     """
     runs, steps = seen.gnss.shape[:2]
     out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
     most = largest(seen.start)
-    believed = np.zeros((LANES, 16))
-    fusion = Fusion(np.empty((most, 22)), np.zeros((most, 3)), np.zeros(9), np.empty(18), np.empty(3))
+    fusion = Fusion(
+        np.zeros((3, LANES)),
+        np.zeros((9 * most, LANES)),
+        np.zeros((9 * most, LANES)),
+        np.zeros((3 * most, LANES)),
+        np.ones((most, LANES)),
+        np.zeros((1, LANES)),
+        np.zeros((9, LANES)),
+        split,
+    )
     for first in range(0, runs, LANES):
         star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
-            n = gather(star, seen, known, (first, last), t, old)
-            for lane in range(last - first + 1):
-                step(star, known, fusion, believed[lane], (split, least_det), (n, old, lane))
-                write(out, star, believed[lane], (first + lane, t, seen.start[t]), n, lane)
+            n = gather(star, seen, known, first, last, t, old)
+            step(star, known, fusion, n, old)
+            write_ego(out, star, fusion.x, fusion.cov, first, last, t, seen.start[t], n)
             old = n
     return out
 
 
-@part
-def write(out: Any, star: Star, believed: AnyArray, at: Any, n: int, lane: int) -> None:
-    """Copy what a step found in one run."""
-    (x, cov, theirs), (run, t, link) = out, at
-    for i in range(3):
-        x[run, t, i] = believed[i]
-        for j in range(3):
-            cov[run, t, i, j] = believed[3 + PLACE[i][j]] + believed[9 + PLACE[i][j]]
-        for k in range(1, n):
-            theirs[run, link + k - 1, i] = position_or_nan(star, k, i, lane)
+@inner
+def step(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) -> None:
+    """Predict and fuse."""
+    fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
+    o = 0.0 * fix[0]
+    nothing = zeros(o, square(ROW))
+    if old == 0:
+        x, fixed, w = fix, nothing, o + 0.5
+        add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
+    else:
+        new = load(star.status, NEW, (0.0,))[0]
+        x, w = add(load(fusion.x, 0, ROW), load(star.motion, MOVED, ROW)), load(fusion.weight, 0, (0.0,))[0]
+        fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
+        independent = add_diagonal(load(fusion.independent, 0, square(ROW)), load(star.motion, PROCESS, ROW))
+        add_source(fusion, 0, load(fusion.dependent, 0, square(ROW)), independent)
+    add_neighbours(star, known, fusion, x, n)
+    w = best_weight(fusion, fixed, n, w)
+    total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
+    for k in range(n):
+        s = w if k == 0 else 1.0 - w
+        information, derivative, _ = source(fusion, k, s)
+        total, dependent = add(total, information), add(dependent, scale(derivative, s))
+        eta = add(eta, apply(information, load(fusion.gap, k, ROW)))
+    cov = inverse(total)
+    dependent = product(product(cov, dependent), cov)
+    store(fusion.x, 0, add(x, apply(cov, eta)))
+    store(fusion.cov, 0, cov)
+    store(fusion.dependent, 0, dependent)
+    store(fusion.independent, 0, subtract(cov, dependent))
+    store(fusion.weight, 0, (w,))
 
 
-@part
-def message(star: Star, k: int, row: int, lane: int) -> Any:
-    """Three numbers of member k's last message."""
-    at = 12 * k + 3 * row
-    return star.motion[at, lane], star.motion[at + 1, lane], star.motion[at + 2, lane]
-
-
-@part
-def diagonal(v: Any) -> Any:
-    """A diagonal matrix."""
-    return v[0], 0.0, 0.0, v[1], 0.0, v[2]
-
-
-@part
-def step(star: Star, known: Assumptions, fusion: Fusion, believed: AnyArray, choice: Any, sizes: Any) -> None:
-    """Predict and fuse one run, whose belief is (16,): x m, dependent and independent covariance m^2, w."""
-    (split, least_det), (n, old, lane) = choice, sizes
-    w, dependent, independent = 0.5, NOTHING, diagonal(message(star, 0, VARIANCE, lane))
-    fix, variance, moved = (
-        message(star, 0, POSITION, lane),
-        message(star, 0, VARIANCE, lane),
-        message(star, 0, MOVED, lane),
-    )
-    fusion.fixed[:] = 0.0
-    for c in range(3):
-        fusion.at[c] = fix[c] if old == 0 else believed[c] + moved[c]
-        if old > 0:
-            weight = star.status[NEW, lane] / variance[c]
-            fusion.fixed[DIAGONAL[c]], fusion.fixed[6 + c] = weight, weight * (fix[c] - fusion.at[c])
-    if old > 0:
-        w, dependent = believed[15], six(believed, 3)
-        independent = plus(six(believed, 9), diagonal(message(star, 0, PROCESS, lane)))
-    alone = describe(dependent, independent, split, fusion.source, 0)
-    count = gather_sources(star, known, fusion, split, n, lane)
-    w = best_weight(fusion, count, least_det, alone, w)
-    dependent, independent = fuse(fusion, count, w)
-    for k in range(6):
-        believed[3 + k], believed[9 + k] = dependent[k], independent[k]
-    believed[0], believed[1], believed[2], believed[15] = fusion.at[0], fusion.at[1], fusion.at[2], w
-
-
-@part
-def gather_sources(star: Star, known: Assumptions, fusion: Fusion, split: bool, n: int, lane: int) -> int:
-    """Sources of the neighbours of which a message is held, behind the ego's own, and the gaps m of their pseudo-fixes;
-    how many there are.
-
-    A source that depends on nothing joins the fix: its information counts whatever the weight.
-    """
-    count, at, fixed = 1, fusion.at, fusion.fixed
+@inner
+def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
+    """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
+    o = 0.0 * x[0]
+    one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
     for k in range(1, n):
-        if math.isnan(position_or_nan(star, k, 0, lane)):
-            continue
-        x, y, z = message(star, k, POSITION, lane)
-        x, y, z = x - at[0], y - at[1], z - at[2]
-        seen, relative = direction(x, y, z), UNIT
+        gap = subtract(load(star.motion, 4 * k + POSITION, ROW), x)
+        relative, variance = load(star.relative, k, RELATIVE), load(star.motion, 4 * k + VARIANCE, ROW)
+        noise = one
         if len(known.relative_std):
-            relative = converted_cov(seen, deviations(star, k, lane), known.min_range)
-        p, q, r = vector(measured(star, seen, k, lane))
-        p, q, r = x - p, y - q, z - r
-        theirs = diagonal(message(star, k, VARIANCE, lane))
-        if describe(theirs, relative, split, fusion.source, count):
-            weight = inverse3(plus(theirs, relative))
-            u, v, w = times(weight, p, q, r)
-            for m, value in enumerate((*weight, u, v, w)):
-                fixed[m] += value
-        else:
-            fusion.gap[count, 0], fusion.gap[count, 1], fusion.gap[count, 2] = p, q, r
-            count += 1
-    return count
+            std = (relative[5], relative[6], relative[7])
+            noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, known.min_range))
+        held = load(star.status, 5 * k + HELD, (0.0,))[0]
+        store(fusion.used, k, (choose(o + NOWHERE - variance[0], held, o),))
+        store(fusion.gap, k, subtract(gap, vector(completed(relative, gap))))
+        add_source(fusion, k, add_diagonal(zeros(o, square(ROW)), variance), noise)
 
 
-@part
-def deviations(star: Star, k: int, lane: int) -> Any:
-    """Standard deviations of range m and angles rad."""
-    return star.relative[8 * k + 5, lane], star.relative[8 * k + 6, lane], star.relative[8 * k + 7, lane]
+@inside
+def add_source(fusion: Fusion, k: int, dependent: Numbers, independent: Numbers) -> None:
+    """Set a source; plain covariance intersection takes all of its error as dependent."""
+    if not fusion.split:
+        dependent, independent = add(dependent, independent), scale(independent, 0.0)
+    store(fusion.dependent, k, dependent)
+    store(fusion.independent, k, independent)
 
 
-@part
-def measured(star: Star, expected: Any, k: int, lane: int) -> Any:
-    """The measurement of member k, its missing components as expected."""
-    at, (d, a, i) = 8 * k, deviations(star, k, lane)
-    return (
-        star.relative[at, lane] if d < math.inf else expected[0],
-        star.relative[at + 1, lane] if a < math.inf else expected[1],
-        star.relative[at + 2, lane] if a < math.inf else expected[2],
-        star.relative[at + 3, lane] if i < math.inf else expected[3],
-        star.relative[at + 4, lane] if i < math.inf else expected[4],
-    )
+@inner
+def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]:
+    """L, L' and K I L' of a source at its s; 0 for one that is not used.
+
+    K I is (1 - K D) / s, which keeps its digits beside an I of 1e8 m^2; if not split it is 0.
+    """
+    d, i = load(fusion.dependent, k, square(ROW)), load(fusion.independent, k, square(ROW))
+    root = scale(inverse(add(d, scale(i, s))), load(fusion.used, k, (0.0,))[0])
+    share = product(root, d)
+    derivative = product(share, root)
+    bend = scale(derivative, 0.0)
+    if fusion.split:
+        bend = scale(subtract(derivative, product(share, derivative)), 1.0 / max(s, 0.0 * s + 1e-12))
+    return scale(root, s), derivative, bend
 
 
-@part
-def direction(x: float, y: float, z: float) -> Any:
-    """Length of a vector, sine and cosine of its azimuth and of its inclination."""
-    flat2 = x * x + y * y
-    flat, d = math.sqrt(flat2), math.sqrt(flat2 + z * z)
-    sine, cosine = (y / flat, x / flat) if flat > 0.0 else (0.0, 1.0)
-    up, level = (flat / d, z / d) if d > 0.0 else (0.0, 1.0)
-    return d, sine, cosine, up, level
+@inner
+def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
+    """w of least trace in [LEAST, 1]."""
+    low, high = 0.0 * w + LEAST, 0.0 * w + 1.0
+    for round_ in range(ROUNDS):
+        first, second = derivatives(fusion, fixed, n, w)
+        low, high = choose(first, low, w), choose(-first, high, w)
+        newton = choose(second, w - first / second, w)
+        inside_low, inside_high = newton - low, high - newton
+        middle = 0.5 * (low + high)
+        below, above = (low, high) if round_ < BISECT else (middle, middle)
+        before, w = w, choose(inside_low, choose(inside_high, newton, above), below)
+        if abs(w - before) <= 0.0 * w + TOLERANCE:
+            break
+    return w
+
+
+@inner
+def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float, float]:
+    """First and second derivative of tr P by w."""
+    total, slope, bend = fixed, scale(fixed, 0.0), scale(fixed, 0.0)
+    for k in range(n):
+        information, derivative, curvature = source(fusion, k, w if k == 0 else 1.0 - w)
+        total, bend = add(total, information), add(bend, curvature)
+        slope = add(slope, derivative) if k == 0 else subtract(slope, derivative)
+    p = inverse(total)
+    twice = product(p, p)
+    bend = add(product(product(slope, p), slope), bend)
+    return -inner_product(twice, slope), 2.0 * inner_product(twice, transpose(bend))
+
+
+@inside
+def product(a: Numbers, b: Numbers) -> Numbers:
+    """A B."""
+    return negate(minus_product(a, b))
+
+
+@inside
+def inner_product(a: Numbers, b: Numbers) -> float:
+    """The sum of a_i b_i."""
+    p = times(a, b)
+    total: float = p[0] + p[1] + p[2] + p[3] + p[4] + p[5] + p[6] + p[7] + p[8]
+    return total

@@ -1,29 +1,32 @@
-"""Building blocks of a filter of a star in information form, for blocks of any size d >= 3, position first.
+"""Gaussian of a star in information form: prediction, fixes and relative measurements in d x d blocks, d >= 3.
 
-The state of member k is tuple k; its block is k - 1, and the ego's is the last, so that elimination ends with the ego's
-covariance. A filter calls, step by step, `gather` of `coopoc.kernels.stars.messages`, `predict_state`, `predict` of
-`coopoc.kernels.stars.elimination`, `rearrange`, `add_fix` and `add_relative`, and `solve`.
+The state of member k is tuple k, its position first; its block is k - 1, and the ego's is the last, so that elimination
+ends with the ego's covariance. A filter calls, step by step, `gather` of `coopoc.kernels.stars.messages`,
+`predict_state`, `predict` of `coopoc.kernels.stars.elimination`, `rearrange`, `add_fix` and `add_relative`, and
+`solve`. The argument `row` is any tuple of d numbers, from which the compiler takes d.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from ...arrays import AnyArray, Floats
+from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import (
     add,
     add_corner,
     add_diagonal,
     apply,
+    choose_each,
     first3,
     from_upper,
     load,
     negate,
     plus_applied,
+    scale,
     square,
     store,
     subtract,
@@ -35,7 +38,7 @@ from ..compiling.small import (
 from ..compiling.vectors import LANES, choose
 from .elimination import eliminate, substitute
 from .messages import MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
-from .relative import completed, converted, exact, incomplete, vector
+from .relative import Numbers, completed, converted, exact, incomplete, vector
 
 LEAST_KNOWN = 1e-4
 """1/m^2, information along x below which nothing is known of where a member is."""
@@ -67,16 +70,19 @@ class Joint(NamedTuple):
     stride: int
 
 
-@inside
-def joint_size(most: int, row: Any) -> int:
+def joint_rows(most: int, row: Numbers) -> int:
     """Rows of memory for `most` members."""
     return 4 * len(row) * most + 2 * len(row) * len(row) * (most * most + most)
 
 
+joint_size = storage(joint_rows)
+"""The same, for compiled code."""
+
+
 @storage
-def joint_in(memory: AnyArray, most: int, row: Any) -> Joint:
+def joint_in(memory: Floats, most: int, row: Numbers) -> Joint:
     """A Gaussian of up to `most` members, whose state is as long as `row`, in memory (>= joint_size LANES,)."""
-    d, size = len(row), joint_size(most, row)
+    d, size = len(row), len(memory) // LANES
     rows = memory[: size * LANES].reshape((size, LANES))
     a, b = d * most, d * d * most * most
     return Joint(
@@ -92,19 +98,15 @@ def joint_in(memory: AnyArray, most: int, row: Any) -> Joint:
 
 
 @storage
-def joint_within(most: int, row: Any) -> Joint:
+def joint_within(most: int, row: Numbers) -> Joint:
     """Room for `most` members, made by compiled code."""
     return joint_in(np.zeros(joint_size(most, row) * LANES), most, row)
 
 
-def new_joint(most: int, row: Any) -> Joint:
-    """Room for `most` members."""
-    d = len(row)
-    information, factor, scratch = (
-        np.zeros((d * d * blocks, LANES)) for blocks in (most * most, most * most, 2 * most)
-    )
-    state, eta, move, process = (np.zeros((d * most, LANES)) for _ in range(4))
-    return Joint(state, information, factor, eta, move, process, scratch, most)
+def new_joint(most: int, row: Numbers, memory: Floats | None = None) -> Joint:
+    """Room for `most` members, or that in memory."""
+    plain: Any = joint_in
+    return cast(Joint, plain.py_func(np.zeros(joint_rows(most, row) * LANES) if memory is None else memory, most, row))
 
 
 @inside
@@ -114,7 +116,7 @@ def block_of(k: int, n: int) -> int:
 
 
 @inner
-def predict_state(star: Star, joint: Joint, n: int, old: int, row: Any) -> None:
+def predict_state(star: Star, joint: Joint, n: int, old: int, row: Numbers) -> None:
     """Move the members that stay; the ego starts where its first fix is, one that joins where the ego measures it, or,
     if the ego does not measure all three components, where its own message puts it.
 
@@ -142,7 +144,7 @@ def predict_state(star: Star, joint: Joint, n: int, old: int, row: Any) -> None:
 
 
 @inside
-def first_place(star: Star, k: int, ego: Any) -> Any:
+def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
     seen = load(star.relative, k, RELATIVE)
     measured = add(ego, vector(seen))
@@ -150,31 +152,26 @@ def first_place(star: Star, k: int, ego: Any) -> Any:
         return measured
     lacks = seen[5] + seen[6] + seen[7] - (0.0 * seen[0] + 1e300)
     new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
-    x, y, z = load(star.motion, 4 * k + POSITION, ROW)
     near = seen[0] + 1.0
-    return (
-        choose(lacks, choose(new, x, ego[0] + near), measured[0]),
-        choose(lacks, choose(new, y, ego[1] + near), measured[1]),
-        choose(lacks, choose(new, z, ego[2] + 0.1 * near), measured[2]),
-    )
+    somewhere = add(ego, (near, near, 0.1 * near))
+    return choose_each(lacks, choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere), measured)
+
+
+@inner
+def place_on_broadcast(star: Star, joint: Joint, n: int, row: Numbers) -> None:
+    """Put members of which nothing was known where their first message with a position does: what was measured of them
+    is linear there, and not where they were assumed to be until now."""
+    for k in range(1, n):
+        if star.previous[k] >= 0:
+            state = load(joint.state, k, row)
+            own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
+            new, at = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5, first3(state)
+            there = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), at)
+            store(joint.state, k, with_first3(state, choose_each(own - LEAST_KNOWN, at, there)))
 
 
 @inside
-def place(star: Star, joint: Joint, k: int, row: Any) -> None:
-    """Put a member of which nothing was known where its first message with a position does: what was measured of it is
-    linear there, and not where it was assumed to be until now."""
-    state = load(joint.state, k, row)
-    own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
-    new, at = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5, first3(state)
-    x, y, z = load(star.motion, 4 * k + POSITION, ROW)
-    there = choose(new, x, at[0]), choose(new, y, at[1]), choose(new, z, at[2])
-    known = own - LEAST_KNOWN
-    found = choose(known, at[0], there[0]), choose(known, at[1], there[1]), choose(known, at[2], there[2])
-    store(joint.state, k, with_first3(state, found))
-
-
-@inside
-def placed(joint: Joint, k: int, seen: Any, row: Any) -> Any:
+def placed(joint: Joint, k: int, seen: Numbers, row: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
     whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
@@ -192,7 +189,7 @@ def stayed(star: Star, n: int, old: int) -> bool:
 
 
 @inner
-def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Any, row: Any) -> None:
+def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers, row: Numbers) -> None:
     """Information in the order of the new star; that of a member that joins is diagonal, the tuple `prior`."""
     if stayed(star, n, old):
         return
@@ -217,7 +214,7 @@ def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Any, row: Any) 
 
 
 @inner
-def copy(source: AnyArray, target: AnyArray, n: int, stride: int, block: Any) -> None:
+def copy(source: Floats, target: Floats, n: int, stride: int, block: Numbers) -> None:
     """The blocks on and above the diagonal."""
     for i in range(n):
         for j in range(i, n):
@@ -225,7 +222,9 @@ def copy(source: AnyArray, target: AnyArray, n: int, stride: int, block: Any) ->
 
 
 @inside
-def relative_information(star: Star, joint: Joint, k: int, std: AnyArray, least: float, row: Any) -> Any:
+def relative_information(
+    star: Star, joint: Joint, k: int, std: Floats, least: float, row: Numbers
+) -> tuple[Numbers, Numbers]:
     """Information (3, 3) of the converted measurement of member k at the predicted geometry, and what it adds to the
     information vector: W and W (measured vector - predicted vector)."""
     seen = load(star.relative, k, RELATIVE)
@@ -235,7 +234,7 @@ def relative_information(star: Star, joint: Joint, k: int, std: AnyArray, least:
     if len(std) or lacking:
         weight = converted(x, y, z, deviations(seen, gap, len(std) == 0), least)
         if lacking:
-            weight = times_all(weight, placed(joint, k, seen, row))
+            weight = scale(weight, placed(joint, k, seen, row))
     else:
         o, one = 0.0 * x, 0.0 * x + 1.0
         weight = one, o, o, one, o, one
@@ -245,14 +244,7 @@ def relative_information(star: Star, joint: Joint, k: int, std: AnyArray, least:
 
 
 @inside
-def times_all(six: Any, factor: Any) -> Any:
-    """All six numbers times one."""
-    a, b, c, d, e, f = six
-    return a * factor, b * factor, c * factor, d * factor, e * factor, f * factor
-
-
-@inside
-def deviations(seen: Any, gap: Any, unit: bool) -> Any:
+def deviations(seen: Numbers, gap: Numbers, unit: bool) -> Numbers:
     """Standard deviations of range m and angles rad; of a unit covariance 1 m along each."""
     if unit:
         flat2 = gap[0] * gap[0] + gap[1] * gap[1]
@@ -261,29 +253,25 @@ def deviations(seen: Any, gap: Any, unit: bool) -> Any:
 
 
 @inside
-def exact_information(star: Star, joint: Joint, k: int, n: int, least: float, row: Any) -> Any:
+def exact_information(star: Star, joint: Joint, k: int, n: int, least: float, row: Numbers) -> tuple[Numbers, Numbers]:
     """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
     seen = load(star.relative, k, RELATIVE)
     ahead = subtract(first3(load(joint.move, k - 1, row)), first3(load(joint.move, n - 1, row)))
     gap = subtract(first3(load(joint.state, k, row)), first3(load(joint.state, 0, row)))
     x, y, z = add(gap, ahead)
-    xx, xy, xz, yy, yz, zz, p, q, r = exact(x, y, z, seen, (seen[5], seen[6], seen[7]), least)
+    found = exact(x, y, z, seen, (seen[5], seen[6], seen[7]), least)
     if incomplete(seen):
-        known = placed(joint, k, seen, row)
-        xx, xy, xz, yy, yz, zz = times_all((xx, xy, xz, yy, yz, zz), known)
-        p, q, r = p * known, q * known, r * known
-    weight = from_upper((xx, xy, xz, yy, yz, zz))
-    return weight, plus_applied((p, q, r), weight, ahead)
+        found = scale(found, placed(joint, k, seen, row))
+    weight = from_upper(found[:6])
+    return weight, plus_applied(found[6:], weight, ahead)
 
 
 @inside
-def add_relative(a: AnyArray, eta: AnyArray, stride: int, members: Any, edge: Any, row: Any) -> None:
-    """Add information (weight, vector) about the position of member k less that of the ego, to matrix and vector.
-
-    Args:
-        members: k and the number n of blocks.
-    """
-    (k, n), (weight, vector) = members, edge
+def add_relative(
+    a: Floats, eta: Floats, stride: int, k: int, n: int, weight: Numbers, vector: Numbers, row: Numbers
+) -> None:
+    """Add information (weight, vector) about the position of member k of n less that of the ego, to matrix and
+    vector."""
     i, e, like = k - 1, n - 1, square(row)
     for at in (i, e):
         diagonal = at * stride + at
@@ -296,7 +284,7 @@ def add_relative(a: AnyArray, eta: AnyArray, stride: int, members: Any, edge: An
 
 
 @inside
-def add_fix(joint: Joint, i: int, weight: Any, gap: Any, row: Any) -> None:
+def add_fix(joint: Joint, i: int, weight: Numbers, gap: Numbers, row: Numbers) -> None:
     """Add a measured position to block i: its inverse variances, and the measured position less the predicted one."""
     at = i * joint.stride + i
     own = load(joint.information, at, square(row))
@@ -306,7 +294,7 @@ def add_fix(joint: Joint, i: int, weight: Any, gap: Any, row: Any) -> None:
 
 
 @inside
-def solve(a: AnyArray, joint: Joint, eta: AnyArray, n: int, row: Any) -> Any:
+def solve(a: Floats, joint: Joint, eta: Floats, n: int, row: Numbers) -> Numbers:
     """Step A^-1 eta of the state in place of eta; minus the covariance of the ego."""
     cov = eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch, square(row), row)
     substitute(joint.factor, eta, n, joint.stride, square(row), row)
@@ -314,7 +302,7 @@ def solve(a: AnyArray, joint: Joint, eta: AnyArray, n: int, row: Any) -> Any:
 
 
 @inside
-def move(joint: Joint, n: int, row: Any) -> None:
+def move(joint: Joint, n: int, row: Numbers) -> None:
     """Add the step in `eta` to the state."""
     for k in range(n):
         store(joint.state, k, add(load(joint.state, k, row), load(joint.eta, block_of(k, n), row)))

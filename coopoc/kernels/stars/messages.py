@@ -1,4 +1,4 @@
-"""What the last message of each member of a star holds at a step, for LANES runs side by side.
+"""The newest message of each member of a star, brought forward to a step, for LANES runs side by side.
 
 The one place that defines a message: the members of the star, the place of each in the last one, its motion
 since then, and its position as broadcast, brought forward to now. A message that is missing or lost has held = 0, one
@@ -8,14 +8,14 @@ whose position was used before, or has no fix, has new = 0.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy import uint64
 
-from ...arrays import AnyArray, Bools, Floats, Ints
+from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, load, scale, store
+from ..compiling.small import add, choose_each, load, scale, store
 from ..compiling.vectors import LANES, choose, put, take
 from ..motion import MotionNoise, process_variance
 
@@ -27,6 +27,8 @@ SENT, USES, AGE, HELD, NEW = range(5)
 age in steps, 1 if there is one, and 1 if its position counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
+Three: TypeAlias = tuple[float, float, float]
+Five: TypeAlias = tuple[float, float, float, float, float]
 ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
@@ -59,7 +61,7 @@ class Measurements(NamedTuple):
 
 
 class Assumptions(NamedTuple):
-    """What a filter assumes of them; arrays are broadcastable to (R, T, N, 3) m^2.
+    """Noise model of a star filter; arrays are broadcastable to (R, T, N, 3) m^2.
 
     Attributes:
         process: of one step.
@@ -108,7 +110,7 @@ class Star(NamedTuple):
 
 
 @storage
-def star_in(memory: AnyArray, columns: AnyArray, most: int) -> Star:
+def star_in(memory: Floats, columns: Ints, most: int) -> Star:
     """A star of up to `most` members in memory (>= 30 most LANES,) and columns (>= 3 most,)."""
     rows = memory[: 30 * most * LANES].reshape((30 * most, LANES))
     return Star(
@@ -130,13 +132,12 @@ def star_within(most: int) -> Star:
 
 def new_star(most: int) -> Star:
     """Room for `most` members."""
-    columns = [np.zeros(most, np.int64) for _ in range(3)]
-    status, motion, relative, last = (np.zeros((rows * most, LANES)) for rows in (5, 12, 8, 5))
-    return Star(columns[0], columns[1], status, motion, relative, columns[2], last)
+    plain: Any = star_in
+    return cast(Star, plain.py_func(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most))
 
 
 @inner
-def largest(start: AnyArray) -> int:
+def largest(start: Ints) -> int:
     """Members of the largest star."""
     most = 0
     for t in range(len(start) - 1):
@@ -145,10 +146,16 @@ def largest(start: AnyArray) -> int:
 
 
 @inner
-def gather(star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int, old: int) -> int:
-    """Fill the star of step t for runs (first, last), at most LANES, the last one repeated; the number of its members.
+def gather(star: Star, seen: Measurements, known: Assumptions, first: int, last: int, t: int, old: int) -> int:
+    """Fill the star of step t for runs first to last, at most LANES, the last one repeated; the number of its members.
 
     Args:
+        star: of the last step, of `old` members.
+        seen: measurements and messages.
+        known: noise model.
+        first: run.
+        last: run.
+        t: step.
         old: members of the last star.
     """
     n = 1 + seen.start[t + 1] - seen.start[t]
@@ -156,10 +163,10 @@ def gather(star: Star, seen: Measurements, known: Assumptions, runs: Any, t: int
     for k in range(n):
         link = seen.start[t] + k - 1
         star.member[k] = member = seen.ego if k == 0 else seen.neighbour[link]
-        star.previous[k] = place = index_of(member, star.last_member, old)
+        star.previous[k] = index_of(member, star.last_member, old)
         for lane in range(uint64(LANES)):
-            run = min(runs[0] + int(lane), runs[1])
-            receive(star, seen, known, (run, t, link), (k, place, lane))
+            run = min(first + int(lane), last)
+            receive(star, seen, known, run, t, link, k, lane)
             if k > 0:
                 measured(star.relative, five_of(seen.relative, run, link), known.relative_std, k, lane)
         interpret(star, known, k, seen.dt)
@@ -176,30 +183,30 @@ def remember(star: Star, old: int) -> None:
 
 
 @inside
-def clear(values: AnyArray) -> None:
+def clear(values: Floats) -> None:
     """Fill with zeros."""
     for i in range(len(values)):
         store(values, i, (0.0,))
 
 
 @inside
-def index_of(member: int, members: AnyArray, count: int) -> int:
+def index_of(member: int, members: Ints, count: int) -> int:
     """Index of a member, -1 if it is not among the first `count`."""
-    place = -1
+    index = -1
     for i in range(count):
         if members[i] == member:
-            place = i
-    return place
+            index = i
+    return index
 
 
 @inside
-def receive(star: Star, seen: Measurements, known: Assumptions, source: Any, target: Any) -> None:
-    """Copy the last message of a member in one run: velocity, process noise, position, its variance, and its status."""
-    (run, t, link), (k, place, lane) = source, target
-    i, here, before, status = uint64(run), uint64(link), uint64(5 * max(place, 0)), uint64(5 * k)
+def receive(star: Star, seen: Measurements, known: Assumptions, run: int, t: int, link: int, k: int, lane: int) -> None:
+    """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
+    previous, i, here, status = star.previous[k], uint64(run), uint64(link), uint64(5 * k)
+    before = uint64(5 * max(previous, 0))
     sent = t if k == 0 else seen.newest[i, here]
     when = sent if sent >= 0 else t
-    again = place >= 0 and star.last_status[before + uint64(SENT), lane] == sent
+    again = previous >= 0 and star.last_status[before + uint64(SENT), lane] == sent
     star.status[status + uint64(SENT), lane] = sent
     star.status[status + uint64(USES), lane] = star.last_status[before + uint64(USES), lane] + 1.0 if again else 1.0
     star.status[status + uint64(AGE), lane] = t - when
@@ -228,33 +235,41 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
     late, often = dt * dt * age * known.acceleration, 2.0 * uses - 1.0
     velocity, late = load(star.motion, 4 * k + MOVED, ROW), late * late
     one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(known.motion, velocity, dt))
-    one = one[0] + late, one[1] + late, one[2] + late
+    one = add(one, (late, late, late))
     moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
     flat = 0.0 * age + known.flat
     grown = scale(one, age * (known.growth[0] * age + known.growth[1]))
     store(star.motion, 4 * k + MOVED, moved)
-    store(
-        star.motion,
-        4 * k + PROCESS,
-        (
-            choose(held, often * one[0], flat),
-            choose(held, often * one[1], flat),
-            choose(held, often * one[2], flat),
-        ),
-    )
+    store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
     store(star.motion, 4 * k + POSITION, add(load(star.motion, 4 * k + POSITION, ROW), scale(moved, age)))
     store(star.motion, 4 * k + VARIANCE, add(load(star.motion, 4 * k + VARIANCE, ROW), grown))
 
 
-@inside
-def position_or_nan(star: Star, k: int, axis: int, lane: int) -> float:
-    """Position m of member k by its last message, NaN if no message with a position is held."""
-    known = star.status[5 * k + HELD, lane] > 0.0 and star.motion[12 * k + 3 * VARIANCE + axis, lane] < NOWHERE
-    return star.motion[12 * k + 3 * POSITION + axis, lane] if known else np.nan
+@inner
+def write_ego(
+    out: tuple[Floats, Floats, Floats],
+    star: Star,
+    x: Floats,
+    cov: Floats,
+    first: int,
+    last: int,
+    t: int,
+    link: int,
+    n: int,
+) -> None:
+    """Copy the ego's estimate in runs first to last, and its neighbours' own ones, NaN where none is held."""
+    for lane in range(last - first + 1):
+        for i in range(3):
+            out[0][first + lane, t, i] = x[i, lane]
+            for j in range(3):
+                out[1][first + lane, t, i, j] = cov[3 * i + j, lane]
+            for k in range(1, n):
+                held = star.status[5 * k + HELD, lane] > 0.0 and star.motion[12 * k + 3 * VARIANCE + i, lane] < NOWHERE
+                out[2][first + lane, link + k - 1, i] = star.motion[12 * k + 3 * POSITION + i, lane] if held else np.nan
 
 
 @inside
-def measured(relative: AnyArray, seen: Any, std: AnyArray, k: int, lane: int) -> None:
+def measured(relative: Floats, seen: Five, std: Floats, k: int, lane: int) -> None:
     """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
     d, sa, ca, si, ci = seen
     at, unit = uint64(8 * k), len(std) == 0
@@ -273,7 +288,7 @@ def measured(relative: AnyArray, seen: Any, std: AnyArray, k: int, lane: int) ->
 
 
 @inside
-def three_of(values: AnyArray, run: Any, t: Any, member: Any) -> Any:
+def three_of(values: Floats, run: int, t: int, member: int) -> Three:
     """Three of what is broadcastable to (R, T, N, 3)."""
     one = uint64(1)
     i, j = min(run, uint64(values.shape[0]) - one), min(t, uint64(values.shape[1]) - one)
@@ -282,7 +297,7 @@ def three_of(values: AnyArray, run: Any, t: Any, member: Any) -> Any:
 
 
 @inside
-def five_of(relative: AnyArray, run: int, link: int) -> Any:
+def five_of(relative: Floats, run: int, link: int) -> Five:
     """The five numbers of a measurement of `components`."""
     i, j = uint64(run), uint64(link)
     return (
@@ -295,6 +310,6 @@ def five_of(relative: AnyArray, run: int, link: int) -> Any:
 
 
 @inside
-def put_lane(memory: AnyArray, at: Any, lane: int, values: Any) -> None:
+def put_lane(memory: Floats, at: int, lane: int, values: Three) -> None:
     """Write three numbers of one run."""
     memory[at, lane], memory[at + uint64(1), lane], memory[at + uint64(2), lane] = values

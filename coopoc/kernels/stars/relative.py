@@ -6,22 +6,24 @@ A missing component has an infinite standard deviation, hence no information.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numba.extending import overload
 from numpy import uint64
 
-from ...arrays import AnyArray, Floats, Ints
+from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, inner, inside
 from ..compiling.vectors import LANES, Batched, choose, lane, less, pack, plus, put
 
+Numbers: TypeAlias = tuple[float, ...]
+"""A vector or a matrix; each number a float, or one of LANES runs side by side."""
 QUARTER = (math.pi / 2, 6.123233995736766e-17)
 """Of a turn, rad: the nearest number, and what it lacks."""
 
 
 @as_written
-def components(relative: AnyArray, links: Ints) -> Floats:
+def components(relative: Floats, links: Ints) -> Floats:
     """(R, M, 5) range m, sine and cosine of azimuth and of inclination, of some of (R, L, 3) measurements.
 
     A missing range is -1, sine and cosine of a missing angle are 0. LANES links side by side.
@@ -55,7 +57,7 @@ def or_else(value: float, missing: float) -> float:
 
 
 @as_written
-def sine_and_cosine(turn: Any) -> Any:
+def sine_and_cosine(turn: float) -> tuple[float, float]:
     """By their Taylor series within an eighth of a turn of a multiple of a quarter, exact to the last bit there."""
     quarters = 1.0 * math.floor(turn * (2.0 / math.pi) + 0.5)
     x = less(less(turn, quarters, QUARTER[0]), quarters, QUARTER[1])
@@ -72,7 +74,7 @@ def sine_and_cosine(turn: Any) -> Any:
 
 
 @inner
-def vector(seen: Any) -> Any:
+def vector(seen: Numbers) -> Numbers:
     """The measured vector, m."""
     ground = seen[0] * seen[3]
     return ground * seen[2], ground * seen[1], seen[0] * seen[4]
@@ -96,9 +98,9 @@ def series(sine: float, cosine: float) -> float:
 
 
 @inner
-def one_angle(sine: Any, cosine: Any, which: int) -> float:
+def one_angle(sine: float, cosine: float, k: int) -> float:
     """The `angle` of one run."""
-    y, x = lane(sine, which), lane(cosine, which)
+    y, x = lane(sine, k), lane(cosine, k)
     return series(y, x) if abs(y) <= 0.25 * x else math.atan2(y, x)
 
 
@@ -120,7 +122,7 @@ def _of_several_runs(sine: Any, cosine: Any) -> Any:
 
 
 @inner
-def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
+def converted(x: float, y: float, z: float, std: Numbers, least: float) -> Numbers:
     """Information, upper triangle, of a converted measurement along (x, y, z): C^-1 of `vector_cov`, whose axes are
     those of range, azimuth and inclination."""
     flat2 = plus(x * x, y, y)
@@ -142,25 +144,30 @@ def converted(x: float, y: float, z: float, std: Any, least: float) -> Any:
 
 
 @inner
-def at_measurement(seen: Any, std: Any, least: float) -> Any:
+def at_measurement(seen: Numbers, std: Numbers, least: float) -> Numbers:
     """The information of `exact`, upper triangle, at the measured vector itself; its distance is at least `least`."""
     d, level = max(seen[0], least), max(abs(seen[3]), 1e-3)
     a, b, c = 1.0 / std[0], seen[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
-    ax, ay, az, bx, by = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4], -b * seen[1], b * seen[2]
     tilt = c * seen[3] * seen[4]
-    cx, cy, cz = tilt * seen[2], tilt * seen[1], -c * level * level
+    along = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4]
+    return gram(along, -b * seen[1], b * seen[2], (tilt * seen[2], tilt * seen[1], -c * level * level))
+
+
+@inside
+def gram(a: Numbers, bx: float, by: float, c: Numbers) -> Numbers:
+    """J^T J, upper triangle, of the whitened rows a of range, (bx, by, 0) of azimuth and c of inclination."""
     return (
-        dot(ax, ax, bx, bx, cx, cx),
-        dot(ax, ay, bx, by, cx, cy),
-        plus(ax * az, cx, cz),
-        dot(ay, ay, by, by, cy, cy),
-        plus(ay * az, cy, cz),
-        plus(az * az, cz, cz),
+        dot(a[0], a[0], bx, bx, c[0], c[0]),
+        dot(a[0], a[1], bx, by, c[0], c[1]),
+        plus(a[0] * a[2], c[0], c[2]),
+        dot(a[1], a[1], by, by, c[1], c[1]),
+        plus(a[1] * a[2], c[1], c[2]),
+        plus(a[2] * a[2], c[2], c[2]),
     )
 
 
 @inner
-def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> Any:
+def exact(x: float, y: float, z: float, seen: Numbers, std: Numbers, least: float) -> Numbers:
     """J^T J, upper triangle, and J^T r of the whitened range, azimuth and inclination at the vector (x, y, z).
 
     An angle's residual is that between the measured direction and the vector's, which never needs wrapping.
@@ -171,22 +178,14 @@ def exact(x: float, y: float, z: float, seen: Any, std: Any, least: float) -> An
     raised = angle(less(seen[3] * z, seen[4], flat), plus(seen[4] * z, seen[3], flat))
     d = max(r, least)
     ground = max(flat, 1e-3 * d)
-    a = 1.0 / (r * std[0])
-    ax, ay, az, ar = a * x, a * y, a * z, (seen[0] - r) / std[0]
-    b = 1.0 / (ground * ground * std[1])
-    bx, by, br = -b * y, b * x, turned / std[1]
-    c = 1.0 / (ground * d * d * std[2])
-    cx, cy, cz, cr = c * x * z, c * y * z, -c * ground * ground, raised / std[2]
+    a, b, c = 1.0 / (r * std[0]), 1.0 / (ground * ground * std[1]), 1.0 / (ground * d * d * std[2])
+    along, bx, by, raise_ = (a * x, a * y, a * z), -b * y, b * x, (c * x * z, c * y * z, -c * ground * ground)
+    ar, br, cr = (seen[0] - r) / std[0], turned / std[1], raised / std[2]
     return (
-        dot(ax, ax, bx, bx, cx, cx),
-        dot(ax, ay, bx, by, cx, cy),
-        plus(ax * az, cx, cz),
-        dot(ay, ay, by, by, cy, cy),
-        plus(ay * az, cy, cz),
-        plus(az * az, cz, cz),
-        dot(ax, ar, bx, br, cx, cr),
-        dot(ay, ar, by, br, cy, cr),
-        plus(az * ar, cz, cr),
+        *gram(along, bx, by, raise_),
+        dot(along[0], ar, bx, br, raise_[0], cr),
+        dot(along[1], ar, by, br, raise_[1], cr),
+        plus(along[2] * ar, raise_[2], cr),
     )
 
 
@@ -198,30 +197,38 @@ def dot(a: float, x: float, b: float, y: float, c: float, z: float) -> float:
 
 
 @inside
-def incomplete(seen: Any) -> bool:
+def incomplete(seen: Numbers) -> bool:
     """True if any of these runs lacks a component; `seen` with the three standard deviations behind."""
     return not seen[5] + seen[6] + seen[7] <= 0.0 * seen[0] + 1e300
 
 
 @inner
-def completed(seen: Any, gap: Any) -> Any:
+def completed(seen: Numbers, gap: Numbers) -> Numbers:
     """The measurement, its missing components (of infinite deviation) those of the vector `gap`."""
-    x, y, z = gap
-    flat = math.sqrt(plus(x * x, y, y))
-    d = math.sqrt(plus(x * x + y * y, z, z))
+    d, sa, ca, si, ci = direction(gap[0], gap[1], gap[2])
     limit = 0.0 * d + 1e300
     reach, azimuth, inclination = limit - seen[5], limit - seen[6], limit - seen[7]
     return (
         choose(reach, seen[0], d),
-        choose(azimuth, seen[1], y / flat),
-        choose(azimuth, seen[2], x / flat),
-        choose(inclination, seen[3], flat / d),
-        choose(inclination, seen[4], z / d),
+        choose(azimuth, seen[1], sa),
+        choose(azimuth, seen[2], ca),
+        choose(inclination, seen[3], si),
+        choose(inclination, seen[4], ci),
     )
 
 
 @inner
-def converted_cov(seen: Any, std: Any, least: float) -> Any:
+def direction(x: float, y: float, z: float) -> Numbers:
+    """Length of a vector, sine and cosine of its azimuth and of its inclination."""
+    flat2 = plus(x * x, y, y)
+    flat, d = math.sqrt(flat2), math.sqrt(plus(x * x + y * y, z, z))
+    o, one = 0.0 * d, 0.0 * d + 1.0
+    sine, cosine = choose(flat, y / flat, o), choose(flat, x / flat, one)
+    return d, sine, cosine, choose(d, flat / d, o), choose(d, z / d, one)
+
+
+@inner
+def converted_cov(seen: Numbers, std: Numbers, least: float) -> Numbers:
     """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
 
     Args:
@@ -244,6 +251,6 @@ def converted_cov(seen: Any, std: Any, least: float) -> Any:
 
 
 @inside
-def min_of(std: Any) -> Any:
+def min_of(std: float) -> float:
     """At most 1e3."""
     return -max(-std, -1e3)

@@ -7,23 +7,20 @@ of (L + dt)^2 - L^2 times its own variance. All lanes hold the same run.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import AnyArray, Floats, Ints
+from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, inner, inside, storage
-from ..compiling.small import load, square, store
+from ..compiling.small import store
 from ..compiling.vectors import LANES
 from ..motion import ROUNDING, MotionNoise, process_variance
 from ..solo import ESTIMATE, NO_FIX_YET, dead_reckon
-from .joint import Joint, joint_in, joint_size
+from .joint import Joint, joint_in, joint_rows, new_joint
 from .joint_filter import step
 from .messages import (
-    AGE,
-    HELD,
     MOVED,
-    NEW,
     POSITION,
     PROCESS,
     ROW,
@@ -39,26 +36,10 @@ from .relative import or_else, sine_and_cosine
 
 RELATIVE, MESSAGE, MESSAGE_AGE, VELOCITY, FIX = slice(0, 3), 3, 4, slice(5, 8), slice(8, 11)
 """Where a neighbour's input stands in its row: the measurement, 1 for a message, its age s, velocity m/s, fix m."""
-LAST_AGE, LAST_USED = 3, 4
-"""Of a known vehicle, behind the velocity of its last message: its age, and for how long it has served, s."""
-
-
-class Memory(NamedTuple):
-    """What a stream keeps from step to step; M vehicles known, up to `most` in the star.
-
-    Attributes:
-        numbers: of the star and its Gaussian.
-        columns: of the star and its Gaussian.
-        last: (M, 5).
-        place: (M,) index in the last star, -1 for none.
-        size: (2,) members of the last star, `most`.
-    """
-
-    numbers: Floats
-    columns: Ints
-    last: Floats
-    place: Ints
-    size: Ints
+LAST, LAST_AGE, LAST_SERVED, PREVIOUS, WIDTH = slice(11, 14), 14, 15, 16, 17
+"""Behind it the velocity of its last message m/s, the age of that, how long it has served, s, and the neighbour's index
+in the last star, -1 for none."""
+FIX_GROWTH = (1.0, 0.0)
 
 
 class Noise(NamedTuple):
@@ -80,7 +61,7 @@ def packed(noise: Noise) -> Floats:
 
 
 @storage
-def unpacked(values: AnyArray) -> Noise:
+def unpacked(values: Floats) -> Noise:
     """The Noise of an array; a message holds a fix and a velocity."""
     motion = MotionNoise(values[:3], values[3:6], values[6], values[7], values[8])
     fixes = values[9:12].reshape((1, 1, 1, 3))
@@ -89,79 +70,68 @@ def unpacked(values: AnyArray) -> Noise:
     return Noise(motion, known, values[18], values[19] > 0.0)
 
 
-FIX_GROWTH = (1.0, 0.0)
-
-
-@as_written
-def resized(numbers: AnyArray, size: AnyArray, most: int) -> Floats:
-    """Memory for a star of up to `most` members, with the state and the information of the last star."""
-    found = np.zeros((30 * most + joint_size(most, ROW)) * LANES)
-    if size[0] > 0:
-        before = joint_in(numbers[30 * size[1] * LANES :], size[1], ROW)
-        now = joint_in(found[30 * most * LANES :], most, ROW)
-        for i in range(size[0]):
-            store(now.state, i, load(before.state, i, ROW))
-            for j in range(i, size[0]):
-                one = load(before.information, i * size[1] + j, square(ROW))
-                store(now.information, i * most + j, one)
-    return found
+def resized(memory: Floats, n: int, before: int, most: int) -> Floats:
+    """Memory for a star of up to `most` members, with the state and the information of the n of the last one."""
+    larger = np.zeros((30 * most + joint_rows(most, ROW)) * LANES)
+    if n:
+        old, new = (
+            new_joint(before, ROW, memory[30 * before * LANES :]),
+            new_joint(most, ROW, larger[30 * most * LANES :]),
+        )
+        new.state[: 3 * n] = old.state[: 3 * n]
+        blocks, more = (joint.information.reshape(joint.stride, joint.stride, 9, LANES) for joint in (old, new))
+        more[:n, :n] = blocks[:n, :n]
+    return larger
 
 
 @as_written
 def stream_step(
-    given: AnyArray,
-    inbox: AnyArray,
-    numbers: AnyArray,
-    index: AnyArray,
-    last: AnyArray,
-    history: AnyArray,
-    assumed: AnyArray,
-    answer: AnyArray,
+    given: Floats,
+    rows: Floats,
+    memory: Floats,
+    columns: Ints,
+    old: int,
+    history: Floats,
+    assumed: Floats,
+    answer: Floats,
 ) -> int:
     """Take what is new and fill the answer: position m, covariance m^2, positions of the neighbours m.
 
     Args:
         given: (12,) fix m, velocity m/s, dt s, age of the fix s; then x0 m if it is known before the first step, 1.
-        inbox: (k, 12) of the neighbours measured now, behind each its row in `last`.
-        numbers: of Memory.
-        last: of Memory.
-        index: its size, columns and place, one behind the other.
+        rows: (k, WIDTH) of the neighbours measured now; their last messages are brought up to date.
+        memory: of the star and its Gaussian.
+        columns: (3 most,) of the star, of up to `most` members.
+        old: members of the last star.
+        history: of `motion`.
         assumed: of `packed`.
+        answer: (12 + 3 k,).
     """
-    n, old, most, slots = 1 + len(inbox), index[0], index[1], inbox[:, 11]
-    memory = Memory(numbers, index[2 : 2 + 3 * most], last, index[2 + 3 * most :], index[:2])
-    noise = unpacked(assumed)
-    star = star_in(memory.numbers, memory.columns, most)
-    joint = joint_in(memory.numbers[30 * most * LANES :], most, ROW)
-    moved, q, since, late, dt = np.empty(3), np.empty(3), np.zeros(3), np.zeros(3), given[6]
-    found = dead_reckon(given, history, noise.motion, moved, q, since, late)
-    if found != ESTIMATE and found != NO_FIX_YET:
-        return found
-    for slot in range(len(memory.last)):
-        memory.last[slot, LAST_AGE] += dt
-    there = found == ESTIMATE
+    n, most, noise, dt = 1 + len(rows), len(columns) // 3, unpacked(assumed), given[6]
+    star, joint = star_in(memory, columns, most), joint_in(memory[30 * most * LANES :], most, ROW)
+    moved, q, since, late = np.empty(3), np.empty(3), np.zeros(3), np.zeros(3)
+    outcome = dead_reckon(given, history, noise.motion, moved, q, since, late)
     exact = old == 0 and given[11] > 0.0
-    for k in range(n - 1):
-        receive(memory, inbox[k], int(slots[k]))
-    if old == 0 and not there and not exact:
-        return NO_FIX_YET
-    for c in range(3):
-        ego(star, noise.known, (given[c] + since[c], late[c], there), (moved[c], q[c]), (given[8 + c], exact), c)
-    status(star, 0, (1.0, 0.0, 1.0, 1.0 if there or exact else 0.0))
-    star.previous[0] = 0 if old > 0 else -1
+    if outcome != ESTIMATE and outcome != NO_FIX_YET:
+        return outcome
     for k in range(1, n):
-        star.previous[k] = memory.place[int(slots[k - 1])]
-        neighbour(star, memory, noise, inbox[k - 1], int(slots[k - 1]), k, dt)
-    for k in range(n):
-        interpret(star, noise.known, k, dt if k > 0 else 1.0)
-    step(star, joint, noise.known, noise.refine, None, (n, old), ROW)
-    finish(memory, slots, n, dt)
-    answered(joint, n, answer)
+        receive(rows[k - 1], dt)
+    if outcome == NO_FIX_YET and old == 0 and not exact:
+        return outcome
+    set_ego(star, noise.known, given, moved, q, since, late, outcome == ESTIMATE, exact)
+    star.previous[0] = 0 if old > 0 else -1
+    interpret(star, noise.known, 0, 1.0)
+    for k in range(1, n):
+        star.previous[k] = int(rows[k - 1, PREVIOUS])
+        set_neighbour(star, noise, rows[k - 1], k, dt)
+        interpret(star, noise.known, k, dt)
+    step(star, joint, noise.known, noise.refine, n, old)
+    write_answer(joint, n, answer)
     return ESTIMATE
 
 
 @inside
-def answered(joint: Joint, n: int, answer: AnyArray) -> None:
+def write_answer(joint: Joint, n: int, answer: Floats) -> None:
     """Position m and covariance m^2 of the ego, and positions of its neighbours m."""
     for c in range(3):
         answer[c] = joint.state[c, 0]
@@ -172,79 +142,78 @@ def answered(joint: Joint, n: int, answer: AnyArray) -> None:
 
 
 @inner
-def see(star: Star, row: AnyArray, std: AnyArray, k: int) -> None:
+def set_ego(
+    star: Star,
+    known: Assumptions,
+    given: Floats,
+    moved: Floats,
+    q: Floats,
+    since: Floats,
+    late: Floats,
+    fixed: bool,
+    exact: bool,
+) -> None:
+    """The ego's motion and its fix, brought forward; a known start, moved, is joined with the first fix."""
+    for c in range(3):
+        weight = 1.0 / (known.fixes[0, 0, 0, c] + late[c]) if fixed else 0.0
+        z = given[c] + since[c] if fixed else 0.0
+        if exact:
+            more = 1.0 / max(q[c], 1e-18)
+            z = (z * weight + (given[8 + c] + moved[c]) * more) / (weight + more)
+            weight = weight + more
+        set_axis(star, 0, c, moved[c], q[c], z, 1.0 / weight if weight > 0.0 else 1.0)
+    set_status(star, 0, 1.0, 0.0, 1.0, 1.0 if fixed or exact else 0.0)
+
+
+@inside
+def set_axis(star: Star, k: int, c: int, moved: float, process: float, position: float, variance: float) -> None:
+    """The motion and the message of member k on axis c, in all lanes."""
+    store(star.motion, 3 * (4 * k + MOVED) + c, (moved,))
+    store(star.motion, 3 * (4 * k + PROCESS) + c, (process,))
+    store(star.motion, 3 * (4 * k + POSITION) + c, (position,))
+    store(star.motion, 3 * (4 * k + VARIANCE) + c, (variance,))
+
+
+@inside
+def set_status(star: Star, k: int, uses: float, age: float, held: float, new: float) -> None:
+    """The status of member k, in all lanes."""
+    for i, value in enumerate((uses, age, held, new)):
+        store(star.status, 5 * k + USES + i, (value,))
+
+
+@inside
+def receive(row: Floats, dt: float) -> None:
+    """Replace the last message by a new one; a vehicle that was not in the last star has not been moved by it."""
+    row[LAST_AGE] += dt
+    if row[PREVIOUS] < 0.0:
+        row[LAST_SERVED] = 0.0
+    if row[MESSAGE] > 0.0:
+        for c in range(3):
+            row[11 + c] = row[5 + c]
+        row[LAST_AGE], row[LAST_SERVED] = row[MESSAGE_AGE], 0.0
+
+
+@inner
+def set_neighbour(star: Star, noise: Noise, row: Floats, k: int, dt: float) -> None:
+    """Fill member k from its last message and its measurement."""
+    held, there = row[LAST_AGE] <= noise.max_age + ROUNDING, math.isfinite(row[8] + row[9] + row[10])
+    new = held and there and row[MESSAGE] > 0.0
+    age = row[LAST_AGE] / dt if held else 0.0
+    set_status(star, k, 1.0 + row[LAST_SERVED] / dt, age, 1.0 if held else 0.0, 1.0 if new else 0.0)
+    row[LAST_SERVED] += dt
+    interval = noise.motion.interval if noise.motion.interval > 0.0 else dt
+    share, variance = dt / interval, process_variance(noise.motion, row[LAST], interval)
+    for c in range(3):
+        position = row[8 + c] if there else 0.0
+        set_axis(star, k, c, row[11 + c], variance[c] * share * share, position, noise.known.broadcast[0, 0, 0, c])
+    measure(star, row, noise.known.relative_std, k)
+
+
+@inner
+def measure(star: Star, row: Floats, std: Floats, k: int) -> None:
     """Range m, azimuth and inclination rad of member k, with which a row begins; NaN is what was not measured."""
     sa, ca = sine_and_cosine(row[1])
     si, ci = sine_and_cosine(row[2])
     seen = or_else(row[0], -1.0), or_else(sa, 0.0), or_else(ca, 0.0), or_else(si, 0.0), or_else(ci, 0.0)
     for lane in range(LANES):
         measured(star.relative, seen, std, k, lane)
-
-
-@inside
-def receive(memory: Memory, row: AnyArray, slot: int) -> None:
-    """Replace the last message by a new one; a vehicle that was not in the last star has not been moved by it."""
-    if memory.place[slot] < 0:
-        memory.last[slot, LAST_USED] = 0.0
-    if row[MESSAGE] > 0.0:
-        for c in range(3):
-            memory.last[slot, c] = row[5 + c]
-        memory.last[slot, LAST_AGE], memory.last[slot, LAST_USED] = row[MESSAGE_AGE], 0.0
-
-
-@inside
-def ego(star: Star, known: Assumptions, fix: Any, motion: Any, start: Any, c: int) -> None:
-    """One axis of the ego: its motion, its fix; a known start, moved, is joined with the first fix."""
-    (z, late, there), (moved, q), (x0, exact) = fix, motion, start
-    variance = known.fixes[0, 0, 0, c] + late
-    weight = 1.0 / variance if there else 0.0
-    if exact:
-        more = 1.0 / max(q, 1e-18)
-        z = ((z * weight if there else 0.0) + (x0 + moved) * more) / (weight + more)
-        weight = weight + more
-    for lane in range(LANES):
-        star.motion[3 * MOVED + c, lane], star.motion[3 * PROCESS + c, lane] = moved, q
-        star.motion[3 * POSITION + c, lane] = z if weight > 0.0 else 0.0
-        star.motion[3 * VARIANCE + c, lane] = 1.0 / weight if weight > 0.0 else 1.0
-
-
-@inside
-def status(star: Star, k: int, values: Any) -> None:
-    """Uses, age in steps, held and new of member k."""
-    store(star.status, 5 * k + USES, (values[0],))
-    store(star.status, 5 * k + AGE, (values[1],))
-    store(star.status, 5 * k + HELD, (values[2],))
-    store(star.status, 5 * k + NEW, (values[3],))
-
-
-@inner
-def neighbour(star: Star, memory: Memory, noise: Noise, row: AnyArray, slot: int, k: int, dt: float) -> None:
-    """Fill member k from its last message and its measurement."""
-    last, at = memory.last[slot], 12 * k
-    held = last[LAST_AGE] <= noise.max_age + ROUNDING
-    there = math.isfinite(row[8] + row[9] + row[10])
-    age = last[LAST_AGE] / dt if held else 0.0
-    status(
-        star,
-        k,
-        (1.0 + last[LAST_USED] / dt, age, 1.0 if held else 0.0, 1.0 if held and row[MESSAGE] > 0.0 and there else 0.0),
-    )
-    interval = noise.motion.interval if noise.motion.interval > 0.0 else dt
-    share = dt / interval
-    variance = process_variance(noise.motion, last, interval)
-    for c in range(3):
-        values = last[c], variance[c] * share * share, row[8 + c] if there else 0.0, noise.known.broadcast[0, 0, 0, c]
-        for lane in range(LANES):
-            for i in range(4):
-                star.motion[at + 3 * i + c, lane] = values[i]
-    see(star, row, noise.known.relative_std, k)
-
-
-@inside
-def finish(memory: Memory, slots: AnyArray, n: int, dt: float) -> None:
-    """Remember the star: places of its members, and how long their velocities have served."""
-    memory.place[:] = -1
-    for k in range(1, n):
-        memory.place[int(slots[k - 1])] = k
-        memory.last[int(slots[k - 1]), LAST_USED] += dt
-    memory.size[0] = n

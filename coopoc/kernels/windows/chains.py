@@ -1,8 +1,10 @@
-"""The Gauss-Newton step of a window of stars: each neighbour is a chain of points that meets the ego's points only.
+"""Gauss-Newton step of a window of stars: each neighbour's chain of points is eliminated onto the ego's points.
 
-Eliminating the chains one after the other leaves the ego's information matrix of h x h blocks. With S the information
-of a point without the motion that leaves it, of information Q, the next one inherits (S^-1 + Q^-1)^-1 = Q (S + Q)^-1 S,
-which is no difference of near numbers, and its blocks beside the ego's points, and eta, times Q (S + Q)^-1.
+A neighbour's points meet one another in time and the ego's points, never another neighbour. A chain is eliminated from
+its newest point back; what remains is a dense matrix of the ego's h points and, behind an arrival cost, of the
+neighbours' points of the first step, which it couples. With S the information of a point without the motion that leads
+to it, of information Q, the one before inherits (S^-1 + Q^-1)^-1 = Q (S + Q)^-1 S, which is no difference of near
+numbers, and its blocks beside the ego's points, and eta, times Q (S + Q)^-1.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy import uint64
 
-from ...arrays import Floats
+from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inner
 from ..compiling.small import (
     add,
@@ -26,169 +28,241 @@ from ..compiling.small import (
     minus_product,
     mirrored,
     negate,
+    plus_applied,
     scale,
     scale_rows,
     store,
     subtract,
     times,
+    transpose,
     zeros,
 )
 from ..compiling.vectors import LANES, take
 from ..stars.elimination import eliminate, substitute
-from .slots import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, place_of
-
-FLOOR = 1e-12
-"""1/m^2 on every point of a neighbour: one of which nothing is known has a place all the same."""
+from .window_layout import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, row_of
 
 
-class Memory(NamedTuple):
-    """Scratch: of each place its blocks beside the ego's points, its eta, minus its inverse pivot and its move; the
-    ego's matrix of h x h blocks, its eta, two rows of blocks; of each run the largest move m, and a mask."""
+class System(NamedTuple):
+    """The normal equations of a window and their solution.
+
+    Attributes:
+        arm: (9 h rows, LANES) blocks of each point beside the ego's points.
+        eta: (3 rows, LANES).
+        pivot: (9 rows, LANES) minus the inverse pivots.
+        move: (3 rows, LANES) m, the Gauss-Newton step.
+        end: (rows,) last step of the point's chain, counted from the first of the window.
+        core: (9 c^2, LANES) dense matrix of the points that remain.
+        vector: (3 c, LANES) its information vector, then its solution.
+        scratch: (9 c, LANES).
+        cov: (9, LANES) minus the covariance of the ego's newest point.
+        most: (LANES,) largest step m.
+        active: (LANES,) 1 where a run still moves.
+        arrival: (9 most^2, LANES), arrival cost around `Window.start`, neighbours first, then the ego.
+    """
 
     arm: Floats
     eta: Floats
     pivot: Floats
     move: Floats
-    a: Floats
-    b: Floats
-    row: Floats
+    end: Ints
+    core: Floats
+    vector: Floats
+    scratch: Floats
     cov: Floats
     most: Floats
     active: Floats
+    arrival: Floats
 
 
-def new_memory(length: int, most: int) -> Memory:
-    """Scratch for the same."""
-    places = (length + 1) * most
-    return Memory(
-        np.zeros((9 * length * places, LANES)),
-        np.zeros((3 * places, LANES)),
-        np.zeros((9 * places, LANES)),
-        np.zeros((3 * places, LANES)),
-        np.zeros((9 * length * length, LANES)),
-        np.zeros((3 * length, LANES)),
-        np.zeros((9 * length, LANES)),
-        np.zeros((9, LANES)),
-        np.zeros(LANES),
-        np.zeros(LANES),
-    )
+def new_system(length: int, most: int, arrival: Floats | None = None) -> System:
+    """Room for windows of `length` steps of at most `most` members, behind an arrival cost or not."""
+    rows, core = (length + 1) * most, length + (0 if arrival is None else most - 1)
+    arm, eta, pivot, move = (np.zeros((size * rows, LANES)) for size in (9 * length, 3, 9, 3))
+    dense, vector, scratch = (np.zeros((size * core, LANES)) for size in (9 * core, 3, 9))
+    cov, most_moved, active = np.zeros((9, LANES)), np.zeros(LANES), np.zeros(LANES)
+    arrival, end = np.zeros((9, LANES)) if arrival is None else arrival, np.zeros(rows, np.int64)
+    return System(arm, eta, pivot, move, end, dense, vector, scratch, cov, most_moved, active, arrival)
 
 
 @inner
-def move(window: Window, span: Any, memory: Memory, share: Any) -> Any:
-    """Move all points by a share of the Gauss-Newton step; the largest step m of each run. Minus the covariance of the
-    ego's newest point is in `memory.cov`."""
+def gauss_newton(window: Window, span: tuple[int, int], system: System, coupled: int, prior: float) -> None:
+    """Solve for the step of all points of a span; minus the covariance of the ego's newest point is in `system.cov`.
+
+    Args:
+        coupled: neighbours in the arrival cost; -1 without one.
+        prior: 1/m^2, information of the first point of every other chain around `Window.start`.
+    """
     first, last = span
-    h = last - first + 1
-    assemble_ego(window, span, memory)
+    outer = max(coupled, 0)
+    size = outer + last - first + 1
+    assemble_core(window, span, system, coupled)
     for step in range(first, last + 1):
-        for place in range(
-            place_of(window.layout, step, 1), place_of(window.layout, step, count_of(window.sizes, step))
-        ):
-            if step == first or window.previous[place] < 0:
-                fold(window, span, step, place, memory)
-    store(memory.cov, 0, eliminate(memory.a, memory.a, memory.b, h, h, memory.row, ONE, ROW))
-    substitute(memory.a, memory.b, h, h, ONE, ROW)
+        ego = row_of(window.layout, step, 0)
+        for row in range(ego + 1, ego + count_of(window.sizes, step)):
+            if step == last or window.later[row] < 0:
+                fold(window, span, step, row, system, coupled, prior)
+    cov = eliminate(system.core, system.core, system.vector, size, size, system.scratch, ONE, ROW)
+    store(system.cov, 0, cov)
+    substitute(system.core, system.vector, size, size, ONE, ROW)
+    for step in range(first, last + 1):
+        ego = row_of(window.layout, step, 0)
+        store(system.move, ego, load(system.vector, outer + step - first, ROW))
+        for k in range(1, count_of(window.sizes, step)):
+            if coupled >= 0 and step == first:
+                store(system.move, ego + k, load(system.vector, k - 1, ROW))
+            else:
+                unfold(window, span, step, ego + k, system, outer)
+
+
+@inner
+def assemble_core(window: Window, span: tuple[int, int], system: System, coupled: int) -> None:
+    """Arrival cost, and information and eta of the ego's points: fixes, odometry, and the ego's end of each edge."""
+    first, last = span
+    outer = max(coupled, 0)
+    size = outer + last - first + 1
+    nothing = zeros(take(window.located, uint64(0)), ONE)
+    for i in range(size):
+        store(system.vector, i, zeros(nothing[0], ROW))
+        for j in range(i, size):
+            store(system.core, i * size + j, nothing)
+    if coupled >= 0:
+        add_arrival(window, first, system, outer + 1, size)
+    for s in range(last - first + 1):
+        ego, i = row_of(window.layout, first + s, 0), outer + s
+        own, diagonal = load(window.used, ego, ROW), i * (size + 1)
+        block, eta = add_diagonal(load(system.core, diagonal, ONE), own), times(own, fix_gap(window, ego))
+        eta = add(load(system.vector, i, ROW), eta)
+        if s > 0:
+            process, off = motion(window, row_of(window.layout, first + s - 1, 0), ego)
+            block, eta, above = add_diagonal(block, process), add(eta, off), diagonal - size - 1
+            store(system.core, above, add_diagonal(load(system.core, above, ONE), process))
+            store(system.core, above + 1, add_diagonal(nothing, negate(process)))
+            store(system.vector, i - 1, subtract(load(system.vector, i - 1, ROW), off))
+        for row in range(ego + 1, ego + count_of(window.sizes, first + s)):
+            block, eta = add(block, load(window.edge, row, ONE)), subtract(eta, load(window.eta, row, ROW))
+        store(system.core, diagonal, block)
+        store(system.vector, i, eta)
+
+
+@inner
+def add_arrival(window: Window, first: int, system: System, n: int, size: int) -> None:
+    """Move the arrival cost from where it expects the n points of the first step to the points."""
+    for i in range(n):
+        away = from_start(window, first, i, n)
+        own = mirrored(load(system.arrival, i * (window.layout[1] + 1), ONE))
+        store(system.core, i * (size + 1), own)
+        eta = plus_applied(load(system.vector, i, ROW), own, away)
+        for j in range(i + 1, n):
+            block = load(system.arrival, i * window.layout[1] + j, ONE)
+            store(system.core, i * size + j, block)
+            eta = plus_applied(eta, block, from_start(window, first, j, n))
+            store(system.vector, j, plus_applied(load(system.vector, j, ROW), transpose(block), away))
+        store(system.vector, i, eta)
+
+
+@inner
+def from_start(window: Window, first: int, i: int, n: int) -> Any:
+    """m from the point of block i of the first step to where it was expected."""
+    row = row_of(window.layout, first, i + 1 if i < n - 1 else 0)
+    return subtract(load(window.start, row, ROW), load(window.point, row, ROW))
+
+
+@inner
+def fold(
+    window: Window, span: tuple[int, int], step: int, row: int, system: System, coupled: int, prior: float
+) -> None:
+    """Eliminate the chain that ends at a row onto the ego's points; its point in the first step joins them where an
+    arrival cost couples it."""
+    first, last = span
+    h, outer, end = last - first + 1, max(coupled, 0), step - first
+    size = outer + h
+    nothing = zeros(take(window.located, uint64(0)), ROW)
+    eta, own, flat = nothing, zeros(nothing[0], ONE), nothing[0] + prior
+    while True:
+        here, arm = step - first, row * h
+        information, fix = load(window.edge, row, ONE), load(window.used, row, ROW)
+        store(system.arm, arm + here, negate(information))
+        own = add_diagonal(add(own, information), fix)
+        eta = add(add(eta, load(window.eta, row, ROW)), times(fix, fix_gap(window, row)))
+        if coupled >= 0 and here == 0:
+            i = row - row_of(window.layout, first, 1)
+            for j in range(end + 1):
+                store(system.core, i * size + outer + j, add_to(system, i * size + outer + j, arm + j))
+            store(system.core, i * (size + 1), add(load(system.core, i * (size + 1), ONE), own))
+            store(system.vector, i, add(load(system.vector, i, ROW), eta))
+            return
+        before = window.previous[row] if here > 0 else -1
+        process, off = nothing, nothing
+        if before >= 0:
+            before = row_of(window.layout, step - 1, before)
+            process, off = motion(window, before, row)
+            eta = add(eta, off)
+        else:
+            own = add_diagonal(own, (flat, flat, flat))
+            eta = add(eta, scale(subtract(load(window.start, row, ROW), load(window.point, row, ROW)), flat))
+        pivot = negate(inverse(add_diagonal(own, process)))
+        solved = minus_apply(pivot, eta)
+        store(system.eta, row, eta)
+        store(system.pivot, row, pivot)
+        system.end[row] = end
+        for i in range(here, end + 1):
+            store(system.scratch, i, minus_product(pivot, load(system.arm, arm + i, ONE)))
+        for i in range(here, end + 1):
+            left, at = load(system.arm, arm + i, ONE), (outer + i) * size + outer
+            for j in range(i, end + 1):
+                right = load(system.scratch, j, ONE)
+                store(system.core, at + j, less_transposed_product(load(system.core, at + j, ONE), left, right))
+            moved = less_transposed_applied(load(system.vector, outer + i, ROW), left, solved)
+            store(system.vector, outer + i, moved)
+        if before < 0:
+            return
+        own = mirrored(scale_rows(process, minus_product(pivot, own)))
+        eta = subtract(times(process, solved), off)
+        for i in range(here, end + 1):
+            store(system.arm, before * h + i, scale_rows(process, load(system.scratch, i, ONE)))
+        step, row = step - 1, before
+
+
+@inner
+def add_to(system: System, at: int, arm: int) -> Any:
+    """A block of the dense matrix and one of a chain."""
+    return add(load(system.core, at, ONE), load(system.arm, arm, ONE))
+
+
+@inner
+def unfold(window: Window, span: tuple[int, int], step: int, row: int, system: System, outer: int) -> None:
+    """The step of a point of a chain, those of the ego and of the point before being known."""
+    first, last = span
+    h, eta = last - first + 1, load(system.eta, row, ROW)
+    for i in range(step - first, system.end[row] + 1):
+        eta = less_applied(eta, load(system.arm, row * h + i, ONE), load(system.vector, outer + i, ROW))
+    before = window.previous[row] if step > first else -1
+    if before >= 0:
+        before = row_of(window.layout, step - 1, before)
+        process, _ = motion(window, before, row)
+        eta = add(eta, times(process, load(system.move, before, ROW)))
+    store(system.move, row, minus_apply(load(system.pivot, row, ONE), eta))
+
+
+@inner
+def advance(window: Window, span: tuple[int, int], system: System, share: Any) -> Any:
+    """Move all points by a share of the step, and the edges' information vectors with them; the largest step m."""
     most = 0.0 * share
-    for step in range(last, first - 1, -1):
-        ego = place_of(window.layout, step, 0)
-        own = load(memory.b, step - first, ROW)
-        most = max(most, largest_of(own))
-        store(window.point, ego, add(load(window.point, ego, ROW), scale(own, share)))
-        for place in range(ego + 1, ego + count_of(window.sizes, step)):
-            moved = unfold(window, span, step, place, memory)
+    for step in range(span[0], span[1] + 1):
+        ego = row_of(window.layout, step, 0)
+        own = load(system.move, ego, ROW)
+        for row in range(ego, ego + count_of(window.sizes, step)):
+            moved = load(system.move, row, ROW)
             most = max(most, largest_of(moved))
-            store(window.point, place, add(load(window.point, place, ROW), scale(moved, share)))
+            store(window.point, row, add(load(window.point, row, ROW), scale(moved, share)))
+            if row > ego:
+                ahead = scale(subtract(moved, own), share)
+                eta = less_applied(load(window.eta, row, ROW), load(window.edge, row, ONE), ahead)
+                store(window.eta, row, eta)
     return most
 
 
 @inner
-def assemble_ego(window: Window, span: Any, memory: Memory) -> None:
-    """Information and eta of the ego's points: fixes, odometry, and the ego's end of each edge."""
-    first, last = span
-    h = last - first + 1
-    trust = take(window.odometry, uint64(0))
-    nothing = zeros(trust, ONE)
-    for s in range(h):
-        ego = place_of(window.layout, first + s, 0)
-        own, gap = load(window.used, ego, ROW), fix_gap(window, ego)
-        block, eta = add_diagonal(nothing, own), times(own, gap)
-        for j in range(s + 1, h):
-            store(memory.a, s * h + j, nothing)
-        if s > 0:
-            process, off = motion(window, place_of(window.layout, first + s - 1, 0), ego)
-            process, off = scale(process, trust), scale(off, trust)
-            block, eta = add_diagonal(block, process), add(eta, off)
-            before = s - 1
-            store(memory.a, before * (h + 1), add_diagonal(load(memory.a, before * (h + 1), ONE), process))
-            store(memory.a, before * (h + 1) + 1, add_diagonal(nothing, negate(process)))
-            store(memory.b, before, subtract(load(memory.b, before, ROW), off))
-        for place in range(ego + 1, ego + count_of(window.sizes, first + s)):
-            block, eta = add(block, load(window.edge, place, ONE)), subtract(eta, load(window.eta, place, ROW))
-        store(memory.a, s * (h + 1), block)
-        store(memory.b, s, eta)
-
-
-@inner
-def fold(window: Window, span: Any, step: int, place: int, memory: Memory) -> None:
-    """Eliminate the chain that begins at a place onto the ego's points."""
-    first, last = span
-    h, begin = last - first + 1, step - first
-    nothing = zeros(take(window.odometry, uint64(0)), ROW)
-    own, eta = (
-        add_diagonal(zeros(nothing[0], ONE), (nothing[0] + FLOOR, nothing[0] + FLOOR, nothing[0] + FLOOR)),
-        nothing,
-    )
-    while True:
-        end, arm = step - first, place * h
-        information, fix = load(window.edge, place, ONE), load(window.used, place, ROW)
-        store(memory.arm, arm + end, negate(information))
-        own = add_diagonal(add(own, information), fix)
-        eta = add(add(eta, load(window.eta, place, ROW)), times(fix, fix_gap(window, place)))
-        after = window.later[place] if step < last else -1
-        process, off = nothing, nothing
-        if after >= 0:
-            after = place_of(window.layout, step + 1, after)
-            process, off = motion(window, place, after)
-        eta = subtract(eta, off)
-        pivot = negate(inverse(add_diagonal(own, process)))
-        solved = minus_apply(pivot, eta)
-        store(memory.eta, place, eta)
-        store(memory.pivot, place, pivot)
-        for i in range(begin, end + 1):
-            store(memory.row, i, minus_product(pivot, load(memory.arm, arm + i, ONE)))
-        for i in range(begin, end + 1):
-            left = load(memory.arm, arm + i, ONE)
-            for j in range(i, end + 1):
-                at = i * h + j
-                right = load(memory.row, j, ONE)
-                store(memory.a, at, less_transposed_product(load(memory.a, at, ONE), left, right))
-            store(memory.b, i, less_transposed_applied(load(memory.b, i, ROW), left, solved))
-        if after < 0:
-            return
-        own = mirrored(scale_rows(process, minus_product(pivot, own)))
-        eta = add(times(process, solved), off)
-        for i in range(begin, end + 1):
-            store(memory.arm, after * h + i, scale_rows(process, load(memory.row, i, ONE)))
-        step, place = step + 1, after
-
-
-@inner
-def unfold(window: Window, span: Any, step: int, place: int, memory: Memory) -> Any:
-    """The move of a point of a chain, those of the ego and of the next one being known."""
-    first, last = span
-    h, eta = last - first + 1, load(memory.eta, place, ROW)
-    begin = step
-    here = place
-    while begin > first and window.previous[here] >= 0:
-        begin, here = begin - 1, place_of(window.layout, begin - 1, window.previous[here])
-    for i in range(begin - first, step - first + 1):
-        eta = less_applied(eta, load(memory.arm, place * h + i, ONE), load(memory.b, i, ROW))
-    after = window.later[place] if step < last else -1
-    if after >= 0:
-        after = place_of(window.layout, step + 1, after)
-        process, _ = motion(window, place, after)
-        eta = add(eta, times(process, load(memory.move, after, ROW)))
-    moved = minus_apply(load(memory.pivot, place, ONE), eta)
-    store(memory.move, place, moved)
-    return moved
+def gap_of(points: AnyArray, ego: int, row: int) -> Any:
+    """Vector m from the ego to a neighbour."""
+    return subtract(load(points, row, ROW), load(points, ego, ROW))

@@ -1,55 +1,85 @@
 """Moving horizons and fixed-lag smoothers of one ego's star: a window of steps behind an arrival cost.
 
-A Gauss-Newton step of the window eliminates it step by step up to the newest, solves that, and substitutes back
-(`windows.sweep`); a step that leaves the window becomes the arrival cost of the next. LANES runs go side by
-side.
+A step that leaves the window is solved by itself, given its own past; its Gaussian, predicted, is the arrival cost of
+the next one. LANES runs go side by side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import uint64
 
-from ...arrays import AnyArray, Bools, Floats
-from ..compiling.compile import as_written, inner
-from ..compiling.small import load, negate, store
-from ..compiling.vectors import LANES, put, take
-from ..stars.joint import Joint, new_joint
+from ...arrays import AnyArray, Bools, Floats, Ints
+from ..compiling.compile import as_written, inner, inside
+from ..compiling.small import (
+    add,
+    add_diagonal,
+    choose_each,
+    load,
+    plus_applied,
+    store,
+    subtract,
+    times,
+    zeros,
+)
+from ..compiling.vectors import LANES, choose, put, take
+from ..stars.edges import AT_GAP, EXACT, edge
+from ..stars.elimination import predict
+from ..stars.joint import Joint, add_relative, block_of, new_joint, rearrange, solve
 from ..stars.messages import (
+    MOVED,
     NEW,
+    POSITION,
+    RELATIVE,
     SENT,
     USES,
     VARIANCE,
     Assumptions,
     Measurements,
-    Star,
+    clear,
     interpret,
     new_star,
     receive,
 )
-from .back import Past, ego_covariance, new_past
-from .slots import ROW, Window, any_positive, count_of, enter, new_window, place_of, star_at
-from .sweep import distance, start_points, sweep
+from ..stars.relative import completed, vector
+from .chains import System, advance, gap_of, gauss_newton, new_system
+from .window_layout import (
+    ONE,
+    ROW,
+    Window,
+    any_positive,
+    count_of,
+    enter,
+    largest_of,
+    motion,
+    new_window,
+    row_of,
+    star_at,
+)
 
 
 class Settings(NamedTuple):
-    """Steps of a window; relative measurements in range and angles, or converted vectors; Gauss-Newton steps after the
-    first, taken where a vector has left the point at which its measurement is linear by more than `strayed` m; steps
-    for which a velocity may serve, negative where a message counts when it arrives and not when it was sent; whether a
-    step is estimated when it leaves the window."""
+    """How a horizon is solved.
+
+    Attributes:
+        length: steps of a window.
+        exact: relative measurements in range and angles, or converted vectors.
+        repeats: Gauss-Newton steps after the first, taken where a vector has left its `base` by more than `strayed`.
+        strayed: m.
+        age: steps for which a velocity may serve, negative where a message counts when it arrives and not when it was
+            sent.
+    """
 
     length: int
     exact: bool
-    sweeps: int
+    repeats: int
     strayed: float
     age: float
-    smoothed: bool
 
 
-class Found(NamedTuple):
+class Estimates(NamedTuple):
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m, and (R, T) whether a window still moved."""
 
     x: Floats
@@ -58,97 +88,221 @@ class Found(NamedTuple):
     moving: Bools
 
 
-class Horizon(NamedTuple):
-    """A window of LANES runs, its past, and the memory of its steps; mask (LANES,): 1 where a run still moves."""
-
-    window: Window
-    past: Past
-    joint: Joint
-    star: Star
-    mask: Floats
-
-
-def new_horizon(length: int, most: int) -> Horizon:
-    """Room for windows of `length` steps of at most `most` members."""
-    joint = new_joint(most, ROW)
-    return Horizon(new_window(length, most), new_past(length, most), joint, new_star(most), np.ones(LANES))
-
-
-def horizons(seen: Measurements, known: Assumptions, arrival: AnyArray, settings: Settings) -> Found:
-    """All windows of a drive."""
-    found = empty(seen)
-    for runs, horizon in each_group(seen, settings.length):
-        advance(horizon, seen, known, arrival, settings, runs, (0, len(seen.start) - 1), found)
-    return found
-
-
-def empty(seen: Measurements) -> Found:
-    """Room for what is found."""
-    runs, steps = seen.gnss.shape[:2]
-    x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
-    return Found(x, cov, np.empty((runs, len(seen.neighbour), 3)), np.zeros((runs, steps), np.bool_))
-
-
-def each_group(seen: Measurements, length: int) -> Iterator[tuple[tuple[int, int], Horizon]]:
-    """First and last run of LANES runs, and room for them, to `advance` step by step."""
-    most = 1 + int(np.diff(seen.start).max(initial=0))
-    for first in range(0, len(seen.gnss), LANES):
-        yield (first, min(first + LANES, len(seen.gnss)) - 1), new_horizon(length, most)
-
-
-@as_written
-def advance(
-    horizon: Horizon,
-    seen: Measurements,
-    known: Assumptions,
-    arrival: AnyArray,
-    settings: Settings,
-    runs: Any,
-    steps: Any,
-    found: Found,
-) -> None:
-    """Take in the steps from steps[0] up to steps[1], and solve the window that ends at each, in runs first to last.
+def horizons(seen: Measurements, known: Assumptions, arrival: Ints, settings: Settings) -> Estimates:
+    """Estimates at the newest step of all windows of a drive.
 
     Args:
         seen: `newest` and `fresh` are overwritten where messages count when they were sent.
+        known: the noise that is assumed.
         arrival: (R, M) step at which the message of each link arrives, -1 for never.
+        settings: of the windows.
     """
-    window, past, joint, star, mask = horizon
-    end = len(seen.start) - 2
-    for t in range(steps[0], steps[1]):
+    (runs, steps), most = seen.gnss.shape[:2], 1 + int(np.diff(seen.start).max(initial=0))
+    x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
+    estimates = Estimates(x, cov, np.empty((runs, len(seen.neighbour), 3)), np.zeros((runs, steps), np.bool_))
+    window, joint, star = new_window(settings.length, most), new_joint(most, ROW), new_star(most)
+    system = new_system(settings.length, most, joint.information)
+    for first in range(0, runs, LANES):
+        here = first, min(first + LANES, runs) - 1
+        follow_horizon((window, joint, star, system), seen, known, arrival, settings, here, estimates)
+    return estimates
+
+
+@as_written
+def follow_horizon(
+    memory: Any,
+    seen: Measurements,
+    known: Assumptions,
+    arrival: Ints,
+    settings: Settings,
+    runs: tuple[int, int],
+    estimates: Estimates,
+) -> None:
+    """Solve the window that ends at each step, in runs first to last."""
+    window, joint, star, system = memory
+    for t in range(len(seen.start) - 1):
         span = (max(0, t - settings.length + 1), t)
         enter(window, star, seen, known, runs, t)
         if settings.age >= 0.0:
             for step in range(span[0], t + 1):
                 gather_arrived(window, seen, known, arrival, settings.age, runs, step, t)
-        use_fixes(window, t if settings.age < 0.0 else span[0], t)
-        start_points(window, past, known, t)
-        mask[:] = 1.0
-        for count in range(settings.sweeps + 1):
-            sweep(window, past, joint, known, span, settings.exact, count == 0, mask)
-            for lane in range(0 if settings.smoothed else runs[1] - runs[0] + 1):
-                if mask[lane] > 0.0:
-                    write_lane(window, joint.scratch, seen.start[t], (runs[0] + lane, lane), t, found)
-            if settings.sweeps == 0 and settings.age < 0.0:
-                break
-            find_moving(window, past, span, settings, mask, joint.scratch)
+        use_new_fixes(window, t if settings.age < 0.0 else span[0], t)
+        start_points(window, known, t)
+        if span[0] > 0:
+            leave(window, joint, known, span[0] - 1)
+        elif t == 0:
+            forget(joint, known, count_of(window.sizes, 0))
+        system.active[:] = 1.0
+        for count in range(settings.repeats + 1):
+            solve_window(window, known, span, settings.exact, count == 0, system)
             for lane in range(runs[1] - runs[0] + 1):
-                found.moving[runs[0] + lane, t] = settings.exact and mask[lane] > 0.0
-            if not any_positive(mask):
+                if system.active[lane] > 0.0:
+                    write_lane(window, system.cov, seen.start[t], (runs[0] + lane, lane), t, estimates)
+            if settings.repeats == 0 and settings.age < 0.0:
                 break
-        late = t - settings.length + 1
-        for step in range(max(late, 0), (t if t == end else late) + 1 if settings.smoothed else 0):
-            store(joint.scratch, 0, negate(ego_covariance(window, past, joint, (step, t))))
+            put(system.most, uint64(0), distance(window, span))
+            for lane in range(LANES):
+                system.active[lane] = 1.0 if system.most[lane] > settings.strayed else 0.0
             for lane in range(runs[1] - runs[0] + 1):
-                write_lane(window, joint.scratch, seen.start[step], (runs[0] + lane, lane), step, found)
+                estimates.moving[runs[0] + lane, t] = settings.exact and system.active[lane] > 0.0
+            if not any_positive(system.active):
+                break
 
 
 @inner
-def find_moving(window: Window, past: Past, span: Any, settings: Settings, mask: AnyArray, scratch: AnyArray) -> None:
-    """Mask the runs in which a vector has left the one at which its measurement is linear."""
-    put(scratch, uint64(0), distance(window, past, span))
-    for lane in range(LANES):
-        mask[lane] = 1.0 if scratch[0, lane] > settings.strayed else 0.0
+def solve_window(
+    window: Window, known: Assumptions, span: tuple[int, int], exact: bool, entered: bool, system: System
+) -> None:
+    """One Gauss-Newton step of the window in the active runs.
+
+    Args:
+        window: its steps, and their relative measurements as last made linear.
+        known: the noise that is assumed.
+        span: its first and last step.
+        exact: measurements in range and angles.
+        entered: the newest step has just come: it is solved converted, and made exact where that leads.
+        system: the normal equations.
+    """
+    active, last = take(system.active, uint64(0)), span[1]
+    coupled, prior = count_of(window.sizes, span[0]) - 1, 1.0 / known.flat
+    for step in range(span[0], last + (0 if entered else 1) if exact else span[0]):
+        linearise_step(window, known, step, active)
+    gauss_newton(window, span, system, coupled, prior)
+    if exact and entered:
+        ego = row_of(window.layout, last, 0)
+        for row in range(ego + 1, ego + count_of(window.sizes, last)):
+            gap = add(gap_of(window.point, ego, row), gap_of(system.move, ego, row))
+            put_edge(window, known, ego, row, gap, EXACT, active)
+        gauss_newton(window, span, system, coupled, prior)
+    advance(window, span, system, active)
+
+
+@inner
+def linearise_step(window: Window, known: Assumptions, step: int, active: Any) -> None:
+    """The relative measurements of a step in range and angles, where its points are."""
+    ego = row_of(window.layout, step, 0)
+    for row in range(ego + 1, ego + count_of(window.sizes, step)):
+        put_edge(window, known, ego, row, gap_of(window.point, ego, row), EXACT, active)
+
+
+@inner
+def put_edge(window: Window, known: Assumptions, ego: int, row: int, gap: Any, how: Any, active: Any) -> None:
+    """The relative measurement of a row, linear at the vector `gap`, where `active` is positive."""
+    z = load(window.relative, row, RELATIVE)
+    information, eta = edge(gap, z, known.relative_std, known.min_range, how)
+    eta = plus_applied(eta, information, subtract(gap, gap_of(window.point, ego, row)))
+    o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole_of(window, row)) - 0.5
+    information, eta = choose_each(used, information, zeros(o, ONE)), choose_each(used, eta, zeros(o, ROW))
+    store(window.edge, row, choose_each(active, information, load(window.edge, row, ONE)))
+    store(window.eta, row, choose_each(active, eta, load(window.eta, row, ROW)))
+    store(window.base, row, choose_each(active, gap, load(window.base, row, ROW)))
+
+
+@inner
+def whole_of(window: Window, row: int) -> Any:
+    """1 where all components of a relative measurement were measured, else 0."""
+    z = load(window.relative, row, RELATIVE)
+    return choose(1e300 - (z[5] + z[6] + z[7]), 0.0 * z[0] + 1.0, 0.0 * z[0])
+
+
+@inner
+def distance(window: Window, span: tuple[int, int]) -> Any:
+    """m by which a vector has left the one at which its measurement is linear, the largest along an axis."""
+    most = 0.0 * load(window.point, row_of(window.layout, span[1], 0), ROW)[0]
+    for step in range(span[0], span[1] + 1):
+        ego = row_of(window.layout, step, 0)
+        for row in range(ego + 1, ego + count_of(window.sizes, step)):
+            most = max(most, largest_of(subtract(gap_of(window.point, ego, row), load(window.base, row, ROW))))
+    return most
+
+
+@inner
+def start_points(window: Window, known: Assumptions, t: int) -> None:
+    """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it, and
+    one that nothing has located yet where its first position puts it, with its earlier points.
+
+    Its relative measurements are converted vectors, weighted by that geometry.
+    """
+    ego, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)
+    for k in range(count_of(window.sizes, t)):
+        row, previous = ego + k, window.previous[ego + k]
+        fix, new = load(window.motion, 4 * row + POSITION, ROW), take(window.status, uint64(5 * row + NEW))
+        there = 0.0 * new + 1.0 if k == 0 else max(new, whole_of(window, row))
+        at = fix
+        if previous >= 0:
+            located = take(window.located, uint64(before + previous))
+            at = add(load(window.point, before + previous, ROW), load(window.motion, 4 * row + MOVED, ROW))
+            first = new - located - 0.5  # > 0: its first position
+            at = choose_each(first, fix, at)
+            there = max(there, located)
+            if any_above(first):
+                locate_before(window, row, t, first, at)
+        elif k > 0:
+            origin = load(window.point, ego, ROW)
+            at = add(origin, vector(completed(load(window.relative, row, RELATIVE), subtract(fix, origin))))
+        put(window.located, uint64(row), there)
+        store(window.point, row, at)
+        store(window.start, row, at)
+        if k > 0:
+            put_edge(window, known, ego, row, gap_of(window.point, ego, row), AT_GAP, 0.0 * new + 1.0)
+
+
+@inside
+def any_above(values: Any) -> bool:
+    """True if any of these runs has a number > 0."""
+    return not values <= 0.0 * values
+
+
+@inner
+def locate_before(window: Window, row: int, t: int, mask: Any, at: Any) -> None:
+    """Bring the earlier points of a member, which nothing had located, to where its first position puts them."""
+    here, step = row, t
+    while window.previous[here] >= 0 and step > 0 and t - step < len(window.sizes) - 1:
+        at = subtract(at, load(window.motion, 4 * here + MOVED, ROW))
+        here, step = row_of(window.layout, step - 1, window.previous[here]), step - 1
+        lost = choose(mask, 0.5 - take(window.located, uint64(here)), 0.0 * at[0])
+        store(window.point, here, choose_each(lost, at, load(window.point, here, ROW)))
+        put(window.located, uint64(here), choose(lost, 0.0 * at[0] + 1.0, take(window.located, uint64(here))))
+
+
+@inner
+def forget(joint: Joint, known: Assumptions, n: int) -> None:
+    """Know nothing of the past of the first step."""
+    clear(joint.information)
+    nothing = zeros(0.0 * take(joint.information, uint64(0)), ONE)
+    flat = nothing[0] + 1.0 / known.flat
+    for i in range(n):
+        store(joint.information, i * (joint.stride + 1), add_diagonal(nothing, (flat, flat, flat)))
+
+
+@inner
+def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
+    """A step becomes the past of the next one: its mean, moved, is where that expects its points, and its covariance,
+    grown by the process noise, the arrival cost."""
+    ego, after, n = row_of(window.layout, step, 0), row_of(window.layout, step + 1, 0), count_of(window.sizes, step)
+    for k in range(n):
+        i, row, fix = block_of(k, n), ego + k, load(window.used, ego + k, ROW)
+        at, off = i * (joint.stride + 1), load(window.motion, 4 * row + POSITION, ROW)
+        store(joint.information, at, add_diagonal(load(joint.information, at, ONE), fix))
+        store(joint.eta, i, times(fix, subtract(off, load(window.start, row, ROW))))
+        process, later = zeros(fix[0], ROW), window.later[row]
+        if later >= 0:
+            process, _ = motion(window, row, after + later)
+        store(joint.process, i, process)
+    for k in range(1, n):
+        away = subtract(gap_of(window.point, ego, ego + k), gap_of(window.start, ego, ego + k))
+        information = load(window.edge, ego + k, ONE)
+        eta = plus_applied(load(window.eta, ego + k, ROW), information, away)
+        add_relative(joint.information, joint.eta, joint.stride, k, n, information, eta, ROW)
+    solve(joint.information, joint, joint.eta, n, ROW)
+    predict(joint.information, n, joint.stride, joint.process, joint.scratch, ONE, ROW)
+    m, prior = count_of(window.sizes, step + 1), 1.0 / known.flat
+    rearrange(star_at(window, step + 1), joint, m, n, (prior, prior, prior), ROW)
+    for row in range(after, after + m):
+        if window.previous[row] >= 0:
+            before = ego + window.previous[row]
+            mean = add(load(window.start, before, ROW), load(joint.eta, block_of(window.previous[row], n), ROW))
+            store(window.start, row, add(mean, load(window.motion, 4 * row + MOVED, ROW)))
 
 
 @inner
@@ -156,16 +310,16 @@ def gather_arrived(
     window: Window,
     seen: Measurements,
     known: Assumptions,
-    arrival: AnyArray,
+    arrival: Ints,
     age: float,
-    runs: Any,
+    runs: tuple[int, int],
     step: int,
     now: int,
 ) -> None:
     """Put the messages that have arrived by now where they belong: the message of a step moves its sender there, or
     the last one before that has arrived and is not too old, as if it had done so since it was sent, and its fix stands
     at the step at which it was sent."""
-    star, here = star_at(window, step), place_of(window.layout, step, 0)
+    star, here = star_at(window, step), row_of(window.layout, step, 0)
     for k in range(1, count_of(window.sizes, step)):
         link, place, changed = seen.start[step] + k - 1, window.previous[here + k], step == now
         for run in range(runs[0], runs[1] + 1):
@@ -179,31 +333,30 @@ def gather_arrived(
         if changed:
             for lane in range(uint64(LANES)):
                 run = min(runs[0] + int(lane), runs[1])
-                receive(star, seen, known, (run, step, link), (k, place, lane))
+                receive(star, seen, known, run, step, link, k, lane)
                 used_since = max(seen.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, known, k, seen.dt)
 
 
 @inner
-def use_fixes(window: Window, first: int, last: int) -> None:
+def use_new_fixes(window: Window, first: int, last: int) -> None:
     """Information of the new fixes of some steps."""
     for step in range(first, last + 1):
-        for place in range(
-            place_of(window.layout, step, 0), place_of(window.layout, step, count_of(window.sizes, step))
-        ):
-            new = take(window.status, uint64(5 * place + NEW))
-            p, q, r = load(window.motion, 4 * place + VARIANCE, ROW)
-            store(window.used, place, (new / p, new / q, new / r))
+        ego = row_of(window.layout, step, 0)
+        for row in range(ego, ego + count_of(window.sizes, step)):
+            new = take(window.status, uint64(5 * row + NEW))
+            p, q, r = load(window.motion, 4 * row + VARIANCE, ROW)
+            store(window.used, row, (new / p, new / q, new / r))
 
 
 @inner
-def write_lane(window: Window, cov: AnyArray, link: int, which: Any, t: int, found: Found) -> None:
-    """Copy one run's points and the ego's covariance."""
-    (run, lane), ego = which, place_of(window.layout, t, 0)
+def write_lane(window: Window, cov: AnyArray, link: int, which: tuple[int, int], t: int, estimates: Estimates) -> None:
+    """Copy one run's points and the ego's covariance, whose negative is in `cov`."""
+    (run, lane), ego = which, row_of(window.layout, t, 0)
     for i in range(3):
-        found.x[run, t, i] = window.point[3 * ego + i, lane]
+        estimates.x[run, t, i] = window.point[3 * ego + i, lane]
         for j in range(3):
-            found.covariance[run, t, i, j] = cov[3 * min(i, j) + max(i, j), lane]
+            estimates.covariance[run, t, i, j] = -cov[3 * min(i, j) + max(i, j), lane]
         for k in range(1, count_of(window.sizes, t)):
-            found.neighbours[run, link + k - 1, i] = window.point[3 * (ego + k) + i, lane]
+            estimates.neighbours[run, link + k - 1, i] = window.point[3 * (ego + k) + i, lane]

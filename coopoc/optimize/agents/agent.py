@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ...errors import InputError
 from ..algebra.sparse import Sparse, sparse
 from ..algebra.tape import numbers_of
 from ..descent.trust_region import arrive
@@ -62,7 +61,7 @@ def agents_of(problem: Problem, owner: tuple[str, ...], links: Sequence[Link]) -
     """The robots of a problem.
 
     Raises:
-        InputError: a kind of measurement that no tape can hold.
+        InputError: a formula that CasADi cannot run.
     """
     by = makers(problem, owner)
     labels = np.array(owner)
@@ -79,10 +78,7 @@ def agents_of(problem: Problem, owner: tuple[str, ...], links: Sequence[Link]) -
         poses = np.setdiff1d(local.poses, np.searchsorted(nodes, points))
         penalty = [_penalty(problem, link, np.searchsorted(nodes, link.nodes)) for link in mine]
         local = local.replace_unchecked(poses=tuple(poses.tolist()), factors=(*local.factors, *penalty))
-        system = sparse(local, least=0)
-        if system is None:
-            kinds = sorted({f.kind for f in local.factors})
-            raise InputError("problem", f"kinds {kinds}", "must run on CasADi's numbers", "Use solve instead.")
+        system = sparse(local)
         found.append(Agent(robot, nodes, labels[nodes] == robot, mine, penalty, system, np.array(local.x0)))
     return found
 

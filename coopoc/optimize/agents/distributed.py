@@ -75,7 +75,7 @@ def solve_distributed(
 
     Raises:
         InputError: no x0, B realisations, constraints, rho not > 0, loss outside [0, 1), rounds, steps or a seed that
-            are no whole numbers, another number of owners, or a kind of measurement that no tape can hold.
+            are no whole numbers, another number of owners, or a formula that CasADi cannot run.
 
     References:
         Boyd et al., Distributed Optimization and Statistical Learning via the ADMM, 2011, section 7; McGann, Lassak and
@@ -109,7 +109,7 @@ def solve_distributed(
         apart.append(max((_agree(problem, link, agents) for link in links if _pair(link) in arrived), default=0.0))
         for agent in agents.values():
             x[agent.nodes[agent.own]] = agent.x[agent.own]
-        cost.append(problem.cost(x) if system is None else system.cost(x))
+        cost.append(system.cost(x))
         sent.append((2 * len(size), 2 * sum(size.values())))
     messages, sent_bytes = np.cumsum(sent, axis=0).T
     return Distributed(x, np.array(cost), np.array(apart), messages, sent_bytes, tuple(agents))

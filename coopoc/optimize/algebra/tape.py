@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ...arrays import Floats, Ints
+from ...errors import InputError
 from ..model.converted import is_converted
 from ..model.factor import Factor
 from ..model.losses import Loss
@@ -23,10 +24,6 @@ if TYPE_CHECKING:
 
 Model = Literal["cost", "gauss-newton", "newton", "converted"]
 """What a tape gives: the cost alone, with J^T J, with the exact Hessian; or J^T J of the converted measurement."""
-
-
-class NoTape(Exception):
-    """A formula that CasADi cannot run, or one with an operation that no tape has."""
 
 
 class Kind(NamedTuple):
@@ -52,12 +49,10 @@ class Written(NamedTuple):
     Attributes:
         tape: for the kernel.
         entries: (outputs, 2); the cost has -1 twice.
-        function: the same as CasADi's Function of (nodes, numbers) -> outputs.
     """
 
     tape: Tape
     entries: Ints
-    function: Any
 
 
 def kind_of(factor: Factor, space: Space) -> Kind:
@@ -81,7 +76,7 @@ def write(kind: Kind, model: Model) -> Written:
     """The tape of a kind.
 
     Raises:
-        NoTape: the formula has none.
+        InputError: CasADi cannot run the formula, or no tape has an operation of it.
     """
     import casadi as ca
 
@@ -109,9 +104,8 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.cse(here)
     kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
     found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
-    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found))
-    function = ca.Function("tape", [nodes, number], found)
-    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2), function)
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found), kind.measurement.name)
+    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
 
 
 def _cost(kind: Kind, converted: bool) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
@@ -136,16 +130,17 @@ def _cost(kind: Kind, converted: bool) -> tuple[Any, Any, Any, tuple[Any, Any, A
         if converted and not (vectors or known.linear):
             white = ca.SX(size, 1)
         rho = symbolic.robust(square, kind.loss)
-    except Exception as problem:  # the formula is the user's: whatever it raises, the plain way takes it
-        raise NoTape(f"{known.name} does not run on CasADi's numbers: {problem}") from problem
+    except Exception as problem:  # the formula is the user's, who must learn what it raised
+        hint = "Take its functions from the namespace m, such as m.sqrt, and choose by m.where."
+        why = " ".join(str(problem).split())[:80]
+        raise InputError("kind", repr(known.name), f"must run on CasADi's numbers: {why}", hint) from problem
     cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
     return nodes, number, steps, (cost, white, square, rho)
 
 
-def _tape(function: Any) -> Tape:
+def _tape(function: Any, name: str) -> Tape:
     """The operations of a CasADi function of one vector."""
-    from ...kernels.graphs.graph_tape import Tape
-    from ...kernels.graphs.operations import Operation
+    from ...kernels.graphs.graph_tape import Operation, Tape
 
     known, constant, read_in, write_out = _known(), int(Operation.CONST), int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
@@ -153,7 +148,8 @@ def _tape(function: Any) -> Tape:
     for k in range(count):
         found = function.instruction_id(k)
         if found not in known:
-            raise NoTape(f"no tape has CasADi's operation {found}")
+            allowed = f"must not use CasADi's operation {found}"
+            raise InputError("kind", repr(name), allowed, "Use +, -, *, /, ** and the functions of m.")
         code[k] = operation = known[found]
         read, written = function.instruction_input(k), function.instruction_output(k)
         if operation == constant:
@@ -172,7 +168,7 @@ def _known() -> dict[int, int]:
     """CasADi's number of an operation -> ours."""
     import casadi as ca
 
-    from ...kernels.graphs.operations import Operation
+    from ...kernels.graphs.graph_tape import Operation
 
     known = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
     return known | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}  # of one slot, which is read twice

@@ -1,26 +1,17 @@
-"""gauss-newton: the reference. Levenberg-Marquardt, arrowhead elimination for stars and windows, sparse otherwise."""
+"""gauss-newton: the reference. Levenberg-Marquardt with sparse Cholesky factors; stars for all realisations at once."""
 
 from __future__ import annotations
-
-from functools import partial
 
 import numpy as np
 
 from ...arrays import Floats
-from ..algebra.cholesky import cholesky_of, with_still
-from ..algebra.dense import damped_step
-from ..algebra.sparse import Sparse, sparse
-from ..assessment.curvature import newton_step
+from ..algebra.sparse import sparse
+from ..algebra.star import is_star, star_at
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, descend
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, descend
 from ..descent.trust_region import arrive
 from ..model.linear import Linear
 from ..model.problem import Problem
-
-PATIENCE = 40
-"""Gauss-Newton steps before the exact Hessian takes over: with large residuals J^T J alone creeps or overshoots."""
-DENSE_POINTS = 60
-"""Up to this many points a problem without a separator is solved densely."""
 
 
 def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
@@ -32,51 +23,28 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         tolerance: m, largest move of a point in the last step.
     """
     check_limits(max_iterations, tolerance)
-    step = linear_step(structure)
+    star = is_star(structure)
+
+    def step(linear: Linear, damping: Floats) -> Floats:
+        return star_at(structure, linear).solve(damping)[0]
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        if max_iterations and (system := sparse(problem)) is not None:
-            return _by_tapes(system, x, 1 if problem.linear else max_iterations, tolerance)
-        patience = max_iterations if problem.batch is not None else min(max_iterations, PATIENCE)
-        end = descend(problem, step, x, patience, tolerance)
-        if end.converged.all() or patience == max_iterations:
-            return SolverResult(end.x, end.iterations, extras={"record": end.record})
-        more = descend(problem, partial(newton_step, problem), end.x, max_iterations - patience, tolerance, exact=True)
-        extras = {"newton_steps": int(more.iterations.sum()), "record": np.concatenate([end.record, more.record])}
-        return SolverResult(more.x, end.iterations + more.iterations, extras=extras)
+        if problem.batch is None:
+            end = arrive(sparse(problem), x[0], min(1, max_iterations) if problem.linear else max_iterations, tolerance)
+            extras = {"newton_steps": end.newton_steps, "record": end.record}
+            return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
+        if star:
+            found = descend(problem, step, x, max_iterations, tolerance)
+            return SolverResult(found.x, found.iterations)
+        ends = [solver(problem.pick(b), start[None]) for b, start in enumerate(x)]
+        return SolverResult(np.concatenate([e.x for e in ends]), np.concatenate([e.iterations for e in ends]))
 
     return solver
-
-
-def _by_tapes(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
-    """The result of a single problem from x (1, n, ambient)."""
-    end = arrive(system, x[0], max_iterations, tolerance)
-    extras = {"newton_steps": end.newton_steps, "record": end.record}
-    return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
-
-
-def linear_step(problem: Problem) -> Step:
-    """The linear solver that suits the structure; batched unless the problem is large and has no separator."""
-    if not problem.separator and len(problem.names) > DENSE_POINTS:
-        return partial(_sparse_step, problem)
-    return partial(damped_step, problem)
-
-
-def _sparse_step(problem: Problem, linear: Linear, damping: Floats) -> Floats:
-    out = np.empty_like(damping)
-    still = None if problem.movable is None else ~problem.movable
-    for b, residual in enumerate(zip(*linear.residual, strict=True)):
-        J = problem.jacobian(linear, b)
-        factored = cholesky_of(with_still(J.T @ J, damping[b] + (0 if still is None else still)))
-        if factored is None:
-            raise np.linalg.LinAlgError("J^T J is not positive definite")
-        out[b] = -factored.solve(J.T @ np.concatenate([r.ravel() for r in residual])).reshape(out[b].shape)
-    return out
 
 
 BACKEND = Backend(
     "gauss-newton",
     prepare,
-    "reference: Levenberg-Marquardt, all realisations at once; large graphs by sparse LU",
+    "reference: Levenberg-Marquardt, all realisations at once; large graphs by sparse Cholesky factors",
     capabilities=Capabilities(batched=True, compiled=True),
 )

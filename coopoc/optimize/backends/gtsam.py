@@ -52,7 +52,8 @@ def prepare(
         used = 0
         if own and max_iterations:
             x, used = levenberg_marquardt(problem, x, max_iterations)
-        left, system = max_iterations - used, sparse(problem)
+        left = max_iterations - used
+        system = None if problem.batch else sparse(problem)
         patience = left if system is None else min(left, PATIENCE)
         end = minimise(problem, step, x, patience, tolerance)
         if system is not None and int(np.max(end.iterations)) >= PATIENCE:

@@ -6,16 +6,16 @@ moved onto them by the least step; from then on every step keeps them, so that t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats
-from ..algebra.arrowhead import structure
-from ..algebra.normal import Pattern, normal_equations
-from ..assessment.active import constraint_rows
+from ..algebra.sparse import Sparse, sparse
+from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..model.constraint import bounded
@@ -48,43 +48,53 @@ def prepare(
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    limits = _limits(structure)
-    programme, step = _programme(structure, limits, kkt_tolerance)
+    limits, programmes = _limits(structure), {}
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
+        system = sparse(problem)
+        if system.layout not in programmes:
+            programmes[system.layout] = _programme(system, limits, kkt_tolerance)
+        programme, step_of = programmes[system.layout]
+        step = step_of(system)
         if problem.constraints:
             try:
-                start, feasible = _nearest(limits, x[0])
+                x, feasible = _nearest(limits, x)
             except np.linalg.LinAlgError:
-                return SolverResult(x, np.zeros(1, dtype=np.int64), extras=dict(programme.counts))
-            x = start[None]
+                return SolverResult(x, 0, extras=dict(programme.counts))
             if not feasible:
-                return SolverResult(x, np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool), dict(programme.counts))
-        found = minimise(problem, step, x, max_iterations, tolerance)
-        return replace(found, extras=found.extras | dict(programme.counts))
+                return SolverResult(x, 0, True, dict(programme.counts))
+        found = minimise(problem, step, x[None], max_iterations, tolerance)
+        return SolverResult(
+            found.x[0], int(np.ravel(found.iterations)[0]), extras=found.extras | dict(programme.counts)
+        )
 
     return solver
 
 
-def _programme(problem: Problem, limits: _Limits, tolerance: float) -> tuple[Programme, Step]:
-    scheme, _ = structure(problem)
-    pattern, source = _upper(scheme, problem.space.dof)
-    nodes, at_own = [f.nodes for f in problem.factors], np.arange(problem.space.dof)
-    own = np.flatnonzero(scheme.pairs[:, 0] == scheme.pairs[:, 1])
-    at = scheme.pairs[own, 0]
-    programme = Programme(limits.matrix, tolerance)
+def _programme(system: Sparse, limits: _Limits, tolerance: float) -> tuple[Programme, Callable[[Sparse], Step]]:
+    """The quadratic programme of a structure, and the step of a problem that has it."""
+    from scipy.sparse import csc_matrix
 
-    def step(linear: Linear, damping: Floats) -> Floats:
-        blocks, gradient = normal_equations(scheme, linear, nodes)
-        if damping.any():
-            blocks[:, own[:, None], at_own, at_own] += damping[:, at]
-        values = np.ascontiguousarray(blocks.reshape(len(blocks), -1)[:, source])
-        q = gradient.reshape(len(gradient), -1)
-        if not len(limits.lower):
-            return programme.each(pattern, values, q).reshape(damping.shape)
-        return programme.solve(filled(pattern, values[0]), q[0], *limits.around(linear.x[0])).reshape(damping.shape)
+    entries = system.entries
+    moving, diagonal = np.flatnonzero(entries.number.ravel() >= 0), entries.diagonal
+    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    programme = Programme(csc_matrix(limits.matrix[:, moving]), tolerance)
 
-    return programme, step
+    def step_of(system: Sparse) -> Step:
+        def step(linear: Linear, damping: Floats) -> Floats:
+            dx = np.zeros(damping.size)
+            _, q, values = system.quadratic(linear.x[0], "gauss-newton")
+            values, q = np.array(values), np.array(q)
+            values[diagonal] += damping.ravel()[moving]
+            if len(limits.lower):
+                dx[moving] = programme.solve(filled(pattern, values), q, *limits.around(linear.x[0]))
+            else:
+                dx[moving] = programme.each(pattern, values[None], q[None])[0]
+            return dx.reshape(damping.shape)
+
+        return step
+
+    return programme, step_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,26 +150,10 @@ def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:
         return space.retract(x, step.reshape(len(x), -1)), False
 
 
-@lru_cache(maxsize=64)
-def _upper(scheme: Pattern, dof: int) -> tuple[Any, Any]:
-    """Upper triangle of J^T J as CSC with its structure, and where each value lies in the flat blocks."""
-    from scipy.sparse import csc_array, csc_matrix
-
-    i, j = scheme.pairs.T
-    row = np.broadcast_to(dof * i[:, None, None] + np.arange(dof)[:, None], (len(i), dof, dof)).ravel()
-    col = np.broadcast_to(dof * j[:, None, None] + np.arange(dof), (len(i), dof, dof)).ravel()
-    flat = np.arange(dof * dof * len(i))
-    keep = row <= col
-    shape = (dof * scheme.nodes, dof * scheme.nodes)
-    numbered = csc_array((flat[keep] + 1.0, (row[keep], col[keep])), shape=shape)
-    numbered.sort_indices()
-    return csc_matrix(numbered), (numbered.data - 1).astype(np.int64)
-
-
 BACKEND = Backend(
     "osqp",
     prepare,
     "sequential quadratic programming, persistent workspace",
     "osqp",
-    Capabilities(batched=True, constraints="linear"),
+    Capabilities(constraints="linear"),
 )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..assessment.active import Rows, constraint_rows
+from ..assess.active import Rows, constraint_rows
 from ..model.factor import unchecked
 from ..model.linear import linearise
 from ..model.losses import Loss

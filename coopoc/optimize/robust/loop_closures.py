@@ -164,7 +164,7 @@ class _Search:
         """Rounds of a pinned problem until no more candidates join within the bodies."""
         marked, bound, weight, left, ends = self.marked, self.bound, self.weight, self.left, self.ends(body)
         judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
-        sparse(problem, least=0)  # is kept as long as the problem is, so that all rounds share its analysis
+        sparse(problem)  # is kept as long as the problem is, so that all rounds share its analysis
         chances, rounds = 1, 0
         while rounds < ROUNDS:
             self.x, rounds = inner(reweigh(problem, marked, weight, self.x)), rounds + 1
@@ -192,8 +192,7 @@ class _Search:
         costs = []
         for joins in (0.0, 1.0):
             self.weight[group] = joins
-            system = sparse(reweigh(problem, self.marked, self.weight, self.x), least=0)
-            assert system is not None
+            system = sparse(reweigh(problem, self.marked, self.weight, self.x))
             costs.append(system.cost(arrive(system, self.x, STEPS, TOLERANCE).x if joins else self.x))
         good = 2.0 * (costs[1] - costs[0]) <= self.bound[group]
         self.weight[group] = float(good)
@@ -238,7 +237,7 @@ class _Search:
         rows = rows_among(problem, used)
         part = restricted(pinned(problem, body[body == bodies[0]]), used, self.x, rows)
         inside = _among(marked, rows)
-        sparse(part, least=0)  # is kept as long as the part is, so that all placements share its analysis
+        sparse(part)  # is kept as long as the part is, so that all placements share its analysis
 
         def placement(group: int) -> Placement:
             first, weight = int(np.flatnonzero(marked.group == group)[0]), self.weight.copy()
@@ -292,8 +291,8 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
     Raises:
         InputError: that leaves nodes free.
     """
-    system = sparse(reweigh(problem, marked, weight, x), least=0)
-    if system is None or not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
+    system = sparse(reweigh(problem, marked, weight, x))
+    if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
         raise InputError("candidates", repr(problem), "must leave known inliers that hold all nodes", HINT)
     distance, volume = np.zeros(len(marked.row)), np.zeros(len(marked.row))
     for k in np.unique(marked.factor):

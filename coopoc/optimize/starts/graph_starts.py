@@ -181,9 +181,8 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
                 ranges[point] = len(others)
         solved = used | joins
         part = restricted(problem, solved, x)
-        if (system := sparse(part, least=0)) is not None:
-            end = arrive(system, np.array(part.x0), STEPS, TOLERANCE)
-            x[solved], iterations = end.x, iterations + end.iterations
+        end = arrive(sparse(part), np.array(part.x0), STEPS, TOLERANCE)
+        x[solved], iterations = end.x, iterations + end.iterations
     return x, iterations
 
 

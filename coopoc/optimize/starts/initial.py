@@ -6,8 +6,8 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..algebra.dense import damped_step
 from ..algebra.sparse import Sparse, sparse
+from ..algebra.star import is_star, star_at
 from ..algebra.tape import Model
 from ..model.converted import converted_rows, is_converted
 from ..model.factor import Factor, unchecked
@@ -39,14 +39,13 @@ def initial_guess(problem: Problem) -> Floats:
         return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.ambient)))
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
-    if (system := sparse(problem)) is not None:
-        x, touched = _solution(system, "converted")
+    if problem.batch is None:
+        x, touched = _solution(sparse(problem), "converted")
         return x if touched else _apart(problem, x)
-    linear = converted(problem)
-    if (system := sparse(linear)) is not None:
-        return _apart(problem, _solution(system, "gauss-newton")[0])
-    x = np.zeros((batch, len(problem.names), problem.dimension))
-    return _apart(problem, damped_step(linear, linear.linearise(x), np.full_like(x, RIDGE)) if linear.factors else x)
+    if not is_star(problem):
+        return np.concatenate([initial_guess(problem.pick(b)) for b in range(batch)])
+    x, linear = np.zeros((batch, len(problem.names), problem.dimension)), converted(problem)
+    return _apart(problem, star_at(linear, linear.linearise(x)).solve(RIDGE)[0])
 
 
 def _solution(system: Sparse, model: Model) -> tuple[Floats, bool]:

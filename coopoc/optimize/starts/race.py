@@ -38,7 +38,7 @@ def race(
     noise explains, ends the search. Others are tried where the first had trouble, and all whose costs are near
     the least go on (ROUNDS). Where the noise does not explain the end, the steps to it had trouble and no second start
     led there, the growing start is tried, too: stated noise that is ten times too small costs a few more starts and not
-    that. A problem that is not large takes the first.
+    that.
 
     Args:
         problem: at any start.
@@ -46,21 +46,16 @@ def race(
         growing: problem -> x0 and iterations of a start that is tried last, "incremental".
     """
     system, tried, taken = sparse(problem), {}, 0
-    limit, straight = np.inf, set[str]()
-    if system is not None:
-        mean, variance = expected(problem, system.size)
-        limit = mean + EXCESS * np.sqrt(variance)
+    mean, variance = expected(problem, system.size)
+    limit, straight = mean + EXCESS * np.sqrt(variance), set[str]()
     for name, start in starts.items():
         x = start()
-        if system is None:
-            return problem.replace_unchecked(x0=frozen(x)), Search(name)
         end = arrive(system, x, STEPS, TOLERANCE)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         if smooth(end):
             if tried[name][0] <= limit:
                 return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
             straight |= {name} if end.converged else set()
-    assert system is not None
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
     for within, steps in ROUNDS:

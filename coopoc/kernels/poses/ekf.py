@@ -1,0 +1,227 @@
+"""Extended Kalman filter of poses: one vehicle, or a fleet in one state or by fusion of pairs of estimates."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ..compiling.compile import compiled, part
+from .odometry import PoseNoise, join, predict
+from .scalar_update import COST, USED, Poses, settle, update_fix, update_heading, update_relative
+
+UNPLACED = 7
+"""Bits of all components: nothing is known of the position of one of the two."""
+JOINT, NAIVE, INTERSECTION = range(3)
+"""How estimates are fused: in one state, as if their errors were independent, by covariance intersection."""
+TRIED = 10
+"""Weights that covariance intersection tries."""
+LEAST = 1e-9
+
+
+class PoseMeasurements(NamedTuple):
+    """What n members have measured in R runs of T steps, in body frames.
+
+    Attributes:
+        own: (R, T, n, 8) fix m, compass rad, NaN where missing, velocity m/s forward, left and up, yaw rate rad/s.
+        active: (T, n) whether a member is there.
+        ends: (L, 2) numbers of observer and other, -1 for a landmark.
+        first: (T+1,) first relative measurement of each step.
+        place: (L, 3) m, of the landmark.
+        relative: (R, L, 3) m, rad from the observer's heading, rad; NaN where missing.
+        dt: s.
+    """
+
+    own: Floats
+    active: Bools
+    ends: Ints
+    first: Ints
+    place: Floats
+    relative: Floats
+    dt: float
+
+
+class PoseOptions(NamedTuple):
+    """How members are filtered.
+
+    Attributes:
+        d: numbers of a member, 4 or 6.
+        passes: of the relative measurements, each linear at the state that the last one found.
+        fusion: JOINT, NAIVE or INTERSECTION.
+    """
+
+    d: int
+    passes: int
+    fusion: int
+
+
+@compiled
+def run_filter(
+    measured: PoseMeasurements,
+    noise: PoseNoise,
+    begin: Floats,
+    spread: Floats,
+    options: PoseOptions,
+    poses: Poses,
+    pair: Poses,
+) -> tuple[Floats, Floats, Floats]:
+    """States (R, T, n, d), NaN where absent, their covariances (R, T, n, d, d), and cost and number of rows (R, 2).
+
+    Args:
+        measured: by the members.
+        noise: that is assumed.
+        begin: (R, n, 4) m and rad, poses at the first step; NaN for the first fix and compass.
+        spread: (4,) standard deviations of these.
+        options: of the filter.
+        poses: memory for the members.
+        pair: memory for two members.
+    """
+    (runs, steps, members, _), d = measured.own.shape, options.d
+    x, cov = np.full((runs, steps, members, d), np.nan), np.full((runs, steps, members, d, d), np.nan)
+    cost = np.zeros((runs, 2))
+    for run in range(runs):
+        for t in range(steps):
+            step(measured, noise, begin, spread, options, poses, pair, run, t)
+            for k in range(members):
+                if measured.active[t, k]:
+                    for i in range(d):
+                        x[run, t, k, i] = poses.x[d * k + i]
+                        for j in range(d):
+                            cov[run, t, k, i, j] = poses.cov[d * k + i, d * k + j]
+        cost[run, 0], cost[run, 1] = poses.count[COST], poses.count[USED]
+    return x, cov, cost
+
+
+@compiled
+def step(
+    measured: PoseMeasurements,
+    noise: PoseNoise,
+    begin: Floats,
+    spread: Floats,
+    options: PoseOptions,
+    poses: Poses,
+    pair: Poses,
+    run: int,
+    t: int,
+) -> None:
+    """One step of all members: prediction, then each one's compass and fix, then the relative measurements."""
+    d = options.d
+    if t == 0:
+        poses.count[COST] = poses.count[USED] = 0.0
+    for k in range(measured.own.shape[2]):
+        own, member = measured.own[run, t, k], d * k
+        if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
+            predict(poses, member, d, (own[4], own[5], own[6]), own[7], measured.dt, noise)
+        elif measured.active[t, k]:
+            join(poses, member, d, own, noise)
+            for i in range(4 if t == 0 else 0):
+                if not math.isnan(begin[run, k, i]):
+                    poses.x[member + i] = begin[run, k, i]
+                    poses.cov[member + i, member + i] = spread[i] * spread[i]
+    for k in range(measured.own.shape[2]):
+        own = measured.own[run, t, k]
+        if measured.active[t, k] and not math.isnan(own[3]):
+            update_heading(poses, d * k, own[3], noise.heading, noise.gate)
+        if measured.active[t, k] and not math.isnan(own[0]):
+            update_fix(poses, d * k, (own[0], own[1], own[2]), noise.fix, noise.gate)
+    settle(poses)
+    if measured.first[t] == measured.first[t + 1]:
+        return
+    if options.fusion == JOINT:
+        update_jointly(measured, noise, options, poses, run, t)
+    else:
+        for k in range(measured.first[t], measured.first[t + 1]):
+            fuse_pair(measured, noise, options, poses, pair, run, k)
+
+
+@compiled
+def update_jointly(
+    measured: PoseMeasurements, noise: PoseNoise, options: PoseOptions, poses: Poses, run: int, t: int
+) -> None:
+    """All relative measurements of a step, pass after pass: the first linear at the state after the fixes, each of the
+    others at what the last one found, from the same prior."""
+    d, begin, end = options.d, measured.first[t], measured.first[t + 1]
+    left_out = np.zeros(end - begin, np.int64)
+    for k in range(begin, end):
+        i, j = d * measured.ends[k, 0], d * max(measured.ends[k, 1], 0)
+        if max(poses.cov[i, i], poses.cov[j, j]) > 0.5 * noise.flat:
+            left_out[k - begin] = UNPLACED
+    if options.passes > 1:
+        poses.prior_x[:], poses.prior_cov[:] = poses.x, poses.cov
+    for again in range(options.passes):
+        poses.linear[:] = poses.x
+        if again:
+            poses.x[:], poses.cov[:] = poses.prior_x, poses.prior_cov
+        for k in range(begin, end):
+            ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
+            left_out[k - begin] = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])
+        settle(poses)
+
+
+@part
+def add_relative(
+    measured: PoseMeasurements, noise: PoseNoise, poses: Poses, ends: tuple[int, int], run: int, k: int, left_out: int
+) -> int:
+    """Relative measurement k of members at `ends`."""
+    place = (measured.place[k, 0], measured.place[k, 1], measured.place[k, 2])
+    relative = (measured.relative[run, k, 0], measured.relative[run, k, 1], measured.relative[run, k, 2])
+    return update_relative(poses, ends, place, relative, noise.relative, noise.gate, left_out)
+
+
+@part
+def fuse_pair(
+    measured: PoseMeasurements, noise: PoseNoise, options: PoseOptions, poses: Poses, pair: Poses, run: int, k: int
+) -> None:
+    """Update the observer of a relative measurement with the estimate of the member that it measured.
+
+    Their joint covariance is taken as block diagonal, each block over its weight: 1 and 1 if the errors were
+    independent, w and 1 - w for a bound whatever their correlation (covariance intersection), with the w that
+    minimises the sum of the observer's d variances, each over what it was: at most d, so that their product never grows
+    (a trace of the position alone would let headings grow without end). What the measured member would learn is
+    dropped.
+
+    Args:
+        measured: by the members.
+        noise: that is assumed.
+        options: its fusion not JOINT.
+        poses: the state; covariances between members are zero.
+        pair: memory.
+        run: of the measurement.
+        k: number of the measurement.
+
+    References:
+        Carrillo-Arce et al., Decentralized multi-robot cooperative localization using covariance intersection,
+        IROS 2013.
+    """
+    d, observer, other = options.d, options.d * measured.ends[k, 0], options.d * measured.ends[k, 1]
+    ends = (np.int64(0), np.int64(d) if other >= 0 else np.int64(-1))
+    tries = TRIED if options.fusion == INTERSECTION and other >= 0 else 0
+    best, chosen = math.inf, 1.0
+    for attempt in range(tries + 1):
+        weight = chosen if attempt == tries else (attempt + 1.0) / TRIED
+        pair.cov[:] = 0.0
+        set_member(pair, 0, poses, observer, d, weight)
+        if other >= 0:
+            set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)
+        for i in range(2 * d):
+            pair.linear[i] = pair.x[i]
+        add_relative(measured, noise, pair, ends, run, k, np.int64(0))
+        settle(pair)
+        total = 0.0
+        for i in range(d):
+            before = poses.cov[observer + i, observer + i]
+            total += pair.cov[i, i] / before if before > 0.0 else 0.0
+        if attempt < tries and total < best:
+            best, chosen = total, weight
+    set_member(poses, observer, pair, 0, d, 1.0)
+
+
+@part
+def set_member(poses: Poses, member: int, source: Poses, at: int, d: int, weight: float) -> None:
+    """Copy the state and the covariance over `weight` of one member."""
+    for i in range(d):
+        poses.x[member + i] = source.x[at + i]
+        for j in range(d):
+            poses.cov[member + i, member + j] = source.cov[at + i, at + j] / weight

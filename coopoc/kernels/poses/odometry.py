@@ -1,0 +1,137 @@
+"""Prediction of poses: odometry of speed and yaw rate moves a member's state and its covariance."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from ...arrays import Floats
+from ..compiling.compile import part
+from .scalar_update import HEADING, Poses, Three
+
+UNKNOWN_HEADING = math.pi**2 / 3.0
+"""rad^2, variance of a heading of which nothing is known: uniform over a turn."""
+
+
+class PoseNoise(NamedTuple):
+    """What a pose filter assumes.
+
+    Attributes:
+        fix: three variances, m^2.
+        heading: rad^2, of a compass.
+        relative: three variances, m^2, rad^2, rad^2.
+        velocity: noise of the odometer: ratio, least std m/s, 1 for a ratio of the speed on every axis.
+        yaw_rate: rad^2/s^2.
+        lasting: stationary variances of scale error and of yaw-rate bias, rad^2/s^2.
+        keep: share of both that is left after a step.
+        flat: m^2, prior of a member that joins.
+        gate: standard deviations of its innovation beyond which a measurement is left out.
+    """
+
+    fix: Three
+    heading: float
+    relative: Three
+    velocity: Three
+    yaw_rate: float
+    lasting: tuple[float, float]
+    keep: float
+    flat: float
+    gate: float
+
+
+@part
+def velocity_variances(u: Three, noise: PoseNoise) -> Three:
+    """Variance (m/s)^2 of each component of a measured velocity, forward, left and up."""
+    ratio, floor, of_speed = noise.velocity
+    a, b, c = abs(u[0]), abs(u[1]), abs(u[2])
+    if of_speed > 0.0:
+        a = b = c = math.sqrt(a * a + b * b + c * c)
+    a, b, c = max(ratio * a, floor), max(ratio * b, floor), max(ratio * c, floor)
+    return a * a, b * b, c * c
+
+
+@part
+def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt: float, noise: PoseNoise) -> None:
+    """Move one member by its odometry.
+
+    th' = th + dt (w - b), p' = p + dt R(th + dt (w - b) / 2) u / (1 + s), and P' = F P F^T + G Q G^T with the
+    derivatives of these; s and b decay (Gauss-Markov).
+
+    Args:
+        poses: the state.
+        member: its first number.
+        d: numbers of a member.
+        velocity: u, forward, left and up m/s.
+        rate: w, rad/s.
+        dt: s.
+        noise: that is assumed.
+    """
+    x, cov, (forward, left, up) = poses.x, poses.cov, velocity
+    qf, ql, qu = velocity_variances(velocity, noise)
+    scale, bias = 1.0, 0.0
+    if d > 4:
+        scale, bias = 1.0 / (1.0 + x[member + 4]), x[member + 5]
+    heading = x[member + HEADING] + 0.5 * dt * (rate - bias)
+    cos, sin, up = dt * scale * math.cos(heading), dt * scale * math.sin(heading), dt * scale * up
+    east, north = cos * forward - sin * left, sin * forward + cos * left
+    x[member] += east
+    x[member + 1] += north
+    x[member + 2] += up
+    x[member + HEADING] += dt * (rate - bias)
+    for i in range(member + 4, member + d):
+        x[i] *= noise.keep
+    move_rows(cov, member, d, (east, north, up), scale, dt, noise.keep)
+    move_rows(cov.T, member, d, (east, north, up), scale, dt, noise.keep)
+    cov[member, member] += cos * cos * qf + sin * sin * ql
+    cov[member + 1, member + 1] += sin * sin * qf + cos * cos * ql
+    cov[member, member + 1] += cos * sin * (qf - ql)
+    cov[member + 1, member] += cos * sin * (qf - ql)
+    cov[member + 2, member + 2] += (dt * scale) * (dt * scale) * qu
+    effect = (-0.5 * dt * north, 0.5 * dt * east, 0.0, dt)
+    for i in range(4):
+        for j in range(4):
+            cov[member + i, member + j] += effect[i] * effect[j] * noise.yaw_rate
+    for i in range(4, d):
+        cov[member + i, member + i] += (1.0 - noise.keep * noise.keep) * noise.lasting[i - 4]
+
+
+@part
+def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: float, keep: float) -> None:
+    """F P in the rows of a member; the transposed of it, moved once more, is F P F^T.
+
+    Args:
+        cov: P.
+        member: its first number.
+        d: numbers of a member.
+        moved: east, north and up m.
+        scale: 1 / (1 + s).
+        dt: s.
+        keep: share of s and b that is left.
+    """
+    east, north, up = moved
+    for j in range(len(cov)):
+        cov[member, j] -= north * cov[member + HEADING, j]
+        cov[member + 1, j] += east * cov[member + HEADING, j]
+    if d > 4:
+        for j in range(len(cov)):
+            ds, db = -scale * cov[member + 4, j], -dt * cov[member + 5, j]
+            cov[member, j] += east * ds - 0.5 * north * db
+            cov[member + 1, j] += north * ds + 0.5 * east * db
+            cov[member + 2, j] += up * ds
+            cov[member + HEADING, j] += db
+            cov[member + 4, j] *= keep
+            cov[member + 5, j] *= keep
+
+
+@part
+def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> None:
+    """Begin a member where its fix and compass place it, and know nothing of it yet."""
+    for i in range(member, member + d):
+        for j in range(len(poses.x)):
+            poses.cov[i, j] = poses.cov[j, i] = 0.0
+        poses.x[i] = 0.0
+    for i in range(4):
+        poses.x[member + i] = 0.0 if math.isnan(own[i]) else own[i]
+        poses.cov[member + i, member + i] = noise.flat if i < HEADING else UNKNOWN_HEADING
+    for i in range(4, d):
+        poses.cov[member + i, member + i] = noise.lasting[i - 4]

@@ -1,0 +1,231 @@
+"""Sequential scalar EKF update of the joint pose state, and the rows of compasses, fixes, ranges and angles.
+
+The state of a member is d = 4 or 6 numbers: position m, heading rad and, of six, the odometer's scale error and the
+yaw rate's bias rad/s. A row is linear in the pose of one member, (a, b, c, h), and at most in the position of another,
+(-a, -b, -c): every measurement here is one of the vector between the two and of the first one's heading.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy import uint64
+
+from ...arrays import Floats
+from ..compiling.compile import part
+from ..compiling.vectors import LANES, less, plus, put, take
+
+HEADING = 3
+"""Index of the heading in a member's state."""
+ROWS = 4
+"""Rows that may be pending, so that one pass over the covariance serves them all."""
+NEAREST = 1e-3
+"""m, least distance at which an angle is linearised."""
+Ends = tuple[int, int]
+"""First number of the member and of the other, -1 for none."""
+Row = tuple[float, float, float, float]
+Three = tuple[float, float, float]
+
+
+class Poses(NamedTuple):
+    """State of n members of d numbers each, filled up with zeros to a multiple of LANES, and memory of an update.
+
+    Attributes:
+        x: (size,).
+        cov: (size, size), to which pending rows have not been applied.
+        linear: (size,) state at which relative measurements are linearised.
+        prior_x: (size,) before the relative measurements.
+        prior_cov: (size, size).
+        columns: (ROWS, size) P h of pending rows.
+        gains: (ROWS, size) P h / s of these.
+        weights: (ROWS,) 1 / s of these.
+        count: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
+    """
+
+    x: Floats
+    cov: Floats
+    linear: Floats
+    prior_x: Floats
+    prior_cov: Floats
+    columns: Floats
+    gains: Floats
+    weights: Floats
+    count: Floats
+
+
+COST, USED, PENDING = range(3)
+
+
+def new_poses(numbers: int) -> Poses:
+    """Room for so many numbers."""
+    size = -(-numbers // LANES) * LANES
+    (x, linear, prior_x), (cov, prior_cov) = np.zeros((3, size)), np.zeros((2, size, size))
+    columns, gains = np.zeros((2, ROWS, size))
+    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, np.zeros(ROWS), np.zeros(3))
+
+
+@part
+def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: float, gate: float) -> bool:
+    """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance; nothing where r^2 > gate^2 s.
+
+    The covariance follows when ROWS rows are pending, or with `settle`; a row sees those that are pending.
+
+    Args:
+        poses: the state.
+        ends: of the row.
+        row: (a, b, c, h).
+        residual: r, at the state.
+        variance: of the measurement.
+        gate: in standard deviations.
+
+    Returns:
+        Whether the measurement is used.
+    """
+    if poses.count[PENDING] == ROWS:
+        settle(poses)
+    cov, columns, pending, (k, o), (a, b, c, h) = poses.cov, poses.columns, int(poses.count[PENDING]), ends, row
+    tiles = len(poses.x) // LANES
+    for tile in range(tiles):
+        x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
+        if o >= 0:
+            x, y = x - entries(cov, o, tile, tiles), y - entries(cov, o + 1, tile, tiles)
+            z = z - entries(cov, o + 2, tile, tiles)
+        total = plus(plus(plus(h * entries(cov, k + HEADING, tile, tiles), a, x), b, y), c, z)
+        put(columns, uint64(pending * tiles + tile), total)
+    for q in range(pending):
+        share = along(columns, q, ends, row) * poses.weights[q]
+        for tile in range(tiles):
+            left = less(entries(columns, pending, tile, tiles), share, entries(columns, q, tile, tiles))
+            put(columns, uint64(pending * tiles + tile), left)
+    s = variance + along(columns, pending, ends, row)
+    weight = 1.0 / s
+    square = residual * residual * weight
+    poses.count[COST] += min(square, gate * gate) + math.log(s)
+    if square > gate * gate:
+        return False
+    for tile in range(tiles):
+        column = entries(columns, pending, tile, tiles)
+        put(poses.x, uint64(tile), plus(take(poses.x, uint64(tile)), residual * weight, column))
+        put(poses.gains, uint64(pending * tiles + tile), weight * column)
+    poses.weights[pending] = weight
+    poses.count[USED] += 1.0
+    poses.count[PENDING] += 1.0
+    return True
+
+
+@part
+def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
+    """LANES numbers of a row of `tiles` times as many."""
+    return take(rows, uint64(row * tiles + tile))
+
+
+@part
+def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
+    """h^T v of a row and a column."""
+    (k, o), (a, b, c, h) = ends, row
+    total = a * columns[q, k] + b * columns[q, k + 1] + c * columns[q, k + 2] + h * columns[q, k + HEADING]
+    if o >= 0:
+        total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
+    return float(total)
+
+
+@part
+def settle(poses: Poses) -> None:
+    """Apply the pending rows to the covariance, which is read once for all of them."""
+    size, tiles, gains = len(poses.x), len(poses.x) // LANES, poses.gains
+    pending = int(poses.count[PENDING])
+    for q in range(pending, ROWS if pending > 0 else 0):
+        for i in range(size):
+            gains[q, i] = 0.0
+    for i in range(size if pending > 0 else 0):
+        p, q, r, s = gains[0, i], gains[1, i], gains[2, i], gains[3, i]
+        if p != 0.0 or q != 0.0 or r != 0.0 or s != 0.0:
+            for tile in range(tiles):
+                left = less(entries(poses.cov, i, tile, tiles), p, entries(poses.columns, 0, tile, tiles))
+                left = less(left, q, entries(poses.columns, 1, tile, tiles))
+                left = less(left, r, entries(poses.columns, 2, tile, tiles))
+                left = less(left, s, entries(poses.columns, 3, tile, tiles))
+                put(poses.cov, uint64(i * tiles + tile), left)
+    poses.count[PENDING] = 0.0
+
+
+@part
+def wrapped(angle: float) -> float:
+    """The same angle in [-pi, pi)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@part
+def update_heading(poses: Poses, member: int, heading: float, variance: float, gate: float) -> None:
+    """A compass heading rad."""
+    residual = wrapped(heading - poses.x[member + HEADING])
+    update_row(poses, (member, np.int64(-1)), (0.0, 0.0, 0.0, 1.0), residual, variance, gate)
+
+
+@part
+def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: float) -> None:
+    """A position m."""
+    for axis in range(3):
+        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0)
+        update_row(poses, (member, np.int64(-1)), row, fix[axis] - poses.x[member + axis], variance[axis], gate)
+
+
+@part
+def relative_row(linear: Floats, component: int, ends: Ends, place: Three, measured: float) -> tuple[float, Row]:
+    """Residual and row of a range (0), a bearing from the observer's heading (1) or an inclination (2).
+
+    Args:
+        linear: the state at which they are taken.
+        component: which of the three.
+        ends: observer, and the other or -1 for a landmark.
+        place: of the landmark, m.
+        measured: m or rad.
+    """
+    (k, o), (px, py, pz) = ends, place
+    if o >= 0:
+        px, py, pz = linear[o], linear[o + 1], linear[o + 2]
+    x, y, z = px - linear[k], py - linear[k + 1], pz - linear[k + 2]
+    flat2 = max(x * x + y * y, NEAREST * NEAREST)
+    flat, r2 = math.sqrt(flat2), flat2 + z * z
+    if component == 0:
+        r = math.sqrt(r2)
+        return measured - r, (-x / r, -y / r, -z / r, 0.0)
+    if component == 1:
+        return wrapped(measured - math.atan2(y, x) + linear[k + HEADING]), (y / flat2, -x / flat2, 0.0, -1.0)
+    row = (-x * z / (flat * r2), -y * z / (flat * r2), flat / r2, 0.0)
+    return wrapped(measured - math.atan2(flat, z)), row
+
+
+@part
+def update_relative(
+    poses: Poses, ends: Ends, place: Three, measured: Three, variances: Three, gate: float, left_out: int
+) -> int:
+    """The components of one relative measurement, linear at `poses.linear`.
+
+    Args:
+        poses: the state.
+        ends: observer, and the other or -1 for a landmark.
+        place: of the landmark, m.
+        measured: m, rad, rad, NaN where missing.
+        variances: of the three.
+        gate: in standard deviations.
+        left_out: a bit for each component that is left out.
+
+    Returns:
+        The bits, and those of the components beyond the gate.
+    """
+    (k, o), x, linear = ends, poses.x, poses.linear
+    for component in range(3):
+        if math.isnan(measured[component]) or left_out & (1 << component):
+            continue
+        residual, row = relative_row(linear, component, ends, place, measured[component])
+        residual -= row[HEADING] * (x[k + HEADING] - linear[k + HEADING])
+        for axis in range(3):
+            residual -= row[axis] * (x[k + axis] - linear[k + axis])
+            if o >= 0:
+                residual += row[axis] * (x[o + axis] - linear[o + axis])
+        if not update_row(poses, ends, row, residual, variances[component], gate):
+            left_out |= 1 << component
+    return left_out

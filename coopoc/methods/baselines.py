@@ -1,0 +1,107 @@
+"""Published baselines: LKF-SA, the Laplacian Kalman filter over the star, and MSMV-R, pseudo-fixes of neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..arrays import Floats
+from ..kernels.solo import FixNoise
+from ..kernels.stars import lkf_sa, msmv
+from ..kernels.stars.messages import Assumptions
+from ..world.inbox import Inbox
+from ..world.recording import Recording, check_recording
+from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
+from .egos import Estimate, follow_egos
+from .kalman import solo_filter
+from .noise_model import NoiseModel, resolve
+from .options import check_options
+from .star import assumptions, measurements
+from .track import Track
+
+RECONSTRUCTION = "MSMV-R is a reconstruction: the equations of MSMV are not public; the paper's curve is not matched"
+
+
+@dataclass(frozen=True, eq=False)
+class LKFSA:
+    """Per axis: z = [delta; gnss], H = [L; I], L the star's graph Laplacian, delta_i = -sum_j (x_j - x_i) as measured.
+
+    With the identity noise model this is LKF-SA as the paper compares with it. Cov(delta) is sigma^2 L and not the
+    diagonal used here, so no weighting of this form is right; that of `JointFilter(exact=False)`, the edge form, is.
+    With other noise models delta_i has variance deg_i times the mean per-axis variance of the converted vectors. A
+    member whose measurement is incomplete has no edge.
+
+    Args:
+        noise_model: "identity" (the paper), "nominal" or a NoiseModel.
+    """
+
+    noise_model: NoiseModel | str = "identity"
+    name: str = "lkf-sa"
+    cooperative: bool = True
+    message: Message = FIX_AND_VELOCITY
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
+        known = resolve(self.noise_model, recording)
+        assumed = assumptions(recording, known)
+
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x, cov, neighbours = lkf_sa.run_filter(measurements(recording, ego, box), assumed)
+            yield Estimate(slice(None), x, cov, box.link, neighbours)
+
+        return follow_egos(self, recording, egos, run, known.notes, missing=True)
+
+
+@dataclass(frozen=True, eq=False)
+class MSMV:
+    """Kalman filter of the ego with one pseudo-fix per neighbour: y_j = p_j - rho(r_ij), C_j = P_j + J C_r J^T.
+
+    p_j, P_j are the neighbour's own solo estimate; P^-1 += C_p^-1 + sum C_j^-1. The errors of p_j are correlated in
+    time, so the covariance is over-confident (data incest), and NEES shows it. With the identity noise model all
+    covariances are unit matrices and the message is shorter. The equations of MSMV are not public: this is a
+    reconstruction.
+
+    Args:
+        noise_model: "identity", "nominal" or a NoiseModel.
+    """
+
+    noise_model: NoiseModel | str = "identity"
+    name: str = "msmv-r"
+    cooperative: bool = True
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+    @property
+    def message(self) -> Message:
+        """Without covariance under the identity noise model, with it otherwise."""
+        name = self.noise_model if isinstance(self.noise_model, str) else self.noise_model.name
+        return ESTIMATE if name == "identity" else ESTIMATE_AND_COV
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos; InputError if one is unknown or absent."""
+        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
+        assumed, own = solo_estimates(recording, known, columns)
+        assumed = assumed._replace(growth=(0.0, 1.0), acceleration=0.0)
+
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            x, cov, theirs = msmv.run_filter(measurements(recording, ego, box, own), assumed)
+            yield Estimate(slice(None), x, cov, box.link, theirs)
+
+        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION), missing=True)
+
+
+def solo_estimates(recording: Recording, known: NoiseModel, egos: Sequence[int]) -> tuple[Assumptions, Floats]:
+    """What a filter assumes whose messages hold solo estimates, and these, (R, T, N, 3) m of all vehicles in the stars
+    of some egos (columns)."""
+    links = recording.links
+    members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+    x, p, _ = solo_filter(recording, members, known, FixNoise(known.gnss_variance))
+    all_x, all_p = np.full((2, *recording.gnss.shape), np.nan)
+    all_x[:, :, members], all_p[:, :, members] = x, p
+    return assumptions(recording, known)._replace(broadcast=all_p), all_x

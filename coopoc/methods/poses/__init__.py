@@ -1,0 +1,1 @@
+"""Pose filters and smoothers: positions with headings, from what is measured on board."""

@@ -1,0 +1,214 @@
+"""The pose filter: extended Kalman filter of position and heading of a vehicle alone or of the whole fleet."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints, checked, number
+from ...errors import InputError
+from ...plugins import one_of
+from ...short_repr import short_repr
+from ...world.inbox import inbox
+from ...world.recording import Recording, check_recording
+from ...world.sensors import Sensors
+from ...world.spherical import wrap
+from ...world.v2x import NO_MESSAGE, Message
+from ..options import check_options
+from ..track import Track
+from ..whole_fleet import CENTRE, centre
+from .pose_inputs import (
+    POSE,
+    SPREAD,
+    UPLOAD,
+    check_spread,
+    first_poses,
+    fleet_members,
+    pose_egos,
+    pose_measurements,
+    pose_noise,
+    to_landmarks,
+)
+from .pose_stream import PoseStream
+
+if TYPE_CHECKING:
+    from ...kernels.poses.ekf import PoseOptions
+
+Unit = Literal["solo", "fleet"]
+Fusion = Literal["joint", "naive", "intersection"]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFilter:
+    """Extended Kalman filter of (x, y, z, heading) driven by speed and yaw rate, with fixes, compass, ranges, bearings.
+
+    th' = th + dt w, p' = p + dt R(th + dt w / 2) u; range |p_j - p_i|, bearing atan2(p_j - p_i) - th_i; a component
+    that was not measured is no row. A landmark's position is known. With `exact` one more Gauss-Newton step on the
+    relative measurements follows, from the same prior.
+
+    Args:
+        unit: "solo", each vehicle with its landmarks; "fleet", all vehicles.
+        fusion: of a fleet. "joint": one state with all cross-covariances, at a centre, the optimum. Decentralised, each
+            vehicle fuses the estimates that reach it in time: "naive" as if their errors were independent;
+            "intersection" by covariance intersection.
+        lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
+        exact: False is the plain extended Kalman filter.
+        gate: standard deviations of an innovation beyond which a component is left out; infinity keeps all.
+        begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
+        spread: (4,) standard deviations of these.
+        assumed: noise, default that of the recording.
+
+    References:
+        Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.4.
+        Roumeliotis, Bekey, Distributed multirobot localization, IEEE TRA 18(5), 2002 (the fleet's joint state).
+        Carrillo-Arce, Nerurkar, Gordillo, Roumeliotis, Decentralized multi-robot cooperative localization using
+        covariance intersection, IROS 2013.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 1], [[[0, 0, 0]], [[9, 0, 0]]], np.full((2, 1, 3), [9.0, 0, 0]))
+    >>> track = PoseFilter("solo")(observe(fleet, Sensors(), runs=3, frame="body"))
+    >>> track.x.shape, track.heading.shape
+    ((3, 2, 1, 3), (3, 2, 1))
+    """
+
+    unit: Unit = "fleet"
+    fusion: Fusion = "joint"
+    lasting: bool = False
+    exact: bool = True
+    gate: float = np.inf
+    begin: Floats | None = None
+    spread: tuple[float, ...] = SPREAD
+    assumed: Sensors | None = None
+    name: str = ""
+
+    __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        check_options(self)
+        one_of("unit", self.unit, get_args(Unit))
+        one_of("fusion", self.fusion, get_args(Fusion))
+        if self.fusion != "joint" and self.unit != "fleet":
+            raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
+        number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
+        check_spread(self.spread)
+        if not self.name:
+            object.__setattr__(self, "name", f"pose-{self.unit if self.fusion == 'joint' else self.fusion}")
+
+    @property
+    def cooperative(self) -> bool:
+        """Whether other vehicles take part."""
+        return self.unit != "solo"
+
+    @property
+    def message(self) -> Message:
+        """What each vehicle sends."""
+        if self.unit == "solo":
+            return NO_MESSAGE
+        return UPLOAD if self.fusion == "joint" else POSE
+
+    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+        """Track of the egos.
+
+        Raises:
+            InputError: a recording in the world frame, an ego that is unknown, absent at times or a landmark, or one
+                whose first pose is not known.
+        """
+        began, recording = time.perf_counter(), check_recording(recording, body=True)
+        columns, links, notes = pose_egos(recording, egos), recording.links, tuple[str, ...]()
+        received, sent = np.zeros((2, recording.runs, len(columns)))
+        if self.unit == "solo":
+            begin = first_poses(recording, self.begin, columns)
+            found = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
+            x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*found, strict=True))[:2])
+        else:
+            members = fleet_members(recording)
+            begin = first_poses(recording, self.begin, members)
+            own = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
+            in_time = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
+            x, cov, _ = self.run_filter(recording, members, own, begin, in_time[:, own])
+            x, cov = (values[:, :, [members.index(column) for column in columns]] for values in (x, cov))
+        if self.unit == "fleet" and self.fusion == "joint":
+            met, notes = centre(recording, self.message), (CENTRE,)
+            received, sent = met.received_bytes[:, columns], met.sent_bytes[:, columns]
+        elif self.unit == "fleet":
+            for k, column in enumerate(columns):
+                box = inbox(recording, column, self.message)
+                received[:, k], sent[:, k] = box.received_bytes, box.sent_bytes
+        extras: dict[str, Floats] = {}
+        for k, name in enumerate(("speed_scale", "yaw_rate_bias") if self.lasting else (), 4):
+            extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
+        return Track(
+            recording.t,
+            tuple(columns),
+            x[..., :3],
+            cov[..., :3, :3],
+            received,
+            sent,
+            time.perf_counter() - began,
+            notes=notes,
+            heading=wrap(x[..., 3]),
+            heading_covariance=cov[..., 3, :4],
+            extras=extras,
+        )
+
+    def start(self, dt: float, begin: Floats | None = None) -> PoseStream:
+        """This filter for a vehicle alone that is fed as it drives, one `step` of dt s after the other.
+
+        Args:
+            dt: s.
+            begin: (4,) m and rad, pose at the first step; None: its fix and compass.
+
+        Raises:
+            InputError: a filter of a fleet, or one without `assumed`.
+
+        >>> from coopoc import OwnMeasurement, Sensors
+        >>> stream = PoseFilter("solo", assumed=Sensors(heading_std=0.1)).start(dt=0.1)
+        >>> stream.step(OwnMeasurement([9.0, 0, 0], 0.0, gnss=[1.0, 2.0, 0.0], heading=0.5)).x.round(3).tolist()
+        [1.0, 2.0, 0.0, 0.5]
+        """
+        if self.unit == "fleet":
+            raise InputError("unit", self.unit, "has no stream", 'Take "solo".')
+        if self.assumed is None:
+            raise InputError("assumed", None, "is needed: a stream has no recording", "Give assumed=Sensors(...).")
+        dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
+        first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
+        spread = np.array(self.spread, dtype=float)
+        return PoseStream(pose_noise(self.assumed, dt, self.gate), self.options(), first, spread, dt)
+
+    def run_filter(
+        self,
+        recording: Recording,
+        members: Sequence[int],
+        links: Ints,
+        begin: Floats,
+        kept: Bools | None = None,
+        place: Floats | None = None,
+    ) -> tuple[Floats, Floats, Floats]:
+        """States (R, T, n, d), covariances (R, T, n, d, d), and cost and number of rows (R, 2) of some members.
+
+        Args:
+            recording: in body frames.
+            members: columns.
+            links: as of `pose_measurements`, like `kept` and `place`.
+            begin: (R, N, 4) first poses.
+            kept: which links count.
+            place: of what they measure.
+        """
+        from ...kernels.poses.ekf import run_filter
+        from ...kernels.poses.scalar_update import new_poses
+
+        noise, options = pose_noise(self.assumed or recording.sensors, recording.dt, self.gate), self.options()
+        measured = pose_measurements(recording, members, links, kept, place)
+        memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
+        first, spread = np.ascontiguousarray(begin[:, members]), np.array(self.spread, dtype=float)
+        return run_filter(measured, noise, first, spread, options, *memory)
+
+    def options(self) -> PoseOptions:
+        """As the kernel takes them."""
+        from ...kernels.poses.ekf import PoseOptions
+
+        return PoseOptions(6 if self.lasting else 4, 1 + self.exact, get_args(Fusion).index(self.fusion))

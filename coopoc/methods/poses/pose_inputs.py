@@ -1,0 +1,152 @@
+"""Inputs of pose methods: egos, first poses, the noise that is assumed, and arguments of the kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints, checked, listed
+from ...errors import InputError
+from ...world.body import Body
+from ...world.recording import Recording
+from ...world.sensors import Sensors
+from ...world.v2x import Message
+from ..star import FORGOTTEN
+
+if TYPE_CHECKING:
+    from ...kernels.poses.ekf import PoseMeasurements
+    from ...kernels.poses.odometry import PoseNoise
+
+POSE = Message("pose and covariance", 16)
+"""Position and heading (4), covariance (10), id and time (2)."""
+UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_neighbour=4)
+"""Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2); of each other vehicle range, angles and id (4)."""
+SPREAD = (1.0, 1.0, 1.0, 0.2)
+"""m and rad, standard deviations of poses at the first step that are given."""
+LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
+"""rad and rad/s: a filter needs some noise, however exact its sensors are."""
+
+
+def pose_egos(recording: Recording, egos: Sequence[int | str]) -> list[int]:
+    """Columns of egos that are there throughout; InputError for one that is not, and for a landmark."""
+    egos = listed("egos", egos, "Give [0] for the first.")
+    columns = recording.observing(egos)
+    for ego, column in zip(egos, columns, strict=True):
+        if column in recording.landmarks:
+            raise InputError("egos", repr(ego), "is a landmark", "Its position is known.")
+        if np.isnan(recording.velocity[0, :, column, 0]).any():
+            raise InputError("egos", repr(ego), "is absent at some steps", "Cut it with recording.between(...).")
+    return columns
+
+
+def body_of(recording: Recording) -> Body:
+    """Yaw rates and headings of a recording in body frames."""
+    assert recording.body is not None
+    return recording.body
+
+
+def present(recording: Recording) -> Bools:
+    """(T, N) whether a vehicle is there; landmarks are not."""
+    there: Bools = np.isfinite(recording.velocity[0, :, :, 0])
+    there[:, list(recording.landmarks)] = False
+    return there
+
+
+def fleet_members(recording: Recording) -> list[int]:
+    """Columns of all vehicles that are there at some step."""
+    return np.flatnonzero(present(recording).any(axis=0)).tolist()
+
+
+def to_landmarks(recording: Recording, links: Ints) -> Ints:
+    """Those of some links that measure a landmark."""
+    return links[np.isin(recording.links.neighbour[links], recording.landmarks)]
+
+
+def check_spread(spread: Sequence[float]) -> None:
+    """InputError unless four numbers > 0."""
+    if not (checked("spread", spread, "(4,)", (4,)) > 0).all():
+        raise InputError("spread", spread, "must be > 0", "Give m, m, m and rad.")
+
+
+def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[int]) -> Floats:
+    """Poses (R, N, 4) m and rad at the first step that were given, NaN where a fix and a compass take their place.
+
+    Args:
+        recording: in body frames.
+        begin: (N, 4) or (R, N, 4), or None.
+        columns: of vehicles whose pose must be known by one of the two.
+
+    Raises:
+        InputError: another shape, or an unknown pose.
+    """
+    shape = (recording.runs, len(recording.ids), 4)
+    given = np.full(shape[1:], np.nan) if begin is None else checked("begin", begin)
+    if given.shape not in (shape, shape[1:]):
+        raise InputError("begin", f"shape {given.shape}", f"must have shape {shape[1:]} or {shape}", "One pose each.")
+    poses = np.ascontiguousarray(np.broadcast_to(given, shape))
+    first = np.concatenate([recording.gnss[:, 0], body_of(recording).heading[:, 0, :, None]], axis=2)
+    lacking = np.isnan(first) & np.isnan(poses) & np.isfinite(recording.velocity[:, 0, :, :1])
+    for column in columns:
+        if lacking[:, column].any():
+            what = "position" if lacking[:, column, :3].any() else "heading"
+            hint = "Give begin=, or that of co.pose_start(recording)."
+            raise InputError("begin", f"no {what} of {recording.ids[column]}", "must be known at the start", hint)
+    return poses
+
+
+def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
+    """What a pose filter assumes of its sensors.
+
+    Args:
+        sensors: that a method may know.
+        dt: s.
+        gate: standard deviations of an innovation beyond which a measurement is left out.
+    """
+    from ...kernels.poses.odometry import PoseNoise
+
+    x, y, z = (float(std * std) for std in sensors.fix_std)
+    compass = max(float(np.hypot(sensors.heading_std, sensors.heading_bias_std)), LEAST_HEADING_STD)
+    a, b, c = (float(std * std) for std in sensors.relative_std)
+    of_speed = float(sensors.velocity_reading == "speed")
+    return PoseNoise(
+        fix=(x, y, z),
+        heading=compass**2,
+        relative=(a, b, c),
+        velocity=(sensors.velocity_std_ratio, sensors.velocity_floor, of_speed),
+        yaw_rate=max(sensors.yaw_rate_std, LEAST_YAW_RATE_STD) ** 2,
+        lasting=(sensors.speed_scale_std**2, sensors.yaw_rate_bias_std**2),
+        keep=float(np.exp(-dt / sensors.odometry_error_time)),
+        flat=FORGOTTEN,
+        gate=float(gate),
+    )
+
+
+def pose_measurements(
+    recording: Recording, members: Sequence[int], links: Ints, kept: Bools | None = None, place: Floats | None = None
+) -> PoseMeasurements:
+    """Arguments of the kernel.
+
+    Args:
+        recording: in body frames.
+        members: columns.
+        links: indices of their relative measurements.
+        kept: (R, links) whether a measurement counts in a run; None for all.
+        place: (links, 3) m, of what is measured and no member; None: landmarks stand at their fix.
+    """
+    from ...kernels.poses.ekf import PoseMeasurements
+
+    body, table, number = body_of(recording), recording.links, np.full(len(recording.ids), -1)
+    number[list(members)] = np.arange(len(members))
+    own = [recording.gnss, body.heading[..., None], recording.velocity, body.yaw_rate[..., None]]
+    relative = recording.relative[:, links]
+    return PoseMeasurements(
+        np.ascontiguousarray(np.concatenate([values[:, :, members] for values in own], axis=3)),
+        np.ascontiguousarray(present(recording)[:, members]),
+        np.stack([number[table.observer[links]], number[table.neighbour[links]]], axis=1),
+        np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),
+        np.ascontiguousarray(recording.gnss[0, 0, table.neighbour[links]] if place is None else place),
+        np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),
+        recording.dt,
+    )

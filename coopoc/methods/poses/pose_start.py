@@ -1,0 +1,175 @@
+"""First poses of vehicles that do not know theirs: several headings are tried, and the most likely one is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...arrays import Floats, Ints, instance, number
+from ...errors import InputError
+from ...world.frames import turned
+from ...world.recording import Recording, check_recording
+from ...world.sensors import Sensors
+from ...world.spherical import to_vector, wrap
+from .pose_filter import PoseFilter
+from .pose_inputs import body_of, fleet_members, to_landmarks
+
+
+def pose_start(
+    recording: Recording,
+    *,
+    seconds: float = 30.0,
+    headings: int = 24,
+    gate: float = 5.0,
+    assumed: Sensors | None = None,
+) -> Floats:
+    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
+
+    With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
+    odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle;
+    the one whose innovations, and bearings of other vehicles from fix to fix, have the largest likelihood over the
+    first seconds is kept. A compass leaves one. Vehicles without a fix that see fewer than two landmarks come last:
+    for them those that were found before are places, too.
+
+    Args:
+        recording: in body frames.
+        seconds: of it that are used.
+        headings: that are tried.
+        gate: as of the filter.
+        assumed: noise, default that of the recording.
+
+    Raises:
+        InputError: a vehicle that has no fix and sees neither a landmark nor a vehicle with a pose in that time.
+
+    References:
+        Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.5 (multi-hypothesis tracking).
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> t = np.arange(40) * 0.1
+    >>> path = np.stack([20 * np.sin(0.3 * t), -20 * np.cos(0.3 * t), 0 * t], axis=1)[:, None]
+    >>> fleet = Fleet(("a",), t, path, np.gradient(path, 0.1, axis=0))
+    >>> exact = Sensors(gnss_std=(0.1, 0.1, 0.1), compass=False)
+    >>> begin = pose_start(observe(fleet, exact, assumed=exact, frame="body"))
+    >>> bool(abs(begin[0, 0, 3]) < 0.3)  # it sets out to the east
+    True
+    """
+    check_recording(recording, body=True)
+    headings = number("headings", headings, 4, 360, kind=int, allowed="4..360", hint="24 are 15 degrees apart.")
+    steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
+    part = recording.between(0, max(steps, 2))
+    noise = recording.sensors if assumed is None else instance("assumed", assumed, Sensors)
+    spread = (*_spread(noise), np.pi / headings)
+    filter_ = PoseFilter("solo", gate=gate, spread=spread, assumed=noise)
+    begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
+    for run in range(recording.runs):
+        known = np.full((len(part.t), len(part.ids), 3), np.nan)
+        known[:, list(part.landmarks)] = part.gnss[run][:, list(part.landmarks)]
+        waiting = fleet_members(part)
+        while waiting:
+            column, links = _next(part, run, waiting, known)
+            begin[run, column], known[:, column] = _most_likely(part, run, column, links, known, filter_, headings)
+            waiting.remove(column)
+    return begin
+
+
+def _next(recording: Recording, run: int, waiting: list[int], known: Floats) -> tuple[int, Ints]:
+    """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix or sees
+    two of them; else, of the one with most, those to all whose places `known` (T, N, 3) m are finite."""
+    every: list[Ints] = []
+    for column in waiting:
+        links = recording.links.of(column)
+        marks = to_landmarks(recording, links)
+        whole = marks[np.isfinite(recording.relative[run, marks, :2]).all(axis=1)]
+        fix = np.isfinite(recording.gnss[run, :, column, 0]).any()
+        if fix or len(np.unique(recording.links.neighbour[whole])) > 1:
+            return column, marks
+        every.append(links[np.isfinite(known[recording.links.step[links], recording.links.neighbour[links], 0])])
+    most = int(np.argmax([np.isfinite(recording.relative[run, links, :2]).all(axis=1).sum() for links in every]))
+    return waiting[most], every[most]
+
+
+def _most_likely(
+    recording: Recording, run: int, column: int, links: Ints, known: Floats, filter_: PoseFilter, headings: int
+) -> tuple[Floats, Floats]:
+    """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood."""
+    angles = 2 * np.pi * np.arange(headings) / headings
+    place = known[recording.links.step[links], recording.links.neighbour[links]]
+    tried = np.full((headings, len(recording.ids), 4), np.nan)
+    tried[:, column] = _hypotheses(recording, run, column, links, place, angles)
+    copies = recording.of_runs(np.full(headings, run))
+    noise = filter_.assumed or recording.sensors
+    if len(to_landmarks(recording, links)) < len(links):
+        filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
+    x, _, cost = filter_.run_filter(copies, [column], links, tried, place=place)
+    best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, angles, noise))
+    return tried[best, column], x[best, :, 0, :3]
+
+
+def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
+    """Noise of measurements of vehicles whose places are as uncertain as a fix, at these ranges (L,) m."""
+    fix = max(noise.fix_std[:2])
+    apart = max(float(np.nanmedian(ranges)), fix)
+    return replace(
+        noise,
+        range_std=float(np.hypot(noise.range_std, fix)),
+        azimuth_std=float(np.hypot(noise.azimuth_std, fix / apart)),
+    )
+
+
+def _spread(sensors: Sensors) -> tuple[float, float, float]:
+    """Of a position from one fix or one landmark, whichever is worse, m."""
+    x, y, z = (max(std, sensors.range_std) for std in sensors.fix_std)
+    return 2 * x, 2 * y, 2 * z
+
+
+def _turns(recording: Recording, run: int, column: int) -> Floats:
+    """(T,) rad that a vehicle has turned since the first step, by its yaw rates."""
+    return np.append(0.0, np.cumsum(recording.dt * body_of(recording).yaw_rate[run, 1:, column]))
+
+
+def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Floats, noise: Sensors) -> Floats:
+    """(headings,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
+    links = recording.links.of(column)
+    links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
+    step, other = recording.links.step[links], recording.links.neighbour[links]
+    gap = recording.gnss[run, step, other] - recording.gnss[run, step, column]
+    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _turns(recording, run, column)[step]
+    residual = wrap(recording.relative[run, links, 1] + angles[:, None] - azimuth)
+    fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
+    found: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
+    return found
+
+
+def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known: Floats, angles: Floats) -> Floats:
+    """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading; `known`
+    (L, 3) m are the places of what the links measure."""
+    body, relative = body_of(recording), recording.relative[run, links]
+    fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
+    seen = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
+    if not len(fixes) and not len(seen):
+        given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
+        allowed = "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found"
+        raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
+    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (known[seen] == known[seen[0]]).all():
+        given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
+        raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
+    turns = _turns(recording, run, column)
+    middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
+    way = recording.dt * turned(recording.velocity[run, :, column], middle)
+    way[0] = 0.0
+    way = np.cumsum(way, axis=0)
+    if len(fixes):
+        step = int(fixes[0])
+        place, offset = recording.gnss[run, step, column], way[step]
+    else:
+        link = links[seen[0]]
+        step = int(recording.links.step[link])
+        flat = np.array([*relative[seen[0], :2], np.pi / 2])
+        flat[2] = relative[seen[0], 2] if np.isfinite(relative[seen[0], 2]) else flat[2]
+        place = known[seen[0]]
+        offset = way[step] + turned(to_vector(flat), np.asarray(turns[step]))
+    compass = body.heading[run, 0, column]
+    angles = angles if np.isnan(compass) else np.full(len(angles), compass)
+    position = place - turned(np.broadcast_to(offset, (len(angles), 3)), angles)
+    return np.column_stack([position, angles])

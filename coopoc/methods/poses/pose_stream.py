@@ -1,0 +1,132 @@
+"""Streaming poses: a vehicle alone, fed step by step with what is measured on board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ...arrays import Floats, instance, number
+from ...errors import InputError
+from ...world.spherical import wrap
+from ..stream import fix_or_none, numbers, three
+
+if TYPE_CHECKING:
+    from ...kernels.poses.ekf import PoseOptions
+    from ...kernels.poses.odometry import PoseNoise
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMeasurement:
+    """What a vehicle measures of itself in a step.
+
+    Args:
+        velocity: (3,) m/s, forward, left and up, the mean over the step.
+        yaw_rate: rad/s, the mean over the step.
+        gnss: (3,) m; None or NaN for no fix.
+        heading: rad, of a compass; None or NaN for none.
+
+    >>> OwnMeasurement([9.0, 0.0, 0.0], 0.1).row.shape
+    (8,)
+    """
+
+    velocity: npt.ArrayLike
+    yaw_rate: float
+    gnss: npt.ArrayLike | None = None
+    heading: float | None = None
+    row: Floats = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        heading = np.nan
+        if self.heading is not None and not (isinstance(self.heading, float) and np.isnan(self.heading)):
+            heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
+        rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
+        row = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], three("velocity", self.velocity), [rate]])
+        object.__setattr__(self, "row", row)
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkMeasurement:
+    """A landmark as the ego measures it now.
+
+    Args:
+        relative: (3,) range m, bearing from the heading rad, inclination rad, NaN for a component that is missing.
+        place: (3,) m, its position.
+
+    >>> LandmarkMeasurement([9.0, 0.1, 1.57], place=[5.0, 5.0, 3.0]).relative.tolist()
+    [9.0, 0.1, 1.57]
+    """
+
+    relative: npt.ArrayLike
+    place: npt.ArrayLike
+
+    def __post_init__(self) -> None:
+        for name in ("relative", "place"):
+            values = numbers(getattr(self, name))
+            if values.shape != (3,) or np.isinf(values).any() or (name == "place" and np.isnan(values).any()):
+                given, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
+                raise InputError(name, given, "must be three numbers", hint)
+            object.__setattr__(self, name, values)
+
+
+class PoseEstimate(NamedTuple):
+    """Pose of the ego.
+
+    Attributes:
+        x: (d,) position m, heading rad and, of six numbers, speed scale and yaw-rate bias rad/s.
+        covariance: (d, d).
+    """
+
+    x: Floats
+    covariance: Floats
+
+
+class PoseStream:
+    """A pose filter of one's own, step by step (`PoseFilter.start`); fed a recording it gives the numbers of its Track.
+
+    Args:
+        noise: that is assumed.
+        options: of the filter.
+        begin: (4,) m and rad, pose at the first step, NaN for its fix and compass.
+        spread: (4,) standard deviations of it.
+        dt: s of a step.
+    """
+
+    def __init__(self, noise: PoseNoise, options: PoseOptions, begin: Floats, spread: Floats, dt: float) -> None:
+        from ...kernels.poses.scalar_update import new_poses
+
+        self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
+        self._begin, self._later = begin[None, None], False
+        self._poses, self._pair = new_poses(options.d), new_poses(2 * options.d)
+
+    def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
+        """Pose of the ego now.
+
+        Args:
+            own: measurement of itself.
+            landmarks: that it measures, the nearest first as in a recording.
+
+        Raises:
+            InputError: a first step without fix and compass where `begin` does not give them.
+        """
+        from ...kernels.poses.ekf import PoseMeasurements, step
+
+        marks = [instance("landmarks", mark, LandmarkMeasurement) for mark in landmarks]
+        if not self._later and np.isnan(np.where(np.isnan(self._begin), own.row[:4], self._begin)).any():
+            what = "must give what the first fix and compass do not"
+            raise InputError("begin", None, what, "Give (x, y, z, heading).")
+        t, count = int(self._later), len(marks)
+        place = np.array([mark.place for mark in marks], dtype=float).reshape(-1, 3)
+        relative = np.array([mark.relative for mark in marks], dtype=float).reshape(1, -1, 3)
+        both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1], (count, 1))
+        first = np.array([0, 0, count] if t else [0, count, count])
+        active = np.ones((2, 1), dtype=bool)
+        measured = PoseMeasurements(both, active, ends, first, place, relative, self._dt)
+        step(measured, self._noise, self._begin, self._spread, self._options, self._poses, self._pair, 0, t)
+        self._later, d = True, self._options.d
+        x = self._poses.x[:d].copy()
+        x[3] = wrap(x[3])
+        return PoseEstimate(x, self._poses.cov[:d, :d].copy())

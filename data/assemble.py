@@ -1,0 +1,270 @@
+"""Rows (one per vehicle and instant) -> Fleet: what every reader of drives ends with; and what no drive looks like."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from coopoc.arrays import Bools, Floats, Ints
+from coopoc.errors import InputError
+from coopoc.world.fleet import Fleet
+
+SAME = 1e-6
+"""s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
+SLOWEST, FASTEST = 2e-3, 500.0
+"""m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
+LATEST = 1e11
+"""s since 1970, the year 5138."""
+LONGEST_ID = 200
+"""Characters."""
+CELLS, PER_ROW = 500_000, 200
+"""Steps times vehicles that any file may take, and how many more a row of it may."""
+
+
+def assemble(
+    vehicle: Sequence[str],
+    t: Floats,
+    position: Floats,
+    velocity: Floats | None = None,
+    *,
+    dt: float | None = None,
+    max_gap: float | None = None,
+    any_scale: bool = False,
+    file: str = "rows",
+    **labels: str,
+) -> Fleet:
+    """Fleet of L rows; vehicles keep the order of their first row, absence is a missing row.
+
+    Args:
+        vehicle: (L,) ids.
+        t: (L,) s.
+        position: (L, 3) m.
+        velocity: (L, 3) m/s; None: the backward difference u_t = (x_t - x_{t-1})/dt, with u_0 := u_1.
+        dt: s; None keeps the stamps, a number resamples every vehicle linearly.
+        max_gap: s, the longest gap between two rows of a vehicle that `dt` bridges; in a longer one it is absent. None:
+            as `longest_gap`.
+        any_scale: True accepts positions that do not look like metres and seconds.
+        file: named in errors.
+        labels: name, source and licence of the Fleet.
+
+    Raises:
+        InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, a
+            vehicle that would vanish or never be there at two instants in a row, an implausible scale (`check_scale`),
+            many times more steps than rows, or what Fleet refuses.
+
+    >>> assemble(["a", "a"], np.array([0, 0.1]), np.array([[0.0, 0, 0], [1, 0, 0]])).velocity[0, 0, 0]
+    np.float64(10.0)
+    """
+    for field, value in (("dt", dt), ("max_gap", max_gap)):
+        if value is not None and not value > 0:
+            raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
+    if not len(t):
+        raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
+    ids, column = _ids(vehicle, file)
+    numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
+    stamps = np.round(np.asarray(t, dtype=float), 6)
+    by_vehicle = np.split(np.argsort(column, kind="stable"), np.cumsum(np.bincount(column))[:-1])
+    for one, rows in zip(ids, by_vehicle, strict=True):
+        late = np.flatnonzero(np.diff(stamps[rows]) <= 0)
+        if len(late):
+            before, after = stamps[rows[late[0]]], stamps[rows[late[0] + 1]]
+            raise InputError(
+                f"{file}: row {rows[late[0] + 1] + 1}, column t",
+                f"{after!s} s after {before!s} s of vehicle {one}",
+                "dt must be > 0: the stamps of a vehicle increase from row to row",
+                "Remove the repeated row." if before == after else "Sort the rows by time.",
+            )
+    if not any_scale:
+        check_scale(stamps, numbers[:, :3], by_vehicle, file)
+    if dt is None:
+        grid, table = _on_stamps(stamps, column, numbers, file)
+    else:
+        start = stamps.min()
+        since = np.round(stamps - start, 6)  # seconds since 1970 would leave few digits to compare
+        steps = (since.max() + SAME) / dt + 1
+        check_size(steps, len(ids), len(stamps), dt, file)
+        grid = dt * np.arange(int(steps))
+        gaps = [longest_gap(since[rows], dt, max_gap) for rows in by_vehicle]
+        each = zip(by_vehicle, gaps, strict=True)
+        table = np.stack([interpolate(since[rows], numbers[rows], grid, gap) for rows, gap in each], axis=1)
+        grid = start + grid
+    present = np.isfinite(table[..., 0])
+    lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
+    for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
+        given = f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row"
+        hint = (
+            "Resample all vehicles with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
+        )
+        raise InputError(f"{file}: vehicle {ids[k]}", given, "must be there at instants in a row", hint)
+    u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
+    return Fleet(ids, grid, table[..., :3], u, **labels)
+
+
+def longest_gap(t: Floats, dt: float, max_gap: float | None) -> float:
+    """s, the longest gap between times (L,) s that is bridged: max_gap, or the largest of 5 dt, 0.5 s and 1.5 times the
+    median interval.
+
+    >>> longest_gap(np.arange(4.0), 0.1, None)
+    1.5
+    """
+    return max_gap or max(5 * dt, 0.5, 1.5 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0)
+
+
+def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: str = "rows") -> Floats:
+    """(T, N, 3) u_t = (x_t - x_{t-1})/(t_t - t_{t-1}); the first step of a presence takes the next one's value.
+
+    >>> backward_difference(np.array([0, 0.5]), np.array([[[0.0, 0, 0]], [[1, 0, 0]]]), ["a"])[1, 0]
+    array([2., 0., 0.])
+    """
+    u = np.full_like(position, np.nan)
+    if len(t) > 1:
+        u[1:] = np.diff(position, axis=0) / np.diff(t)[:, None, None]
+        starts = np.isfinite(position[:-1]) & ~np.isfinite(u[:-1])
+        u[:-1][starts] = u[1:][starts]
+    alone = np.argwhere(np.isfinite(position[..., 0]) & ~np.isfinite(u[..., 0]))
+    if len(alone):
+        given = f"none for {ids[alone[0, 1]]} at t = {t[alone[0, 0]]:g} s"
+        hint = "Add the columns vx, vy, vz, or leave out the vehicle's single instants."
+        raise InputError(f"{file}: velocity", given, "needs two instants in a row to be derived", hint)
+    return u
+
+
+def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floats:
+    """(G, C) linear interpolation of (L, C) values, NaN outside the stamps and inside gaps longer than max_gap seconds.
+
+    >>> interpolate(np.array([0.0, 1, 9]), np.array([[0.0], [1], [9]]), np.array([0.5, 5]), max_gap=2).ravel()
+    array([0.5, nan])
+    """
+    right = np.clip(np.searchsorted(t, grid, side="left"), 1, len(t) - 1)
+    left = right - 1
+    near = np.where(np.abs(grid - t[left]) < np.abs(grid - t[right]), left, right)
+    on_stamp = np.abs(grid - t[near]) <= SAME
+    grid = np.where(on_stamp, t[near], grid)
+    out = np.column_stack([np.interp(grid, t, v, left=np.nan, right=np.nan) for v in values.T])
+    out[(t[right] - t[left] > max_gap + SAME) & ~on_stamp] = np.nan
+    return out
+
+
+def smooth(position: Floats, dt: float, cutoff: float) -> Floats:
+    """Penalised least squares on jerk: argmin_s |s - x|^2 + lam |D^3 s|^2, with lam = (2 pi cutoff dt)^-6.
+
+    The gain is 1 below the cutoff, 1/2 at it, and falls with the sixth power of the frequency above it; straight
+    lines and constant accelerations pass unchanged, and so do both ends of the drive.
+
+    Args:
+        position: (T, ...) m, no NaN.
+        dt: s.
+        cutoff: Hz.
+
+    Source: Whittaker, Proc. Edinburgh Math. Soc. 41, 1923; Eilers, Analytical Chemistry 75(14), 2003.
+
+    >>> bool(np.allclose(smooth(np.arange(9.0) ** 2, 0.1, 0.5), np.arange(9.0) ** 2))
+    True
+    """
+    from scipy.linalg import cho_solve_banded, cholesky_banded
+
+    steps = len(position)
+    if steps < 4:
+        return np.array(position, dtype=float)
+    third = np.diff(np.eye(4), n=3, axis=0)[0]
+    bands = np.zeros((4, steps))
+    for i in range(4):
+        for j in range(i, 4):
+            bands[3 - (j - i), j : steps - 3 + j] += third[i] * third[j]
+    bands *= (2 * np.pi * cutoff * dt) ** -6
+    bands[3] += 1
+    flat = np.asarray(position, dtype=float).reshape(steps, -1)
+    return np.asarray(cho_solve_banded((cholesky_banded(bands), False), flat)).reshape(np.shape(position))
+
+
+def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: str) -> None:
+    """InputError where rows look like degrees or milliseconds, or move too fast for metres and seconds.
+
+    The typical speed of a vehicle is the median of |dx| / dt over the pairs of rows between which it moves, that of a
+    file the largest of its vehicles. A file in which nothing moves has none.
+
+    Args:
+        t: (L,) s.
+        position: (L, 3) m.
+        by_vehicle: rows of each vehicle in time order.
+        file: named in the error.
+
+    >>> x = np.array([[11.58, 48.14, 0.0], [11.5801, 48.1401, 0]])
+    >>> check_scale(np.array([0.0, 1]), x, [np.arange(2)], "drive.csv")
+    Traceback (most recent call last):
+    coopoc.errors.InputError: drive.csv: columns x, y = 11.58..11.5801, 48.14..48.1401: look like degrees, must be \
+metres in a local frame. Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True.
+    """
+    check_time(t, file)
+    speed = max([0.0, *(_typical_speed(t[rows], position[rows]) for rows in by_vehicle)])
+    (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
+    if 0 < speed < SLOWEST and max(-west, east) <= 360 and max(-south, north) <= 180:
+        given = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
+        hint = "Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True."
+        raise InputError(f"{file}: columns x, y", given, "look like degrees, must be metres in a local frame", hint)
+    if speed > FASTEST:
+        hint = "Check the units (seconds, metres) and that no two vehicles share an id, or pass any_scale=True."
+        where, given = f"{file}: columns t, x, y, z", f"a typical speed of {speed:.4g} m/s"
+        raise InputError(where, given, f"must be below {FASTEST:g} m/s", hint)
+
+
+def check_time(t: Floats, file: str) -> None:
+    """InputError where times (L,) s are beyond any date.
+
+    >>> check_time(np.array([1.7e9]), "drive.csv")
+    """
+    late = t[np.abs(t) > LATEST]
+    if len(late):
+        allowed = "must be seconds: it looks like milliseconds or nanoseconds since 1970"
+        raise InputError(f"{file}: column t", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates.")
+
+
+def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> None:
+    """InputError where a time step asks for many more instants than the file has rows.
+
+    >>> check_size(3.0, 2, 6, 0.1, "drive.csv")
+    """
+    if not steps * vehicles <= max(CELLS, PER_ROW * rows):
+        raise InputError(
+            f"{file}: column t with dt = {dt:g} s",
+            f"{steps:.3g} steps of {vehicles} vehicles for {rows} rows",
+            f"must be at most {PER_ROW} instants a row",
+            "Check that t is in seconds (not nanoseconds or milliseconds), or take a longer dt.",
+        )
+
+
+def _ids(vehicle: Sequence[str], file: str) -> tuple[tuple[str, ...], Ints]:
+    """Names in the order of their first row, and the (L,) column of each row."""
+    place: dict[str, int] = {}
+    column = np.array([place.setdefault(str(one), len(place)) for one in vehicle], dtype=np.int64)
+    for name, k in place.items():
+        if len(name) > LONGEST_ID:
+            where, allowed = f"{file}: row {np.argmax(column == k) + 1}", f"must have at most {LONGEST_ID} characters"
+            raise InputError(f"{where}, column id", f"{name[:40]}...", allowed, "Check the column.")
+    return tuple(place), column
+
+
+def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tuple[Floats, Floats]:
+    """Equally spaced grid (T,) and the rows on it (T, N, C): instants without any vehicle are filled in."""
+    instants, step = np.unique(stamps, return_inverse=True)
+    gaps: Any = np.diff(instants) if len(instants) > 1 else np.ones(1)
+    steps = np.rint((instants - instants[0]) / gaps.min())
+    sparse = steps[-1] > 50 * len(steps)
+    place = np.zeros(len(steps), dtype=np.int64) if sparse else steps.astype(np.int64)
+    grid = instants.copy() if sparse else np.round(np.linspace(instants[0], instants[-1], place[-1] + 1), 6)
+    if sparse or np.abs(grid[place] - instants).max() > 1e-3 * gaps.min() + 1e-6:
+        given = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
+        hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
+        raise InputError(f"{file}: t", given, "must be equally spaced", hint)
+    grid[place] = instants
+    table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
+    table[place[step], column] = numbers
+    return grid, table
+
+
+def _typical_speed(t: Floats, position: Floats) -> float:
+    speed = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
+    moving: Bools = speed > 0
+    return float(np.median(speed[moving])) if moving.any() else 0.0

@@ -1,0 +1,209 @@
+"""Readers and writers of drives: tables (those of CARLA, too), TUM trajectories, SUMO's floating-car data."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from coopoc.arrays import Floats
+from coopoc.errors import InputError
+from coopoc.file_names import file_name, inside
+from coopoc.formats import trajectories as tum
+from coopoc.formats.values import LARGEST
+from coopoc.plugins import one_of
+from coopoc.world.fleet import Fleet
+
+from .assemble import assemble
+from .cells import named_columns, numeric, read_frame, seconds, words
+
+NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
+LAYOUT = ("id", "x", "y", "z", "yaw", *VELOCITY)
+"""Columns of CARLA's tables of 14 columns, or 15 with an index; accelerations and angular velocities follow."""
+AGREED = 0.3
+"""|dx/dt - v| / |v| below which an interval is believed: those in use differ by factors of 1.5 and more."""
+
+
+def read_table(
+    path: Path, *, columns: Mapping[str, str] | None = None, handedness: str | None = None, **options: Any
+) -> Fleet:
+    """Fleet of a CSV, Parquet or Excel file; without vx, vy, vz the velocity is the backward difference.
+
+    A table of CARLA (with yaw and velocities, or 14 columns as LAYOUT, such as the paper's data set, IEEE DataPort
+    10.21227/511y-4s83) needs `handedness`, and without a column t `dt`: rows of each id are then equally spaced.
+
+    Args:
+        path: s, m, m/s in a local east-north-up frame; a missing row means absent.
+        columns: names in the file, as {"id": "vehicle"}, where they differ from id, t, x, y, z, vx, vy, vz.
+        handedness: "left" for CARLA's own export, whose y is flipped, or "right".
+        options: dt (s, resample; None keeps the stamps), max_gap and any_scale, as of `assemble`.
+
+    Raises:
+        InputError: a missing column, text or NaN in a cell (with its row, the header not counted), stamps that no
+            filter can use, or an unknown frame or interval of a CARLA table.
+    """
+    names = dict(columns or {})
+    frame = read_frame(path, names.get("id", "id"))
+    if len(frame.columns) in (14, 15) and not {*NEEDED[2:], *names} & set(frame.columns):
+        frame = frame.rename(columns=dict(zip(frame.columns[-14:], LAYOUT, strict=False)))
+    stamped = "t" in {*names, *frame.columns} or "yaw" not in frame.columns
+    needed = NEEDED if stamped else tuple(name for name in NEEDED if name != "t")
+    given = bool({*VELOCITY} & {*names, *frame.columns})
+    frame = named_columns(frame, names, (*NEEDED, *VELOCITY), (*needed, *(VELOCITY if given else ())), path.name)
+    carla = given and "yaw" in frame.columns
+    source = f"table {path.name}" + ("" if given else ", velocity by backward difference")
+    if carla or handedness:
+        one_of("handedness", handedness or "unknown", ("left", "right"))
+        source += f", {handedness}-handed"
+    if stamped:
+        t = seconds(frame, "t", path.name)
+    else:
+        dt = options.pop("dt", None)
+        if dt is None:
+            raise InputError("dt", "unknown", "must be given for a table without a column t", "Pass dt=0.1.")
+        t = dt * frame.groupby("id").cumcount().to_numpy()
+    numbers = np.column_stack([numeric(frame, name, path.name) for name in (*"xyz", *(VELOCITY if given else ()))])
+    if handedness == "left":
+        numbers[:, 1::3] *= -1
+    labels = {"file": path.name, "name": path.stem, "source": source}
+    velocity = numbers[:, 3:] if given else None
+    fleet = assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
+    if carla and not (apart := _disagreement(fleet)) < AGREED:
+        found = f"dt {fleet.dt:g} s leaves {apart:.0%} of |v|"
+        allowed = "must agree with positions and velocities"
+        raise InputError(f"{path.name}: dt", found, allowed, "Pass another dt=, or check the units of t.")
+    return fleet
+
+
+def _disagreement(fleet: Fleet) -> float:
+    """rms |dx/dt - v| / rms |v|, v being the mean over the step; 0 if nothing moves."""
+    middle = (fleet.velocity[1:] + fleet.velocity[:-1]) / 2
+    apart, size = (np.sqrt(np.nanmean(v**2)) for v in (np.diff(fleet.position, axis=0) / fleet.dt - middle, middle))
+    return float(apart / size) if size > 0 or apart > 0 else 0.0
+
+
+def write_table(fleet: Fleet, path: Path) -> None:
+    """Write id, t, x, y, z, vx, vy, vz of every present vehicle and instant; numbers come back bit by bit."""
+    import pandas as pd
+
+    step, column = np.nonzero(fleet.present)
+    frame = pd.DataFrame({"id": np.array(fleet.ids)[column], "t": np.round(fleet.t[step], 6)})
+    frame[["x", "y", "z"]] = fleet.position[step, column]
+    frame[list(VELOCITY)] = fleet.velocity[step, column]
+    if path.suffix == ".parquet":
+        frame.to_parquet(path, index=False)
+    else:
+        frame.to_csv(path, index=False, lineterminator="\n")
+
+
+def tum_files(path: Path) -> list[Path]:
+    """The file itself, or the .tum (else .txt) files of a folder by name."""
+    if path.is_file():
+        return [path]
+    return sorted(path.glob("*.tum")) or sorted(path.glob("*.txt"))
+
+
+def read_tum(path: Path, *, repeats: Literal["refuse", "drop"] = "refuse", **options: Any) -> Fleet:
+    """Fleet of a TUM file or a folder of them; ids are file names, velocity is the backward difference.
+
+    Args:
+        path: file or folder; s and m; orientation is checked for a unit quaternion and not kept (a Fleet has none).
+        repeats: "drop" leaves out a pose whose stamp is that of the pose before, "refuse" raises.
+        options: dt (s, resample: needed when the vehicles' stamps differ), max_gap and any_scale, as of `assemble`.
+
+    Raises:
+        InputError: no file, or what `coopoc.formats.tum.read_tum` raises.
+    """
+    files = tum_files(path)
+    if not files:
+        raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
+    poses = [tum.read_tum(file, repeats=repeats) for file in files]
+    ids = [file.stem for file, one in zip(files, poses, strict=True) for _ in range(len(one))]
+    t, x = (np.concatenate([getattr(one, field) for one in poses]) for field in ("stamps", "position"))
+    source = f"TUM {path.name}, velocity by backward difference"
+    return assemble(ids, t, x, **options, file=path.name, name=path.stem, source=source)
+
+
+def write_tum(fleet: Fleet, folder: Path) -> None:
+    """Write <id>.tum for every vehicle: no velocity, and the identity as orientation, which a Fleet lacks.
+
+    Args:
+        fleet: to write.
+        folder: for the files.
+
+    Raises:
+        InputError: an id that is no file name, ids that differ in case only, or a symbolic link out of the folder.
+    """
+    hint = "Write a .csv or .parquet file, which takes any id."
+    paths = [folder / f"{file_name('id', name, hint)}.tum" for name in fleet.ids]
+    if len({name.casefold() for name in fleet.ids}) < len(fleet.ids):
+        raise InputError("id", sorted(fleet.ids), "must differ in more than their case", hint)
+    folder.mkdir(parents=True, exist_ok=True)
+    for column, path in enumerate(inside(folder, path) for path in paths):
+        present = fleet.present[:, column]
+        position = fleet.position[present, column]
+        poses = tum.Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
+        tum.write_tum(poses, path)
+
+
+def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Fleet:
+    """Fleet of a SUMO FCD file: positions are moved from the front bumper to the middle of the vehicle.
+
+    centre = front - length/2 (sin a cos s, cos a cos s, sin s), with the angle a in degrees clockwise from north
+    and the slope s in degrees; velocity = speed along the same direction.
+
+    Args:
+        path: XML with id, x, y, angle, speed, and z and slope if the network has elevation.
+        vehicle_length: m, of every vehicle (5.0 is SUMO's default; the file does not hold it).
+        options: dt (s, resample; None keeps SUMO's steps), max_gap and any_scale, as of `assemble`.
+
+    Raises:
+        InputError: no XML, an attribute missing or no finite number, or what Fleet refuses.
+    """
+    vehicle, t, (*front, angle, slope, speed) = _fcd_rows(path)
+    angle, slope = np.radians(angle), np.radians(slope)
+    ahead = np.column_stack([np.sin(angle) * np.cos(slope), np.cos(angle) * np.cos(slope), np.sin(slope)])
+    centre, velocity = np.column_stack(front) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
+    source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"
+    return assemble(vehicle, t, centre, velocity, **options, file=path.name, name=path.stem, source=source)
+
+
+def _fcd_rows(path: Path) -> tuple[list[str], Floats, Floats]:
+    """Ids, times (L,) s, and x, y, z, angle deg, slope deg, speed m/s (6, L)."""
+    vehicle: list[str] = []
+    rows: list[list[float]] = []
+    now = "0"
+    try:
+        for event, element in ElementTree.iterparse(path, events=("start", "end")):
+            if event == "start" and element.tag == "timestep":
+                now = element.attrib["time"]
+            elif event == "end" and element.tag == "vehicle":
+                a = element.attrib
+                given = [now, a["x"], a["y"], a.get("z", "0"), a["angle"], a.get("slope", "0"), a["speed"]]
+                vehicle.append(a["id"])
+                rows.append([_finite(word) for word in given])
+                if np.isnan(rows[-1]).any():
+                    allowed = "must be seven finite numbers: time, x, y, z, angle, slope, speed"
+                    where = f"{path.name}: vehicle {a['id']} at time {now} s"
+                    raise InputError(where, " ".join(given), allowed, "Mend the numbers or remove the vehicle.")
+            elif event == "end" and element.tag == "timestep":
+                element.clear()
+    except ElementTree.ParseError as error:
+        raise InputError(path.name, error, "must be XML of sumo --fcd-output", "Write the file again.") from None
+    except KeyError as error:
+        hint = "Run sumo with --fcd-output.attributes x,y,z,angle,slope,speed."
+        allowed = f"every vehicle needs it (time {now} s)"
+        raise InputError(f"{path.name}: attribute {error}", "missing", allowed, hint) from None
+    table = np.array(rows).reshape(-1, 7)
+    return vehicle, table[:, 0], table[:, 1:].T
+
+
+def _finite(word: str) -> float:
+    try:
+        value = float(word) if word.isascii() and "_" not in word else np.nan
+    except ValueError:
+        return np.nan
+    return value if abs(value) <= LARGEST else np.nan

@@ -1,0 +1,170 @@
+"""PyFG -> Recording in body frames: odometry and ranges of several robots, on equal steps, with the file's truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from coopoc.arrays import Floats, Ints
+from coopoc.errors import InputError
+from coopoc.formats.graph import Graph, PointEdges
+from coopoc.formats.pyfg import read_pyfg
+from coopoc.world.fleet import Fleet
+from coopoc.world.frames import midway, turned
+from coopoc.world.recording import Recording
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
+
+from .assemble import backward_difference
+from .log.read import Log, steps_in_words
+from .log.units import Summary
+from .planar import nearest, planar_recording, steps_of
+
+FLAT = 0.01
+"""m and rad, of heights and inclinations in a plane, and m/s, least noise of a velocity."""
+
+
+def read_graph_log(path: Path, *, dt: float = 0.1) -> Log:
+    """Log of a PyFG file: `graph_recording`, with the counts of what its file holds."""
+    graph = read_pyfg(path)
+    seen, truth = graph_recording(graph, dt=dt)
+    vehicles = {name: "landmark" if k in seen.landmarks else "odometry" for k, name in enumerate(seen.ids)}
+    read = {"ranges": len(seen.links), "bearings": int(np.isfinite(seen.relative[0, :, 1]).sum())}
+    edges = len(graph.ranges) + len(graph.relative_point) + int(_others(graph).sum())
+    left = {
+        "edges outside the steps that all robots share, beside another of the same pair and step, or between points": (
+            edges - len(seen.links)
+        ),
+        "priors": len(graph.pose_prior) + len(graph.point_prior),
+    }
+    refused = {what: (count, "") for what, count in left.items() if count}
+    read = {what: count for what, count in read.items() if count}
+    return Log(seen, truth, Summary(path.name, steps_in_words(seen), vehicles, read, refused, {}, seen.notes), True)
+
+
+def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]:
+    """Recording of the robots of a graph in the plane, in one run, and the truth that its vertices hold.
+
+    Odometry is chained and differenced over steps; a range belongs to the nearest step, and to the robot that is named
+    first, and so does a measured point or pose of another robot, as range and bearing. Standard deviations are those of
+    the file, for one step. Points are landmarks; messages arrive at once.
+
+    Args:
+        graph: of `read_pyfg`, with stamps.
+        dt: s, of a step.
+
+    Raises:
+        InputError: a graph in space, poses without stamps, a robot whose odometry has a gap, robots that share no time.
+    """
+    if graph.dimension != 2 or np.isnan(graph.stamps[graph.is_pose]).any():
+        hint = "Take formats and solve for others."
+        raise InputError("graph", repr(graph), "must be in the plane, with stamps", hint)
+    robots, n = graph.robots, len(graph.robots)
+    begin = max(graph.stamps[places[0]] for places in robots.values())
+    end = min(graph.stamps[places[-1]] for places in robots.values())
+    if not end - begin >= 2 * dt:
+        raise InputError("graph", repr(graph), "must hold robots that share two steps", "Give a smaller dt.")
+    t = dt * np.arange(int((end - begin) / dt) + 1)
+
+    def on_steps(places: Ints, values: Floats) -> Floats:
+        return np.column_stack([np.interp(t + begin, graph.stamps[places], column) for column in values.T])
+
+    path = np.stack([on_steps(places, _chained(graph, places)) for places in robots.values()], axis=1)
+    marks = np.flatnonzero(~graph.is_pose & np.isfinite(graph.position).all(axis=1))
+    truth = np.zeros((len(t), n + len(marks), 4))
+    for k, places in enumerate(robots.values()):
+        pose = np.column_stack([graph.position[places], np.unwrap(graph.orientation[places, 0])])
+        truth[:, k, [0, 1, 3]] = on_steps(places, pose)
+    truth[:, n:, :2] = graph.position[marks]
+    ids = (*robots, *(graph.names[k] for k in marks))
+    moved = np.diff(path, axis=0, prepend=path[:1]) / dt
+    velocity = turned(moved * [1.0, 1.0, 0.0], -midway(path[..., 2]))[..., :2]
+    column = np.full(len(graph.names), -1)
+    for k, places in enumerate(robots.values()):
+        column[places] = k
+    column[marks] = n + np.arange(len(marks))
+    recording = planar_recording(
+        ids,
+        t,
+        velocity,
+        moved[..., 2],
+        graph.position[marks],
+        _relative(graph, column, n, begin, t),
+        _sensors(graph, dt),
+        V2X(max_neighbours=n - 1, radius=float("inf")),
+        "odometry and relative measurements are real; no fix, no compass",
+    )
+    position = truth[..., :3]
+    u = backward_difference(t, position, ids)
+    return recording, Fleet(ids, t, position, u, name="pyfg", heading=truth[..., 3])
+
+
+def _chained(graph: Graph, places: Ints) -> Floats:
+    """(n, 3) m, m, rad, poses of a robot by its odometry, the first at the origin."""
+    edges, path = graph.relative_pose, np.zeros((len(places), 3))
+    after = {a: k for k, (a, b) in enumerate(edges.nodes.tolist()) if graph.names[a][0] == graph.names[b][0]}
+    for n, (place, then) in enumerate(zip(places[:-1].tolist(), places[1:].tolist(), strict=True)):
+        k = after.get(place, -1)
+        if k < 0 or edges.nodes[k, 1] != then:
+            given = f"no odometry from {graph.names[place]} to {graph.names[then]}"
+            raise InputError("graph", given, "must join all poses of a robot", "Cut the file at the gap.")
+        (x, y, heading), (dx, dy), turn = path[n], edges.position[k], edges.orientation[k, 0]
+        c, s = np.cos(heading), np.sin(heading)
+        path[n + 1] = x + c * dx - s * dy, y + s * dx + c * dy, heading + turn
+    return path
+
+
+def _others(graph: Graph) -> Floats:
+    """(M,) True for relative poses of another robot."""
+    pairs = graph.relative_pose.nodes.tolist()
+    return np.array([graph.names[a][0] != graph.names[b][0] for a, b in pairs], dtype=bool)
+
+
+def _vectors(graph: Graph) -> PointEdges:
+    """Points that were measured, and poses of other robots as points."""
+    points, poses, other = graph.relative_point, graph.relative_pose, _others(graph)
+    return PointEdges(
+        np.concatenate([points.nodes, poses.nodes[other]]),
+        np.concatenate([points.position, poses.position[other]]),
+        np.concatenate([points.covariance, poses.covariance[other, :2, :2]]),
+        np.append(points.stamps, poses.stamps[other]),
+    )
+
+
+def _relative(graph: Graph, column: Ints, robots: int, begin: float, t: Floats) -> Floats:
+    """(L, 5) step, observer, neighbour, range m, bearing rad or NaN; of several of a pair at a step the nearest in
+    time."""
+    points, ranges = _vectors(graph), graph.ranges
+    ends = column[np.concatenate([points.nodes, ranges.nodes])]
+    ends = np.where((ends[:, :1] >= robots) & (ends[:, :1] > ends[:, 1:]), ends[:, ::-1], ends)  # a robot observes
+    reach = np.append(np.hypot(*points.position.T), ranges.distance)
+    bearing = np.append(np.arctan2(*points.position.T[::-1]), np.full(len(ranges), np.nan))
+    step, late = steps_of(np.append(points.stamps, ranges.stamps) - begin, t[1] - t[0], len(t))
+    order = nearest(late, step, np.where(ends[:, 0] < robots, ends[:, 0], -1), ends[:, 1])
+    return np.column_stack([step, ends, reach, bearing])[order]
+
+
+def _sensors(graph: Graph, dt: float) -> Sensors:
+    """Noise that the file states; that of an odometry edge is white, so that its variance grows with its time."""
+    edges, stamps = graph.relative_pose, graph.stamps
+    lasts = stamps[edges.nodes[:, 1]] - stamps[edges.nodes[:, 0]]
+    own = (lasts > 0) & ~_others(graph)
+    move, turn = (np.sqrt(np.mean(dt / lasts[own] * edges.covariance[own, k, k])) / dt for k in (0, 2))
+    points = _vectors(graph)
+    square = np.square(points.position).sum(axis=1)
+    ahead = points.position / np.sqrt(np.maximum(square, FLAT**2))[:, None]
+    along, whole = np.einsum("mi,mij,mj->m", ahead, points.covariance, ahead), np.trace(points.covariance.T)
+    bearing = (whole - along) / np.maximum(square, whole)
+    along = np.append(along, graph.ranges.variance)
+    return Sensors(
+        gnss_std=(1.0, 1.0, FLAT),
+        velocity_std_ratio=0.0,
+        velocity_floor=max(float(move), FLAT),
+        yaw_rate_std=float(turn),
+        range_std=float(np.sqrt(np.mean(along))) if len(along) else 1.0,
+        azimuth_std=float(np.sqrt(np.mean(bearing))) if len(bearing) else Sensors().azimuth_std,
+        inclination_std=FLAT,
+        compass=False,
+        min_range=0.0,
+    )

@@ -1,0 +1,337 @@
+"""One member of a log on the steps of a Recording: fixes, velocity or speed and yaw rate, heading, when it is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from coopoc.arrays import Bools, Floats, Ints
+from coopoc.errors import InputError
+
+from ..assemble import SAME, longest_gap, smooth
+from ..planar import nearest, steps_of
+from .units import Rows, Tally
+
+MOVING = 1.0
+"""m/s, least speed at which a course is a heading."""
+COURSE_RATE = 0.25
+"""Half-power frequency, in fixes, of the smoother that makes velocities of fixes."""
+COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
+DERIVED = "the velocity of {} is derived from the fixes: their errors depend on each other"
+
+HeadingAt = Callable[[Floats], Floats]
+
+
+class Signal(NamedTuple):
+    """Samples of a vehicle at their own times: (M,) s, increasing, and (M, C)."""
+
+    t: Floats
+    value: Floats
+
+
+class Steps(NamedTuple):
+    """How a log is brought to steps.
+
+    Attributes:
+        grid: (T,) s.
+        max_gap: s, of odometry; None as of `longest_gap`.
+        planar: whether heights were not measured, and are 0.
+        body: whether speed and yaw rate stay as they were measured.
+        tally: counts what is read and what is not.
+    """
+
+    grid: Floats
+    max_gap: float | None
+    planar: bool
+    body: bool
+    tally: Tally
+
+    @property
+    def dt(self) -> float:
+        """s."""
+        return float(self.grid[1] - self.grid[0])
+
+    def gap(self, t: Floats) -> float:
+        """s, the longest gap of samples at times (M,) that is bridged."""
+        return longest_gap(t, self.dt, self.max_gap)
+
+    def nearest(self, t: Floats) -> tuple[Ints, Floats]:
+        """Nearest step of each time (M,) s, -1 outside, and how far off it is in s."""
+        return steps_of(t - self.grid[0], self.dt, len(self.grid))
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """A member of a log on T steps.
+
+    Args:
+        gnss: (T, 3) m, NaN without a fix.
+        velocity: (T, 3) m/s, mean over the step that ends at each instant, in body frames forward; NaN where absent.
+        heading: function from times s to headings rad, NaN where unknown; None if there is none at all.
+        text: what was read, in words.
+        course: what its heading is the course of, "" where it was measured.
+        stands: whether it stands, as a road-side unit does.
+        yaw_rate: (T,) rad/s as velocity, of body frames.
+        compass: (T,) rad, NaN without a heading, of body frames.
+    """
+
+    gnss: Floats
+    velocity: Floats
+    heading: HeadingAt | None
+    text: str
+    course: str
+    stands: bool
+    yaw_rate: Floats
+    compass: Floats
+
+
+def samples(rows: Rows, names: Sequence[str], tally: Tally, required: int) -> tuple[Signal, Ints]:
+    """Rows of one vehicle as samples (M, C) of some kinds at one time each, NaN where a kind is missing, and the first
+    row (M,) of each.
+
+    Args:
+        rows: in SI units.
+        names: kinds, the columns of the samples.
+        tally: counts rows that repeat a kind at one time, and samples without the first `required` kinds.
+        required: how many of the kinds a sample needs.
+    """
+    mine = np.flatnonzero(rows.of(*names))
+    mine = mine[np.argsort(rows.t[mine], kind="stable")]
+    t = rows.t[mine]
+    fresh = np.append(True, np.diff(t) > SAME)[: len(t)]
+    sample = np.cumsum(fresh) - 1
+    column = np.array([list(names).index(kind) for kind in rows.kind[mine].tolist()], dtype=np.int64)
+    value = np.full((int(fresh.sum()), len(names)), np.nan)
+    first = np.unique(sample * len(names) + column, return_index=True)[1]
+    again = np.setdiff1d(np.arange(len(mine)), first)
+    tally.refuse_rows("repeated rows (same time, vehicle and kind)", rows, mine[again])
+    value[sample[first], column[first]] = rows.value[mine[first]]
+    whole = np.isfinite(value[:, :required]).all(axis=1)
+    begins = mine[fresh]
+    if not whole.all():
+        reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
+        tally.refuse(reason, int(np.isfinite(value[~whole]).sum()), rows.place(int(begins[~whole][0])))
+    return Signal(t[fresh][whole], value[whole]), begins[whole]
+
+
+def member(name: str, rows: Rows, steps: Steps) -> Member:
+    """A vehicle, or what stands: a road-side unit, in body frames a landmark, has fixes at one instant and no odometry.
+
+    Args:
+        name: its id.
+        rows: its own, in SI units and metres.
+        steps: of the recording.
+
+    Raises:
+        InputError: neither odometry nor two fixes, a speed without a heading; in body frames no speed or yaw rate.
+    """
+    tally, size = steps.tally, len(steps.grid)
+    fixes, first = samples(rows, ("x", "y", "z"), tally, 2 if steps.planar else 3)
+    if steps.planar:
+        fixes.value[:, 2] = 0.0
+    measured, _ = samples(rows, ("heading",), tally, 1)
+    still, none = np.zeros((size, 3)), np.full(size, np.nan)
+    if len(fixes.t) == 1 and not rows.in_group("odometry").any():
+        text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
+        heading = heading_at(measured, None, np.inf) if len(measured.t) and not steps.body else None
+        return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
+    turn, _ = samples(rows, ("yaw_rate",), tally, 1)
+    derived = velocity_of_fixes(fixes, steps.gap(fixes.t)) if len(fixes.t) > 1 else None
+    if steps.body:
+        speed, _ = samples(rows, ("speed",), tally, 1)
+        for kind, signal in (("speed", speed), ("yaw_rate", turn)):
+            if not len(signal.t):
+                allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
+                raise InputError(f"vehicle {name}", f"no {kind}", allowed, hint)
+        tally.refuse("world velocities in body frames", int(rows.of("vx", "vy", "vz").sum()))
+        signals, course = (speed, turn), ""
+        heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
+        forward, rate = step_means(speed, steps.grid), step_means(turn, steps.grid)[:, 0]
+        velocity = forward * [1.0, 0.0, 0.0]
+        along, _ = _heading(measured, turn, ((derived, "fixes"),), steps)
+        carried = still if along is None else np.nan_to_num(forward * _ahead(along(steps.grid)))
+        text = f"{len(speed.t)} speeds, {len(turn.t)} yaw rates, {len(measured.t)} headings"
+    else:
+        moved, heading, text, course = _in_world(name, rows, turn, measured, derived, steps)
+        signals, rate = (moved,), none
+        velocity = carried = step_means(moved, steps.grid)
+    there = np.ones(size, dtype=bool)
+    for signal in signals:
+        interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
+        there &= covered(signal.t, steps.grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
+    gnss = _fixes_on_steps(rows, fixes, first, carried, there, steps)
+    known = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
+    if known.any() or not steps.body:
+        tally.refuse(f"steps of {name} before its first fix", int((there & ~known).sum()))
+        there &= known
+    span = "throughout" if there.all() else f"{there.mean():.0%} of the time"
+    text = f"{int(np.isfinite(gnss[:, 0]).sum())} fixes, {text}, {span}"
+    absent = np.where(there, 0.0, np.nan)
+    compass = _compass_on_steps(measured, rate, steps) + absent if steps.body else none
+    return Member(gnss, velocity + absent[:, None], heading, text, course, False, rate + absent, compass)
+
+
+def _in_world(
+    name: str, rows: Rows, turn: Signal, measured: Signal, derived: Signal | None, steps: Steps
+) -> tuple[Signal, HeadingAt | None, str, str]:
+    """Velocity at its own times, heading, where both come from in words, and the course that the heading is."""
+    tally, rate = steps.tally, turn if len(turn.t) > 1 else None
+    world, _ = samples(rows, ("vx", "vy", "vz"), tally, 2)
+    speed, first = samples(rows, ("speed",), tally, 1)
+    heading, course = _heading(measured, rate, ((world, "odometry"), (derived, "fixes")), steps)
+    source = f", heading from the course of the {course}" if course else ", heading measured" if heading else ""
+    if len(world.t):
+        tally.refuse_rows("speeds where a world velocity is given", rows, first)
+        return Signal(world.t, np.nan_to_num(world.value)), heading, f"{len(world.t)} velocities{source}", course
+    if len(speed.t):
+        if heading is None:
+            allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
+            given = f"of {name}, which has no heading"
+            raise InputError(f"{rows.place(int(first[0]))}, speed", given, allowed, hint)
+        turned = heading(speed.t)
+        known = np.isfinite(turned)
+        tally.refuse_rows("speeds without a heading", rows, first[~known])
+        if course:
+            tally.assume(COURSE.format("{}", course), name)
+        velocity = Signal(speed.t[known], speed.value[known] * _ahead(turned[known]))
+        return velocity, heading, f"{len(velocity.t)} speeds{source}", course
+    if derived is None:
+        hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
+        raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
+    tally.assume(DERIVED, name)
+    return derived, heading, f"velocity derived from them{source}", course
+
+
+def _heading(
+    measured: Signal, rate: Signal | None, moves: Sequence[tuple[Signal | None, str]], steps: Steps
+) -> tuple[HeadingAt | None, str]:
+    """Heading that was measured, else the course of the first of `moves` that moves, and whose course it is."""
+    if len(measured.t):
+        return heading_at(measured, rate, steps.gap(measured.t)), ""
+    for velocity, what in moves:
+        if velocity is not None:
+            moving = np.hypot(velocity.value[:, 0], velocity.value[:, 1]) > MOVING
+            v = velocity.value[moving]
+            if len(v):
+                course = Signal(velocity.t[moving], np.arctan2(v[:, 1:2], v[:, :1]))
+                return heading_at(course, rate, np.inf), what
+    return None, ""
+
+
+def _ahead(heading: Floats) -> Floats:
+    """(M, 3) unit vectors."""
+    return np.column_stack([np.cos(heading), np.sin(heading), 0 * heading])
+
+
+def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
+    """True between samples at most `gap` apart, and up to `edge` beyond a sample.
+
+    >>> covered(np.array([0.0, 1, 5]), np.array([0.5, 2, 4.8]), 2.0, 0.3).tolist()
+    [True, False, True]
+    """
+    right = np.clip(np.searchsorted(t, at), min(1, len(t) - 1), len(t) - 1)
+    left = np.maximum(right - 1, 0)
+    between = (at >= t[left] - SAME) & (at <= t[right] + SAME) & (t[right] - t[left] <= gap + SAME)
+    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME
+    return np.asarray(between | near)
+
+
+def step_means(signal: Signal, grid: Floats) -> Floats:
+    """(T, C) mean over the step that ends at each instant, of the samples joined by straight lines.
+
+    >>> step_means(Signal(np.array([0.0, 1]), np.array([[0.0], [2]])), np.array([0.0, 0.5, 1])).ravel().tolist()
+    [0.0, 0.5, 1.5]
+    """
+    dt = grid[1] - grid[0]
+    means: Floats = np.diff(_integral(signal, np.append(grid[0] - dt, grid)), axis=0) / dt
+    return means
+
+
+def _integral(signal: Signal, at: Floats) -> Floats:
+    """(G, C) integral from the first sample, which holds before it, as the last one does behind it."""
+    t, v = signal
+    if len(t) == 1:
+        constant: Floats = (at - t[0])[:, None] * v
+        return constant
+    whole = np.vstack([0 * v[:1], np.cumsum(np.diff(t)[:, None] * (v[1:] + v[:-1]) / 2, axis=0)])
+    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    inside = np.clip(at, t[0], t[-1])
+    s = (inside - t[k])[:, None]
+    bend = (v[k + 1] - v[k]) / (t[k + 1] - t[k])[:, None]
+    beyond = (at - inside)[:, None] * np.where((at < t[0])[:, None], v[0], v[-1])
+    out: Floats = whole[k] + s * v[k] + 0.5 * s**2 * bend + beyond
+    return out
+
+
+def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:
+    """Function from times (G,) s to headings (G,) rad, NaN where unknown.
+
+    Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
+    is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
+
+    >>> at = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.0]])), None, 2.0)
+    >>> at(np.array([0.5, 9.0])).round(3).tolist()
+    [3.142, nan]
+    """
+    turned = (lambda at: _integral(yaw_rate, at)[:, 0]) if yaw_rate is not None else np.zeros_like
+    offset = np.unwrap(heading.value[:, 0] - turned(heading.t))
+    sampled = heading.t if yaw_rate is None else yaw_rate.t
+
+    def at(times: Floats) -> Floats:
+        found = np.interp(times, heading.t, offset) + turned(times)
+        return np.where(covered(sampled, times, gap, gap / 2), np.arctan2(np.sin(found), np.cos(found)), np.nan)
+
+    return at
+
+
+def velocity_of_fixes(fixes: Signal, gap: float) -> Signal:
+    """Velocity (M, 3) m/s at the times of the fixes, from a smooth curve through each stretch without a gap.
+
+    Its errors are those of the fixes: a filter that takes both for independent believes too much.
+    """
+    t, x = fixes
+    step = max(float(np.median(np.diff(t))), SAME)
+    out = np.zeros_like(x)
+    for part in np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > gap + SAME) + 1):
+        if len(part) < 2:
+            continue
+        grid = np.arange(t[part[0]], t[part[-1]] + step / 2, step)
+        even = np.column_stack([np.interp(grid, t[part], column) for column in x[part].T])
+        speed = np.gradient(smooth(even, step, COURSE_RATE / step), step, axis=0) if len(grid) > 1 else 0 * even
+        out[part] = np.column_stack([np.interp(t[part], grid, column) for column in speed.T])
+    return Signal(t, out)
+
+
+def _fixes_on_steps(rows: Rows, fixes: Signal, first: Ints, velocity: Floats, there: Bools, steps: Steps) -> Floats:
+    """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
+    grid, tally = steps.grid, steps.tally
+    gnss = np.full((len(grid), 3), np.nan)
+    step, _ = steps.nearest(fixes.t)
+    lag, outside = grid[step] - fixes.t, step < 0
+    absent = ~there[step] & ~outside
+    same = np.zeros(len(step), dtype=np.int64)
+    chosen = nearest(np.abs(lag), np.where(absent, -1, step), same, same)
+    beside = np.setdiff1d(np.flatnonzero(~outside & ~absent), chosen)
+    tally.refuse_rows("fixes outside the recording", rows, first[outside])
+    tally.refuse_rows("fixes in gaps of the odometry", rows, first[absent])
+    tally.refuse_rows("fixes beside a nearer one of the same step", rows, first[beside])
+    after = np.minimum(step[chosen] + 1, len(grid) - 1)
+    between = np.where((lag[chosen] < 0) & there[after], after, step[chosen])
+    gnss[step[chosen]] = fixes.value[chosen] + lag[chosen, None] * velocity[between]
+    tally.count("fixes", len(chosen))
+    return gnss
+
+
+def _compass_on_steps(measured: Signal, rate: Floats, steps: Steps) -> Floats:
+    """(T,) headings rad, each brought to the nearest step by the yaw rate; of several at a step the nearest in time."""
+    found = np.full(len(steps.grid), np.nan)
+    step, late = steps.nearest(measured.t)
+    same = np.zeros(len(step), dtype=np.int64)
+    kept = nearest(late, step, same, same)
+    at = step[kept]
+    turned = measured.value[kept, 0] + (steps.grid[at] - measured.t[kept]) * rate[at]
+    found[at] = np.arctan2(np.sin(turned), np.cos(turned))
+    return found

@@ -1,0 +1,326 @@
+"""A log of one's own -> Recording: what any reader finds in files, on steps, and the truth where there is some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from coopoc.arrays import Floats, checked, instance, named, number
+from coopoc.errors import InputError
+from coopoc.file_names import given_path
+from coopoc.plugins import one_of, suggestion
+from coopoc.short_repr import short_repr
+from coopoc.world.axes import texts
+from coopoc.world.body import Body
+from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
+from coopoc.world.sensors import Sensors
+from coopoc.world.spherical import wrap
+from coopoc.world.v2x import V2X
+
+from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
+from ..bag import read_bag
+from ..cells import TABLES, headers
+from ..nmea import read_nmea
+from ..source import parted
+from .frames import Origin, assumed, local, on_one_clock, origin_of
+from .links import linked, of_vehicles
+from .motion import Steps, member, samples
+from .tables import is_log_table, read_log_table
+from .units import Rows, Summary, Tally, stacked
+
+Frame = Literal["world", "body"]
+READERS: Mapping[str, Callable[..., Rows]] = {
+    **dict.fromkeys(TABLES, read_log_table),
+    **dict.fromkeys((".nmea", ".nme"), read_nmea),
+    **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
+}
+"""Ending of a file -> (path, tally, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
+TRUTH = "truth"
+"""Stem of the file of a folder that holds the truth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """What a log holds: `print(log.summary)` first.
+
+    Args:
+        recording: one run of real measurements.
+        truth: on the steps of the recording, NaN where it is unknown; None if there is none.
+        summary: what was read, what was not and why, what is assumed.
+        messages: whether messages were logged; if not, a channel may be simulated.
+        origin: (latitude deg, longitude deg, height m) of the local frame, None if positions were local.
+    """
+
+    recording: Recording
+    truth: Fleet | None
+    summary: Summary
+    messages: bool
+    origin: Origin | None = None
+
+    __repr__ = short_repr
+
+    def part(self, since: float | None = None, until: float | None = None) -> Log:
+        """The same log from `since` to `until` s after its first step, such as a part to train on and the rest.
+
+        Raises:
+            InputError: a part of fewer than two steps.
+        """
+        truth = None if self.truth is None else parted(self.truth, since, until)
+        return replace(self, recording=parted(self.recording, since, until), truth=truth)
+
+
+def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
+    """Whether a path is a log: a bag, NMEA, a folder with such files or tables, or a table with a column of a log.
+
+    Args:
+        path: of a file or folder.
+        columns: names in the file, as `read_log` takes them; a key that only a log has makes it one.
+
+    >>> is_log(Path("drive.nmea")), is_log(Path("drive.parquet"), {"latitude": "lat"})
+    (True, True)
+    """
+    if path.is_dir():
+        return _is_bag(path) or any(file.suffix.lower() in READERS for file in path.iterdir())
+    ending = path.suffix.lower()
+    return is_log_table(path, columns) if ending in TABLES else ending in READERS
+
+
+def read_log(
+    path: str | Path,
+    *,
+    dt: float | None = None,
+    max_gap: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    kinds: Mapping[str, str] | None = None,
+    ignore: Sequence[str] = (),
+    clock: Mapping[str, float] | None = None,
+    origin: Origin | None = None,
+    truth: str | Path | None = None,
+    sensors: Sensors | None = None,
+    any_scale: bool = False,
+    frame: Frame = "world",
+) -> Log:
+    """Read a file or a folder of logged measurements: tables (CSV, Parquet, Excel), NMEA, or a ROS bag.
+
+    docs/your_data.md describes the tables. A file named truth in a folder holds the truth.
+
+    Args:
+        path: a file, or a folder whose files belong to one drive.
+        dt: s, steps of the recording; None: the median interval of the densest odometry (else of the densest fixes).
+        max_gap: s, the longest gap of a vehicle's odometry that is bridged; it is absent in longer ones. None: the
+            largest of 5 dt, 0.5 s and 1.5 times its own median interval.
+        columns: names in the files, as {"t": "timestamp", "vehicle": "car"}.
+        kinds: names in a column kind, as {"uwb": "range"}.
+        ignore: kinds that are left out; topics of a bag.
+        clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
+        origin: latitude deg, longitude deg, height m of the local frame; None: the first fix.
+        truth: file of the truth, if it is not in the folder under that name; topic in a bag.
+        sensors: noise that methods may assume; None: the standard deviations in the log, else `Sensors()`.
+        any_scale: True accepts positions that do not look like metres and seconds.
+        frame: "world", or "body" for pose filters: speed, yaw rate, compass and bearings stay as they were measured, a
+            vehicle needs no fix, and what has one fix and no odometry is a landmark.
+
+    Returns:
+        Log: recording, truth, summary.
+
+    Raises:
+        InputError: names file, row, column, value, what is allowed and how to correct it.
+        MissingLibraryError: pynmeagps or rosbags is not installed, and there is NMEA or a bag.
+
+    >>> import tempfile
+    >>> file = Path(tempfile.mkdtemp()) / "drive.csv"
+    >>> _ = file.write_text("t,vehicle,x,y,vx,vy\\n0,a,0,0,9,0\\n1,a,9,0,9,0\\n2,a,18,0,9,0\\n")
+    >>> read_log(file).recording
+    Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
+    """
+    path, tally, body = given_path(path), Tally(), frame == "body"
+    one_of("frame", frame, get_args(Frame))
+    instance("any_scale", any_scale, bool, "Give True or False.")
+    texts("ignore", ignore)
+    for field, value in (("dt", dt), ("max_gap", max_gap)):
+        if value is not None:
+            number(field, value, 1e-12, allowed="> 0 s", hint="Give seconds.")
+    for field, mapping in (("columns", columns), ("kinds", kinds), ("clock", clock)):
+        named(field, mapping or {}, f"Give {field}={{name: ...}}.")
+    for one, ahead in (clock or {}).items():
+        number(f"clock[{one!r}]", ahead, -np.inf, allowed="finite s", hint="Give the seconds that it is ahead.")
+    if origin is not None:
+        checked("origin", origin, "(3,)", (3,))
+    options: dict[str, Any] = {"columns": columns or {}, "kinds": kinds or {}, "ignore": ignore}
+    rows, actual = _rows(path, truth, tally, options)
+    check_time(rows.t, path.name)
+    rows = on_one_clock(rows, clock or {}, path.name)
+    origin = origin_of(rows, origin)
+    rows = local(rows, origin)
+    if not any_scale:
+        _check_scale(rows, path.name)
+    ids = _ids(rows, body)
+    grid = _grid(rows, dt, path.name)
+    steps = Steps(grid, max_gap, not rows.of("z").any(), body, tally)
+    members = {one: member(one, rows.take(rows.vehicle == one), steps) for one in ids}
+    marks = [k for k, one in enumerate(members.values()) if body and one.stands]
+    rows = of_vehicles(rows, [ids[k] for k in marks], tally)
+    found = linked(rows, members, steps)
+    noise = sensors or assumed(rows, steps.planar, body, tally, steps.dt)
+    to_landmark = np.isin(found.links.neighbour, marks)
+    pairs = (found.links.step * len(ids) + found.links.observer)[~to_landmark]
+    arrays = {
+        name: np.stack([getattr(one, name) for one in members.values()], axis=1)[None]
+        for name in ("gnss", "velocity", "yaw_rate", "compass")
+    }
+    recording = Recording(
+        ids=tuple(ids),
+        t=grid,
+        gnss=arrays["gnss"],
+        velocity=arrays["velocity"],
+        links=found.links,
+        relative=found.relative[None],
+        broadcasts=found.broadcasts & ~np.isin(np.arange(len(ids)), marks),
+        arrival=np.where(to_landmark, -1, found.arrival)[None],
+        sensors=noise,
+        v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
+        observers=tuple(range(len(ids))),
+        notes=(f"measurements of {path.name}, nothing is simulated", *tally.sentences),
+        body=Body(arrays["yaw_rate"], arrays["compass"]) if body else None,
+        landmarks=tuple(marks),
+    )
+    fleet = None if actual is None else _truth(local(actual, origin), recording, max_gap, path.stem)
+    text = {name: one.text for name, one in members.items()}
+    summary = Summary(
+        path.name, steps_in_words(recording), text, tally.read, tally.refused, tally.left, tally.sentences
+    )
+    return Log(recording, fleet, summary, "messages" in tally.read, origin)
+
+
+def steps_in_words(recording: Recording) -> str:
+    """The line of a summary on the steps of a recording."""
+    t = recording.t
+    return f"{len(t)} steps of {recording.dt:g} s, {t[-1] - t[0]:.1f} s"
+
+
+def _is_bag(path: Path) -> bool:
+    return (path / "metadata.yaml").is_file()
+
+
+def _rows(path: Path, truth: str | Path | None, tally: Tally, options: dict[str, Any]) -> tuple[Rows, Rows | None]:
+    """Measurements of a file or a folder, and the truth: of the file that is named, of `truth.*`, or of a topic."""
+    if not path.exists():
+        raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
+    actual: list[Rows] = []
+    if _is_bag(path) or READERS.get(path.suffix.lower()) is read_bag:
+        file = Path(truth) if truth is not None and Path(truth).exists() else None
+        files = [path]
+        read: Callable[..., Rows] = partial(read_bag, truth="" if file else str(truth or ""), actual=actual)
+    else:
+        if truth is not None and not Path(truth).is_file():
+            raise InputError("truth", str(truth), "must be a file", "Check the path.")
+        files = sorted(f for f in path.iterdir() if f.suffix.lower() in READERS) if path.is_dir() else [path]
+        own = [f for f in files if f.stem.lower() == TRUTH and f != path]
+        file = Path(truth) if truth is not None else own[0] if own else None
+        files = [f for f in files if f not in own and f != file]
+        if not files:
+            allowed = f"must hold files in {', '.join(READERS)}"
+            raise InputError("path", str(path), allowed, "Point at the folder of the log.")
+        _check_headers(options["columns"], [*files, *([file] if file else [])], path.name)
+        read = _read_file
+    rows = stacked([read(one, tally, **options) for one in files])
+    if not len(rows):
+        raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
+    if file is not None:
+        actual = [_read_file(file, Tally(), **{**options, "ignore": ()})]
+    return rows, actual[0] if actual else None
+
+
+def _read_file(file: Path, tally: Tally, **options: Any) -> Rows:
+    read = READERS.get(file.suffix.lower(), read_log_table)
+    return read(file, tally, **options)
+
+
+def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:
+    """InputError for a name of a column that none of the tables of a log has."""
+    found = {header for file in files if columns and file.suffix.lower() in TABLES for header in headers(file)}
+    for key, header in columns.items():
+        if header not in found:
+            allowed = f"is in no table, which have {', '.join(sorted(found))}"
+            hint = suggestion(header, found, "Name a column of a table.")
+            raise InputError(f"{name}: columns[{key!r}]", repr(header), allowed, hint)
+
+
+def _check_scale(rows: Rows, name: str) -> None:
+    parts, t, position = [], np.empty(0), np.empty((0, 3))
+    for one in dict.fromkeys(rows.vehicle[rows.of("x")].tolist()):
+        fixes, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Tally(), 2)
+        parts.append(len(t) + np.arange(len(fixes.t)))
+        t, position = np.append(t, fixes.t), np.append(position, np.nan_to_num(fixes.value), axis=0)
+    if len(t):
+        check_scale(t, position, parts, name)
+
+
+def _ids(rows: Rows, body: bool) -> list[str]:
+    """Members that can be placed, in the order of their first row: by fixes, or in body frames by odometry, too."""
+    known = set(rows.vehicle[rows.of("x", *(("speed", "yaw_rate") if body else ()))].tolist())
+    if known:
+        return [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in known]
+    if body:
+        hint = "Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks."
+        raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
+    hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once."
+    raise InputError("fixes", "none", "must be there: a position in the local frame starts from one", hint)
+
+
+def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
+    """Steps over all fixes and odometry."""
+    names, t = set(rows.vehicle.tolist()), rows.t[rows.in_group("odometry", "fix")]
+    densest = 0.0
+    for group in ("fix", "odometry"):
+        here = rows.in_group(group)
+        gaps = [np.diff(np.unique(np.round(rows.t[here & (rows.vehicle == one)], 6))) for one in names]
+        densest = min((float(np.median(each)) for each in gaps if len(each)), default=densest)
+    if dt is None and not densest > 0:
+        raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
+    step = float(f"{densest:.3g}") if dt is None else dt
+    count = (t.max() - t.min()) / step + 1.5
+    check_size(count, len(names), len(rows), step, name)
+    if count < 2:
+        allowed = f"must be well below the {np.ptp(t):g} s of the log"
+        raise InputError("dt", f"{step:g} s", allowed, "Take a shorter dt.")
+    grid: Floats = t.min() + step * np.arange(int(count))
+    return grid
+
+
+def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:
+    """Truth of the members that have one, on the steps of the recording."""
+    shape, start = (len(recording.t), len(recording.ids)), recording.t[0]
+    known = set(rows.vehicle.tolist())
+    if not known & set(recording.ids):
+        allowed = f"must name vehicles of the log: {', '.join(recording.ids)}"
+        where = f"{rows.file[0]}: column vehicle"
+        raise InputError(where, ", ".join(sorted(known)), allowed, "Rename them, or leave the truth out.")
+    axes = ("x", "y", "z") if rows.of("z").any() else ("x", "y")
+    position, heading = np.full((*shape, 3), np.nan), np.full((*shape, 1), np.nan)
+    for column, one in enumerate(recording.ids):
+        mine = rows.take(rows.vehicle == one)
+        for out, kinds in ((position, axes), (heading, ("heading",))):
+            true, _ = samples(mine, kinds, Tally(), len(kinds))
+            value = np.zeros((len(true.t), out.shape[2]))
+            value[:, : len(kinds)] = true.value if kinds is axes else np.unwrap(true.value, axis=0)
+            if len(true.t) > 1:
+                gap = longest_gap(true.t, recording.dt, max_gap)
+                out[:, column] = interpolate(true.t - start, value, recording.t - start, gap)
+            elif len(true.t) and kinds is axes:
+                out[:, column] = value[0]
+    there = np.isfinite(position[..., 0])
+    beside = np.zeros(shape, dtype=bool)
+    beside[1:] |= there[:-1]
+    beside[:-1] |= there[1:]
+    position[there & ~beside] = np.nan
+    velocity = backward_difference(recording.t, position, recording.ids)
+    turned = wrap(heading[..., 0]) if np.isfinite(heading).any() else None
+    source = f"truth of {name}"
+    return Fleet(recording.ids, recording.t, position, velocity, name=name, source=source, heading=turned)

@@ -1,0 +1,389 @@
+"""Sliding windows: laws of a cooperative method, closed forms, minima, the linear case, late messages."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.optimize import least_squares
+
+from coopoc import (
+    V2X,
+    CooperativeMAP,
+    FixedLagSmoother,
+    Fleet,
+    InputError,
+    JointFilter,
+    Kalman,
+    Method,
+    MovingHorizon,
+    NoiseModel,
+    Sensors,
+    load_fleet,
+    observe,
+)
+from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
+from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
+from coopoc.methods.star import ACCELERATION_STD
+from coopoc.optimize import Problem, solve
+from coopoc.world.inbox import inbox
+from coopoc.world.recording import Recording
+from coopoc.world.spherical import spherical, to_vector, wrap
+
+S2 = Sensors.paper_scenario2()
+SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
+MAPS = [CooperativeMAP(window=w, noise_model=k) for w in (1, 4) for k in ("identity", "nominal")]
+HORIZONS = [
+    FixedLagSmoother(lag=3),
+    FixedLagSmoother(lag=3, noise_model="identity"),
+    MovingHorizon(horizon=4),
+    MovingHorizon(horizon=4, noise_model="identity"),
+]
+LATE = V2X(max_neighbours=4, loss=0.2, latency=0.2)
+Window = CooperativeMAP | FixedLagSmoother | MovingHorizon
+
+
+def label(method: Window) -> str:
+    return f"{method.name}-{method.noise_model}-{getattr(method, 'window', '')}"
+
+
+@pytest.fixture(scope="module")
+def recording(crossing: Fleet) -> Recording:
+    return observe(crossing, S2, V2X(max_neighbours=4), runs=3)
+
+
+@pytest.mark.parametrize("method", [*MAPS, *HORIZONS], ids=label)
+def test_zero_noise_gives_zero_error(method: Window, crossing: Fleet) -> None:
+    recording = observe(crossing.between(0, 40), SILENT, V2X(max_neighbours=4), assumed=S2)
+    assert isinstance(method, Method)
+    assert errors(method(recording, [0, 3]), crossing.between(0, 40)).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", [*MAPS, *HORIZONS], ids=label)
+def test_the_world_moved_and_renumbered_moves_the_estimate(method: Window, crossing: Fleet) -> None:
+    shift, fleet, names = np.array([1000.0, -500.0, 30.0]), crossing.between(0, 40), list(crossing.ids)
+    here = method(observe(fleet, S2, LATE, runs=2), ["c0"])
+    there = method(observe(replace(fleet, position=fleet.position + shift), S2, LATE, runs=2), ["c0"])
+    assert there.x - shift == pytest.approx(here.x, abs=1e-5)
+    assert there.covariance == pytest.approx(here.covariance, abs=1e-5)
+    shuffled = fleet.select([names[0], *reversed(names[1:])])
+    assert method(observe(shuffled, S2, LATE, runs=2), ["c0"]).x == pytest.approx(here.x, abs=1e-6)
+
+
+@pytest.mark.parametrize("method", [*MAPS, *HORIZONS], ids=label)
+def test_a_run_and_a_step_know_nothing_of_others(method: Window, crossing: Fleet) -> None:
+    """One run is the first of six, and a short drive the beginning of a long one."""
+    fleet = crossing.between(0, 40)
+    many = method(observe(fleet, S2, LATE, runs=6), [0]).x
+    assert np.array_equal(method(observe(fleet, S2, LATE, runs=1), [0]).x, many[:1])
+    assert np.array_equal(method(observe(fleet.between(0, 25), S2, LATE, runs=6), [0]).x, many[:, :25])
+
+
+@pytest.mark.parametrize("method", [CooperativeMAP(), FixedLagSmoother(lag=1), MovingHorizon(horizon=3)], ids=label)
+def test_bytes_are_those_of_the_inbox(method: Window, crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=4, loss=0.2, rate=5.0, overhead=100), runs=3)
+    track = method(recording, [0, 3])
+    for e, ego in enumerate((0, 3)):
+        box = inbox(recording, ego, method.message)
+        assert np.array_equal(track.received_bytes[:, e], box.received_bytes)
+        assert (track.sent_bytes[:, e] == box.sent_bytes).all()
+
+
+@pytest.mark.parametrize("window", [1, 5])
+def test_without_neighbours_it_is_the_egos_own_problem(crossing: Fleet, window: int) -> None:
+    """A snapshot is the fix; a window is the linear least squares of its own fixes and odometry."""
+    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
+    track = CooperativeMAP(window=window)(recording, [2])
+    if window == 1:
+        assert track.x[:, :, 0] == pytest.approx(recording.gnss[:, :, 2], abs=1e-6)
+        assert track.covariance[0, 5, 0] == pytest.approx(3.5**2 * np.eye(3), rel=1e-9)
+        return
+    step, dt = 30, recording.dt
+    steps = np.arange(step - window + 1, step + 1)
+    std = dt * S2.assumed_velocity_std(recording.velocity[1, steps, 2])
+    for axis in range(3):
+        rows = np.concatenate([np.eye(window) / 3.5, np.diff(np.eye(window), axis=0) / std[1:, axis, None]])
+        moved = dt * recording.velocity[1, steps[1:], 2, axis]
+        right = [recording.gnss[1, steps, 2, axis] / 3.5, moved / std[1:, axis]]
+        assert track.x[1, step, 0, axis] == pytest.approx(np.linalg.lstsq(rows, np.concatenate(right))[0][-1], abs=1e-6)
+
+
+def test_identity_snapshot_has_a_closed_form(recording: Recording) -> None:
+    """Unit weights: each neighbour's fix minus its vector has variance 2, x = (z + 1/2 sum (z_j - v_j)) / (1 + K/2)."""
+    track = CooperativeMAP(noise_model="identity")(recording, [1])
+    for step in (0, 17, 45):
+        links = recording.links.of(1)
+        links = links[recording.links.step[links] == step]
+        seen = recording.gnss[:, step, recording.links.neighbour[links]] - to_vector(recording.relative[:, links])
+        expected = (recording.gnss[:, step, 1] + 0.5 * seen.sum(axis=1)) / (1 + 0.5 * len(links))
+        assert track.x[:, step, 0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_the_track_is_the_problems_solution(recording: Recording, window: int) -> None:
+    """With an ideal channel every step equals Problem.from_window solved alone; a neighbour's estimate is its point."""
+    track = CooperativeMAP(window=window)(recording, [0])
+    for run, step in ((0, 5), (1, 20), (2, 59)):
+        problem = Problem.from_window(recording, step, 0, window, run)
+        solution = solve(problem)
+        assert track.x[run, step, 0] == pytest.approx(solution.x[problem.separator[-1]], abs=2e-5)
+        assert track.covariance[run, step, 0] == pytest.approx(solution.covariance[problem.separator[-1]], abs=1e-5)
+        here = recording.links.step[recording.links.of(0)] == step
+        assert track.neighbours[run, here] == pytest.approx(solution.x[problem.separator[-1] + 1 :], abs=2e-5)
+
+
+@pytest.mark.parametrize("backend", ["gtsam", "osqp"])
+@pytest.mark.parametrize("window", [1, 3])
+def test_backends_give_the_same_track(crossing: Fleet, backend: str, window: int) -> None:
+    recording = observe(crossing.between(0, 12), S2, V2X(max_neighbours=4, loss=0.2), runs=2)
+    reference = CooperativeMAP(window=window)(recording, [0])
+    track = CooperativeMAP(backend=backend, window=window)(recording, [0])
+    assert track.x == pytest.approx(reference.x, abs=5e-5)
+    assert track.covariance == pytest.approx(reference.covariance, abs=5e-4)
+    assert track.notes == (f"{backend} loops over the runs",)
+    assert reference.notes == ()
+
+
+def test_a_fix_is_used_once_in_a_window(formation: Fleet) -> None:
+    """At 1 Hz a message is held for ten steps; used at each of them it would be ten fixes, and NEES would show it."""
+    fleet = formation.between(0, 150)
+    recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0), runs=20, observers=[0])
+    track = CooperativeMAP(window=8)(recording, [0])
+    assert nees(track, fleet)[:, 20:].mean() == pytest.approx(3.0, abs=0.3)
+
+
+def test_more_neighbours_and_longer_windows_help(formation: Fleet) -> None:
+    fleet = formation.between(0, 80)
+    by_k = [
+        rt_le(CooperativeMAP()(observe(fleet, S2, V2X.ideal(k), runs=10, observers=[0]), [0]), fleet).mean()
+        for k in (0, 2, 10)
+    ]
+    assert by_k[0] > 1.2 * by_k[1] > 1.2 * 1.2 * by_k[2]
+    recording = observe(fleet, S2, V2X.ideal(4), runs=10, observers=[0])
+    by_window = [rt_le(CooperativeMAP(window=w)(recording, [0]), fleet).mean() for w in (1, 3, 10)]
+    assert by_window[0] > 1.2 * by_window[1] > 1.2 * 1.2 * by_window[2]
+
+
+@pytest.mark.parametrize("window", [1, 4])
+def test_a_neighbour_without_messages_is_left_out(crossing: Fleet, window: int) -> None:
+    """All messages lost: the estimate is that without neighbours, and the neighbours have no estimate."""
+    silent = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=2)
+    alone = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
+    track = CooperativeMAP(window=window)(silent, [0])
+    assert track.x == pytest.approx(CooperativeMAP(window=window)(alone, [0]).x, abs=1e-5)
+    assert np.isnan(track.neighbours).all()
+    assert (track.received_bytes == 0).all()
+
+
+def test_a_late_fix_is_brought_forward(formation: Fleet) -> None:
+    """Two steps late: the neighbours' fixes enter at z + 2 dt u with variance sigma^2 + 4 times one step's."""
+    fleet = formation.between(0, 20)
+    recording = observe(fleet, S2, V2X(max_neighbours=3, latency=0.2), observers=[0])
+    track = CooperativeMAP(noise_model="nominal")(recording, [0])
+    step, dt = 10, recording.dt
+    problem = Problem.from_snapshot(recording, step, 0)
+    fixes, relative = problem.factors
+    late = [recording.ids.index(n) for n in problem.names[1:]]
+    u = recording.velocity[0, step - 2, late]
+    z, std = fixes.z.copy(), np.array(np.broadcast_to(fixes.std, fixes.z.shape))
+    z[1:] = recording.gnss[0, step - 2, late] + 2 * dt * u
+    drift = dt**2 * 2 * ACCELERATION_STD
+    std[1:] = np.sqrt(3.5**2 + 4 * ((dt * S2.assumed_velocity_std(u)) ** 2 + drift**2))
+    stated = replace(problem, factors=(replace(fixes, z=z, std=std), relative))
+    assert track.x[0, step, 0] == pytest.approx(solve(stated).x[0], abs=1e-4)
+
+
+def test_vehicles_that_meet_are_solved_converted(crossing: Fleet) -> None:
+    """An inclination beyond pi puts the neighbour straight below, where the azimuth has no derivative."""
+    recording = observe(crossing, S2, V2X(max_neighbours=1), runs=2)
+    relative = recording.relative.copy()
+    relative[..., 0], relative[..., 2] = 3.0, np.pi + 0.1
+    track = CooperativeMAP()(replace(recording, relative=relative), [0])
+    assert "where vehicles met" in track.notes[0]
+    assert np.isfinite(track.x).all()
+    assert (np.linalg.eigvalsh(track.covariance[:, :, 0]) > 1e-3).all()
+    assert np.isfinite(track.covariance).all()
+
+
+def test_fitted_knowledge_is_taken(crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=4), runs=2)
+    fitted = NoiseModel.fitted(recording, crossing)
+    assert isinstance(CooperativeMAP(noise_model=fitted), Method)
+    assert rt_le(CooperativeMAP(window=3, noise_model=fitted)(recording, [0]), crossing).mean() < 3.0
+
+
+@pytest.mark.parametrize("method", HORIZONS, ids=label)
+def test_zero_neighbours_is_the_solo_filter(method, crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=3)
+    solo = Kalman(method.noise_model)(recording, [0, 1])
+    track = method(recording, [0, 1])
+    assert track.x == pytest.approx(solo.x, abs=2e-4)  # the flat prior weighs 1e-6 of a fix
+    assert (track.received_bytes == 0).all()
+
+
+def test_no_message_ever_is_at_best_the_solo_filter(crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=4, loss=1.0), runs=3)
+    solo = rt_le(Kalman("nominal")(recording, [0]), crossing).mean()
+    for method in (FixedLagSmoother(lag=3), MovingHorizon(horizon=4)):
+        assert rt_le(method(recording, [0]), crossing).mean() < 1.2 * solo
+
+
+@pytest.mark.parametrize("v2x", [V2X(4), V2X(4, loss=0.3), V2X(4, rate=2.0)], ids=["ideal", "lossy", "slow"])
+@pytest.mark.parametrize("noise_model", ["identity", "nominal"])
+def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model: str, crossing: Fleet) -> None:
+    """The law of performance.md 1.2 and methods.md 6.9; JointFilter is held against filterpy in test_methods."""
+    recording = observe(crossing.between(0, 30), S2, v2x, runs=2)
+    peer = JointFilter(noise_model, exact=False)(recording, [0, 3])
+    lags = [FixedLagSmoother(lag=lag, noise_model=noise_model, exact=False) for lag in (1, 10)]
+    horizons = [MovingHorizon(horizon=n, noise_model=noise_model, exact=False) for n in (1, 5)]
+    for method in (*lags, *horizons):
+        track = method(recording, [0, 3])
+        assert track.x == pytest.approx(peer.x, abs=1e-8)
+        assert track.covariance == pytest.approx(peer.covariance, abs=1e-8)
+        assert track.neighbours == pytest.approx(peer.neighbours, abs=1e-7, nan_ok=True)
+
+
+def test_no_lag_is_the_joint_filter(formation: Fleet) -> None:
+    """Its exact step, too, and over a late channel."""
+    recording = observe(formation.between(0, 60), S2, LATE, runs=3, observers=[0, 3])
+    track, peer = FixedLagSmoother(lag=0)(recording, [0, 3]), JointFilter()(recording, [0, 3])
+    assert track.x == pytest.approx(peer.x, abs=1e-8)
+    assert track.covariance == pytest.approx(peer.covariance, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    "method", [FixedLagSmoother("identity", lag=3), MovingHorizon("identity", horizon=4)], ids=label
+)
+def test_in_a_linear_model_the_newest_point_is_gtsams_of_the_whole_drive(method: Window, crossing: Fleet) -> None:
+    """Independent check: GTSAM solves all steps so far at once; the flat priors weigh 1e-6 of a fix."""
+    recording = observe(crossing.between(0, 10), S2, V2X(max_neighbours=3), runs=2)
+    track, known = method(recording, [0]), NoiseModel.identity()
+    for run in range(2):
+        problem = Problem.from_window(recording, 9, 0, 10, run, known)
+        theirs, newest = solve(problem, "gtsam"), problem.separator[-1]
+        assert track.x[run, 9, 0] == pytest.approx(theirs.x[newest], abs=1e-4)
+        assert track.covariance[run, 9, 0] == pytest.approx(theirs.covariance[newest], abs=1e-4)
+
+
+def test_the_horizon_is_at_its_minimum(formation: Fleet) -> None:
+    """Independent check: scipy.optimize.least_squares on a drive that the horizon holds whole, from the truth."""
+    fleet = formation.select(range(4)).between(0, 6)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
+    track, order = MovingHorizon(horizon=6)(recording, [0]), [0, *recording.links.neighbour[:3]]
+    for run in range(2):
+        moved = recording.dt * recording.velocity[run][:, order]
+        std = recording.dt * S2.assumed_velocity_std(recording.velocity[run][:, order])
+        seen = recording.relative[run].reshape(6, 3, 3)
+
+        def whitened(x: np.ndarray, run=run, moved=moved, std=std, seen=seen) -> np.ndarray:
+            points = x.reshape(6, 4, 3)
+            fixes = (points - recording.gnss[run][:, order]) / S2.gnss_std
+            motions = (np.diff(points, axis=0) - moved[1:]) / std[1:]
+            gap = np.stack(spherical(*np.moveaxis(points[:, 1:] - points[:, :1], -1, 0)), axis=-1) - seen
+            gap[..., 1:] = wrap(gap[..., 1:])
+            return np.concatenate([r.ravel() for r in (fixes, motions, gap / S2.relative_std)])
+
+        best = least_squares(whitened, fleet.position[:, order].ravel(), xtol=1e-12, ftol=1e-12)
+        assert track.x[run, -1, 0] == pytest.approx(best.x.reshape(6, 4, 3)[-1, 0], abs=5e-4)
+        cov = np.linalg.inv(best.jac.T @ best.jac)[-12:-9, -12:-9]
+        assert track.covariance[run, -1, 0] == pytest.approx(cov, abs=2e-3)
+
+
+def test_late_messages_stand_at_their_true_time(formation: Fleet) -> None:
+    """Independent check: numpy.linalg.lstsq over all steps, rows written out from the arrivals of the messages."""
+    fleet = formation.select(range(4)).between(0, 9)
+    recording = observe(fleet, S2, V2X(max_neighbours=3, latency=0.2, loss=0.3), runs=3, observers=[0])
+    track, dt, now = MovingHorizon(horizon=12, noise_model="identity")(recording, [0]), recording.dt, 8
+    for run in range(3):
+        rows, right = [], []
+        place = {(v, s): 4 * s + v for s in range(now + 1) for v in range(4)}
+
+        def row(std: float, value: np.ndarray, *terms: tuple[int, float], rows=rows, right=right) -> None:
+            rows.append(np.zeros(4 * (now + 1)))
+            for column, sign in terms:
+                rows[-1][column] = sign / std
+            right.append(value / std)
+
+        links = recording.links
+        arrived = {
+            (int(n), int(s)): 0 <= a <= now
+            for n, s, a in zip(links.neighbour, links.step, recording.arrival[run], strict=True)
+        }
+        arrived |= {(0, s): True for s in range(now + 1)}
+        for s in range(now + 1):
+            for link in np.flatnonzero(links.step == s):
+                vector = to_vector(recording.relative[run, link])
+                row(1.0, vector, (place[int(links.neighbour[link]), s], 1), (place[0, s], -1))
+            for v in range(4):
+                if arrived[v, s]:
+                    row(1.0, recording.gnss[run, s, v], (place[v, s], 1))
+                sent = [k for k in range(s + 1) if arrived[v, k]]
+                if s and sent:
+                    age = s - sent[-1]
+                    error = np.sqrt((2 * age + 1) * (1 + (dt**2 * age * ACCELERATION_STD) ** 2))
+                    row(error, dt * recording.velocity[run, sent[-1], v], (place[v, s], 1), (place[v, s - 1], -1))
+        x = np.linalg.lstsq(np.array(rows), np.array(right))[0]
+        assert track.x[run, now, 0] == pytest.approx(x[place[0, now]], abs=1e-4)  # flat priors weigh 1e-6
+
+
+def test_a_late_message_is_worth_more_in_its_place() -> None:
+    """In traffic that brakes, at 1 s of latency: fixes that are brought forward make a filter over-confident."""
+    fleet = load_fleet("town10").between(300, 400)
+    recording = observe(fleet, S2, V2X(max_neighbours=4, latency=1.0), runs=5, observers=[12])
+    late, forward = MovingHorizon(horizon=10)(recording, [12]), JointFilter()(recording, [12])
+    assert late.notes == ()
+    assert rt_le(late, fleet).mean() < 0.92 * rt_le(forward, fleet).mean()
+    assert nees(late, fleet).mean() < 3.6 < 5.0 < nees(forward, fleet).mean()
+
+
+def test_what_comes_after_the_horizon_is_dropped_and_counted(formation: Fleet) -> None:
+    fleet = formation.select(range(3)).between(0, 20)
+    recording = observe(fleet, S2, V2X(max_neighbours=2, latency=0.5), runs=2, observers=[0])
+    track = MovingHorizon(horizon=4)(recording, [0])
+    assert track.notes == (f"{2 * 2 * 15} fixes came later than the horizon and were dropped",)
+    solo = Kalman()(recording, [0])  # without a fix of theirs neighbours say nothing of where the ego is
+    assert track.x[:, 0, 0] == pytest.approx(solo.x[:, 0, 0], abs=1e-4)
+    assert MovingHorizon(horizon=5)(recording, [0]).notes == ()
+
+
+@pytest.mark.parametrize("method", [FixedLagSmoother(lag=2), MovingHorizon(horizon=2)], ids=label)
+def test_consistent_and_on_the_bound(method, formation: Fleet) -> None:
+    """NEES gate as in test_methods; RT-LE is not below the filtering bound of the star beyond its interval, nor far."""
+    sensors = replace(S2, velocity_reading="speed")
+    fleet, v2x = formation.select(range(4)).between(0, 100), V2X(max_neighbours=3)
+    track = method(observe(fleet, sensors, v2x, runs=40, seed=1, observers=[0]), [0])
+    assert nees_inside(track, fleet).min() >= 0.95
+    bound = bound_rt_le(posterior_bound(fleet, sensors, 0, v2x))
+    square = rt_le(track, fleet)[:, 0] ** 2
+    half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
+    assert square.mean() + half > bound**2
+    assert square.mean() - half < 1.05 * bound**2
+
+
+@pytest.mark.parametrize("window", [1, 5])
+def test_the_covariance_means_something(formation: Fleet, window: int) -> None:
+    """Run-averaged NEES inside the 99 % chi-square band at 95 % of the steps."""
+    fleet = formation.between(0, 150)
+    recording = observe(fleet, S2, V2X.ideal(6), runs=40, observers=[0], seed=1)
+    track = CooperativeMAP(window=window)(recording, [0])
+    assert nees_inside(track, fleet).min() >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda r: CooperativeMAP(window=0), "window"),
+        (lambda r: CooperativeMAP(backend="ipopt"), "backend"),
+        (lambda r: CooperativeMAP(noise_model="guess")(r, [0]), "noise_model"),
+        (lambda r: CooperativeMAP()(r, ["missing"]), "egos"),
+        (lambda r: CooperativeMAP(robust="tukey"), "robust"),
+        (lambda r: CooperativeMAP(robust="truncated", threshold=1.0), "threshold"),
+        (lambda r: FixedLagSmoother(lag=-1), "lag"),
+        (lambda r: MovingHorizon(horizon=0), "horizon"),
+    ],
+)
+def test_wrong_input_says_what_to_do(recording: Recording, make, field: str) -> None:
+    with pytest.raises(InputError, match=field):
+        make(recording)
