@@ -64,7 +64,7 @@ def run(
         retry_failed: repeat failed cells.
         dry_run: print which cells would be kept, repeated and computed, then stop.
     """
-    from .study.parse import assignments
+    from .study.cell import assignments
     from .study.publish import tables
     from .study.run import plan, run_study
 

@@ -21,7 +21,7 @@ import tyro
 import coopoc as co
 from coopoc import plugins
 from coopoc.cli import OWN, _status
-from coopoc.study.parse import assignments
+from coopoc.study.cell import assignments
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"

@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 from ..errors import InputError, MissingLibraryError
+from .cell import Cell
 from .compute import Function, Outcome, WorkerDiedError, attempt
 from .provenance import environment
-from .study import Cell
 
 PATIENCE = 30.0
 """Seconds without any worker until a run gives up: one that is restarted is back by then."""

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from ..errors import InputError
 from ..workers import leave_with
 from . import store
-from .study import Cell, Params, Row
+from .cell import Cell, Params, Row
 
 Function: TypeAlias = Callable[[Params], list[Row]]
 OF_WORKERS = {

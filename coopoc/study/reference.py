@@ -20,6 +20,7 @@ from ..plugins import names
 from . import store
 from .compare import Change, Direction, change_table, plain
 from .results import SEED, Results, ego_by_run
+from .study import find_study
 from .tables import Table
 
 TOLERANCE, TRAINED = 0.01, 0.05
@@ -194,8 +195,6 @@ def reference(
         write: write the reference values from these results.
         all: show every value, not only those that moved.
     """
-    from .run import find_study
-
     results = Results.load(folder)
     if not study and results.study not in names("coopoc.studies"):
         hint = f"If it is a file of your own, name it: coopoc reference {folder} --study FILE.py:NAME."

@@ -17,13 +17,14 @@ from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.storage import digest, save_recording
 from . import store
+from .cell import Cell
 from .cluster import Cluster, connected
 from .compute import compute, part_of, schedule
 from .manifest import Manifest, environments, locked, one_at_a_time
 from .provenance import environment
 from .publish import publish
 from .results import Results
-from .study import Cell, Study, find_study
+from .study import Study, find_study
 
 
 def run_study(

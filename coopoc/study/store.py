@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from ..errors import InputError
 from ..file_names import replaceable
 from ..seals import UNSEALED, holds, sealed
-from .study import Cell, Row
+from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")
 

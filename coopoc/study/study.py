@@ -2,66 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import itertools
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..file_names import file_name
 from ..one_file import file_digest, from_file, in_file
 from ..plugins import find, unknown
-from .parse import parse
+from .cell import Cell, Params, Row, Scalar, digest, parse
 from .provenance import code_of
 
 if TYPE_CHECKING:
     from .plot import Plot
     from .results import Results
     from .tables import Table
-
-Scalar: TypeAlias = str | int | float | bool | None
-Params: TypeAlias = Mapping[str, Any]
-Row: TypeAlias = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One point of the grid.
-
-    Args:
-        params: its own parameters.
-        given: its own parameters and the settings of the study.
-        name: `digest` of everything that changes the numbers.
-    """
-
-    params: Mapping[str, Scalar]
-    given: Params
-    name: str
-
-
-def digest(content: Any) -> str:
-    """First 20 hex digits of the SHA-256 of canonical JSON: the same content has the same name on every machine.
-
-    >>> digest({"a": 1, "b": [0.5]}) == digest({"b": (0.5,), "a": np.int64(1)})
-    True
-    """
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, np.generic | np.ndarray):
-            return value.tolist()
-        hint = "Pass a name, not an object."
-        raise InputError("settings", repr(value), "must be numbers, words, or lists of them", hint)
-
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=plain)
-    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:

@@ -1,11 +1,53 @@
-"""Read the text of --set key=value as the type of the default that it replaces."""
+"""Cell: one point of a study's grid, named by a hash of all that changes its numbers; values as --set gives them."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
 
 from ..errors import InputError
+
+Scalar: TypeAlias = str | int | float | bool | None
+Params: TypeAlias = Mapping[str, Any]
+Row: TypeAlias = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One point of the grid.
+
+    Args:
+        params: its own parameters.
+        given: its own parameters and the settings of the study.
+        name: `digest` of everything that changes the numbers.
+    """
+
+    params: Mapping[str, Scalar]
+    given: Params
+    name: str
+
+
+def digest(content: Any) -> str:
+    """First 20 hex digits of the SHA-256 of canonical JSON: the same content has the same name on every machine.
+
+    >>> digest({"a": 1, "b": [0.5]}) == digest({"b": (0.5,), "a": np.int64(1)})
+    True
+    """
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.generic | np.ndarray):
+            return value.tolist()
+        hint = "Pass a name, not an object."
+        raise InputError("settings", repr(value), "must be numbers, words, or lists of them", hint)
+
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=plain)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
 
 _BOOLS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
