@@ -30,8 +30,8 @@ from coopoc.optimize.descent.local_problem import LocalProblem
 from coopoc.optimize.descent.trust_region import arrive
 from coopoc.optimize.graphs import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
-from coopoc.optimize.model.fuse import fused
-from coopoc.optimize.model.search import Search
+from coopoc.optimize.model.parts import fused
+from coopoc.optimize.model.problem import Search
 from coopoc.optimize.model.space import exp
 from coopoc.optimize.starts.graph_starts import chained, separated
 from coopoc.optimize.starts.linear import linear_start, nearest_rotation

@@ -9,11 +9,11 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..algebra.sparse import Sparse, sparse
-from ..algebra.tape import numbers_of
 from ..descent.trust_region import arrive
 from ..model.factor import Factor, unchecked
-from ..model.part import restricted
+from ..model.parts import restricted
 from ..model.problem import Problem
+from ..model.symbolic import numbers_of
 from .links import Link, makers
 
 CLOSE = 1e-9

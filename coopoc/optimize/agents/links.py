@@ -80,9 +80,7 @@ def links_of(problem: Problem, owner: tuple[str, ...], rho: float) -> list[Link]
     """A link for every pair of owner and observer, two where some copies have a rotation and others have none."""
     space, x0 = problem.space, np.array(problem.x0)
     linear, seen = problem.linearise(x0[None]), dict[tuple[str, int], Floats]()
-    for factor, maker, jacobians in zip(
-        problem.factors, makers(problem, owner), linear.by_node(problem.factors), strict=True
-    ):
+    for factor, maker, jacobians in zip(problem.factors, makers(problem, owner), linear.jacobian, strict=True):
         for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
             square = np.broadcast_to(np.square(jacobian[0]).sum(axis=-2), (len(column), space.dof))
             for row, (node, by) in enumerate(zip(column.tolist(), maker.tolist(), strict=True)):

@@ -23,7 +23,7 @@ from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..model.constraint import steerable
 from ..model.problem import Problem
-from ..model.symbolic import LOSSES, Structure, numbers_of, structure_of
+from ..model.symbolic import Structure, parameters, structure_of
 from .casadi_programme import NlpSolver, Programme, programme
 
 DENSE = 200
@@ -121,7 +121,7 @@ def _run(
 
 def _numbers(problem: Problem, x: Floats) -> Floats:
     """(B, .) the parameters around x (B, n, ambient), and last by what the cost is multiplied: 1 / max diag J^T J."""
-    numbers = numbers_of(problem, x)
+    numbers = parameters(problem, x)
     curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
     return np.append(numbers, 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
 
@@ -148,6 +148,6 @@ BACKEND = Backend(
     prepare,
     "nonlinear programming by FATROP or IPOPT, any constraints",
     "casadi",
-    Capabilities(batched=True, losses=tuple(LOSSES), constraints="all"),
+    Capabilities(batched=True, losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
     fallback,
 )

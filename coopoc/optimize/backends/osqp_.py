@@ -19,8 +19,7 @@ from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..model.constraint import bounded
-from ..model.linear import Linear
-from ..model.local import local
+from ..model.linear import Linear, local
 from ..model.problem import Problem
 from .osqp_programme import CLOSE, Infeasible, Programme, filled
 
