@@ -16,7 +16,7 @@ from coopoc.study.style import look
 from coopoc.study.tables import Table
 
 from . import lineup, scene
-from .federations import CONDITIONS, GRAPHS, RULES, WIRES, fitted, members, trained
+from .federations import CONDITIONS, RULES, fitted, members, trained
 
 if TYPE_CHECKING:
     from coopoc.study.plot import Plot
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 LOST = 1e6
 """m, the RT-LE of a net whose estimates left every bound; a mean above a thousandth of it is shown as "diverged"."""
 REFERENCES = ("kalman", "bound")
-BESIDE = ("centralised", *GRAPHS, "kalman")
+BESIDE = ("centralised", "kalman")
 """Methods beside the rules under `iid` and `heterogeneous`."""
-METHODS = (*RULES, *BESIDE, *WIRES, "bound")
+METHODS = (*RULES, *BESIDE, "bound")
 """Methods of the grid; other rules by name or path: `--set method=mean,mine.py:RULE`."""
 OF_THE_TEST = ("condition", "method", "scenario", "velocity_ratio", "runs", "egos", "data", "seed")
 """Parameters that change no training, and the two that name it."""
@@ -38,12 +38,12 @@ def meaningful(p: Params) -> bool:
 
     `uniform` is `mean` where all clients have as many pieces.
     """
-    from coopoc.learned.federation.aggregate import rule
+    from coopoc.learned.federation.rules import rule
 
     condition, method = str(p["condition"]), str(p["method"])
     if method in BESIDE:
         return condition in ("iid", "heterogeneous")
-    if method in (*WIRES, "bound"):
+    if method == "bound":
         return condition == "iid"
     asked = int(p["members"]) // (2 if condition == "half absent" else 1)
     enough: bool = rule(method).least <= asked
@@ -174,7 +174,6 @@ STUDY = Study(
         "piece": 100,
         "in_mult": 40,
         "out_mult": 5,
-        "radius_m": 30.0,
         "factor": 20.0,
         "offset_m": 10.0,
     },

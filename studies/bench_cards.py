@@ -23,17 +23,16 @@ from coopoc.study.numbers import three
 from .bench_tasks import VERSION, Task, bound, recording
 
 COOPERATIVE = "cooperative"
-"""The shipped net whose method sends sums to its neighbours."""
+"""The shipped net whose method cooperates."""
 SMOOTHERS = frozenset({"batch-smoother"})
 """Methods that see the whole drive, for which a filtering bound is none."""
 
 
-def method(name: str, late: bool = False) -> Method:
+def method(name: str) -> Method:
     """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME".
 
     Args:
         name: of the method.
-        late: whether messages are: then the cooperative gain sends its newest fix, for sums must come in time.
 
     Raises:
         InputError: an unknown name.
@@ -47,7 +46,7 @@ def method(name: str, late: bool = False) -> Method:
     if name not in shipped_weights() and not given_path(name).is_file():
         raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
     learned = load_method(name)
-    return CooperativeGain(learned.model, not late, name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]
+    return CooperativeGain(learned.model, name) if name == COOPERATIVE else learned  # type: ignore[attr-defined]
 
 
 def information(name: str, one: Method) -> str:
@@ -57,7 +56,7 @@ def information(name: str, one: Method) -> str:
     if not one.cooperative:
         return "solo"
     whole = name in WHOLE_FLEET or needs_whole_fleet(name)
-    return "fleet" if whole else "past" if name == COOPERATIVE else "star"
+    return "fleet" if whole else "star"
 
 
 def tried(name: str, task: Task) -> dict[str, Any]:
@@ -67,7 +66,7 @@ def tried(name: str, task: Task) -> dict[str, Any]:
 
 def _tried(name: str, task: Task) -> dict[str, Any]:
     row: dict[str, Any] = {"task": task.name}
-    one = method(name, task.v2x.latency > 0)
+    one = method(name)
     held = information(name, one)
     seen, fleet = recording(task, held in ("", "fleet"))
     one(seen.between(0, 3), [task.columns[0]])  # compiles

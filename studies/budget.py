@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopoc.study.numbers import listed, mean, ratio, rms
 from coopoc.study.style import look
-from coopoc.world.channels import CHANNELS
+from coopoc.world.v2x import CHANNELS
 
 from . import budget_tables, lineup, scene, weights
 from .budget_tables import AXES, CAPS, SCHEDULED, SCHEDULES, SHARED, TRAINED, under, way

@@ -13,9 +13,15 @@ from coopoc.study.numbers import Number, Where, difference, interval, mean, pres
 from coopoc.study.pivot import across, crossed
 from coopoc.study.style import look
 from coopoc.study.tables import Table
-from coopoc.world.channel_load import BIT_RATE, CARRIER_SENSE, channel_load
-from coopoc.world.channels import CHANNELS
-from coopoc.world.v2x import ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
+from coopoc.world.v2x import (
+    BIT_RATE,
+    CARRIER_SENSE,
+    CHANNELS,
+    ESTIMATE_AND_COV,
+    FIX_AND_VELOCITY,
+    Message,
+    channel_load,
+)
 
 from . import scene, weights
 from .lineup import of

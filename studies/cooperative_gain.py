@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -29,11 +29,8 @@ if TYPE_CHECKING:
 
 NEIGHBOURS = (0, 2, 6, 10)
 LOSSES = (0.0, 0.3, 0.7)
-TRAINED = {"cooperative": True, "cooperative-newest": False}
-"""Learned methods, whose weights are the same -> whether their messages are sums."""
 LINES = (
     ("cooperative", "trained"),
-    ("cooperative-newest", "trained"),
     ("joint", "nominal"),
     ("split-ci", "nominal"),
     ("joint", "fitted"),
@@ -61,24 +58,9 @@ def _grid() -> list[dict[str, Any]]:
             of(*line, receivers=which, max_neighbours=k, loss=0.0)
             for which in RECEIVERS
             for k in (0, 6)
-            for line in (*LINES[:3], ("joint", "per-fix"))
+            for line in (*LINES[:2], ("joint", "per-fix"))
         ),
     ]
-
-
-def _trained(p: Params) -> Params:
-    """The parameters with the name of the weights as the method."""
-    return {**p, "method": "cooperative"} if p["method"] in TRAINED else p
-
-
-def key(p: Params) -> dict[str, str]:
-    """Digests that change the numbers of a cell beyond its parameters."""
-    return lineup.key(_trained(p))
-
-
-def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
-    """Train the net that the cells need, once for both kinds of messages."""
-    weights.prepare(map(_trained, cells), jobs)
 
 
 def cell(p: Params) -> list[Row]:
@@ -92,9 +74,9 @@ def cell(p: Params) -> list[Row]:
 def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
     from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
 
-    if p["method"] in TRAINED:
+    if p["method"] == "cooperative":
         nets: list[tuple[int, Any]] = [(s, weights.checkpoint("cooperative", p, s).model) for s in weights.seeds(p)]
-        return [(seed, CooperativeGain(net, TRAINED[p["method"]], p["method"])) for seed, net in nets]
+        return [(seed, CooperativeGain(net)) for seed, net in nets]
     if p["noise_model"] != "per-fix":
         return lineup.methods(p, seen)
     process = NoiseModel.nominal(seen.sensors).process_variance(seen)
@@ -131,7 +113,7 @@ INPUTS = (
 )
 BOUND = (
     "Bounds are for the rms over runs and a channel that loses nothing; with its past, a new neighbour's messages "
-    "carry what it measured before, as sums and split CI's estimates do."
+    "carry what it measured before, as split CI's estimates do."
 )
 METHOD = ("loss", "method", "noise_model")
 FILTERS = {**ALIKE, "method": list(dict.fromkeys(method for method, _ in LINES))}
@@ -180,7 +162,7 @@ def _finding(results: Results, loss: float) -> str:
     if where is None:
         return ""
     most = int(results.select(where)["max_neighbours"].max())
-    one, other = (of(*line, **ALIKE, loss=loss, max_neighbours=most) for line in (LINES[0], LINES[2]))
+    one, other = (of(*line, **ALIKE, loss=loss, max_neighbours=most) for line in LINES[:2])
     if not present(results, other):
         return ""
     mine, std = results.interval("rt_le_m", one).mean, seed_std(results, one)
@@ -193,8 +175,6 @@ STUDY = lineup.study(
     "cooperative_gain",
     "Can transmitted noise estimates replace known noise parameters, also when messages are lost?",
     cell=cell,
-    key=key,
-    prepare=prepare,
     recipe=None,
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "burst": 1.0, "runs": 30, "train_seeds": 3},
@@ -231,7 +211,7 @@ STUDY = lineup.study(
     limitations=(
         "The noise of range and angles is the nominal one, since solo training drives contain no such measurement.",
         "Messages arrive within the step in which they are sent, or never.",
-        "Numbers count as float32; on long drives the sums would have to be restarted.",
+        "Numbers count as float32.",
     ),
     minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},

@@ -26,18 +26,13 @@ if TYPE_CHECKING:
 RULES = (
     "mean",
     "uniform",
-    "fedprox",
     "fedavgm",
     "fedadam",
-    "uncertainty",
     "median",
     "trimmed_mean",
     "krum",
     "multi_krum",
-    "geometric_median",
 )
-WIRES = ("float16", "top-k", "8 bits", "4 bits")
-GRAPHS = ("ring", "v2x")
 CONDITIONS = {
     "iid": "equal sensors, equal amounts of data",
     "heterogeneous": "GNSS 1, 1.5, 2.5, 4 m times velocity 5, 10, 20 %, all, two thirds or one third of the pieces",
@@ -120,21 +115,9 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
 
 
 def _federated(p: Params, nets: Sequence[Any], groups: Sequence[Sequence[Client]]) -> tuple[Trained, ...]:
-    from coopoc.learned.federation.compression import Float16, Quantised, TopK
-    from coopoc.learned.federation.federated import Plan, federate_many
-    from coopoc.learned.federation.topology import Ring, V2XGraph
+    from coopoc.learned.federation.federate import Plan, federate_many
 
-    name = p["method"]
-    wires = dict(zip(WIRES, (Float16(), TopK(0.1), Quantised(8), Quantised(4)), strict=True))
-    graph = {"ring": Ring(), "v2x": V2XGraph(members(p), float(p["radius_m"]))}.get(name)
-    plan = Plan(
-        int(p["rounds"]),
-        "mean" if name in (*WIRES, *GRAPHS) else name,
-        int(p["local_epochs"]),
-        participation=participation(p),
-        compression=wires.get(name),
-        topology=graph,
-    )
+    plan = Plan(int(p["rounds"]), p["method"], int(p["local_epochs"]), participation=participation(p))
     done = federate_many(nets, groups, range(len(nets)), plan)
     return tuple(
         Trained(

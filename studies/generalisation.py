@@ -33,7 +33,7 @@ METHODS = (
     ("kalman", "nominal"),
     ("kalman", "fitted"),
     ("kalman-adaptive", "nominal"),
-    *((name, "trained") for name in ("okf", "fedkalmannet", "magnitude", "split", "recursive", "cooperative")),
+    *((name, "trained") for name in ("okf", "fedkalmannet", "split", "recursive", "cooperative")),
 )
 REAL = {"data": "real", **case(0, 0.10)}
 """Robots that were really driven, whose noise is their own; the setting `real` says where their data are."""

@@ -19,8 +19,8 @@ from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
 from coopoc.study.environment import revision
 from coopoc.study.study import Params, Row, Study
+from coopoc.world.body_frames import in_world, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import in_world, turned
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors

@@ -34,7 +34,7 @@ ASSUMED = {
     ("kalman", "nominal"): "the acting share of the measured velocity",
     ("kalman", "oracle"): "the acting share of the true velocity",
     **{(name, "trained"): "trained at 10 %" for name in ("okf", "fedokf", "fedkalmannet", "centralised")},
-    **{(name, "trained"): WIDELY for name in ("magnitude", "split", "recursive", "cooperative")},
+    **{(name, "trained"): WIDELY for name in ("split", "recursive", "cooperative")},
     lineup.BOUND: "the acting share of the true velocity",
 }
 """(method, noise model) -> assumption on the velocity noise."""

@@ -122,8 +122,7 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
             return [(seed, model.method(name, known)) for seed, model in models]
         from coopoc.learned import CooperativeGain
 
-        # sums where messages are in time, else the newest fix
-        return [(seed, CooperativeGain(model, scene.channel(p).latency == 0, name)) for seed, model in models]
+        return [(seed, CooperativeGain(model, name)) for seed, model in models]
     method: Method = find("coopoc.methods", name)(noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=known)

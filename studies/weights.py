@@ -30,7 +30,7 @@ INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
-LEARNED = (*PAPER, "fedokf", "magnitude", "split", "recursive", "cooperative")
+LEARNED = (*PAPER, "fedokf", "split", "recursive", "cooperative")
 """Methods that are trained."""
 
 

@@ -14,7 +14,7 @@ from test_kernels_window import FITTED as KNOWN
 from test_kernels_window import S2
 
 from coopoc import V2X, CooperativeMAP, Fleet, Recording, observe
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.links import spherical, to_vector, wrap
 
 FITTED = replace(KNOWN, gnss_std=S2.gnss_std)
 

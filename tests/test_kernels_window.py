@@ -15,7 +15,7 @@ from coopoc import V2X, CooperativeMAP, Fleet, NoiseModel, Recording, Sensors, T
 from coopoc.methods import sliding_window
 from coopoc.methods.noise_model import resolve
 from coopoc.world.inbox import inbox
-from coopoc.world.spherical import spherical, wrap
+from coopoc.world.links import spherical, wrap
 from coopoc.world.spoofing import spoofed
 from coopoc.world.v2x import FIX_AND_VELOCITY
 

@@ -12,8 +12,8 @@ from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, obse
 from coopoc.optimize import MEASUREMENTS, Factor, Loss, Problem, SolveError, Status, pose, solve, solve_batch
 from coopoc.optimize.model.window import relative_std
 from coopoc.optimize.starts.initial import converted, initial_guess
+from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import to_vector, vector_cov
 
 S2 = Sensors.paper_scenario2()
 PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)

@@ -13,7 +13,7 @@ import torch
 import coopoc as co
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import GainNet
-from coopoc.learned.federation.federated import federate
+from coopoc.learned.federation.federate import federate
 from coopoc.studies import aggregation, federations
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
@@ -53,7 +53,7 @@ def test_every_condition_is_what_it_says() -> None:
     assert shift == pytest.approx([0.0] * 6 + [10.0] + [0.0] * 5, abs=1e-4)
     liar = federations.participation(given(condition="poisoned update", members=12))
     theta, weights = torch.zeros(2), torch.ones(2)
-    assert [float(liar.answer(c.name, 1, theta, weights)[0]) for c in plain] == [1.0] * 6 + [-20.0] + [1.0] * 5
+    assert [float(liar.answer(c.name, theta, weights)[0]) for c in plain] == [1.0] * 6 + [-20.0] + [1.0] * 5
     assert federations.participation(given(condition="half absent")).count(12) == 6
 
 
@@ -102,7 +102,7 @@ def test_pooled_data_costs_the_drive_and_the_net() -> None:
 
 @pytest.mark.slow
 def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
-    wanted = {**TINY, "runs": 1, "method": "mean,8 bits,v2x,kalman,bound", "condition": "iid,poisoned update"}
+    wanted = {**TINY, "runs": 1, "method": "mean,median,kalman,bound", "condition": "iid,poisoned update"}
     study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
     results = run_study(study, out=tmp_path, progress=False)
     assert results.failed == 0
@@ -110,10 +110,6 @@ def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
     assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]
     assert "equal sensors, equal amounts of data" in shown["tables"][0]["caption"]
     assert shown["findings"]["scenario 2, poisoned update"].startswith("Scenario 2, poisoned update: mean")
-    sent = {name: results.select(method=name, condition="iid")["sent_kb"].iloc[0] for name in ("mean", "8 bits", "v2x")}
-    assert sent["8 bits"] == pytest.approx(2 * (PARAMETERS + 8) / 1e3)
-    degree = sent["v2x"] / (2 * 4 * PARAMETERS / 1e3)
-    assert 1 <= degree <= 5
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,8 @@ from scipy import stats
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.world.inbox import inbox
-from coopoc.world.noise import stream
-from coopoc.world.spherical import spherical, to_vector, vector_cov
+from coopoc.world.links import spherical, to_vector, vector_cov
+from coopoc.world.sensors import stream
 from coopoc.world.v2x import FIX_AND_VELOCITY, lost
 
 S2 = Sensors.paper_scenario2()

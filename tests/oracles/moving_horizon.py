@@ -13,8 +13,8 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.inbox import Inbox
+from coopoc.world.links import spherical, to_vector
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import spherical, to_vector
 from oracles.window import UNKNOWN, Row, message, relative_rows, solve_rows
 
 FLAT, STRAYED = 1e6, 0.03

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...world import spherical as polar
+from ...world import links as polar
 from .measurements import Measurement, measurement
 
 VECTOR = ("coordinate",) * 3
