@@ -56,7 +56,8 @@ test-lower:
 		-n $(JOBS) --dist loadfile $(QUICK)
 
 fuzz: $(VENV)/.ready-fuzz
-	OMP_NUM_THREADS=1 PYTHONPATH=tests $(VENV)/bin/python -m fuzz.every --minutes $(MINUTES)
+	export OMP_NUM_THREADS=1 PYTHONPATH=tests; $(VENV)/bin/python -c "from fuzz.readers import READERS as r; print(*r, sep='\n')" | \
+	while read -r name; do $(VENV)/bin/python -m fuzz.run "$$name" --minutes $(MINUTES) --executions 1000000; done
 
 docs: $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 JUPYTER_CONFIG_PATH=docs OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
@@ -78,7 +79,7 @@ $(READY): pyproject.toml constraints.txt
 
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
-	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,nmea,ros,flower,privacy,export,cluster]'
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,nmea,ros,flower,export,cluster]'
 	@touch $@
 
 $(VENV)/.ready-fuzz: $(VENV)/.ready-dev

@@ -30,7 +30,7 @@ from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.starts.initial import converted
 from coopoc.world.inbox import inbox
-from coopoc.world.spherical import spherical, to_vector
+from coopoc.world.links import spherical, to_vector
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 ROUNDS, NEIGHBOURS, STEPS, RUNS = 7, 10, 301, 10

@@ -30,7 +30,7 @@ import coopoc as co
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter
 from coopoc.world import exchange, sensing
-from coopoc.world.spherical import to_vector
+from coopoc.world.links import to_vector
 from coopoc.world.v2x import NO_MESSAGE
 
 VEHICLES, STEPS, BLOCK = 60, 900, 60.0

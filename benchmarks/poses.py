@@ -19,7 +19,7 @@ from timing import medians, timed
 
 import coopoc as co
 from coopoc.methods.poses.pose_inputs import body_of, first_poses
-from coopoc.world.spherical import wrap
+from coopoc.world.links import wrap
 
 ROUNDS, STEPS, RUNS = 5, 101, 10
 NEIGHBOURS = {0: 3, 10: 1}

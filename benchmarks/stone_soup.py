@@ -24,7 +24,7 @@ from coopoc.methods.sliding_window import CooperativeMAP, Windows, dead_reckoned
 from coopoc.methods.star import assumptions, measurements
 from coopoc.optimize import Problem, solve_batch
 from coopoc.world.inbox import inbox
-from coopoc.world.spherical import spherical, wrap
+from coopoc.world.links import spherical, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 SHOWN = 20

@@ -57,16 +57,16 @@ from .optimize.solve import solve as solve
 from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
-from .world.body import Body as Body
-from .world.channel_load import channel_load as channel_load
+from .world.body_frames import in_world as in_world
 from .world.fleet import Fleet as Fleet
-from .world.frames import in_world as in_world
 from .world.links import Links as Links
+from .world.recording import Body as Body
 from .world.recording import Recording as Recording
 from .world.sensing import observe as observe
 from .world.sensors import Sensors as Sensors
 from .world.v2x import V2X as V2X
 from .world.v2x import Message as Message
+from .world.v2x import channel_load as channel_load
 
 __version__: str
 __all__: list[str]

@@ -19,7 +19,7 @@ def names_in(value: str) -> tuple[str, ...] | None:
         value: "package.module:NAME". A definition, or what a call returns, is one object; a mapping is one whose keys
             are written out.
 
-    >>> names_in("coopoc.world.channels:CHANNELS")
+    >>> names_in("coopoc.world.v2x:CHANNELS")
     ('ideal', 'cam', 'bsm', 'cpm')
     >>> names_in("coopoc.plugins:find")
     ()

@@ -33,7 +33,9 @@ def assemble(
     max_gap: float | None = None,
     any_scale: bool = False,
     file: str = "rows",
-    **labels: str,
+    name: str = "",
+    source: str = "",
+    licence: str = "",
 ) -> Fleet:
     """Fleet of L rows; vehicles keep the order of their first row, absence is a missing row.
 
@@ -47,7 +49,9 @@ def assemble(
             as `longest_gap`.
         any_scale: True accepts positions that do not look like metres and seconds.
         file: named in errors.
-        labels: name, source and licence of the Fleet.
+        name: of the Fleet.
+        source: of the Fleet.
+        licence: of the Fleet.
 
     Raises:
         InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, a
@@ -99,7 +103,7 @@ def assemble(
         )
         raise InputError(f"{file}: vehicle {ids[k]}", given, "must be there at instants in a row", hint)
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
-    return Fleet(ids, grid, table[..., :3], u, **labels)
+    return Fleet(ids, grid, table[..., :3], u, name=name, source=source, licence=licence)
 
 
 def longest_gap(t: Floats, dt: float, max_gap: float | None) -> float:

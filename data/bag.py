@@ -11,7 +11,7 @@ import numpy as np
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.plugins import unknown
 
-from .log.units import Rows, Tally, rows_of
+from .log.units import Rows, Summary, rows_of
 
 READ = {
     "sensor_msgs/msg/NavSatFix": "fix",
@@ -27,7 +27,7 @@ Number = tuple[str, float, float]
 
 def read_bag(
     path: Path,
-    tally: Tally,
+    summary: Summary,
     *,
     columns: Mapping[str, str],
     kinds: Mapping[str, str],
@@ -46,7 +46,7 @@ def read_bag(
 
     Args:
         path: of the bag.
-        tally: counts what is not read.
+        summary: counts what is not read.
         columns: of tables, as is `kinds`: refused.
         kinds: of tables.
         ignore: topics and kinds that are left out.
@@ -78,14 +78,14 @@ def read_bag(
             wanted = [c for c in reader.connections if topics[c.topic]]
             for c in reader.connections:
                 if not topics[c.topic]:
-                    tally.unused(f"{path.name}: topic {c.topic} ({c.msgtype})", c.msgcount)
+                    summary.leave(f"{path.name}: topic {c.topic} ({c.msgtype})", c.msgcount)
             for c, _, raw in reader.messages(connections=wanted) if wanted else ():
                 parts = c.topic.strip("/").split("/")
                 true = c.topic == truth or any(part.lower() in TRUTH for part in parts)
                 message: Any = reader.deserialize(raw, c.msgtype)
                 numbers = _numbers(READ[c.msgtype], message, true)
                 if not numbers and READ[c.msgtype] == "fix":
-                    tally.refuse("fixes that the receiver calls invalid", 1, f"{path.name}: {c.topic}")
+                    summary.refuse("fixes that the receiver calls invalid", 1, f"{path.name}: {c.topic}")
                 t = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
                 name = parts[0] if len(parts) > 1 else path.stem
                 kept = (one for one in numbers if one[0].partition(" of ")[0] not in ignore)

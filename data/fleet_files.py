@@ -68,7 +68,7 @@ def read_table(
     numbers = np.column_stack([numeric(frame, name, path.name) for name in (*"xyz", *(VELOCITY if given else ()))])
     if handedness == "left":
         numbers[:, 1::3] *= -1
-    labels = {"file": path.name, "name": path.stem, "source": source}
+    labels: dict[str, Any] = {"file": path.name, "name": path.stem, "source": source}
     velocity = numbers[:, 3:] if given else None
     fleet = assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
     if carla and not (apart := _disagreement(fleet)) < AGREED:

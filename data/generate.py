@@ -159,8 +159,8 @@ def simulate(recipe: Recipe, map_folder: Path) -> Fleet:
     fleet = fleet_store.quantise(Fleet(tuple(ids), t, position, position, name=recipe.name))
     acceleration = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2) / fleet.dt
     if np.nanmax(acceleration) > JUMP:
-        step, column = np.unravel_index(np.nanargmax(acceleration), acceleration.shape)
-        given = f"{acceleration[step, column]:.1f} m/s^2 of {fleet.ids[column]} at step {step}"
+        step, worst = np.unravel_index(np.nanargmax(acceleration), acceleration.shape)
+        given = f"{acceleration[step, worst]:.1f} m/s^2 of {fleet.ids[worst]} at step {step}"
         raise InputError("acceleration", given, f"must stay below {JUMP} m/s^2", "Try another --seed or lower cutoff.")
     return fleet
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.formats.graph import Graph, PointEdges
 from coopoc.formats.pyfg import read_pyfg
+from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import midway, turned
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
@@ -40,7 +40,7 @@ def read_graph_log(path: Path, *, dt: float = 0.1) -> Log:
     }
     refused = {what: (count, "") for what, count in left.items() if count}
     read = {what: count for what, count in read.items() if count}
-    return Log(seen, truth, Summary(path.name, steps_in_words(seen), vehicles, read, refused, {}, seen.notes), True)
+    return Log(seen, truth, Summary(path.name, steps_in_words(seen), vehicles, read, refused), True)
 
 
 def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]:
@@ -115,7 +115,7 @@ def _chained(graph: Graph, places: Ints) -> Floats:
     return path
 
 
-def _others(graph: Graph) -> Floats:
+def _others(graph: Graph) -> Bools:
     """(M,) True for relative poses of another robot."""
     pairs = graph.relative_pose.nodes.tolist()
     return np.array([graph.names[a][0] != graph.names[b][0] for a, b in pairs], dtype=bool)

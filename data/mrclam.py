@@ -8,18 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints, robust_std
+from coopoc.arrays import Bools, Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.formats.values import LARGEST, read_table, read_words
 from coopoc.short_repr import short_repr
+from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import midway, turned
-from coopoc.world.links import Links
+from coopoc.world.links import Links, wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe, schedule
 from coopoc.world.sensors import Sensors
-from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
 from .assemble import backward_difference, check_size, check_time, interpolate
@@ -303,7 +302,7 @@ def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
     return np.array(table)
 
 
-def _refuse(file: Path, wrong: Floats, allowed: str, hint: str) -> None:
+def _refuse(file: Path, wrong: Bools, allowed: str, hint: str) -> None:
     """InputError with the first line that is wrong."""
     if wrong.any():
         line, words = list(read_words(file))[int(np.argmax(wrong))]

@@ -8,10 +8,10 @@ import numpy as np
 
 from coopoc.arrays import Floats, Ints, robust_std
 from coopoc.errors import InputError
-from coopoc.world.frames import midway, turned
+from coopoc.world.body_frames import midway, turned
+from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
-from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
 from .assemble import interpolate

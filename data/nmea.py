@@ -11,7 +11,7 @@ import numpy as np
 
 from coopoc.errors import InputError, MissingLibraryError
 
-from .log.units import Rows, Tally, rows_of
+from .log.units import Rows, Summary, rows_of
 
 KNOT, DAY = 1852 / 3600, 86400.0
 LATITUDE, LONGITUDE = re.compile(r"\d\d[0-5]\d(\.\d*)?"), re.compile(r"\d{3}[0-5]\d(\.\d*)?")
@@ -20,7 +20,7 @@ SLOW = 0.5
 """m/s, below which a course over ground is noise."""
 
 
-def read_nmea(path: Path, tally: Tally, **_: Any) -> Rows:
+def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
     """Rows latitude, longitude, height (ellipsoidal: altitude and geoid separation), speed and compass_deg of a file,
     which is named after its vehicle.
 
@@ -29,7 +29,7 @@ def read_nmea(path: Path, tally: Tally, **_: Any) -> Rows:
 
     Args:
         path: .nmea file.
-        tally: counts sentences that are damaged, fixes that the receiver calls invalid, and other sentences.
+        summary: counts sentences that are damaged, fixes that the receiver calls invalid, and other sentences.
 
     Raises:
         InputError: no sentence with a fix.
@@ -47,7 +47,7 @@ def read_nmea(path: Path, tally: Tally, **_: Any) -> Rows:
     for number, line in enumerate(path.read_bytes().split(b"\n"), 1):
         start, where = line.find(b"$"), f"{path.name}: line {number}"
         if start < 0:
-            tally.refuse("lines of NMEA files that are no sentence", int(bool(line.strip())), where)
+            summary.refuse("lines of NMEA files that are no sentence", int(bool(line.strip())), where)
             continue
         try:
             sentence: Any = NMEAReader.parse(line[start:].strip() + b"\r\n")
@@ -58,9 +58,9 @@ def read_nmea(path: Path, tally: Tally, **_: Any) -> Rows:
             where += f", {next(iter(str(error).splitlines()), '')[:60].partition(' - ')[0]}"
             reason = "damaged NMEA sentences"
         if reason.startswith("NMEA"):
-            tally.unused(reason, 1)
+            summary.leave(reason, 1)
         elif reason:
-            tally.refuse(reason, 1, where)
+            summary.refuse(reason, 1, where)
     if not found.rows:
         hint = "Check that it holds GGA sentences with a fix."
         raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA", hint)

@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
 from coopoc.world.links import Links
-from coopoc.world.recording import Recording
+from coopoc.world.recording import Body, Recording
 from coopoc.world.sensing import schedule
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X

@@ -72,14 +72,15 @@ def _mrclam_log(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
     refused = {f"measurements of {what}": (number, "") for what, number in counts.items() if number}
     vehicles = dict.fromkeys(log.fleet.ids, "wheel odometry, range and bearing, Vicon")
     read = {"measurements between robots": len(log.range)}
-    summary = Summary(path.name, steps_in_words(seen), vehicles, read, refused, {}, seen.notes)
+    notes = {note: list[str]() for note in seen.notes}
+    summary = Summary(path.name, steps_in_words(seen), vehicles, read, refused, {}, notes)
     return Log(seen, log.fleet, summary, False)
 
 
 def _stored_log(path: Path) -> Log:
     seen, truth = read_recording(path)
     vehicles, grid = dict.fromkeys(seen.ids, "recorded"), f"{steps_in_words(seen)}, {seen.runs} runs"
-    return Log(seen, truth, Summary(path.name, grid, vehicles, {"links": len(seen.links)}, {}, {}, seen.notes), True)
+    return Log(seen, truth, Summary(path.name, grid, vehicles, {"links": len(seen.links)}), True)
 
 
 LOGS: Mapping[str, Callable[..., Log]] = {
@@ -281,6 +282,10 @@ def _resampled(fleet: Fleet, dt: float | None = None, **others: Any) -> Fleet:
     if dt is None:
         return fleet
     step, column = np.nonzero(fleet.present)
-    labels = {"name": fleet.name, "source": f"{fleet.source}, resampled at {dt:g} s", "licence": fleet.licence}
+    labels: dict[str, Any] = {
+        "name": fleet.name,
+        "source": f"{fleet.source}, resampled at {dt:g} s",
+        "licence": fleet.licence,
+    }
     ids = [fleet.ids[c] for c in column]
     return assemble(ids, fleet.t[step], fleet.position[step, column], dt=dt, file=fleet.name, **labels)

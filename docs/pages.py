@@ -158,12 +158,43 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
                     *(["Notes on its Track:", "", *notes, ""] if notes else []),
                     f"::: {kind.__module__}.{kind.__name__}",
                     "",
+                    *_oracle(name),
                 ]
             ),
         )
         lines.append(f"| [{look.label}]({name}.md) | `{name}` | {what} | {_rms(track, fleet):.2f} |")
     head = ["# Each method", "", "| method | name | what it does | RT-LE [m] |", "|---|---|---|---|"]
     yield "methods/index.md", "\n".join([*head, *lines, ""])
+
+
+ORACLES = {
+    "kalman": "solo",
+    "kalman-adaptive": "solo",
+    "lkf-sa": "lkf_sa",
+    "lkf-sa-edge": "joint",
+    "joint": "joint",
+    "drift": "drift",
+    "msmv-r": "msmv",
+    "ci": "covariance_intersection",
+    "split-ci": "covariance_intersection",
+    "cooperative-map": "window",
+    "cooperative-map-5": "window",
+    "mhe": "moving_horizon",
+    "gbp": "gbp",
+    "admm": "admm",
+    "central-filter": "central_filter",
+    "batch-smoother": "batch_smoother",
+}
+"""The textbook implementation of `tests/oracles` that each method is held against."""
+
+
+def _oracle(name: str) -> list[str]:
+    """The method written plainly, as the tests hold it against the compiled one."""
+    if name not in ORACLES:
+        return []
+    file = DOCS.parent / "tests" / "oracles" / f"{ORACLES[name]}.py"
+    words = f"The equations as a loop with dense matrices, one run at a time (`tests/oracles/{file.name}`)."
+    return ["## The method in plain NumPy", "", words, "", "```python", file.read_text().rstrip(), "```", ""]
 
 
 def _bounds(fleet: Any, sensors: Any) -> Iterator[tuple[str, Any]]:

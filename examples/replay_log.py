@@ -28,7 +28,7 @@ from coopoc.arrays import Floats
 from coopoc.formats.trajectories import read_kitti
 from coopoc.learned import load_method
 from coopoc.methods.kalman import ASSUMED
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 GNSS_STD = 2.5
 """m, per axis, of the simulated fixes."""

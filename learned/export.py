@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.file_names import given_path, replaceable
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from .checkpoint import Checkpoint
 from .nets.gain_net import GainNet, Memory

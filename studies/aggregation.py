@@ -53,7 +53,7 @@ def meaningful(p: Params) -> bool:
 
     `uniform` is `mean` where all clients have as many pieces.
     """
-    from coopoc.learned.federation.aggregate import rule
+    from coopoc.learned.federation.rules import rule
 
     condition, method = str(p["condition"]), str(p["method"])
     if method in BESIDE:
@@ -116,7 +116,7 @@ class Trained(NamedTuple):
 def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Trained, ...]:
     """All training seeds of a method under a condition, in one rollout."""
     from coopoc.learned import GainNet
-    from coopoc.learned.federation.federated import Plan, federate_many
+    from coopoc.learned.federation.federate import Plan, federate_many
     from coopoc.learned.federation.participation import Byzantine, Participation
 
     p = {**dict(given), "condition": condition, "method": method}

@@ -102,7 +102,7 @@ def method(name: str) -> Method:
     if name not in shipped_weights() and not given_path(name).is_file():
         raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
     learned: Any = load_method(name)
-    return CooperativeGain(learned.model, sums=False, name=name) if name == "cooperative" else learned
+    return CooperativeGain(learned.model, name) if name == "cooperative" else learned
 
 
 def information(name: str, one: Method) -> str:

@@ -22,8 +22,8 @@ from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import Panel, look
 from coopoc.study.tables import Table, crossed
+from coopoc.world.body_frames import in_world, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.frames import in_world, turned
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors

@@ -110,7 +110,7 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
             return [(seed, model.method(name, known)) for seed, model in models]
         from coopoc.learned import CooperativeGain
 
-        return [(seed, CooperativeGain(model, sums=False, name=name)) for seed, model in models]
+        return [(seed, CooperativeGain(model, name)) for seed, model in models]
     method: Method = find("coopoc.methods", name)(noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=known)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import coopoc as co
-from coopoc.world.frames import body_motion, in_world, true_heading, turned
+from coopoc.world.body_frames import body_motion, in_world, true_heading, turned
 from coopoc.world.storage import read_recording, save_recording
 
 NOISE = co.Sensors(heading_std=0.02, heading_bias_std=0.03, velocity_reading="speed")

@@ -142,23 +142,6 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Pa
         co.pose_start(co.read_log(folder, frame="body").recording)
 
 
-def test_an_azimuth_becomes_a_bearing_by_the_compass(tmp_path: Path) -> None:
-    frame, _ = table()
-    heading = {name: dict(zip(T, way, strict=True)) for name, (_, way, _, _) in drives().items()}
-    turned = frame["kind"] == "bearing"
-    here = [heading[v][t] for t, v in frame.loc[turned, ["t", "vehicle"]].to_numpy().tolist()]
-    world = frame.copy()
-    world.loc[turned, "value"] = wrapped(frame.loc[turned, "value"] + np.array(here))
-    world.loc[turned, "kind"] = "azimuth"
-    for name, part in (("a", frame), ("b", world), ("c", world[world["kind"] != "heading"])):
-        part.to_csv(tmp_path / f"{name}.csv", index=False)
-    a, b, c = (co.read_log(tmp_path / f"{name}.csv", frame="body") for name in "abc")
-    both = a.recording.relative, b.recording.relative
-    assert (np.isnan(both[0]) == np.isnan(both[1])).all()
-    np.testing.assert_allclose(np.nan_to_num(wrapped(both[0] - both[1])), 0, atol=1e-9)
-    assert any("azimuths at times without a heading" in why for why in c.summary.refused)
-
-
 def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counted(tmp_path: Path) -> None:
     frame, _ = table()
     frame = frame[~frame["kind"].isin(["x", "y"]) | (frame["vehicle"] == "mast")]
@@ -258,17 +241,6 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path) -> None
     assert error[2] < 0.8 * error[0]
     assert "600 bearings" in (tmp_path / "real" / "tables" / "rt_le.md").read_text()
     assert any(text.startswith("K = 1 without a landmark") for text in find_study("real").found(results).values())
-
-
-def test_without_a_truth_the_study_scores_innovations(tmp_path: Path) -> None:
-    folder = written(tmp_path / "log", noise=1.0)
-    (folder / "truth.csv").unlink()
-    settings = {"data": f"{folder}?frame=body", "max_neighbours": "0,2", "landmarks": "1"}
-    results = co.run_study("real", tmp_path, settings=settings, progress=False)
-    assert results.failed == 0
-    assert "rt_le_m" not in results.frame
-    assert set(results.frame["method"]) == {"pose-fleet", "pose-intersection", "pose-naive"}
-    assert {file.stem for file in (tmp_path / "real" / "tables").glob("*.md")} == {"innovation", "bytes"}
 
 
 def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:

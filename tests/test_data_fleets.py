@@ -33,14 +33,6 @@ def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
     assert card.sha256 in card.render()
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_velocity_is_exactly_the_step_over_dt(name: str) -> None:
-    fleet = load_fleet(name)
-    error = fleet.position[1:] - fleet.position[:-1] - fleet.dt * fleet.velocity[1:]
-    assert np.nanmax(np.abs(error)) < 1e-12
-    assert np.array_equal(fleet.velocity[0], fleet.velocity[1])
-
-
 @pytest.mark.parametrize("name", ["town10", "town10-validation", "town04"])
 def test_card_counts_the_neighbours_that_a_kd_tree_finds(name: str) -> None:
     """Independent check: SciPy's cKDTree."""
@@ -126,9 +118,3 @@ def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Pat
         load_fleet(tmp_path / "a.csv", colums={})
     with pytest.raises(InputError, match="vehicle_lenght"):
         load_fleet(tmp_path / "a.csv", vehicle_lenght=4)
-
-
-def test_a_bundled_fleet_can_be_resampled() -> None:
-    fleet, coarse = load_fleet("town10"), load_fleet("town10", dt=0.3)
-    assert coarse.dt == 0.3
-    np.testing.assert_allclose(coarse.position, fleet.position[::3], atol=1e-9)

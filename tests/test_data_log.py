@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -177,29 +178,6 @@ def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path: Path) 
     assert bridged.stretches("car2") == ((0, 200),)
 
 
-def test_numbers_are_counted_once(tmp_path: Path) -> None:
-    """Rows are read, refused, or stand in the file: the counts add up."""
-    frame = long(seen(drive(2), k=1), messages=False)
-    double = pd.concat([frame, frame[frame["kind"] == "range"].iloc[:7], frame[frame["kind"] == "x"].iloc[:5]])
-    summary = read_log(write(double, tmp_path / "log.csv")).summary
-    assert summary.read["ranges"] == (frame["kind"] == "range").sum()
-    assert summary.refused["relative measurements beside a nearer one of the same pair, kind and step"][0] == 7
-    assert summary.refused["repeated rows (same time, vehicle and kind)"][0] == 5
-    assert "log.csv: row" in str(summary)
-
-
-@pytest.mark.parametrize("parts", [("range",), ("azimuth",), ("range", "azimuth"), ("range", "azimuth", "inclination")])
-def test_any_subset_of_a_relative_measurement_is_used(tmp_path: Path, parts: tuple[str, ...]) -> None:
-    fleet = drive(4)
-    true = seen(fleet)
-    frame = long(true, messages=False)
-    others = [kind for kind in ("range", "azimuth", "inclination") if kind not in parts]
-    rec = read_log(write(frame[~frame["kind"].isin(others)], tmp_path / "log.csv")).recording
-    solo = float(co.rt_le(co.Kalman()(rec, [1]), fleet).mean())
-    joint = float(co.rt_le(co.JointFilter()(rec, [1]), fleet).mean())
-    assert joint < solo
-
-
 def thinned(frame: pd.DataFrame, every: int = 10) -> pd.DataFrame:
     """Fixes at a tenth of the rate."""
     fix = frame["kind"].isin(["x", "y", "z"])
@@ -218,28 +196,6 @@ def test_methods_run_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
     assert np.isfinite(rec.gnss[0, :, 0, 0]).sum() == 20
     error = float(co.rt_le(METHODS[name]("nominal")(rec, ["car1"]), fleet).mean())
     assert error < 2.2, "a fix is 2.2 m off"
-
-
-WHOLE = ("gbp", "admm", "central-filter", "batch-smoother", "mds", "qcqp-relaxation")
-
-
-@pytest.mark.parametrize("name", WHOLE)
-def test_methods_of_a_fleet_run_on_ranges_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
-    fleet = drive(4, gap=24.0)
-    frame = thinned(long(seen(fleet), messages=False))
-    frame = frame[~frame["kind"].isin(["azimuth", "inclination"])]
-    rec = read_log(write(frame, tmp_path / "log.csv")).recording
-    error = float(co.rt_le(METHODS[name]("nominal")(rec, ["car1"]), fleet).mean())
-    assert error < 3.0
-
-
-@pytest.mark.parametrize("name", [*COOPERATIVE, *WINDOWS])
-def test_methods_run_while_others_come_and_go(tmp_path: Path, name: str) -> None:
-    frame = thinned(long(seen(drive(4), rate=2.0, loss=0.3)))
-    away = (frame["vehicle"] == "car2") & frame["t"].between(5, 12)
-    rec = read_log(write(frame[~away], tmp_path / "log.csv")).recording
-    track = METHODS[name]("nominal")(rec, ["car1"])
-    assert float(co.rt_le(track, drive(4)).mean()) < 2.2
 
 
 def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path: Path) -> None:
@@ -266,3 +222,78 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path: Pat
     assert log.recording.sensors.velocity_floor == pytest.approx(np.sqrt((0.1**2 + 4 * (10 * 0.05) ** 2) / 2), rel=0.01)
     track = co.Kalman()(log.recording, list(log.recording.ids))
     assert 1.2 < nees(track, log.truth)[:, 100:].mean() < 2.8
+
+
+LATE = 0.04
+"""s, behind every step of 0.1 s."""
+MAST = np.array([40.0, 60.0])
+
+
+def straight(t: Any) -> dict[str, Any]:
+    """Two cars that pass each other at 25 m/s."""
+    here = np.asarray(t, dtype=float)
+    return {"east": np.array([15 * here - 100, 0 * here]), "west": np.array([60 - 10 * here, 4 + 0 * here])}
+
+
+def circle(t: float) -> tuple[Any, float]:
+    """Place m and heading rad of a car at 6 m/s that turns by 0.5 rad/s."""
+    return np.array([12 * np.sin(0.5 * t), -12 * np.cos(0.5 * t)]), 0.5 * t
+
+
+def read_rows(rows: list[tuple[Any, ...]], folder: Path, **options: Any) -> co.Recording:
+    file = folder / "log.csv"
+    pd.DataFrame(rows, columns=["t", "vehicle", "kind", "partner", "value"]).to_csv(file, index=False)
+    return co.load_recording(file, **options)
+
+
+@pytest.mark.parametrize("late", [0.0, LATE, -LATE])
+def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path: Path, late: float) -> None:
+    """Moved by the nearest step alone, ranges were wrong by 1 m."""
+    rows: list[tuple[Any, ...]] = [(0.0, "mast", kind, "", MAST[k]) for k, kind in enumerate("xy")]
+    for t in np.round(np.arange(0, 8, 0.1), 1):
+        at = straight(t)
+        for name, speed in (("east", 15.0), ("west", -10.0)):
+            rows += [(t, name, kind, "", value) for kind, value in zip(("x", "y"), at[name], strict=True)]
+            rows += [(t, name, "vx", "", speed), (t, name, "vy", "", 0.0)]
+        then = straight(t + late)
+        for other, place in (("west", then["west"]), ("mast", MAST)):
+            gap = place - then["east"]
+            rows += [(t + late, "east", "range", other, np.hypot(*gap))]
+            rows += [(t + late, "east", "azimuth", other, np.arctan2(gap[1], gap[0]))]
+    found = read_rows(rows, tmp_path)
+    links, place = found.links, found.gnss[0]
+    gap = (place[links.step, links.neighbour] - place[links.step, links.observer])[:, :2]
+    far = np.hypot(*gap.T) > 12.0  # nearer, fixes would not know the direction
+    assert far.sum() > 120
+    np.testing.assert_allclose(found.relative[0, far, 0], np.hypot(*gap[far].T), atol=1e-9)
+    np.testing.assert_allclose(found.relative[0, far, 1], np.arctan2(gap[far, 1], gap[far, 0]), atol=1e-9)
+    assert np.isfinite(found.relative[0]).all()
+    assert (found.relative[0, :, 0] > 0).all()
+
+
+@pytest.mark.parametrize("late", [LATE, -LATE])
+def test_bearings_in_body_frames_turn_with_the_car(tmp_path: Path, late: float) -> None:
+    """A bearing alone is turned; a range and a bearing of what stands are moved, too."""
+    rows: list[tuple[Any, ...]] = []
+    for name, place in (("mast", MAST), ("far", 1e6 * MAST)):
+        rows += [(0.0, name, kind, "", value) for kind, value in zip(("x", "y"), place, strict=True)]
+    for t in np.round(np.arange(0, 6, 0.1), 1):
+        place, _ = circle(t)
+        rows += [(t, "car", "speed", "", 6.0), (t, "car", "yaw_rate", "", 0.5)]
+        rows += [(t, "car", kind, "", value) for kind, value in zip(("x", "y"), place, strict=True)]
+        then, heading = circle(t + late)
+        for name, other in (("mast", MAST), ("far", 1e6 * MAST)):
+            gap = other - then
+            bearing = np.arctan2(gap[1], gap[0]) - heading
+            rows.append((t + late, "car", "bearing", name, np.arctan2(np.sin(bearing), np.cos(bearing))))
+            if name == "mast":
+                rows.append((t + late, "car", "range", name, np.hypot(*gap)))
+    found = read_rows(rows, tmp_path, frame="body", any_scale=True)
+    assert len(found.links) >= 118
+    for step, neighbour, relative in zip(found.links.step, found.links.neighbour, found.relative[0], strict=True):
+        place, heading = circle(found.t[step])
+        gap = (MAST if found.ids[neighbour] == "mast" else 1e6 * MAST) - place
+        off = relative[1] - np.arctan2(gap[1], gap[0]) + heading
+        assert np.arctan2(np.sin(off), np.cos(off)) == pytest.approx(0, abs=1e-4)
+        if found.ids[neighbour] == "mast":
+            assert relative[0] == pytest.approx(np.hypot(*gap), abs=5e-3)

@@ -94,20 +94,6 @@ def test_links_are_the_real_measurements(log: MrclamLog) -> None:
     assert (sees < 0.135).all()
 
 
-@present
-def test_fewer_neighbours_are_the_nearest_ones_and_zero_is_none(log: MrclamLog) -> None:
-    four, one, none = (recording(log, V2X(max_neighbours=k)) for k in (4, 1, 0))
-    assert len(none.links) == 0
-    pairs = np.column_stack([one.links.step, one.links.observer])
-    assert len(np.unique(pairs, axis=0)) == len(pairs) < len(four.links)
-    nearest: dict[tuple[int, int], float] = {}
-    for step, observer, metres in zip(four.links.step, four.links.observer, four.relative[0, :, 0], strict=True):
-        key = (int(step), int(observer))
-        nearest[key] = min(float(metres), nearest.get(key, np.inf))
-    kept = zip(one.links.step.tolist(), one.links.observer.tolist(), one.relative[0, :, 0].tolist(), strict=True)
-    assert {(step, observer): metres for step, observer, metres in kept} == nearest
-
-
 def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:
     """Robots that drive side by side for 3 s at unix time, 1 m apart, and measure the next one."""
     folder.mkdir(exist_ok=True)
@@ -178,10 +164,3 @@ def test_robots_share_an_interval(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match=r"has no Robot1_Groundtruth\.dat"):
         load_fleet(tmp_path / "empty", format="mrclam")
-
-
-def test_a_longer_gap_of_truth_is_bridged_if_asked(tmp_path: Path) -> None:
-    lines = (small(tmp_path) / "Robot1_Groundtruth.dat").read_text().split("\n")
-    (tmp_path / "Robot1_Groundtruth.dat").write_text("\n".join(lines[:6] + lines[16:]))
-    absent = [int((~load_fleet(tmp_path, **gap).present[:, 0]).sum()) for gap in ({}, {"max_gap": 1.2})]
-    assert absent == [10, 0]

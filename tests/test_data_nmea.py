@@ -117,17 +117,6 @@ def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d(shared: Path) -> None:
     np.testing.assert_allclose(log.recording.gnss[0, :100, 0], wanted, atol=1e-5)
 
 
-@pytest.mark.slow
-def test_the_gap_of_the_third_cats_car_is_one(shared: Path) -> None:
-    """Stated for this set: one gap of 221.5 s in car 3."""
-    pytest.importorskip("pynmeagps")
-    rec = co.load_recording(shared / "cats_nmea", dt=0.5)
-    stretches = [rec.stretches(f"AV_veh{k}") for k in (1, 2, 3, 4)]
-    assert [len(one) for one in stretches] == [1, 1, 2, 1]
-    (_, left), (back, _) = stretches[2]
-    assert (back - left) * rec.dt == pytest.approx(221.5, abs=1.1)
-
-
 @pytest.mark.parametrize("ros", [1, 2])
 def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     """Written here: fixes, odometry and imu of two vehicles, a truth by PoseStamped, and a topic of another kind."""

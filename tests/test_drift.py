@@ -25,7 +25,7 @@ from coopoc import (
 )
 from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.world.body_sensing import gauss_markov
+from coopoc.world.body_frames import gauss_markov
 
 WHITE = Sensors(gnss_std=(1.5, 1.5, 1.5))
 OWN = replace(WHITE, gnss_drift_std=2.0, gnss_drift_time=5.0)

@@ -12,7 +12,7 @@ from coopoc import V2X, Fleet, Sensors, observe, run_study
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies.views import of
 from coopoc.study import numbers
-from coopoc.world.spherical import wrap
+from coopoc.world.links import wrap
 
 NOISE = Sensors(heading_std=0.05)
 BIAS = Sensors(heading_bias_std=0.05)

@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from coopoc import V2X, CooperativeMAP, Fleet, JointFilter, NoiseModel, Sensors, observe
 from coopoc.kernels.compiling import compile as kernels
 from coopoc.world.inbox import inbox
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 pytest.importorskip("numba")

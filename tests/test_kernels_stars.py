@@ -8,7 +8,7 @@ from filterpy.kalman import KalmanFilter
 
 from coopoc import LKFSA, MSMV, V2X, Fleet, NoiseModel, Sensors, observe
 from coopoc.kernels.compiling.vectors import LANES
-from coopoc.world.spherical import to_vector, vector_cov
+from coopoc.world.links import to_vector, vector_cov
 
 S2 = Sensors.paper_scenario2()
 KNOWN = {

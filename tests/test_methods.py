@@ -13,7 +13,7 @@ from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, 
 from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.methods.sliding_window import FixedLagSmoother
 from coopoc.methods.star import FORGOTTEN
-from coopoc.world.spherical import spherical, to_vector
+from coopoc.world.links import spherical, to_vector
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)

@@ -12,7 +12,7 @@ from test_pose_methods import WHITE, convoy, observed
 import coopoc as co
 from coopoc.evaluate.metrics import pose_covariance
 from coopoc.learned.pose_noise import PoseTask, fit_pose_noise, log_score
-from coopoc.world.frames import true_heading
+from coopoc.world.body_frames import true_heading
 
 
 def test_the_log_score_is_the_density_of_the_truth() -> None:

@@ -13,7 +13,7 @@ import coopoc as co
 from coopoc.methods.poses.pose_factors import PoseRun, pose_subgraph
 from coopoc.methods.poses.pose_smoother import PoseSmoother
 from coopoc.optimize import Problem, solve
-from coopoc.world.frames import true_heading
+from coopoc.world.body_frames import true_heading
 
 NOISE = co.Sensors(
     gnss_std=(1.5, 1.5, 1.5),

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import coopoc as co
@@ -14,7 +13,7 @@ from coopoc.data.commands import check as data_check
 from coopoc.data.graphs import graph_recording
 from coopoc.data.registry import load_log
 from coopoc.formats.pyfg import read_pyfg
-from coopoc.world.frames import body_motion
+from coopoc.world.body_frames import body_motion
 
 
 @pytest.fixture(scope="module")
@@ -80,41 +79,6 @@ def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
         graph_recording(read_pyfg(file))
     with pytest.raises(co.InputError, match="share two steps"):
         graph_recording(read_pyfg(file), dt=5.0)
-
-
-def circles(folder: Path) -> Path:
-    """A log without noise of two cars on circles, which measure each other and two masts."""
-    rows: list[tuple[object, ...]] = []
-    masts = {"mast": np.array([30.0, 5.0]), "tower": np.array([-20.0, 40.0])}
-    for t in np.round(np.arange(0, 5, 0.1), 1):
-        cars = {
-            name: (r * np.array([np.cos(w * t), np.sin(w * t)]), w * t + np.pi / 2, r * w, w)
-            for name, r, w in (("red", 10.0, 0.5), ("blue", 16.0, 0.3))
-        }
-        for name, (place, heading, speed, rate) in cars.items():
-            rows += [(t, name, "speed", "", speed, 0.1), (t, name, "yaw_rate", "", rate, 0.02)]
-            others = {**masts, **{other: cars[other][0] for other in cars if other != name}}
-            for other, there in others.items():
-                gap = there - place
-                rows.append((t, name, "range", other, float(np.hypot(*gap)), 0.2))
-                if (name, other) != ("red", "tower"):
-                    bearing = np.arctan2(gap[1], gap[0]) - heading
-                    rows.append((t, name, "bearing", other, np.arctan2(np.sin(bearing), np.cos(bearing)), 0.02))
-            if t in (0.0, 2.0):
-                rows += [(t, name, axis, "", value, 0.5) for axis, value in zip("xy", place, strict=True)]
-    rows += [(0.0, name, axis, "", v, 0.1) for name, at in masts.items() for axis, v in zip("xy", at, strict=True)]
-    columns = ["t", "vehicle", "kind", "partner", "value", "std"]
-    pd.DataFrame(rows, columns=columns).to_csv(folder / "circles.csv", index=False)
-    return folder / "circles.csv"
-
-
-def test_one_landmark_alone_gives_no_heading(tmp_path: Path) -> None:
-    """The drive may be turned about it; before, some heading was taken."""
-    frame = pd.read_csv(circles(tmp_path))
-    alone = (frame["vehicle"].isin(["red", "mast"])) & ~((frame["vehicle"] == "red") & frame["kind"].isin(["x", "y"]))
-    frame[alone & ~frame["partner"].isin(["tower", "blue"])].to_csv(tmp_path / "log.csv", index=False)
-    with pytest.raises(co.InputError, match="red sees one landmark alone"):
-        co.pose_start(co.read_log(tmp_path / "log.csv", frame="body").recording)
 
 
 def test_points_and_poses_of_others_are_ranges_and_bearings(shared: Path) -> None:

@@ -13,7 +13,7 @@ import coopoc as co
 from coopoc.data.mrclam import MrclamLog, read_mrclam
 from coopoc.data.mrclam_poses import Calibration, calibrate, grouped, pose_recording, summed
 from coopoc.studies.pose_drives import thinned
-from coopoc.world.body_sensing import gauss_markov
+from coopoc.world.body_frames import gauss_markov
 from coopoc.world.v2x import V2X
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
@@ -57,16 +57,6 @@ def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen: co
     assert np.isnan(seen.gnss[:, :, :5]).all()
     assert seen.body is not None
     assert np.isnan(seen.body.heading).all()
-
-
-def test_thinning_leaves_the_first_part_and_the_robots(seen: co.Recording) -> None:
-    few = thinned(seen, 2, 3000)
-    late = few.links.step >= 3000
-    assert (~late).sum() == (seen.links.step < 3000).sum()
-    assert len(np.unique(few.links.neighbour[late & (few.links.neighbour >= 5)])) == 2
-    robots = seen.links.neighbour < 5
-    assert (few.links.neighbour < 5).sum() == robots.sum()
-    assert not (thinned(seen, 0, 0).links.neighbour >= 5).any()
 
 
 def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened() -> None:

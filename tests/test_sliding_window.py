@@ -29,8 +29,8 @@ from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.star import ACCELERATION_STD
 from coopoc.optimize import Problem, solve
 from coopoc.world.inbox import inbox
+from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import spherical, to_vector, wrap
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)

@@ -15,7 +15,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.metrics import rt_le
 from coopoc.fleets import load_fleet
 from coopoc.learned import GainNet
-from coopoc.learned.federation.federated import federate
+from coopoc.learned.federation.federate import federate
 from coopoc.methods.catalogue import METHODS
 from coopoc.studies import ablation, aggregation, backends, scene
 from coopoc.study.publish import views as published

@@ -15,12 +15,11 @@ from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
 from ..methods.star import FORGOTTEN
 from ..world.axes import columns
+from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet
-from ..world.frames import body_motion, midway, true_heading, turned
-from ..world.links import Links
+from ..world.links import Links, spherical, vector_cov
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
-from ..world.spherical import spherical, vector_cov
 from ..world.v2x import V2X
 
 UNKNOWN_HEADING = 3.0 / np.pi**2

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..methods.track import Track
-from ..world.frames import turned
+from ..world.body_frames import turned
 from ..world.recording import Recording
 
 

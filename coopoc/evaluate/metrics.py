@@ -12,10 +12,10 @@ from ..errors import InputError
 from ..kernels.scores import distances, normalised, root_mean_squares
 from ..methods.track import Track
 from ..plugins import find
+from ..world.body_frames import true_heading
 from ..world.fleet import Fleet
-from ..world.frames import true_heading
+from ..world.links import wrap
 from ..world.recording import Recording
-from ..world.spherical import wrap
 
 
 def errors(track: Track, fleet: Fleet) -> Floats:

@@ -14,9 +14,9 @@ from ..plugins import suggestion
 from ..short_repr import short_repr
 from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet
+from ..world.links import vector_cov
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
-from ..world.spherical import vector_cov
 
 
 @dataclass(frozen=True, eq=False)

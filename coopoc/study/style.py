@@ -73,7 +73,6 @@ METHODS = {
     "central-filter": Look("Whole-fleet filter", "#444E86", "s"),
     "batch-smoother": Look("Whole-fleet smoother", "#111E6C", "D"),
     "pose-solo": Look("Pose filter, solo", "#C98A00", "v"),
-    "pose-star": Look("Pose filter, star", "#00785A", "h"),
     "pose-fleet": Look("Pose filter, one state", BLUE, "o"),
     "pose-learned": Look("Pose filter, learned noise", "#009E73", "s"),
     "pose-naive": Look("Decentralised, naive", VERMILLION, "X"),

@@ -12,20 +12,16 @@ from ..arrays import AnyArray, Bools, Floats, Ints, instance, number
 from ..errors import InputError
 from ..plugins import one_of
 from .axes import columns
-from .body_sensing import body_measurements, gauss_markov, in_body
+from .body_frames import body_measurements, gauss_markov, in_body
 from .fleet import Fleet
-from .links import Links
-from .noise import stream
+from .links import Links, spherical, wrap
 from .recording import Recording
-from .sensors import Sensors
-from .spherical import spherical, wrap
+from .sensors import Sensors, stream
 from .v2x import V2X, lost
 
 Frame = Literal["world", "body"]
 PAIRS = 2_000_000
 """Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
-GRID = 1000
-"""Cells along each side of the ground, at most."""
 VECTOR = np.dtype((np.void, 24))
 """Three numbers."""
 _alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()
@@ -122,7 +118,7 @@ def find_links(
 ) -> Links:
     """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance.
 
-    Vehicles at one distance come by column. Near vehicles are looked up in a grid: linear in vehicles and steps.
+    Vehicles at one distance come by column. Near vehicles are looked up in a k-d tree.
 
     Args:
         fleet: the truth.
@@ -154,28 +150,25 @@ def find_links(
 
 
 def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
-    """Places (step x vehicles + column) of observers and of all vehicles in their cell or the eight around it.
+    """Indices (step x vehicles + column) of observers and of all vehicles about within the radius.
 
     Args:
         position: (T, N, 3) m, NaN where absent.
         columns: of the observers.
-        radius: m, cells are no smaller.
+        radius: m.
     """
+    from scipy.spatial import KDTree
+
     vehicles = position.shape[1]
     here = np.flatnonzero(np.isfinite(position[..., 0]))
-    ground = position.reshape(-1, 3)[here, :2]
-    low, high = ground.min(axis=0, initial=np.inf), ground.max(axis=0, initial=-np.inf)
-    side = max(1.001 * radius, float((high - low).max(initial=0.0)) / GRID, 1e-9)
-    cell = np.floor((ground - low) / side).astype(np.int64) + 1
-    width = GRID + 3  # an empty row and column around the cells of each step
-    key = ((here // vehicles) * width + cell[:, 0]) * width + cell[:, 1]
-    order = np.argsort(key, kind="stable")
-    looks = np.isin(np.arange(vehicles), columns)[here % vehicles]
-    rows = key[looks][:, None] + width * np.arange(-1, 2)
-    begin, end = np.searchsorted(key[order], rows - 1), np.searchsorted(key[order], rows + 1, side="right")
-    count = (end - begin).ravel()
-    place = np.repeat(begin.ravel() - np.cumsum(count) + count, count) + np.arange(count.sum())
-    return np.repeat(here[looks], (end - begin).sum(axis=1)), here[order[place]]
+    place = position.reshape(-1, 3)[here]
+    span = float(np.ptp(place, axis=0).max()) if len(place) else 0.0
+    reach = 1.001 * min(radius, 2.0 * span) + 1e-9
+    tagged = np.column_stack([place, 4.0 * reach * (here // vehicles)])  # those of other steps are far away
+    looks = np.isin(here % vehicles, columns)
+    observers, everyone = (KDTree(each, 32, False, balanced_tree=False) for each in (tagged[looks], tagged))
+    pairs = observers.sparse_distance_matrix(everyone, reach, output_type="ndarray")
+    return here[looks][pairs["i"]], here[pairs["j"]]
 
 
 def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:

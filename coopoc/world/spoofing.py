@@ -9,8 +9,8 @@ import numpy as np
 
 from ..arrays import number
 from ..errors import InputError
-from .noise import stream
 from .recording import Recording
+from .sensors import stream
 
 MOST = 1e9
 """m, no offset is larger."""

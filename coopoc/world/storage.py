@@ -17,10 +17,9 @@ import numpy as np
 from ..arrays import AnyArray
 from ..errors import InputError
 from ..file_names import given_path
-from .body import Body
 from .fleet import Fleet
 from .links import Links
-from .recording import Recording
+from .recording import Body, Recording
 from .sensors import Sensors
 from .v2x import V2X
 

@@ -12,7 +12,7 @@ from coopoc.errors import InputError
 from coopoc.world.sensors import Sensors
 
 from .motion import samples
-from .units import ANGLES, KINDS, Rows, Tally, stacked
+from .units import ANGLES, KINDS, Rows, Summary, stacked
 
 DEGREES = ("latitude", "longitude", "height")
 ENU = (("x", "longitude"), ("y", "latitude"), ("z", "height"))
@@ -82,10 +82,10 @@ def local(rows: Rows, origin: Origin | None) -> Rows:
     value, kind, std = rows.value.copy(), rows.kind.copy(), rows.std.copy()
     for name in dict.fromkeys(kind.tolist()):
         one, here = KINDS[name], rows.kind == name
-        value[here] = one.turn * one.scale * value[here] + one.offset
+        value[here] = one.scale * value[here] + one.offset
         if one.name in ANGLES[:3]:
             value[here] = np.arctan2(np.sin(value[here]), np.cos(value[here]))
-        std[here] *= one.scale
+        std[here] *= abs(one.scale)
         kind[here] = one.name
     rows = replace(rows, value=value, kind=kind, std=std)
     geodetic = rows.of(*DEGREES)
@@ -94,7 +94,7 @@ def local(rows: Rows, origin: Origin | None) -> Rows:
     parts, heights = [rows.take(~geodetic)], rows.of("height").any()
     for name in dict.fromkeys(rows.vehicle[geodetic].tolist()):
         mine = rows.take(geodetic & (rows.vehicle == name))
-        fixes, first = samples(mine, DEGREES, Tally(), 3 if heights else 2)
+        fixes, first = samples(mine, DEGREES, Summary(), 3 if heights else 2)
         at = fixes.value if heights else np.column_stack([fixes.value[:, :2], np.full(len(fixes.t), origin[2])])
         enu, base = to_enu(at, origin), mine.take(first)
         for axis, (to, what) in enumerate(ENU[: 3 if heights else 2]):
@@ -135,7 +135,7 @@ def _earth_centred(geodetic: Floats) -> Floats:
     return np.column_stack([across * np.cos(longitude), across * np.sin(longitude), up])
 
 
-def assumed(rows: Rows, planar: bool, body: bool, tally: Tally, dt: float) -> Sensors:
+def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
@@ -144,7 +144,7 @@ def assumed(rows: Rows, planar: bool, body: bool, tally: Tally, dt: float) -> Se
         rows: in SI units and metres.
         planar: whether no height was logged.
         body: whether the recording is in body frames.
-        tally: takes what is assumed.
+        summary: takes what is assumed.
         dt: s, of the recording.
     """
     base, used = Sensors(), set(rows.kind.tolist())
@@ -159,17 +159,17 @@ def assumed(rows: Rows, planar: bool, body: bool, tally: Tally, dt: float) -> Se
             low, high = np.percentile(every, [2, 98])
             if high > VARIED * low:
                 what = f"{low:.3g} to {high:.3g} {unit}"
-                tally.assume(f"one standard deviation of {names[0]} for all, {level:.3g} {unit}; the log has {what}")
+                summary.assume(f"one standard deviation of {names[0]} for all, {level:.3g} {unit}; the log has {what}")
             return level
         if used & set(names):
-            tally.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
+            summary.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
         return default
 
     x, y, z = base.gnss_std
     up = PLANE_STD if planar else of("z", default=z, unit="m")
     speed = of(*MOTION, default=0.0, unit="m/s") if {*MOTION} & set(given) else None
     if speed is None:
-        tally.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")
+        summary.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")
     turned = body or ("heading" in given and "bearing" in used)
     found = replace(
         base,
@@ -187,7 +187,7 @@ def assumed(rows: Rows, planar: bool, body: bool, tally: Tally, dt: float) -> Se
         return found
     if not body and {"speed", "heading"} <= set(given):
         speed = _across(speed, of("heading", default=0.0, unit="rad"), rows, dt)
-        tally.assume(f"{speed:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds")
+        summary.assume(f"{speed:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds")
     return replace(found, velocity_std_ratio=0.0, velocity_floor=speed)
 
 

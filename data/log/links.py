@@ -10,16 +10,15 @@ import numpy as np
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links
+from coopoc.world.links import Links, spherical, to_vector, wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import schedule
-from coopoc.world.spherical import spherical, to_vector, wrap
 from coopoc.world.v2x import V2X
 
 from ..assemble import SAME
 from ..planar import first_of_each
 from .motion import COURSE, Member, Steps
-from .units import Rows, Tally
+from .units import Rows, Summary
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
 NEAR = 10.0
@@ -72,7 +71,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps) -> Linked:
     was logged at all, every vehicle sends at every step and all arrives at once.
     """
     there = np.stack([np.isfinite(one.velocity[:, 0]) for one in members.values()], axis=1)
-    tally, sent = steps.tally, rows.take(rows.of("message"))
+    summary, sent = steps.summary, rows.take(rows.of("message"))
     pairs, component, value = _measured(rows.take(rows.in_group("relative")), members, there, steps)
     messages, arrived, broadcasts = _messages(sent, tuple(members), there, steps)
     keys, index = np.unique(np.concatenate([pairs, messages]), axis=0, return_inverse=True)
@@ -84,14 +83,14 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps) -> Linked:
         flat = np.isfinite(relative[:, :2]).all(axis=1) & np.isnan(relative[:, 2])
         relative[flat, 2] = np.pi / 2
         if flat.any():
-            tally.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")
+            summary.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")
     if not len(sent):
         arrival, broadcasts = keys[:, 0].copy(), there
         if len(keys):
-            tally.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
+            summary.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
     words = ("ranges", "bearings" if steps.body else "azimuths", "inclinations or elevations")
     for k, what in enumerate(words):
-        tally.count(what, int(np.isfinite(relative[:, k]).sum()) if (component == k).any() else 0)
+        summary.count(what, int(np.isfinite(relative[:, k]).sum()) if (component == k).any() else 0)
     order = np.lexsort((np.nan_to_num(relative[:, 0], nan=np.inf), keys[:, 1], keys[:, 0]))
     return Linked(Links(*keys[order].T), relative[order], broadcasts, arrival[order])
 
@@ -130,14 +129,14 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     return replace(recording, links=fewer, broadcasts=broadcasts, v2x=v2x, **parts)
 
 
-def of_vehicles(rows: Rows, landmarks: Collection[str], tally: Tally) -> Rows:
+def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
     """Rows in which vehicles measure: a range that a landmark measured is one to it; whatever else it measured or sent
     says nothing without its heading."""
     mine, theirs = (np.isin(names, list(landmarks)) for names in (rows.vehicle, rows.partner))
     turned = mine & ~theirs & rows.of("range")
     vehicle, partner = (np.where(turned, b, a) for a, b in ((rows.vehicle, rows.partner), (rows.partner, rows.vehicle)))
     left = mine & ~turned & rows.in_group("relative", "message")
-    tally.refuse_rows("messages of landmarks, and what they measured but ranges to vehicles", rows, left)
+    summary.refuse_rows("messages of landmarks, and what they measured but ranges to vehicles", rows, left)
     return replace(rows, vehicle=vehicle, partner=partner).take(~left)
 
 
@@ -150,7 +149,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     """(M, 3) step, observer, neighbour, (M,) component, and (M,) range m, azimuth (in body frames bearing) rad or
     inclination rad, one of each."""
     observer, partner = (_columns(names, tuple(members)) for names in (rows.vehicle, rows.partner))
-    (step, _), body, tally = steps.nearest(rows.t), steps.body, steps.tally
+    (step, _), body, summary = steps.nearest(rows.t), steps.body, steps.summary
     lag = rows.t - steps.grid[step]
     value = rows.value.copy()
     component = np.array([COMPONENTS[kind] for kind in rows.kind.tolist()], dtype=np.int64)
@@ -159,7 +158,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
         mine = turned & (observer == column)
         value[mine] += (-1 if body else 1) * one.heading(rows.t[mine]) if one.heading is not None else np.nan
         if mine.any() and one.course:
-            tally.assume(COURSE.format("{}", one.course), name)
+            summary.assume(COURSE.format("{}", one.course), name)
     value[turned] = np.arctan2(np.sin(value[turned]), np.cos(value[turned]))
     known, inside = (observer >= 0) & (partner >= 0), step >= 0
     both = known & inside & there[step, observer] & there[step, partner]
@@ -169,7 +168,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
         (known & inside & ~both, "relative measurements while one of the two is absent"),
         (both & np.isnan(value), f"{'azimuths' if body else 'bearings'} at times without a heading"),
     ):
-        tally.refuse_rows(reason, rows, wrong)
+        summary.refuse_rows(reason, rows, wrong)
     good = np.flatnonzero(both & np.isfinite(value))
     good = good[np.argsort(np.abs(lag[good]), kind="stable")]
     seen = Measured(value[good], component[good], step[good], lag[good], observer[good], partner[good])
@@ -178,20 +177,20 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     keys = np.column_stack([seen.step, seen.observer, seen.partner, seen.component])
     first = np.unique(keys, axis=0, return_index=True)[1]
     again = np.sort(np.delete(good, first))
-    tally.refuse_rows("relative measurements beside a nearer one of the same pair, kind and step", rows, again)
+    summary.refuse_rows("relative measurements beside a nearer one of the same pair, kind and step", rows, again)
     return keys[first, :3], keys[first, 3], brought[first]
 
 
 def _messages(rows: Rows, ids: Sequence[str], there: Bools, steps: Steps) -> tuple[Ints, Ints, Bools]:
     """(M, 3) step sent, receiver, sender, (M,) step of arrival or -1, and (T, N) who sends when."""
     sender, receiver, every = _columns(rows.vehicle, ids), _columns(rows.partner, ids), np.arange(len(ids))
-    (step, _), tally = steps.nearest(rows.t), steps.tally
+    (step, _), summary = steps.nearest(rows.t), steps.summary
     sent = (sender >= 0) & (step >= 0) & there[step, sender]
     to_all = rows.partner == ""
     here = there[step, receiver] & (receiver >= 0)
-    tally.refuse_rows("messages of a sender that is absent or has no position", rows, ~sent)
+    summary.refuse_rows("messages of a sender that is absent or has no position", rows, ~sent)
     reason = "messages to a receiver that is absent or has no position"
-    tally.refuse_rows(reason, rows, sent & ~to_all & ~here)
+    summary.refuse_rows(reason, rows, sent & ~to_all & ~here)
     broadcasts = np.zeros(there.shape, dtype=bool)
     broadcasts[step[sent], sender[sent]] = True
     meant = np.where(to_all[:, None], sender[:, None] != every, receiver[:, None] == every)
@@ -204,9 +203,9 @@ def _messages(rows: Rows, ids: Sequence[str], there: Bools, steps: Steps) -> tup
     first: Ints = np.full(len(keys), never)
     np.minimum.at(first, index.reshape(-1), arrived)
     _, once = np.unique(index, return_index=True)
-    tally.refuse_rows("messages beside another of the same pair and step", rows, np.sort(np.delete(k, once)))
-    tally.count("messages", int(sent.sum()))
-    tally.count("messages that were lost", int(np.isinf(rows.arrival[sent]).sum()))
+    summary.refuse_rows("messages beside another of the same pair and step", rows, np.sort(np.delete(k, once)))
+    summary.count("messages", int(sent.sum()))
+    summary.count("messages that were lost", int(np.isinf(rows.arrival[sent]).sum()))
     return keys.reshape(-1, 3), np.where(first == never, -1, first), broadcasts
 
 

@@ -13,7 +13,7 @@ from coopoc.errors import InputError
 
 from ..assemble import SAME, longest_gap, smooth
 from ..planar import nearest, steps_of
-from .units import Rows, Tally
+from .units import Rows, Summary
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
@@ -40,14 +40,14 @@ class Steps(NamedTuple):
         max_gap: s, of odometry; None as of `longest_gap`.
         planar: whether heights were not measured, and are 0.
         body: whether speed and yaw rate stay as they were measured.
-        tally: counts what is read and what is not.
+        summary: counts what is read and what is not.
     """
 
     grid: Floats
     max_gap: float | None
     planar: bool
     body: bool
-    tally: Tally
+    summary: Summary
 
     @property
     def dt(self) -> float:
@@ -88,14 +88,14 @@ class Member:
     compass: Floats
 
 
-def samples(rows: Rows, names: Sequence[str], tally: Tally, required: int) -> tuple[Signal, Ints]:
+def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int) -> tuple[Signal, Ints]:
     """Rows of one vehicle as samples (M, C) of some kinds at one time each, NaN where a kind is missing, and the first
     row (M,) of each.
 
     Args:
         rows: in SI units.
         names: kinds, the columns of the samples.
-        tally: counts rows that repeat a kind at one time, and samples without the first `required` kinds.
+        summary: counts rows that repeat a kind at one time, and samples without the first `required` kinds.
         required: how many of the kinds a sample needs.
     """
     mine = np.flatnonzero(rows.of(*names))
@@ -107,13 +107,13 @@ def samples(rows: Rows, names: Sequence[str], tally: Tally, required: int) -> tu
     value = np.full((int(fresh.sum()), len(names)), np.nan)
     first = np.unique(sample * len(names) + column, return_index=True)[1]
     again = np.setdiff1d(np.arange(len(mine)), first)
-    tally.refuse_rows("repeated rows (same time, vehicle and kind)", rows, mine[again])
+    summary.refuse_rows("repeated rows (same time, vehicle and kind)", rows, mine[again])
     value[sample[first], column[first]] = rows.value[mine[first]]
     whole = np.isfinite(value[:, :required]).all(axis=1)
     begins = mine[fresh]
     if not whole.all():
         reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
-        tally.refuse(reason, int(np.isfinite(value[~whole]).sum()), rows.place(int(begins[~whole][0])))
+        summary.refuse(reason, int(np.isfinite(value[~whole]).sum()), rows.place(int(begins[~whole][0])))
     return Signal(t[fresh][whole], value[whole]), begins[whole]
 
 
@@ -128,26 +128,27 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
     Raises:
         InputError: neither odometry nor two fixes, a speed without a heading; in body frames no speed or yaw rate.
     """
-    tally, size = steps.tally, len(steps.grid)
-    fixes, first = samples(rows, ("x", "y", "z"), tally, 2 if steps.planar else 3)
+    summary, size = steps.summary, len(steps.grid)
+    fixes, first = samples(rows, ("x", "y", "z"), summary, 2 if steps.planar else 3)
     if steps.planar:
         fixes.value[:, 2] = 0.0
-    measured, _ = samples(rows, ("heading",), tally, 1)
-    still, none = np.zeros((size, 3)), np.full(size, np.nan)
+    measured, _ = samples(rows, ("heading",), summary, 1)
+    still: Floats = np.zeros((size, 3))
+    none: Floats = np.full(size, np.nan)
     if len(fixes.t) == 1 and not rows.in_group("odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not steps.body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
-    turn, _ = samples(rows, ("yaw_rate",), tally, 1)
+    turn, _ = samples(rows, ("yaw_rate",), summary, 1)
     derived = velocity_of_fixes(fixes, steps.gap(fixes.t)) if len(fixes.t) > 1 else None
     if steps.body:
-        speed, _ = samples(rows, ("speed",), tally, 1)
+        speed, _ = samples(rows, ("speed",), summary, 1)
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
                 allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
                 raise InputError(f"vehicle {name}", f"no {kind}", allowed, hint)
-        tally.refuse("world velocities in body frames", int(rows.of("vx", "vy", "vz").sum()))
-        signals, course = (speed, turn), ""
+        summary.refuse("world velocities in body frames", int(rows.of("vx", "vy", "vz").sum()))
+        signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
         forward, rate = step_means(speed, steps.grid), step_means(turn, steps.grid)[:, 0]
         velocity = forward * [1.0, 0.0, 0.0]
@@ -156,7 +157,7 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
         text = f"{len(speed.t)} speeds, {len(turn.t)} yaw rates, {len(measured.t)} headings"
     else:
         moved, heading, text, course = _in_world(name, rows, turn, measured, derived, steps)
-        signals, rate = (moved,), none
+        signals, rate = [moved], none
         velocity = carried = step_means(moved, steps.grid)
     there = np.ones(size, dtype=bool)
     for signal in signals:
@@ -165,7 +166,7 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
     gnss = _fixes_on_steps(rows, fixes, first, carried, there, steps)
     known = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
     if known.any() or not steps.body:
-        tally.refuse(f"steps of {name} before its first fix", int((there & ~known).sum()))
+        summary.refuse(f"steps of {name} before its first fix", int((there & ~known).sum()))
         there &= known
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time"
     text = f"{int(np.isfinite(gnss[:, 0]).sum())} fixes, {text}, {span}"
@@ -178,13 +179,13 @@ def _in_world(
     name: str, rows: Rows, turn: Signal, measured: Signal, derived: Signal | None, steps: Steps
 ) -> tuple[Signal, HeadingAt | None, str, str]:
     """Velocity at its own times, heading, where both come from in words, and the course that the heading is."""
-    tally, rate = steps.tally, turn if len(turn.t) > 1 else None
-    world, _ = samples(rows, ("vx", "vy", "vz"), tally, 2)
-    speed, first = samples(rows, ("speed",), tally, 1)
+    summary, rate = steps.summary, turn if len(turn.t) > 1 else None
+    world, _ = samples(rows, ("vx", "vy", "vz"), summary, 2)
+    speed, first = samples(rows, ("speed",), summary, 1)
     heading, course = _heading(measured, rate, ((world, "odometry"), (derived, "fixes")), steps)
     source = f", heading from the course of the {course}" if course else ", heading measured" if heading else ""
     if len(world.t):
-        tally.refuse_rows("speeds where a world velocity is given", rows, first)
+        summary.refuse_rows("speeds where a world velocity is given", rows, first)
         return Signal(world.t, np.nan_to_num(world.value)), heading, f"{len(world.t)} velocities{source}", course
     if len(speed.t):
         if heading is None:
@@ -193,15 +194,15 @@ def _in_world(
             raise InputError(f"{rows.place(int(first[0]))}, speed", given, allowed, hint)
         turned = heading(speed.t)
         known = np.isfinite(turned)
-        tally.refuse_rows("speeds without a heading", rows, first[~known])
+        summary.refuse_rows("speeds without a heading", rows, first[~known])
         if course:
-            tally.assume(COURSE.format("{}", course), name)
+            summary.assume(COURSE.format("{}", course), name)
         velocity = Signal(speed.t[known], speed.value[known] * _ahead(turned[known]))
         return velocity, heading, f"{len(velocity.t)} speeds{source}", course
     if derived is None:
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
-    tally.assume(DERIVED, name)
+    summary.assume(DERIVED, name)
     return derived, heading, f"velocity derived from them{source}", course
 
 
@@ -307,7 +308,7 @@ def velocity_of_fixes(fixes: Signal, gap: float) -> Signal:
 
 def _fixes_on_steps(rows: Rows, fixes: Signal, first: Ints, velocity: Floats, there: Bools, steps: Steps) -> Floats:
     """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
-    grid, tally = steps.grid, steps.tally
+    grid, summary = steps.grid, steps.summary
     gnss = np.full((len(grid), 3), np.nan)
     step, _ = steps.nearest(fixes.t)
     lag, outside = grid[step] - fixes.t, step < 0
@@ -315,13 +316,13 @@ def _fixes_on_steps(rows: Rows, fixes: Signal, first: Ints, velocity: Floats, th
     same = np.zeros(len(step), dtype=np.int64)
     chosen = nearest(np.abs(lag), np.where(absent, -1, step), same, same)
     beside = np.setdiff1d(np.flatnonzero(~outside & ~absent), chosen)
-    tally.refuse_rows("fixes outside the recording", rows, first[outside])
-    tally.refuse_rows("fixes in gaps of the odometry", rows, first[absent])
-    tally.refuse_rows("fixes beside a nearer one of the same step", rows, first[beside])
+    summary.refuse_rows("fixes outside the recording", rows, first[outside])
+    summary.refuse_rows("fixes in gaps of the odometry", rows, first[absent])
+    summary.refuse_rows("fixes beside a nearer one of the same step", rows, first[beside])
     after = np.minimum(step[chosen] + 1, len(grid) - 1)
     between = np.where((lag[chosen] < 0) & there[after], after, step[chosen])
     gnss[step[chosen]] = fixes.value[chosen] + lag[chosen, None] * velocity[between]
-    tally.count("fixes", len(chosen))
+    summary.count("fixes", len(chosen))
     return gnss
 
 

@@ -16,11 +16,10 @@ from coopoc.file_names import given_path
 from coopoc.plugins import one_of, suggestion
 from coopoc.short_repr import short_repr
 from coopoc.world.axes import texts
-from coopoc.world.body import Body
 from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
+from coopoc.world.links import wrap
+from coopoc.world.recording import Body, Recording
 from coopoc.world.sensors import Sensors
-from coopoc.world.spherical import wrap
 from coopoc.world.v2x import V2X
 
 from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
@@ -32,7 +31,7 @@ from .frames import Origin, assumed, local, on_one_clock, origin_of
 from .links import linked, of_vehicles
 from .motion import Steps, member, samples
 from .tables import is_log_table, read_log_table
-from .units import Rows, Summary, Tally, stacked
+from .units import Rows, Summary, stacked
 
 Frame = Literal["world", "body"]
 READERS: Mapping[str, Callable[..., Rows]] = {
@@ -40,7 +39,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys((".nmea", ".nme"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
-"""Ending of a file -> (path, tally, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
+"""Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
 TRUTH = "truth"
 """Stem of the file of a folder that holds the truth."""
 
@@ -139,7 +138,8 @@ def read_log(
     >>> read_log(file).recording
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
-    path, tally, body = given_path(path), Tally(), frame == "body"
+    path, body = given_path(path), frame == "body"
+    summary = Summary(path.name)
     one_of("frame", frame, get_args(Frame))
     instance("any_scale", any_scale, bool, "Give True or False.")
     texts("ignore", ignore)
@@ -153,7 +153,7 @@ def read_log(
     if origin is not None:
         checked("origin", origin, "(3,)", (3,))
     options: dict[str, Any] = {"columns": columns or {}, "kinds": kinds or {}, "ignore": ignore}
-    rows, actual = _rows(path, truth, tally, options)
+    rows, actual = _rows(path, truth, summary, options)
     check_time(rows.t, path.name)
     rows = on_one_clock(rows, clock or {}, path.name)
     origin = origin_of(rows, origin)
@@ -162,12 +162,12 @@ def read_log(
         _check_scale(rows, path.name)
     ids = _ids(rows, body)
     grid = _grid(rows, dt, path.name)
-    steps = Steps(grid, max_gap, not rows.of("z").any(), body, tally)
+    steps = Steps(grid, max_gap, not rows.of("z").any(), body, summary)
     members = {one: member(one, rows.take(rows.vehicle == one), steps) for one in ids}
     marks = [k for k, one in enumerate(members.values()) if body and one.stands]
-    rows = of_vehicles(rows, [ids[k] for k in marks], tally)
+    rows = of_vehicles(rows, [ids[k] for k in marks], summary)
     found = linked(rows, members, steps)
-    noise = sensors or assumed(rows, steps.planar, body, tally, steps.dt)
+    noise = sensors or assumed(rows, steps.planar, body, summary, steps.dt)
     to_landmark = np.isin(found.links.neighbour, marks)
     pairs = (found.links.step * len(ids) + found.links.observer)[~to_landmark]
     arrays = {
@@ -186,16 +186,13 @@ def read_log(
         sensors=noise,
         v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
-        notes=(f"measurements of {path.name}, nothing is simulated", *tally.sentences),
+        notes=(f"measurements of {path.name}, nothing is simulated", *summary.sentences),
         body=Body(arrays["yaw_rate"], arrays["compass"]) if body else None,
         landmarks=tuple(marks),
     )
     fleet = None if actual is None else _truth(local(actual, origin), recording, max_gap, path.stem)
-    text = {name: one.text for name, one in members.items()}
-    summary = Summary(
-        path.name, steps_in_words(recording), text, tally.read, tally.refused, tally.left, tally.sentences
-    )
-    return Log(recording, fleet, summary, "messages" in tally.read, origin)
+    summary.grid, summary.vehicles = steps_in_words(recording), {name: one.text for name, one in members.items()}
+    return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
 
 def steps_in_words(recording: Recording) -> str:
@@ -208,7 +205,7 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file()
 
 
-def _rows(path: Path, truth: str | Path | None, tally: Tally, options: dict[str, Any]) -> tuple[Rows, Rows | None]:
+def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> tuple[Rows, Rows | None]:
     """Measurements of a file or a folder, and the truth: of the file that is named, of `truth.*`, or of a topic."""
     if not path.exists():
         raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
@@ -229,17 +226,17 @@ def _rows(path: Path, truth: str | Path | None, tally: Tally, options: dict[str,
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
         _check_headers(options["columns"], [*files, *([file] if file else [])], path.name)
         read = _read_file
-    rows = stacked([read(one, tally, **options) for one in files])
+    rows = stacked([read(one, summary, **options) for one in files])
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
     if file is not None:
-        actual = [_read_file(file, Tally(), **{**options, "ignore": ()})]
+        actual = [_read_file(file, Summary(), **{**options, "ignore": ()})]
     return rows, actual[0] if actual else None
 
 
-def _read_file(file: Path, tally: Tally, **options: Any) -> Rows:
+def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
     read = READERS.get(file.suffix.lower(), read_log_table)
-    return read(file, tally, **options)
+    return read(file, summary, **options)
 
 
 def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:
@@ -255,7 +252,7 @@ def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str)
 def _check_scale(rows: Rows, name: str) -> None:
     parts, t, position = [], np.empty(0), np.empty((0, 3))
     for one in dict.fromkeys(rows.vehicle[rows.of("x")].tolist()):
-        fixes, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Tally(), 2)
+        fixes, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Summary(), 2)
         parts.append(len(t) + np.arange(len(fixes.t)))
         t, position = np.append(t, fixes.t), np.append(position, np.nan_to_num(fixes.value), axis=0)
     if len(t):
@@ -307,7 +304,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
     for column, one in enumerate(recording.ids):
         mine = rows.take(rows.vehicle == one)
         for out, kinds in ((position, axes), (heading, ("heading",))):
-            true, _ = samples(mine, kinds, Tally(), len(kinds))
+            true, _ = samples(mine, kinds, Summary(), len(kinds))
             value = np.zeros((len(true.t), out.shape[2]))
             value[:, : len(kinds)] = true.value if kinds is axes else np.unwrap(true.value, axis=0)
             if len(true.t) > 1:

@@ -25,7 +25,7 @@ from ..cells import (
     seconds,
     words,
 )
-from .units import ANGLES, KINDS, Rows, Tally, rows_of, stacked
+from .units import ANGLES, KINDS, Rows, Summary, rows_of, stacked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -49,7 +49,7 @@ def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
 
 def read_log_table(
     path: Path,
-    tally: Tally,
+    summary: Summary,
     *,
     columns: Mapping[str, str] | None = None,
     kinds: Mapping[str, str] | None = None,
@@ -59,7 +59,7 @@ def read_log_table(
 
     Args:
         path: of the file. Without a column vehicle, the file is named after its vehicle.
-        tally: counts what is not used.
+        summary: counts what is not used.
         columns: names in the file, as {"t": "time", "latitude": "lat"}; one that the file lacks is left out.
         kinds: names in the column kind, as {"uwb": "range"}.
         ignore: kinds in the file that are left out.
@@ -77,21 +77,21 @@ def read_log_table(
         if not (placed and "vehicle" in frame.columns and frame["vehicle"].is_unique):
             allowed = "is needed; one of places alone has vehicle, x, y, each vehicle once"
             raise missing_column(file, "t", list(frame.columns), allowed)
-        tally.assume("members of a table without times stand where it says, from the first instant on")
+        summary.assume("members of a table without times stand where it says, from the first instant on")
     read = _long if "kind" in frame.columns else _wide
-    rows = read(frame, path, tally, kinds or {}, ignore)
+    rows = read(frame, path, summary, kinds or {}, ignore)
     if "partner" not in frame.columns and rows.in_group("relative").any():
         raise missing_column(file, "partner", list(frame.columns), "is needed")
     _check(rows)
     return rows
 
 
-def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
+def _long(frame: pd.DataFrame, path: Path, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
     file = path.name
     frame = frame.assign(kind=words(frame, "kind", file))
     left = frame["kind"].isin(list(ignore))
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
-        tally.unused(f"kind {kind}, as ignore= asks", int(count))
+        summary.leave(f"kind {kind}, as ignore= asks", int(count))
     frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
     strange = frame["kind"][~frame["kind"].isin(list(KINDS))]
     if len(strange):
@@ -104,7 +104,7 @@ def _long(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
     return _rows(frame, path, "value", "std")
 
 
-def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
+def _wide(frame: pd.DataFrame, path: Path, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
     file = path.name
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     used = [kind for kind in KINDS if kind in frame.columns and kind not in ignore and kind != "message"]
@@ -117,15 +117,15 @@ def _wide(frame: pd.DataFrame, path: Path, tally: Tally, kinds: Mapping[str, str
     if "std" in frame.columns:
         bare = [kind for kind in used if f"{kind}_std" not in frame.columns]
         if bare and (len(used) == 1 or all(KINDS[kind].group == "fix" for kind in used)):
-            tally.assume(f"column std of {file} is the standard deviation of each of {', '.join(bare)}")
+            summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(bare)}")
             frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in bare})
         else:
-            tally.unused(f"{file}: column std, which belongs to no kind (name it {used[0]}_std)", len(frame))
+            summary.leave(f"{file}: column std, which belongs to no kind (name it {used[0]}_std)", len(frame))
         frame = frame.drop(columns="std")
     known = {"t", "vehicle", "partner", "arrival", *used, *(f"{kind}_std" for kind in used)}
     for column in frame.columns:
         if column not in known:
-            tally.unused(f"{file}: column {column}", len(frame))
+            summary.leave(f"{file}: column {column}", len(frame))
     parts = []
     for kind in used:
         column = "arrival" if kind == "message" else kind

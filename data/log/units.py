@@ -23,8 +23,7 @@ class Kind(NamedTuple):
         group: fix, odometry, heading, relative or message.
         name: of the same quantity in SI units.
         limit: largest |value| in its own unit that can be meant; beyond it another unit is.
-        scale: factor that makes it SI.
-        turn: an angle becomes turn * scale * value + offset.
+        scale: in SI it is scale * value + offset.
         offset: rad.
     """
 
@@ -32,7 +31,6 @@ class Kind(NamedTuple):
     name: str
     limit: float = np.inf
     scale: float = 1.0
-    turn: float = 1.0
     offset: float = 0.0
 
 
@@ -48,14 +46,14 @@ KINDS: dict[str, Kind] = {
     "azimuth": Kind("relative", "azimuth", TURN),
     "bearing": Kind("relative", "bearing", TURN),
     "inclination": Kind("relative", "inclination", TURN / 2),
-    "elevation": Kind("relative", "inclination", TURN / 4, 1.0, -1.0, float(np.pi / 2)),
+    "elevation": Kind("relative", "inclination", TURN / 4, -1.0, float(np.pi / 2)),
     "message": Kind("message", "message"),
 }
 """Azimuth and heading are anticlockwise from +x (east), compass_deg clockwise from north, bearing anticlockwise from
 the observer's heading, inclination from +z, elevation above the horizon. A unit that is not SI is in the name."""
 for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "elevation"):
-    KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE, limit=KINDS[_name].limit / DEGREE)
-KINDS["compass_deg"] = KINDS["heading_deg"]._replace(turn=-1.0, offset=float(np.pi / 2))
+    KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
+KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
 
@@ -124,20 +122,37 @@ def stacked(parts: Sequence[Rows]) -> Rows:
     return Rows(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in Rows.__dataclass_fields__})
 
 
-@dataclass(frozen=True)
-class Tally:
-    """Counts that grow while a log is read.
+@dataclass
+class Summary:
+    """What became of the rows of a log, counted while it is read.
 
-    Attributes:
-        read: what -> number.
-        refused: reason -> (number, place of the first) of measurements that are not in the Recording.
-        left: what was never meant to be read -> number.
-        assumed: sentence, with {} for names -> the names, none where it is about all.
+    Args:
+        name: of the log.
+        grid: steps and interval in words.
+        vehicles: id -> what was read of it, in words.
+        read: what -> number of measurements in the Recording.
+        refused: reason -> (number, place of the first) of measurements that are not in it.
+        unused: what was never meant to be read -> number of cells.
+        assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
+
+    >>> summary = Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3})
+    >>> summary.refuse("a second fix in a step", 1, "f: row 2")
+    >>> summary.assume("{} stands", "a"), summary.assume("{} stands", "b")
+    (None, None)
+    >>> print(summary)
+    drive: 3 steps of 0.1 s, 1 vehicle
+      a: 3 fixes
+    read: 3 fixes
+    not used: 1 a second fix in a step (first: f: row 2)
+    assumed: a, b stands
     """
 
+    name: str = ""
+    grid: str = ""
+    vehicles: dict[str, str] = field(default_factory=dict)
     read: dict[str, int] = field(default_factory=dict)
     refused: dict[str, tuple[int, str]] = field(default_factory=dict)
-    left: dict[str, int] = field(default_factory=dict)
+    unused: dict[str, int] = field(default_factory=dict)
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
     def count(self, what: str, number: int) -> None:
@@ -157,9 +172,9 @@ class Tally:
         if len(which):
             self.refuse(reason, len(which), rows.place(int(which[0])))
 
-    def unused(self, what: str, number: int) -> None:
+    def leave(self, what: str, number: int) -> None:
         """Add to what was not meant to be read."""
-        self.left[what] = self.left.get(what, 0) + number
+        self.unused[what] = self.unused.get(what, 0) + number
 
     def assume(self, sentence: str, name: str = "") -> None:
         """Add a sentence, once, and a name that takes the place of its {}."""
@@ -169,43 +184,8 @@ class Tally:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is assumed, with the names.
-
-        >>> tally = Tally()
-        >>> tally.assume("{} stands", "a"), tally.assume("{} stands", "b"), tally.sentences
-        (None, None, ('a, b stands',))
-        """
+        """What is assumed, with the names."""
         return tuple(sentence.format(", ".join(names)) for sentence, names in self.assumed.items())
-
-
-@dataclass(frozen=True)
-class Summary:
-    """What became of the rows of a log.
-
-    Args:
-        name: of the log.
-        grid: steps and interval in words.
-        vehicles: id -> what was read of it, in words.
-        read: what -> number of measurements in the Recording.
-        refused: reason -> (number, place of the first) of measurements that are not in it.
-        unused: what was never meant to be read -> number of cells.
-        assumed: sentences on what the log does not say.
-
-    >>> refused = {"a second fix in a step": (1, "f: row 2")}
-    >>> print(Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3}, refused))
-    drive: 3 steps of 0.1 s, 1 vehicle
-      a: 3 fixes
-    read: 3 fixes
-    not used: 1 a second fix in a step (first: f: row 2)
-    """
-
-    name: str
-    grid: str
-    vehicles: dict[str, str] = field(default_factory=dict)
-    read: dict[str, int] = field(default_factory=dict)
-    refused: dict[str, tuple[int, str]] = field(default_factory=dict)
-    unused: dict[str, int] = field(default_factory=dict)
-    assumed: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         count = len(self.vehicles)
@@ -215,5 +195,5 @@ class Summary:
         for why, (number, first) in self.refused.items():
             lines.append(f"not used: {number} {why}" + (f" (first: {first})" if first else ""))
         lines += [f"not read: {what} ({number} cells)" for what, number in self.unused.items()]
-        lines += [f"assumed: {sentence}" for sentence in self.assumed]
+        lines += [f"assumed: {sentence}" for sentence in self.sentences]
         return "\n".join(lines)

@@ -17,9 +17,8 @@ from coopoc.methods.options import check_options
 from coopoc.plugins import one_of
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
-from coopoc.world.noise import stream
 from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors
+from coopoc.world.sensors import Sensors, stream
 from coopoc.world.v2x import V2X
 
 Noise = Literal["static", "fresh", "wide"]

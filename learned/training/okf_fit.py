@@ -12,7 +12,7 @@ from torch import Tensor
 
 from coopoc.arrays import instance, number
 from coopoc.short_repr import short_repr
-from coopoc.world.noise import stream
+from coopoc.world.sensors import stream
 
 from ..nets.gain import error, known, over_time
 from ..nets.okf import NoiseParameters, OptimisedKF, log_scale, scan

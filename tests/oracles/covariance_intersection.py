@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
-from coopoc.world.spherical import spherical, to_vector
+from coopoc.world.links import spherical, to_vector
 from oracles.messages import Member
 
 LEAST = 1e-9

@@ -11,7 +11,7 @@ import numpy as np
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
 from coopoc.methods.star import FORGOTTEN
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.links import spherical, to_vector, wrap
 from oracles.messages import Member
 
 

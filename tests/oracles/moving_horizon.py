@@ -13,8 +13,8 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.inbox import Inbox
+from coopoc.world.links import spherical, to_vector
 from coopoc.world.recording import Recording
-from coopoc.world.spherical import spherical, to_vector
 from oracles.window import UNKNOWN, Row, message, relative_rows, solve_rows
 
 FLAT, STRAYED = 1e6, 0.03
@@ -138,3 +138,9 @@ def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bo
         covs[now] = cov[i : i + 3, i : i + 3]
         found.update({(v, now): x[v, now] for v in drive.star[now]})
     return found, covs
+
+
+def fixed_lag(drive: Drive, lag: int, exact: bool) -> Any:
+    """Points by (vehicle, step) and the ego's covariances of the newest step: messages count when they arrive, and each
+    step makes one Gauss-Newton step."""
+    return moving_horizon(drive, lag + 1, exact, 0, late=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coopoc.world.spherical import spherical, to_vector, wrap
+from coopoc.world.links import spherical, to_vector, wrap
 
 
 class Drive:

@@ -9,8 +9,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints, checked, listed
 from ...errors import InputError
-from ...world.body import Body
-from ...world.recording import Recording
+from ...world.recording import Body, Recording
 from ...world.sensors import Sensors
 from ...world.v2x import Message
 from ..star import FORGOTTEN

@@ -8,10 +8,10 @@ import numpy as np
 
 from ...arrays import Floats, Ints, instance, number
 from ...errors import InputError
-from ...world.frames import turned
+from ...world.body_frames import turned
+from ...world.links import to_vector, wrap
 from ...world.recording import Recording, check_recording
 from ...world.sensors import Sensors
-from ...world.spherical import to_vector, wrap
 from .pose_filter import PoseFilter
 from .pose_inputs import body_of, fleet_members, to_landmarks
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ...arrays import Floats, instance, number
 from ...errors import InputError
-from ...world.spherical import wrap
+from ...world.links import wrap
 from ..stream import fix_or_none, numbers, three
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from ...arrays import Bools, Floats, instance, number
 from ...errors import InputError
 from ...one_file import in_file
 from ...plugins import find, names, one_of, unknown
-from ...world import spherical as polar
+from ...world import links as polar
 from . import dual
 from .space import Space, exp
 

@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from ...arrays import Floats, Ints, number
 from ...errors import InputError, shown
+from ...world.links import to_vector
 from ...world.recording import Recording, check_recording
 from ...world.sensors import Sensors
-from ...world.spherical import to_vector
 from .factor import Factor
 
 
