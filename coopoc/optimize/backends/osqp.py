@@ -25,8 +25,7 @@ from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
 from ..model.constraint import bounded
-from ..model.linear import Linear
-from ..model.local import local
+from ..model.linear import Linear, local
 from ..model.problem import Problem
 
 SETTINGS = {
