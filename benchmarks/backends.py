@@ -15,12 +15,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from backends_casadi import PLAIN, casadi_exact
-from backends_convex import osqp_linear
-from backends_gtsam import fixed_lag, gtsam_exact, gtsam_linear
-from backends_poses import pose_lag
-from backends_single import one_by_one
-from backends_star import Job, star
+from backends_gtsam import fixed_lag, gtsam_exact, gtsam_linear, pose_lag
+from backends_programmes import PLAIN, casadi_exact, osqp_linear
+from backends_star import Job, one_by_one, star
 from tabulate import tabulate
 from timing import timed
 

@@ -288,8 +288,6 @@ def test_training_refuses_values_from_elsewhere() -> None:
     schedule, wrong = learned.Schedule(epochs=1, checks=1), (*WRONG, *HOSTILE)
     for made in (schedule, learned.Participation(), learned.Setting(), learned.Recipe("okf"), client):
         swept(type(made), init(made), wrong)
-    swept(learned.Privacy, {"clip": 1.0, "noise_multiplier": 1.0, "keyed": True}, wrong)
-    swept(learned.SecureAggregation, init(learned.SecureAggregation()), wrong)
     swept(learned.Segments, init(client.training), HOSTILE)
     swept(learned.OptimisedKF, {"process_std": (1, 1, 1), "velocity_ratio": (1, 1, 1), "gnss_std": (1, 1, 1)}, wrong)
     few = (None, -1, 1.5, "x", [], *HOSTILE)
@@ -298,7 +296,7 @@ def test_training_refuses_values_from_elsewhere() -> None:
     swept(learned.fit, {**fit, "progress": None, "long": None}, few)
     swept(learned.fit_okf, {"training": client.training, "validation": client.validation, "steps": 2}, few)
     federation = {"model": "okf", "clients": [client], "rounds": 1, "local_epochs": 1, "schedule": schedule, "seed": 0}
-    more = dict.fromkeys(("progress", "participation", "compression", "privacy", "topology"))
+    more = dict.fromkeys(("progress", "participation"))
     swept(learned.federate, {**federation, **more, "aggregate": "mean", "epoch": "pass"}, few)
     swept(learned.ledger, {"federation": learned.federate(**federation), "overhead": 0}, wrong)
     swept(learned.LearnedGain, {"model": learned.GainNet(), "name": "n", "x0": None}, wrong)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import casadi
@@ -12,10 +11,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
-from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, measurement, pose, solve, solve_batch
-from coopoc.optimize.backends import casadi_programme
-from coopoc.optimize.backends.casadi_ import DENSE
-from coopoc.optimize.backends.casadi_programme import programme
+from coopoc.optimize import Loss, Problem, Status, pose, solve, solve_batch
+from coopoc.optimize.backends import casadi as casadi_backend
+from coopoc.optimize.backends.casadi import DENSE, programme
 from coopoc.optimize.model.symbolic import _chart
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.recording import Recording
@@ -167,18 +165,6 @@ def test_a_graph_of_poses_is_scipys(seed: int, method: str) -> None:
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_half_a_turn_away_is_found_in_charts(method: str) -> None:
-    """A pose that starts 3 rad off about any axis; SciPy's rotation says what the answer is."""
-    turn = Rotation.random(20, random_state=0)
-    for k in range(20):
-        axis = Rotation.from_rotvec(3.0 * np.eye(3)[k % 3])
-        z = pose([1.0, 2.0, 3.0], turn[k].as_rotvec())
-        problem = Problem(("a",), poses=(0,), x0=pose([[0.0, 0.0, 0.0]], (turn[k] * axis).as_rotvec()[None]))
-        solution = solve(problem.add("pose", "a", z, std=0.1), "casadi", method=method)
-        assert solution.x[0] == pytest.approx(z, abs=1e-7)
-
-
-@pytest.mark.parametrize("method", METHODS)
 def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
     programme.cache_clear()
     for run in (0, 1):
@@ -196,33 +182,6 @@ def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
         before = programme.cache_info().misses
         solve(other, "casadi", method=method)
         assert programme.cache_info().misses == before + 1
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_threads_that_share_a_programme_do_not_disturb_each_other(dense: Recording, method: str) -> None:
-    """Each solve has its own memory of CasADi's solver: the bits are those of one after the other."""
-    problems = [Problem.from_snapshot(dense, step, 0, run) for step in (10, 11, 12, 13) for run in (0, 1)]
-    alone = [solve(problem, "casadi", method=method).x for problem in problems]
-    with ThreadPoolExecutor(4) as pool:
-        found = pool.map(lambda problem: solve(problem, "casadi", method=method).x, problems * 3)
-        assert all(np.array_equal(x, alone[k % len(problems)]) for k, x in enumerate(found))
-
-
-def test_a_kind_of_the_same_name_is_another_structure() -> None:
-    """A formula that is registered anew must not meet the programme of the old one."""
-    found = []
-    for power in (1, 2):
-        measurement("reach", arity=2, components=("coordinate",))(
-            lambda x, y, z, m=np, power=power: ((x * x + y * y + z * z) ** power,)
-        )
-        try:
-            stds = np.outer([1e-3, 1.0], np.ones(3))
-            problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [2, 0, 0]], std=stds)
-            solution = solve(problem.add("reach", ("a", "b"), 81.0, std=1e-3), "casadi")
-            found.append(np.linalg.norm(solution["b"] - solution["a"]))
-        finally:
-            del MEASUREMENTS["reach"]
-    assert found == pytest.approx([9.0, 3.0], abs=1e-4)
 
 
 @pytest.mark.parametrize("start", [None, 20.0])
@@ -267,7 +226,7 @@ def test_inequalities_and_many_numbers_are_ipopts(dense: Recording) -> None:
 
 def test_an_answer_that_is_none_is_found_out(monkeypatch: pytest.MonkeyPatch, dense: Recording) -> None:
     """A solver that is content with any gradient: ipopt takes over, one by one and in a batch."""
-    monkeypatch.setitem(casadi_programme.FATROP, "tolerance", 1e6)
+    monkeypatch.setitem(casadi_backend.FATROP, "tolerance", 1e6)
     programme.cache_clear()
     stars = Problem.from_snapshot(dense, 10, 0, run=None)
     problem = stars.pick(1)
@@ -279,32 +238,6 @@ def test_an_answer_that_is_none_is_found_out(monkeypatch: pytest.MonkeyPatch, de
     assert not best.again.any()
     assert batch.converged.all()
     assert batch.x == pytest.approx(best.x, abs=1e-6)
-
-
-def test_what_is_held_does_not_move(dense: Recording) -> None:
-    problem = Problem.from_snapshot(dense, 10, 0)
-    start = solve(problem).x + 0.3
-    held = replace(problem, x0=start, fixed=(0, 4))
-    for method in METHODS:
-        solution = solve(held, "casadi", method=method)
-        assert (solution.x[[0, 4]] == start[[0, 4]]).all()
-        assert solution.x == pytest.approx(solve(held).x, abs=1e-6)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_it_is_silent(dense: Recording, capfd: pytest.CaptureFixture[str], method: str) -> None:
-    programme.cache_clear()
-    solve(Problem.from_snapshot(dense, 10, 0), "casadi", method=method)
-    solve(Problem.from_snapshot(dense, 10, 0).constrain("position", 0, 5.0, 5.0), "casadi", method=method)
-    solve(flat_graph(0), "casadi", method=method)
-    assert capfd.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_the_limit_of_iterations(method: str) -> None:
-    solution = solve(ranges_only(0), "casadi", throw=False, method=method, max_iterations=1)
-    assert solution.status is Status.MAX_ITERATIONS
-    assert solution.extras["return_status"] == "Maximum_Iterations_Exceeded"
 
 
 @pytest.mark.parametrize(

@@ -200,15 +200,3 @@ def test_one_measurement_decides_nothing() -> None:
     free = free.add("relative_pose", ("A0", "B0"), pose([1.0, 0.0]), std=0.1).add("bearing", ("A0", "B0"), 0.1, std=0.1)
     with pytest.raises(co.InputError, match=r"between B0 and world"):
         solve_gnc(free, [0, 1], start="known")
-
-
-def test_groups_of_candidates_are_judged_together() -> None:
-    """All that one robot measures of another is one hypothesis: the group with a wrong member goes as a whole."""
-    fleet = Fleet(6, 2, 2)
-    pairs = fleet.between(30)
-    bad = np.isin(np.arange(30), [4, 17])
-    problem = from_graph(fleet.graph(fleet.relative(pairs, LOOPS, bad)), start="odometry")
-    solution = solve_gnc(problem, loop_closures(problem), groups=np.arange(30) // 3, start="known")
-    kept = solution.extras["weights"] > 0.5
-    assert kept.tolist() == (~np.isin(np.arange(30) // 3, [1, 5])).tolist()
-    assert absolute_error(solution.position, fleet.position).rmse < 1.0

@@ -64,14 +64,6 @@ def test_wrong_loops_are_found_where_odometry_is_known(seed: int, wrong: float) 
     assert np.abs(solution.position - wanted.position).max() < 0.1
 
 
-def test_without_outliers_both_starts_end_alike() -> None:
-    problem = from_graph(drive(4, wrong=0.0)[0], start="odometry")
-    candidates = loop_closures(problem)
-    known, every = (solve_gnc(problem, candidates, threshold=0.999999, start=start) for start in ("known", "all"))
-    assert known.cost == pytest.approx(every.cost, rel=1e-6)
-    np.testing.assert_allclose(known.position, every.position, atol=1e-5)
-
-
 def test_predictions_are_those_of_dense_algebra() -> None:
     """Oracle: the inverse of J^T J of the known inliers by NumPy."""
     problem = from_graph(drive(5, steps=150, loops=20)[0], start="odometry")
@@ -148,5 +140,6 @@ def test_wrong_loops_of_a_drive_in_space_are_found(shape: str, seed: int, monkey
     assert solution.status is Status.SOLVED
     assert not (bad & ~rejected).any()
     assert (~bad & rejected).sum() <= 0.02 * len(loops)
-    clean = co.solve(from_graph(drive_.graph(relative_pose=joined(odometry, edges.rows(np.flatnonzero(~bad))))))
+    kept = replace(edges, **{f.name: getattr(edges, f.name)[~bad] for f in fields(edges)})
+    clean = co.solve(from_graph(drive_.graph(relative_pose=joined(odometry, kept))))
     assert np.abs(solution.position - clean.position).max() < 0.3

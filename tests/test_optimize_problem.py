@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import casadi as ca
@@ -359,29 +358,6 @@ def test_fixes_at_one_hertz_make_a_window() -> None:
     (fixes,) = (f for f in problem.factors if f.kind == "position")
     assert len(fixes.nodes) == 5
     assert solve(problem).status is Status.SOLVED
-
-
-def test_problems_that_grow_from_one_share_what_they_have_in_common() -> None:
-    """Each extension keeps its own measurements, whatever is added to the others; the common ones are stored once."""
-    one = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
-    two = one.add("position", "b", [1, 0, 0], std=1.0)
-    other = one.add("range", ("a", "b"), 2.0, std=0.5)
-    three = two.add("range", ("a", "b"), 3.0, std=0.5)
-    assert [len(p.factors) for p in (one, two, other, three)] == [1, 2, 2, 3]
-    assert [f.kind for f in other.factors] == ["position", "range"]
-    assert three.factors[:2] == list(two.factors)
-    assert three.factors[-1].z[0, 0] == 3.0
-    assert all(p.factors[0] is one.factors[0] for p in (two, other, three))
-    with pytest.raises(IndexError):
-        two.factors[2]
-
-
-def test_threads_may_extend_one_problem() -> None:
-    one = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
-    with ThreadPoolExecutor(8) as pool:
-        grown = list(pool.map(lambda k: one.add("range", ("a", "b"), 1.0 + k, std=0.5), range(200)))
-    assert [p.factors[1].z[0, 0] for p in grown] == [1.0 + k for k in range(200)]
-    assert all(len(p.factors) == 2 for p in grown)
 
 
 def test_many_single_measurements_are_one_line() -> None:

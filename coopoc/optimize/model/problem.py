@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,12 +16,10 @@ from ...errors import InputError, shown
 from ...world.sensors import Sensors
 from .constraint import Constraint
 from .factor import Factor
-from .growing import Growing
 from .inputs import numbers
 from .linear import Linear, linearise, sparse_jacobian
 from .measurements import lookup
 from .nodes import check_item, indices, no_such_node, points, rows
-from .search import Search
 from .space import Space
 from .window import Noise, WindowStep, recorded_steps, window_factors
 
@@ -38,6 +36,28 @@ DERIVED = (
 """What is found of a problem once, and the fields that it follows from: others may change and it still holds."""
 
 Nodes = str | int | Sequence[str | int] | Sequence[Sequence[str | int]]
+
+
+class Search(NamedTuple):
+    """The search for a start; the Solution's iterations and seconds contain it.
+
+    Attributes:
+        start: name of the start, "" if the user gave x0.
+        iterations: linear steps from all starts that were tried.
+        seconds: to make the starts and to take those steps.
+
+    >>> Search("odometry").iterations
+    0
+    """
+
+    start: str = ""
+    iterations: int = 0
+    seconds: float = 0.0
+
+    @property
+    def extras(self) -> dict[str, str | int | float]:
+        """For `Solution.extras`."""
+        return {"start": self.start, "start_iterations": self.iterations, "start_seconds": self.seconds}
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,8 +217,7 @@ class Problem:
         if len(sizes) > 1:
             hint = "Use the same number of realisations throughout."
             raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
-        before = self.factors if isinstance(self.factors, Growing) else Growing(self.factors)
-        grown = self.replace_unchecked(factors=before.plus(factor))
+        grown = self.replace_unchecked(factors=(*self.factors, factor))
         batches = [b for b in (self.batch, factor.batch) if b is not None]
         grown.__dict__["batch"] = max(batches) if batches else None
         return grown
