@@ -8,8 +8,8 @@ import numpy as np
 
 from coopoc.arrays import AnyArray, Bools
 from coopoc.errors import InputError
-from coopoc.evaluate.innovations import innovation_columns
 from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.metrics import innovation_columns
 from coopoc.evaluate.scores import BYTES, scored
 from coopoc.methods.track import Method
 from coopoc.world.fleet import Fleet

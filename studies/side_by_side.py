@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.evaluate.innovations import dimensions
+from coopoc.evaluate.metrics import dimensions
 from coopoc.study.numbers import present, ran, rms
 from coopoc.study.pivot import pivot
 from coopoc.study.style import look
