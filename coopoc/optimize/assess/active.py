@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.constraint import bounded, values
+from ..model.factor import bounded, values
 from ..model.linear import chain, local
 from ..model.problem import Problem
 
