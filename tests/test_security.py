@@ -22,13 +22,12 @@ from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.merge import merge
-from coopoc.study.pivot import pivot
 from coopoc.study.publish import tables, views
 from coopoc.study.report import report
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
-from coopoc.study.tables import Table
+from coopoc.study.tables import Table, pivot
 
 EVIL = "from pathlib import Path\nPath({mark!r}).write_text('ran')\n"
 SCRIPT = '<script>alert("1")</script>'
