@@ -11,12 +11,12 @@ from ..arrays import Floats, Ints, instance, number
 from ..errors import InputError
 from ..short_repr import short_repr
 from .algebra.sparse import Sparse, sparse
-from .algebra.tape import numbers_of
 from .descent.trust_region import arrive
 from .model.factor import Factor, unchecked
-from .model.part import restricted
+from .model.parts import restricted
 from .model.problem import Problem
 from .model.space import Space, log
+from .model.symbolic import numbers_of
 
 BYTES = 8
 """Of a number that is sent."""
@@ -207,9 +207,7 @@ def links_of(problem: Problem, owner: tuple[str, ...], rho: float) -> list[Link]
     """A link for every pair of owner and observer, two where some copies have a rotation and others have none."""
     space, x0 = problem.space, np.array(problem.x0)
     linear, seen = problem.linearise(x0[None]), dict[tuple[str, int], Floats]()
-    for factor, maker, jacobians in zip(
-        problem.factors, makers(problem, owner), linear.by_node(problem.factors), strict=True
-    ):
+    for factor, maker, jacobians in zip(problem.factors, makers(problem, owner), linear.jacobian, strict=True):
         for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
             square = np.broadcast_to(np.square(jacobian[0]).sum(axis=-2), (len(column), space.dof))
             for row, (node, by) in enumerate(zip(column.tolist(), maker.tolist(), strict=True)):

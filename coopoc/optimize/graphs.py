@@ -16,8 +16,7 @@ from ..formats.graph import ENDS, Graph
 from ..plugins import one_of
 from .algebra.sparse import keep
 from .model.factor import Factor
-from .model.problem import Problem
-from .model.search import Search
+from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import STARTS, contenders, incremental_start, separated
 from .starts.linear import position_variance, rotation_variance

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.constraint import bounded, values
-from ..model.local import chain, local
+from ..model.factor import bounded, values
+from ..model.linear import chain, local
 from ..model.problem import Problem
 
 NEAR = 5e-7
@@ -91,8 +91,6 @@ def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats,
     jacobians = chain(
         space, known, x[None], item.nodes, seen, np.broadcast_to(jacobian, (*value.shape, jacobian.shape[-1]))
     )
-    if len(jacobians) < known.arity:
-        jacobians = (-jacobians[0], jacobians[0])
     row, component = np.nonzero(which)
     data = np.stack([s[0, row, component] for s in jacobians], axis=1)
     if problem.movable is not None:

@@ -22,9 +22,9 @@ from ...errors import InputError
 from ...plugins import one_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
-from ..model.constraint import steerable
+from ..model.factor import steerable
 from ..model.problem import Problem
-from ..model.symbolic import LOSSES, Structure, expressions, numbers_of, structure_of
+from ..model.symbolic import Structure, expressions, parameters, structure_of
 
 DENSE = 200
 """Numbers that can move up to which fatrop is faster than ipopt: 2.0 against 3.8 ms for 165 of a window, 6.6 against
@@ -139,7 +139,7 @@ def _run(
 def _numbers(problem: Problem, x: Floats) -> Floats:
     """(B, .) the parameters around x (B, n, ambient), and last by what the cost is multiplied: 1 / max diag J^T J."""
     curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
-    return np.append(numbers_of(problem, x), 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
+    return np.append(parameters(problem, x), 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
@@ -217,6 +217,6 @@ BACKEND = Backend(
     prepare,
     "nonlinear programming by FATROP or IPOPT, any constraints",
     "casadi",
-    Capabilities(batched=True, losses=tuple(LOSSES), constraints="all"),
+    Capabilities(batched=True, losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
     fallback,
 )

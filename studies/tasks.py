@@ -1,4 +1,4 @@
-"""CL-Bench's tasks of real measurements: robots among landmarks, UWB ranges for pose filters, graphs for backends."""
+"""CL-Bench: its tasks, fixed by version: simulated drives with what goes wrong, logs of real robots, and graphs."""
 
 from __future__ import annotations
 
@@ -12,20 +12,114 @@ from typing import Any
 
 import numpy as np
 
+from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, load_fleet, observe, read_graph, solve
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.poses.pose_filter import PoseFilter
-from coopoc.optimize.graphs import read_graph
-from coopoc.optimize.solve import solve
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
-from coopoc.world.v2x import V2X
+from coopoc.world.spoofing import spoofed
 
 from . import pose_drives
-from .pose_drives import thinned
+
+VERSION = "1"
+"""Another set of tasks, seeds, egos or scores is another version."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a method is tried on.
+
+    Args:
+        name: of the task.
+        question: that it asks.
+        data: bundled fleet.
+        sensors: the noise that acts and that methods may know.
+        v2x: neighbourhood and channel.
+        share: of the vehicles that broadcast false fixes; methods do not know of it.
+        seed: of all draws.
+        runs: noise draws.
+        egos: evenly spaced over the fleet.
+    """
+
+    name: str
+    question: str
+    data: str
+    sensors: Sensors
+    v2x: V2X
+    share: float = 0.0
+    seed: int = 2026
+    runs: int = 10
+    egos: int = 5
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Egos as columns of the fleet."""
+        count = len(load_fleet(self.data).ids)
+        return tuple(k * count // self.egos for k in range(self.egos))
+
+
+WHITE = Sensors.paper_scenario2()
+IDEAL = V2X(max_neighbours=6)
+TASKS = (
+    Task("alone", "No neighbour: the paper's scenario 1, with a bias.", "town10", Sensors.paper_scenario1(), V2X(0)),
+    Task("paper", "The paper's scenario 2.", "town10", WHITE, IDEAL),
+    Task("elsewhere", "The same in another town with sparser traffic.", "town04", WHITE, IDEAL),
+    Task(
+        "lasting",
+        "GNSS errors that persist and are partly common.",
+        "town10",
+        replace(WHITE, gnss_std=(1.5, 1.5, 1.5), gnss_drift_std=2.5, gnss_common_std=1.5),
+        IDEAL,
+    ),
+    Task(
+        "field", "Messages at a CAM's rate, late and lost.", "town10", WHITE, replace(V2X.cam(6), latency=0.1, loss=0.3)
+    ),
+    Task("spoofed", "A fifth of the vehicles broadcasts false fixes.", "town10", WHITE, IDEAL, 0.2),
+    Task(
+        "heading",
+        "A compass of 2 deg with a constant error of 3 deg.",
+        "town10",
+        replace(WHITE, heading_std=float(np.deg2rad(2)), heading_bias_std=float(np.deg2rad(3))),
+        IDEAL,
+    ),
+)
+"""The test: parameters of a method are never chosen on it."""
+VALIDATION = tuple(replace(task, data="town10-validation", seed=1) for task in TASKS)
+"""The same questions on another drive with other draws: parameters may be chosen here."""
+
+
+@lru_cache(maxsize=2)
+def recording(task: Task, everyone: bool) -> tuple[Recording, Fleet]:
+    """What a task's vehicles see, and the truth."""
+    fleet = load_fleet(task.data)
+    egos = None if everyone else list(task.columns)
+    seen = observe(fleet, task.sensors, task.v2x, runs=task.runs, seed=task.seed, observers=egos)
+    if task.share:
+        seen = spoofed(seen, task.share, seed=task.seed, honest=list(task.columns))
+    return seen, fleet
+
+
+@lru_cache(maxsize=64)
+def bound(task: Task, information: str) -> float:
+    """RT-LE m of the bound over an ideal channel without attack, root mean square over the egos: no method is below it.
+
+    Args:
+        task: its drive and noise; a bias is left out.
+        information: "solo", "star" or "fleet".
+    """
+    fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
+    v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
+    if information == "fleet":
+        whole = fleet_bound(fleet, sensors, v2x)
+        bounds: list[Floats] = [whole[:, ego] for ego in task.columns]
+    else:
+        bounds = [
+            posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0)) for ego in task.columns
+        ]
+    return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
+
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
@@ -90,7 +184,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         drive = pose_drives.drive(str(path), until, v2x, GATE)
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
-        return thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
+        return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
     drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")

@@ -13,8 +13,8 @@ import pytest
 import coopoc as co
 from coopoc.data.registry import load_log
 from coopoc.errors import InputError
-from coopoc.studies import bench, bench_cards, bench_real, bench_tasks, pose_drives
-from coopoc.studies.bench_tasks import TASKS, VALIDATION, VERSION
+from coopoc.studies import benchmark, pose_drives, tasks
+from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
 
 ROOT = Path(__file__).resolve().parents[1]
 CARDS = sorted((ROOT / "benchmarks" / "cards").glob("*.json"))
@@ -42,7 +42,7 @@ class Own:
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tasks with two runs and two egos."""
     few = tuple(replace(task, runs=2, egos=2) for task in TASKS if task.name in ("alone", "paper", "spoofed"))
-    monkeypatch.setattr(bench_tasks, "TASKS", few)
+    monkeypatch.setattr(benchmark, "TASKS", few)
 
 
 def test_parameters_are_chosen_on_other_drives_and_draws() -> None:
@@ -56,7 +56,7 @@ def test_parameters_are_chosen_on_other_drives_and_draws() -> None:
 
 
 def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> None:
-    assert bench.benchmark(("joint", "kalman"), out=tmp_path) == 0
+    assert benchmark.benchmark(("joint", "kalman"), out=tmp_path) == 0
     card = json.loads((tmp_path / "joint.json").read_text())
     assert (card["benchmark"], card["method"], card["source"]) == (VERSION, "joint", "")
     row = {row["task"]: row for row in card["tasks"]}["paper"]
@@ -76,7 +76,7 @@ def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> N
 def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None, tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(OWN)
     name = f"{tmp_path / 'mine.py'}:Own"
-    assert bench.benchmark((name,), out=tmp_path) == 1
+    assert benchmark.benchmark((name,), out=tmp_path) == 1
     (file,) = tmp_path.glob("*.json")
     card = json.loads(file.read_text())
     assert len(card["source"]) == 20
@@ -84,7 +84,7 @@ def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None,
     rows = {row["task"]: row for row in card["tasks"]}
     assert rows["alone"]["failed"] == "ValueError: neighbours are missing"
     assert rows["paper"]["rt_le_m"][0] == pytest.approx(6.06, abs=0.1)
-    assert "failed" in bench_cards.page([card])
+    assert "failed" in benchmark.page([card])
 
 
 def test_wrong_words_are_named(tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_wrong_words_are_named(tmp_path: Path) -> None:
         (((), {"table": True, "out": tmp_path}), "holds no card"),
     ):
         with pytest.raises(InputError, match=message):
-            bench.benchmark(given[0], **given[1])  # type: ignore[arg-type]
+            benchmark.benchmark(given[0], **given[1])  # type: ignore[arg-type]
 
 
 def test_no_committed_card_lies_below_its_bound() -> None:
@@ -113,16 +113,8 @@ def test_no_committed_card_lies_below_its_bound() -> None:
 def test_the_page_shows_the_committed_cards() -> None:
     """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
     assert (
-        bench_cards.page([json.loads(file.read_text()) for file in CARDS])
-        in (ROOT / "docs" / "benchmark.md").read_text()
+        benchmark.page([json.loads(file.read_text()) for file in CARDS]) in (ROOT / "docs" / "benchmark.md").read_text()
     )
-
-
-@pytest.mark.slow
-def test_the_bound_with_the_past_is_least() -> None:
-    task = replace(PAPER, egos=1)
-    levels = [bench_tasks.bound(task, each) for each in ("solo", "star", "past")]
-    assert levels == sorted(levels, reverse=True)
 
 
 OWN_POSES = """
@@ -149,8 +141,8 @@ def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Pa
     (tmp_path / "mine.py").write_text(OWN_POSES)
     rows = {}
     for name in ("pose-solo", "pose-fleet", f"{tmp_path / 'mine.py'}:Own"):
-        made = bench_cards.card(name, [], shared / "pyfg") if "fleet" in name else None
-        rows[name] = {row["task"]: row for row in (made or bench_cards.card(name, [], shared))["tasks"]}
+        made = benchmark.card(name, [], shared / "pyfg") if "fleet" in name else None
+        rows[name] = {row["task"]: row for row in (made or benchmark.card(name, [], shared))["tasks"]}
     assert "must hold MRCLAM_Dataset6" in rows["pose-fleet"]["robots"]["failed"]
     solo, whole = rows["pose-solo"]["uwb"], rows["pose-fleet"]["uwb"]
     assert whole["rt_le_m"][2] < solo["rt_le_m"][0]
@@ -159,7 +151,7 @@ def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Pa
     assert log.truth.heading is not None
     begin = np.column_stack([log.truth.position[0], log.truth.heading[0]])
     begin[4] = np.nan
-    noise = replace(log.recording.sensors, range_std=bench_real.RANGE_STD)
+    noise = replace(log.recording.sensors, range_std=tasks.RANGE_STD)
     size = int(10 / log.truth.dt)
 
     def by_hand(made: co.PoseFilter) -> float:
@@ -177,17 +169,17 @@ def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Pa
 
 
 def test_graphs_are_tasks_for_backends(shared: Path) -> None:
-    row = bench_real.graph_row(shared, "mrclam5a.pyfg", "gauss-newton")
+    row = tasks.graph_row(shared, "mrclam5a.pyfg", "gauss-newton")
     assert row["status"] == "SOLVED"
     assert row["over_best"] == pytest.approx(1.0, abs=1e-4)
-    shown = bench_cards.page([{"method": "gauss-newton", "tasks": [row]}])
+    shown = benchmark.page([{"method": "gauss-newton", "tasks": [row]}])
     assert "1 SOLVED" in shown
     with pytest.raises(InputError, match="must name the folder of measurements for gauss-newton"):
-        bench.benchmark(("gauss-newton",))
+        benchmark.benchmark(("gauss-newton",))
 
 
 def test_unknown_methods_are_named_before_anything_runs(tmp_path: Path) -> None:
     for name, words in (("jointt", "Did you mean joint"), ("mine.py:Own", "is not there"), ("pose-solo", "--data")):
         with pytest.raises(co.InputError, match=words):
-            bench.benchmark((name,), out=tmp_path)
+            benchmark.benchmark((name,), out=tmp_path)
     assert not list(tmp_path.iterdir())
