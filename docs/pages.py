@@ -71,23 +71,6 @@ FOUND = {
         "**With identity covariances the federated net alone beats cooperative filters; with fitted covariances it "
         "does not**: 0.95 m, against 2.19 and 0.54 m for LKF-SA with ten neighbours.",
     ),
-    "open_choices": (
-        "learned.md#choices-that-the-paper-leaves-open",
-        "**What the paper leaves open moves results more than the method does**: FedKalmanNet has 0.96 m in scenario "
-        "2, 0.81 m from the true position, 1.23 m with noise of the speed; a fitted Kalman filter differs from it by "
-        "0.04 m at most (20 runs, two training seeds).",
-    ),
-    "privacy": (
-        "privacy.md",
-        "**With four clients a net of 19,938 weights cannot be trained at any epsilon tried; nine parameters "
-        "can**: the federated OKF loses 9 % at epsilon 10 with four clients, 3 % at epsilon 1 with "
-        "sixty.",
-    ),
-    "scaling": (
-        "performance.md#as-fleets-grow",
-        "**The time per vehicle and step at most doubles from 60 to 1,980 vehicles** (CPU times beside other load); "
-        "methods of the whole fleet take 1.1 to 1.2 times as long.",
-    ),
     "side_by_side": (
         "your_data.md",
         "**Any methods under any conditions, with the bound**, on a bundled drive or on your own log.",
