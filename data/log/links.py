@@ -213,8 +213,8 @@ def _to_step(seen: Measured, members: Sequence[Member], steps: Steps) -> Floats:
     """Values (M,) at their steps: z + f(now) - f(then), f being the range, azimuth or inclination of a vector.
 
     In the world `now` is the vector g from the observer to the partner at the step, from the last fixes and the
-    odometry since, and `then` is g + lag du, with the difference du of their velocities. In body frames a bearing grows by
-    lag w, with the observer's yaw rate w; what stands, and was measured by range and bearing at one time, moves by
+    odometry since, and `then` is g + lag du, with the difference du of their velocities. In body frames a bearing grows
+    by lag w, with the observer's yaw rate w; what stands, and was measured by range and bearing at one time, moves by
     lag v, with the observer's velocity v; how a vehicle moves in the observer's frame is not known. Nothing is moved
     where the vectors or the range are not far longer than what lies between.
     """
