@@ -1,8 +1,10 @@
-"""GTSAM's rows of backends.py."""
+"""GTSAM's rows of backends.py, and the pose smoother against a loop on GTSAM's incremental fixed-lag smoother."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gtsam
@@ -10,8 +12,9 @@ import numpy as np
 from backends_star import TOLERANCE, Job, Row, as_good, ours, single
 from classical import KNOWN, NEIGHBOURS, SENSORS
 
-from coopoc.optimize import Problem, solve
-from coopoc.optimize.incremental import FixedLag
+import coopoc as co
+from coopoc.methods.poses.pose_factors import PoseRun, pose_subgraph
+from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import spherical, wrap
 
@@ -75,66 +78,6 @@ def custom_factors(fix: Any, vector: Any, root: Any) -> Any:
     return np.stack([found.atPoint3(k) for k in range(len(fix))])
 
 
-def fixed_lag(problem: Problem, count: int) -> Job:
-    """The star that drives on for `count` steps, realisation by realisation one step later; a lag of ten steps."""
-    fixes, edges = problem.factors
-    n, lag, moved = NEIGHBOURS + 1, 1.05, np.tile([1.0, 0.0, 0.0], (NEIGHBOURS + 1, 1))
-    odometry = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.process_std))
-    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
-    z, roots = fixes.z[:count] + np.arange(count)[:, None, None] * moved, edges.root
-
-    def piece(names: list[str], first: int, steps: int) -> Problem:
-        """The steps from `first` on, and the odometry from the nodes before them where the names have those."""
-        found, each = Problem(names), np.arange(n)
-        before = len(names) - n * steps
-        for k in range(steps):
-            at = before + n * k + each
-            found = found.add("position", at.tolist(), z[first + k], std=KNOWN.gnss_std)
-            if before or k:
-                found = found.add("displacement", np.stack([at - n, at], 1).tolist(), moved, std=KNOWN.process_std)
-            star = np.stack([np.full(NEIGHBOURS, at[0]), at[1:]], 1).tolist()
-            found = found.add("displacement", star, edges.z[first + k], sqrt_information=roots[first + k])
-        return found
-
-    def called(t: int) -> list[str]:
-        return [f"{i}@{t}" for i in range(n)]
-
-    pieces = [piece([*(called(t - 1) if t else []), *called(t)], t, 1) for t in range(count)]
-    whole = {t: piece([name for s in range(t + 1) for name in called(s)], 0, t + 1) for t in (20, count - 1)}
-    best = {t: solve(problem).x[-n] for t, problem in whole.items()}
-
-    def mine() -> Any:
-        smoother = FixedLag(lag, threshold=np.inf)  # what is linear is never linearised again
-        return np.stack(
-            [smoother.update(part, dict.fromkeys(called(t), 0.1 * t), [f"0@{t}"]).x for t, part in enumerate(pieces)]
-        )
-
-    def hand() -> Any:
-        params = gtsam.ISAM2Params()
-        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-        smoother, found = gtsam.IncrementalFixedLagSmoother(lag, params), []
-        for t in range(count):
-            graph, fresh, key = gtsam.NonlinearFactorGraph(), gtsam.Values(), n * t
-            for k in range(n):
-                graph.add(gtsam.PriorFactorPoint3(key + k, z[t, k], prior))
-                fresh.insert(key + k, z[t, k])
-                if t:
-                    graph.add(gtsam.BetweenFactorPoint3(key - n + k, key + k, moved[k], odometry))
-            for k in range(NEIGHBOURS):
-                model = gtsam.noiseModel.Gaussian.SqrtInformation(roots[t, k], False)
-                graph.add(gtsam.BetweenFactorPoint3(key, key + k + 1, edges.z[t, k], model))
-            smoother.update(graph, fresh, dict.fromkeys(range(key, key + n), 0.1 * t))
-            found.append(smoother.calculateEstimate().atPoint3(key))
-            smoother.marginalCovariance(key)
-        return np.stack(found)[:, None]
-
-    def right(x: Any) -> bool:
-        return all(float(np.abs(x[t, 0] - wanted).max()) < 1e-3 for t, wanted in best.items())
-
-    job = "gtsam, fixed lag, converted"
-    return Job([Row(job, "ours", count, mine), Row(job, "hand-written", count, hand)], right)
-
-
 def seen(x: Any, z: Any, std: Any) -> tuple[Any, Any]:
     """Whitened residuals (B, K, 3) of ranges and angles at x (B, n, 3), and derivatives (B, K, 3, 3)."""
     dx, dy, dz = np.moveaxis(x[:, 1:] - x[:, :1], 2, 0)
@@ -190,3 +133,48 @@ def gtsam_exact(problem: Problem) -> Job:
         ],
         as_good(problem),
     )
+
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from oracles.pose_smoother import by_hand  # noqa: E402
+
+LAG = 5.05
+NOISE = co.Sensors(
+    velocity_reading="speed", range_std=0.3, azimuth_std=0.02, inclination_std=0.02, heading_std=0.05, yaw_rate_std=0.02
+)
+
+
+def convoy(steps: int) -> co.Recording:
+    """Four vehicles that wind along at 10 m/s, 8 m apart, and two masts."""
+    t = 0.1 * np.arange(steps)
+    course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * np.arange(4))
+    velocity = 10 * np.stack([np.cos(course), np.sin(course), 0 * course], axis=2)
+    position = 8.0 * np.arange(4)[:, None] * [1, 0, 0] + np.cumsum(0.1 * velocity, axis=0)
+    masts = np.broadcast_to([[0.0, 12, 0], [40, -9, 0]], (steps, 2, 3))
+    moving = np.append(velocity, 0 * masts, axis=1)
+    fleet = co.Fleet(("a", "b", "c", "d", "m", "n"), t, np.append(position, masts, axis=1), moving)
+    return co.observe(fleet, NOISE, co.V2X(max_neighbours=3), frame="body", landmarks=["m", "n"])
+
+
+def pose_lag(steps: int = 150) -> Job:
+    """Poses, fixes, compasses, ranges and bearings, a lag of fifty steps; the loop's numbers are made beforehand."""
+    recording, smoother = convoy(steps), co.PoseSmoother(LAG)
+    drive = PoseRun(recording, 0, NOISE, np.full((len(recording.ids), 4), np.nan), np.array(smoother.spread))
+    known: dict[str, Any] = {}
+    parts = []
+    for step, found in enumerate(smoother.estimates(recording)):
+        parts.append(pose_subgraph(drive, step, known))
+        marks = dict(zip(parts[-1].names, parts[-1].x0, strict=True))  # type: ignore[arg-type]
+        known |= {name: x for name, x in marks.items() if "@" not in name}
+        known |= dict(zip(found.names, found.x, strict=True))
+
+    def mine() -> Any:
+        return np.stack([found.x[:, :2] for found in smoother.estimates(recording)])
+
+    def hand() -> Any:
+        return by_hand(parts, LAG, recording.dt)
+
+    best = hand()
+    job = "gtsam, fixed lag, poses"
+    rows = [Row(job, "ours", steps, mine), Row(job, "hand-written", steps, hand)]
+    return Job(rows, lambda x: float(np.abs(x - best).max()) < 0.01)

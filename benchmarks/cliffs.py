@@ -101,8 +101,7 @@ def method_cases() -> Iterator[Case]:
     others = {
         "drift, time-correlated errors": (DriftFilter(), seen(fleet, drifting, False), "joint, plain"),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
-        "cooperative gain, newest fix": (CooperativeGain(NoiseNet(), sums=False), recording, "joint, plain"),
-        "cooperative gain, sums": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
+        "cooperative gain": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
     }
     for name, (method, measured_by, plain) in others.items():
         yield case(name, plain, method, measured_by, False)

@@ -21,8 +21,7 @@ from unseen_graphs import five_robots
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import solve
-from coopoc.optimize.agents.distributed import BYTES, Distributed, owners, solve_distributed
-from coopoc.optimize.agents.links import makers
+from coopoc.optimize.distributed import BYTES, Distributed, makers, owners, solve_distributed
 from coopoc.optimize.graphs import from_graph
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"

@@ -64,7 +64,7 @@ def run(
         retry_failed: repeat failed cells.
         dry_run: print which cells would be kept, repeated and computed, then stop.
     """
-    from .study.parse import assignments
+    from .study.cell import assignments
     from .study.publish import tables
     from .study.run import plan, run_study
 
@@ -159,9 +159,9 @@ def table(
         value: metric in the cells of a new table.
         where: use only the results with these values.
     """
-    from .study.pivot import pivot
     from .study.publish import tables
     from .study.results import Results
+    from .study.tables import pivot
 
     if rows is None:
         print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))

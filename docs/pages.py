@@ -71,23 +71,6 @@ FOUND = {
         "**With identity covariances the federated net alone beats cooperative filters; with fitted covariances it "
         "does not**: 0.95 m, against 2.19 and 0.54 m for LKF-SA with ten neighbours.",
     ),
-    "open_choices": (
-        "learned.md#choices-that-the-paper-leaves-open",
-        "**What the paper leaves open moves results more than the method does**: FedKalmanNet has 0.96 m in scenario "
-        "2, 0.81 m from the true position, 1.23 m with noise of the speed; a fitted Kalman filter differs from it by "
-        "0.04 m at most (20 runs, two training seeds).",
-    ),
-    "privacy": (
-        "privacy.md",
-        "**With four clients a net of 19,938 weights cannot be trained at any epsilon tried; nine parameters "
-        "can**: the federated OKF loses 9 % at epsilon 10 with four clients, 3 % at epsilon 1 with "
-        "sixty.",
-    ),
-    "scaling": (
-        "performance.md#as-fleets-grow",
-        "**The time per vehicle and step at most doubles from 60 to 1,980 vehicles** (CPU times beside other load); "
-        "methods of the whole fleet take 1.1 to 1.2 times as long.",
-    ),
     "side_by_side": (
         "your_data.md",
         "**Any methods under any conditions, with the bound**, on a bundled drive or on your own log.",
@@ -175,12 +158,43 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
                     *(["Notes on its Track:", "", *notes, ""] if notes else []),
                     f"::: {kind.__module__}.{kind.__name__}",
                     "",
+                    *_oracle(name),
                 ]
             ),
         )
         lines.append(f"| [{look.label}]({name}.md) | `{name}` | {what} | {_rms(track, fleet):.2f} |")
     head = ["# Each method", "", "| method | name | what it does | RT-LE [m] |", "|---|---|---|---|"]
     yield "methods/index.md", "\n".join([*head, *lines, ""])
+
+
+ORACLES = {
+    "kalman": "solo",
+    "kalman-adaptive": "solo",
+    "lkf-sa": "lkf_sa",
+    "lkf-sa-edge": "joint",
+    "joint": "joint",
+    "drift": "drift",
+    "msmv-r": "msmv",
+    "ci": "covariance_intersection",
+    "split-ci": "covariance_intersection",
+    "cooperative-map": "window",
+    "cooperative-map-5": "window",
+    "mhe": "moving_horizon",
+    "gbp": "gbp",
+    "admm": "admm",
+    "central-filter": "central_filter",
+    "batch-smoother": "batch_smoother",
+}
+"""The textbook implementation of `tests/oracles` that each method is held against."""
+
+
+def _oracle(name: str) -> list[str]:
+    """The method written plainly, as the tests hold it against the compiled one."""
+    if name not in ORACLES:
+        return []
+    file = DOCS.parent / "tests" / "oracles" / f"{ORACLES[name]}.py"
+    words = f"The equations as a loop with dense matrices, one run at a time (`tests/oracles/{file.name}`)."
+    return ["## The method in plain NumPy", "", words, "", "```python", file.read_text().rstrip(), "```", ""]
 
 
 def _bounds(fleet: Any, sensors: Any) -> Iterator[tuple[str, Any]]:

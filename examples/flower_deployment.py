@@ -45,7 +45,6 @@ def main(
     data: str = "town10-clients",
     rounds: int = 3,
     kill: int | None = None,
-    patience: float = 3.0,
     change: str = "",
 ) -> None:
     """Train a federation of all vehicles of a fleet, one process each.
@@ -55,17 +54,16 @@ def main(
         data: fleet, a name or a path.
         rounds: of the federation.
         kill: this vehicle, counted from 1, in the middle of the second round.
-        patience: times as long as it took most clients that a round waits for the others.
         change: fields of the recipe, its schedule or its net, such as net-in-mult=2.
     """
     fleet, folder = load_fleet(data), folder.resolve()
     out = folder / "fedkalmannet.safetensors"
-    words = [f'change="rounds={rounds} {change}"', f"patience={patience}", f"nodes={len(fleet.ids)}", f'out="{out}"']
+    words = [f'change="rounds={rounds} {change}"', f"nodes={len(fleet.ids)}", f'out="{out}"']
     with deployment(folder) as site:
         nodes = join(site, {vehicle: fleet.select([vehicle]) for vehicle in fleet.ids})
         run = submit(site, words)
         if kill is not None:
-            wait(partial(logged, site, f"node-{kill}", "ROUND 2]"), run, "round 2")
+            wait(partial(logged, site, "run", "[ROUND 2/"), run, "round 2")
             time.sleep(1)
             os.killpg(nodes[kill - 1].pid, signal.SIGKILL)
             print(f"killed node-{kill}", flush=True)

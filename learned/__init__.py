@@ -2,7 +2,7 @@
 
 from . import torch_installed as torch_installed
 from .checkpoint import Checkpoint, load, save
-from .federation.federated import federate
+from .federation.federate import federate
 from .federation.history import Federation, ledger
 from .federation.participation import Participation
 from .method import Diagnostics, LearnedGain
@@ -13,9 +13,6 @@ from .nets.noise_net import NoiseNet
 from .nets.okf import NoiseParameters, OptimisedKF
 from .nets.recursive import RecursiveFilter, RecursiveGain
 from .nets.split import SplitGain
-from .nets.sums_stream import SumsMeasurement
-from .privacy.differential import Privacy
-from .privacy.secure import SecureAggregation
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
 from .training.clients import Client, Segments, clients
@@ -41,17 +38,14 @@ __all__ = [
     "NoiseParameters",
     "OptimisedKF",
     "Participation",
-    "Privacy",
     "Recipe",
     "Recurrent",
     "RecursiveFilter",
     "RecursiveGain",
     "Schedule",
-    "SecureAggregation",
     "Segments",
     "Setting",
     "SplitGain",
-    "SumsMeasurement",
     "clients",
     "federate",
     "fit",

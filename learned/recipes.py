@@ -25,7 +25,7 @@ from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
 from .training.schedule import STEPS, Epoch, Schedule
 
-REVISION = 6
+REVISION = 7
 """Raised whenever the training code changes what it makes of the same recipe."""
 KINDS = ("federated", "centralised", "individual", "okf")
 """Kinds of training."""
@@ -92,7 +92,6 @@ RECIPES: dict[str, Recipe] = {
         noise="wide",
         net="noise_net",
     ),
-    "magnitude": Recipe("federated", noise="wide", options=(("magnitudes", True),)),
     "recursive": Recipe(
         "federated",
         Schedule(batch=24, mirror=False),

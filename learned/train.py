@@ -19,7 +19,7 @@ from coopoc.workers import leave_with
 from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
-from .federation.federated import Plan, federate_many
+from .federation.federate import Plan, federate_many
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of

@@ -2,33 +2,48 @@
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import replace
+from functools import lru_cache, partial
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from coopoc.errors import InputError
 from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
-from coopoc.study.numbers import Where, interval, listed, mean, per_seed, present, seed_means
-from coopoc.study.pivot import across, crossed
+from coopoc.methods.noise_model import NoiseModel
+from coopoc.study.numbers import Where, across, interval, listed, mean, per_seed, present, seed_means
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
-from coopoc.study.tables import Table
+from coopoc.world.fleet import Fleet
+from coopoc.world.sensing import observe
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
 
 from . import lineup, scene
-from .federations import CONDITIONS, GRAPHS, RULES, WIRES, fitted, members, trained
+from .views import TableView, multiples, selections
 
 if TYPE_CHECKING:
-    from coopoc.study.plot import Plot
+    from coopoc.learned.training.clients import Client
     from coopoc.study.results import Results
 
+RULES = ("mean", "uniform", "fedavgm", "fedadam", "median", "trimmed_mean", "krum", "multi_krum")
+BESIDE = ("centralised", "kalman")
+"""Methods beside the rules under `iid` and `heterogeneous`."""
+METHODS = (*RULES, *BESIDE, "bound")
+"""Methods of the grid; other rules by name or path: `--set method=mean,mine.py:RULE`."""
+CONDITIONS = {
+    "iid": "equal sensors, equal amounts of data",
+    "heterogeneous": "GNSS 1, 1.5, 2.5, 4 m times velocity 5, 10, 20 %, all, two thirds or one third of the pieces",
+    "poisoned update": "one client sends its update times a negative factor",
+    "poisoned data": "one client's reference drive lies beside the true one",
+    "half absent": "half of the clients are asked, drawn anew in every round",
+}
+GNSS_STD, VELOCITY_RATIO, SHARES = (1.0, 1.5, 2.5, 4.0), (0.05, 0.10, 0.20), (1.0, 2 / 3, 1 / 3)
 LOST = 1e6
 """m, the RT-LE of a net whose estimates left every bound; a mean above a thousandth of it is shown as "diverged"."""
-REFERENCES = ("kalman", "bound")
-BESIDE = ("centralised", *GRAPHS, "kalman")
-"""Methods beside the rules under `iid` and `heterogeneous`."""
-METHODS = (*RULES, *BESIDE, *WIRES, "bound")
-"""Methods of the grid; other rules by name or path: `--set method=mean,mine.py:RULE`."""
 OF_THE_TEST = ("condition", "method", "scenario", "velocity_ratio", "runs", "egos", "data", "seed")
 """Parameters that change no training, and the two that name it."""
 
@@ -38,16 +53,101 @@ def meaningful(p: Params) -> bool:
 
     `uniform` is `mean` where all clients have as many pieces.
     """
-    from coopoc.learned.federation.aggregate import rule
+    from coopoc.learned.federation.rules import rule
 
     condition, method = str(p["condition"]), str(p["method"])
     if method in BESIDE:
         return condition in ("iid", "heterogeneous")
-    if method in (*WIRES, "bound"):
+    if method == "bound":
         return condition == "iid"
     asked = int(p["members"]) // (2 if condition == "half absent" else 1)
     enough: bool = rule(method).least <= asked
     return enough and (method != "uniform" or condition == "heterogeneous")
+
+
+def members(p: Params) -> Fleet:
+    """The vehicles that train: a number of the fleet of clients, evenly spaced."""
+    fleet, count = scene.fleet(p["clients"]), int(p["members"])
+    if not 2 <= count <= len(fleet.ids):
+        raise InputError("members", count, f"must be 2..{len(fleet.ids)}, the vehicles of the fleet", "Take fewer.")
+    return fleet.select([int(k) for k in np.arange(count) * len(fleet.ids) // count])
+
+
+def noise(p: Params) -> list[Sensors]:
+    """Noise of each client: the paper's training noise, or one pair of sensors after the other."""
+    paper, count = Sensors.paper_training(p["velocity_reading"]), int(p["members"])
+    if p["condition"] != "heterogeneous":
+        return [paper] * count
+    kinds = [replace(paper, gnss_std=(g,) * 3, velocity_std_ratio=ratio) for ratio in VELOCITY_RATIO for g in GNSS_STD]
+    return [kinds[i % len(kinds)] for i in range(count)]
+
+
+def clients(p: Params, seed: int) -> tuple[Client, ...]:
+    """The clients of a condition for one training seed; the one in the middle is the poisoned one."""
+    from coopoc.learned.federation.participation import heterogeneous, poisoned
+
+    count = int(p["members"])
+    amounts = [SHARES[i % 3] if p["condition"] == "heterogeneous" else 1.0 for i in range(count)]
+    group = list(heterogeneous(members(p), noise(p), amounts, seed=seed, piece=int(p["piece"])))
+    if p["condition"] == "poisoned data":
+        group[count // 2] = poisoned(group[count // 2], float(p["offset_m"]))
+    return tuple(group)
+
+
+def fitted(p: Params) -> NoiseModel:
+    """Noise model fitted to the recordings of all clients with training seed 0."""
+    fleet, acting = members(p), noise(p)
+    seen = {sensors: observe(fleet, sensors, V2X(0), seed=0) for sensors in dict.fromkeys(acting)}
+    gnss, velocity = (
+        np.stack([getattr(seen[sensors], name)[:, :, i] for i, sensors in enumerate(acting)], axis=2)
+        for name in ("gnss", "velocity")
+    )
+    return NoiseModel.fitted(replace(seen[acting[0]], gnss=gnss, velocity=velocity), fleet)
+
+
+class Trained(NamedTuple):
+    """A net of one training seed: the kept one, and that of the last round."""
+
+    kept: Any
+    last: Any
+
+
+@lru_cache(maxsize=2)
+def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Trained, ...]:
+    """All training seeds of a method under a condition, in one rollout."""
+    from coopoc.learned import GainNet
+    from coopoc.learned.federation.federate import Plan, federate_many
+    from coopoc.learned.federation.participation import Byzantine, Participation
+
+    p = {**dict(given), "condition": condition, "method": method}
+    nets = [GainNet(int(p["in_mult"]), int(p["out_mult"]), seed=seed) for seed in range(int(p["train_seeds"]))]
+    groups = [clients(p, seed) for seed in range(len(nets))]
+    if method == "centralised":
+        return _pooled(p, nets, groups)
+    participation = Participation(share=0.5 if condition == "half absent" else 1.0)
+    if condition == "poisoned update":
+        participation = Byzantine(names=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
+    plan = Plan(int(p["rounds"]), method, int(p["local_epochs"]), participation=participation)
+    federations = federate_many(nets, groups, range(len(nets)), plan)
+    return tuple(Trained(fed.model, fed.after(len(fed.history) - 1)) for fed in federations)
+
+
+def _pooled(p: Params, nets: list[Any], groups: list[tuple[Client, ...]]) -> tuple[Trained, ...]:
+    """Nets trained on all pieces in one place."""
+    from coopoc.learned.nets.stack import unflatten
+    from coopoc.learned.training.clients import Segments
+    from coopoc.learned.training.fit import Task, fit_many
+    from coopoc.learned.training.schedule import Schedule
+
+    tasks = []
+    for seed, (net, group) in enumerate(zip(nets, groups, strict=True)):
+        parts = ("training", "validation", "long")
+        training, validation, long = (Segments.join([getattr(client, part) for client in group]) for part in parts)
+        tasks.append(Task(net, training, validation, seed, long=long))
+    return tuple(
+        Trained(fit.model, unflatten(fit.history[-1].weights[None], fit.model)[0])
+        for fit in fit_many(tasks, Schedule(epochs=int(p["steps"])))
+    )
 
 
 def cell(p: Params) -> list[Row]:
@@ -58,12 +158,12 @@ def cell(p: Params) -> list[Row]:
     if p["method"] == "kalman":
         return rows_of({"rt_le_m": bounded_rt_le(Kalman(fitted(p)), *trial, LOST)}, trial[1])
     training = tuple((name, value) for name, value in p.items() if name not in OF_THE_TEST)
-    found: list[Row] = []
+    rows: list[Row] = []
     for seed, net in enumerate(trained(p["condition"], p["method"], training)):
-        kept, last = (bounded_rt_le(one.method(p["method"]), *trial, LOST) for one in (net.kept, net.last))
+        kept, last = (bounded_rt_le(each.method(p["method"]), *trial, LOST) for each in (net.kept, net.last))
         columns = {"rt_le_m": kept, "last_rt_le_m": last}
-        found += [{**row, "train_seed": seed, **net.costs} for row in rows_of(columns, trial[1])]
-    return found
+        rows += [{**row, "train_seed": seed} for row in rows_of(columns, trial[1])]
+    return rows
 
 
 def key(p: Params) -> dict[str, str]:
@@ -71,71 +171,45 @@ def key(p: Params) -> dict[str, str]:
     return {**scene.facts(p), "clients": members(p).digest, "torch": version("torch")}
 
 
-def _table(results: Results, scenario: int, value: str, text: str) -> Table | None:
+def _error(results: Results, where: Where, value: str) -> Interval | str | None:
+    each = interval(results, where, value)
+    return "diverged" if each and not each.mean < LOST / 1e3 else each
+
+
+def _table(scenario: int, value: str, weights: str) -> TableView:
     """Methods down, conditions across, for one metric."""
     at = {"scenario": scenario}
-    ran = [c for c in CONDITIONS if present(results, {**at, "condition": c}, value)]
-    methods = dict.fromkeys((*METHODS, *results.frame["method"]))
 
-    def number(results: Results, where: Where) -> Interval | str | None:
-        found = interval(results, where, value)
-        return "diverged" if found and not found.mean < LOST / 1e3 else found
+    def rows(results: Results) -> Any:
+        names = dict.fromkeys((*METHODS, *results.frame.get("method", ())))
+        return [((look(method).label,), {"method": method}) for method in names]
 
-    columns = across(number, {c.capitalize(): {**at, "condition": c} for c in ran})
-    conditions = "; ".join(f"{c}: {CONDITIONS[c]}" for c in ran)
-    note = "KF: fitted to the noise that the clients saw; the bound knows the acting noise and no bias."
-    caption = f"{scene.caption(results, text, **at)} {conditions}. {note}"
-    rows = [((look(method).label,), {"method": method}) for method in methods]
-    return crossed(results, ("Rule",), rows, columns, caption, best="min", along="column", decimals=3)
-
-
-def _figure(results: Results) -> Plot | None:
-    """Multiples of the mean's RT-LE under iid, one panel per condition, a dot per training seed."""
-    from coopoc.study.multiples import multiples
-
-    at = {"scenario": 2}
-    whole = mean(results, {**at, "condition": "iid", "method": "mean"})
-    if whole is None:
-        return None
-    found: dict[tuple[str, str], dict[str, list[float]]] = {}
-    for rule in RULES:
-        for condition in CONDITIONS:
-            each = seed_means(results, {**at, "condition": condition, "method": rule})
-            if each:
-                found.setdefault((rule, "none"), {})[condition.capitalize()] = [value / whole for value in each]
-    text = "RT-LE of the kept weights as a multiple of the mean's under iid, a dot per training seed."
-    return multiples(found, scene.caption(results, text, **at))
+    return selections(
+        ("Rule",),
+        rows,
+        across(partial(_error, value=value), {name.capitalize(): {**at, "condition": name} for name in CONDITIONS}),
+        f"RT-LE [m], {weights}.",
+        *(f"{name}: {text};" for name, text in CONDITIONS.items()),
+        "KF: fitted to the noise that the clients saw; the bound knows the acting noise and no bias.",
+        at=at,
+        best="min",
+        along="column",
+        decimals=3,
+    )
 
 
-def _costs(results: Results) -> Table | None:
-    """Bytes, seconds and rejected answers."""
-    columns = {
-        "sent_kb": "Sent [kB]",
-        "received_kb": "Received [kB]",
-        "rejected": "Answers rejected",
-        "idle_rounds": "Rounds without change",
-        "train_seconds": "Training [s]",
-    }
-    body = [
-        (condition, look(method).label, *(float(rows[name].mean()) for name in columns))
-        for (condition, method), rows in results.groups(["condition", "method"])
-        if method not in REFERENCES
-    ]
-    text = "Of one client over the whole training, payload only, on average; what the server refused; mean over seeds."
-    return Table(("Condition", "Rule", *columns.values()), tuple(body), text, decimals=1) if body else None
-
-
-def _findings(results: Results) -> dict[str, str]:
-    return {
-        f"scenario {s}, {c}": _finding(results, {"scenario": s, "condition": c}) for s in (1, 2) for c in CONDITIONS
-    }
+def _multiple(results: Results, where: Where) -> list[float]:
+    """RT-LE of each training seed as a multiple of the mean's under iid."""
+    whole = mean(results, {"scenario": where["scenario"], "condition": "iid", "method": "mean"})
+    each = seed_means(results, {name: value for name, value in where.items() if name != "noise_model"})
+    return [value / whole for value in each] if whole else []
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
     """RT-LE of the mean under a condition, and which rules are better or worse over all training seeds."""
-    if not present(results, {**at, "method": "mean"}):
-        return ""
     plain = per_seed(results, {**at, "method": "mean"})
+    if not len(plain):
+        return ""
     better, worse = list[str](), list[str]()
     for rule in RULES[1:]:
         if len(plain) > 1 and present(results, {**at, "method": rule}):
@@ -174,23 +248,27 @@ STUDY = Study(
         "piece": 100,
         "in_mult": 40,
         "out_mult": 5,
-        "radius_m": 30.0,
         "factor": 20.0,
         "offset_m": 10.0,
     },
     tables={
-        f"scenario{scenario}{end}": partial(_table, scenario=scenario, value=value, text=f"RT-LE [m], {words}.")
-        for end, value, words in (
-            ("", "rt_le_m", "kept weights"),
-            ("_last", "last_rt_le_m", "weights of the last round"),
-        )
-        for scenario in (1, 2)
-    }
-    | {
-        "costs": _costs,
+        "scenario1": _table(1, "rt_le_m", "kept weights"),
+        "scenario2": _table(2, "rt_le_m", "kept weights"),
+        "scenario1_last": _table(1, "last_rt_le_m", "weights of the last round"),
+        "scenario2_last": _table(2, "last_rt_le_m", "weights of the last round"),
     },
-    figures={"multiples": _figure},
-    findings=_findings,
+    figures={
+        "multiples": multiples(
+            [(rule, "none") for rule in RULES],
+            {name.capitalize(): {"scenario": 2, "condition": name} for name in CONDITIONS},
+            _multiple,
+            "RT-LE of the kept weights as a multiple of the mean's under iid, a dot per training seed.",
+            at={"scenario": 2},
+        )
+    },
+    findings=lambda results: {
+        f"scenario {s}, {c}": _finding(results, {"scenario": s, "condition": c}) for s in (1, 2) for c in CONDITIONS
+    },
     limitations=(
         "The selected round depends on the reports of all participating clients, the poisoned one included.",
         "Rules have their default parameters, of which some were chosen under iid on town10-validation; krum and "

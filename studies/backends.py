@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,20 +16,16 @@ from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.solution import Status
 from coopoc.optimize.solve import solve
 from coopoc.optimize.starts.initial import initial_guess
-from coopoc.study.numbers import Number, Where, present
-from coopoc.study.pivot import across, crossed
+from coopoc.study.numbers import Number, Where, across, present
 from coopoc.study.study import Params, Row
-from coopoc.study.style import look
+from coopoc.study.style import Panel, look
 from coopoc.world.recording import Recording
 
 from . import lineup, scene
+from .views import TableView, curves, selections
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from coopoc.study.plot import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 BACKENDS = ("gauss-newton", "gtsam", "casadi", "osqp", "cvxpy")
 CONVEX = ("ranges", "converted")
@@ -79,113 +74,66 @@ def referee(problem: Problem) -> Floats:
     def jacobian(flat: Floats) -> Floats:
         return np.asarray(problem.whiten(flat.reshape(start.shape))[1].toarray())
 
-    found = least_squares(residual, start.ravel(), jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-12, max_nfev=500)
-    return np.asarray(found.x.reshape(start.shape))
+    best = least_squares(residual, start.ravel(), jacobian, xtol=1e-15, ftol=1e-15, gtol=1e-12, max_nfev=500)
+    return np.asarray(best.x.reshape(start.shape))
 
 
 def cell(p: Params) -> list[Row]:
     """Rows of one backend on one kind of problem: every ego at evenly spaced steps, `run` counting those."""
     seen = scene.recording({**p, "runs": 1})
     steps = np.linspace(WINDOW, len(seen.t) - 1, int(p["samples"])).astype(int).tolist()
-    found: list[Row] = []
+    rows: list[Row] = []
     for ego in scene.egos(p["data"], str(p["egos"])):
-        for place, step in enumerate(steps):
+        for number, step in enumerate(steps):
             problem = PROBLEMS[p["problem"]](seen, step, ego, 0)
-            found.append({"run": place, "ego": ego, **_solved(problem, p["method"])})
-    return found
+            rows.append({"run": number, "ego": ego, **_solved(problem, p["method"])})
+    return rows
 
 
 def _solved(problem: Problem, backend: str) -> Row:
     """Answer of a backend to one problem, beside the referee; the second call is timed, as imports are once."""
     solve(problem, backend, throw=False)
     began = time.perf_counter()
-    mine = solve(problem, backend, throw=False)
+    solution = solve(problem, backend, throw=False)
     whole = time.perf_counter() - began
     fair = referee(problem)
-    gap, cost = float(np.abs(mine.x - fair).max()), problem.cost(fair)
+    gap, cost = float(np.abs(solution.x - fair).max()), problem.cost(fair)
     return {
         "gap_m": gap,
         "same": float(gap < SAME_M),
-        "cost_gap": (mine.cost - cost) / max(cost, 1e-12),
-        "solved": float(mine.status is Status.SOLVED),
-        "iterations": mine.iterations,
-        "solve_ms": 1e3 * mine.solve_seconds,
+        "cost_gap": (solution.cost - cost) / max(cost, 1e-12),
+        "solved": float(solution.status is Status.SOLVED),
+        "iterations": solution.iterations,
+        "solve_ms": 1e3 * solution.solve_seconds,
         "whole_ms": 1e3 * whole,
         "seconds": whole,
     }
 
 
-ROWS = [
-    ((words, look(backend).label), {"problem": problem, "method": backend})
-    for problem, words in WORDS.items()
-    for backend in BACKENDS
-]
+def _column(value: str, number: Callable[[Any], Any], agreed: bool = False) -> Number:
+    """A number of a column over all solves of a backend, or over those that ended where the referee does."""
+
+    def column(results: Results, where: Where) -> Any:
+        kept = present(results, {**where, **({"same": 1.0} if agreed else {})}, value)
+        return None if kept is None else number(results.select(kept)[value])
+
+    return column
 
 
-def _percent(values: pd.Series[float]) -> str:
+def _percent(values: Any) -> str:
     return f"{100 * values.mean():.0f} %"
 
 
-def _agreement(results: Results) -> Table | None:
-    """Numbers of all solves of a backend, and of those that ended where the referee does."""
+_median = {name: _column(name, lambda values: float(values.median())) for name in ("solve_ms", "whole_ms")}
 
-    def of(number: Callable[[pd.DataFrame], Any], agreed: bool = False) -> Number:
-        def column(results: Results, where: Where) -> Any:
-            kept = present(results, where, "gap_m")
-            rows = None if kept is None else results.select(kept)
-            rows = rows if rows is None or not agreed else rows[rows["same"] == 1.0]
-            return None if rows is None or rows.empty else number(rows)
 
-        return column
-
-    columns = [
-        ("Solves", of(len)),
-        ("At a minimum", of(lambda rows: _percent(rows["solved"]))),
-        ("The referee's", of(lambda rows: _percent(rows["same"]))),
-        ("Farthest [µm]", of(lambda rows: f"{1e6 * rows['gap_m'].max():.2g}", agreed=True)),
-        ("Cost differs", of(lambda rows: f"{rows['cost_gap'].abs().max():.0e}", agreed=True)),
-        ("Lower", of(lambda rows: int((rows["cost_gap"] < -1e-6).sum()))),
-        ("Higher", of(lambda rows: int((rows["cost_gap"] > 1e-6).sum()))),
+def _table(columns: Mapping[str, Number], text: str) -> TableView:
+    rows = [
+        ((words, look(backend).label), {"problem": problem, "method": backend})
+        for problem, words in WORDS.items()
+        for backend in BACKENDS
     ]
-    text = (
-        "Answers beside SciPy's trust-region least squares from the same start. The referee's: less than 1 mm away; of "
-        "those, the farthest and the largest relative difference of cost. Lower, higher: solves that ended in a better "
-        "or a worse minimum than the referee."
-    )
-    return crossed(results, ("Problem", "Backend"), ROWS, columns, scene.caption(results, text, runs=1))
-
-
-def _cost(results: Results) -> Table | None:
-    ks = sorted(results.frame["max_neighbours"].unique()) if len(results.frame) else []
-    columns = [
-        column
-        for value, label in (("solve_ms", "Solver"), ("whole_ms", "All"))
-        for column in across(partial(_median, value=value), {f"{label}, K = {k}": {"max_neighbours": k} for k in ks})
-    ]
-    text = (
-        "Milliseconds of one solve() from its first guess, median. Solver: the backend alone. All: with structure, "
-        "checks, cost and covariance. Batches and streams, which keep the structure, are in docs/performance.md; times "
-        "depend on the machine."
-    )
-    return crossed(results, ("Problem", "Backend"), ROWS, columns, scene.caption(results, text, runs=1))
-
-
-def _median(results: Results, where: Where, value: str) -> float | None:
-    kept = present(results, where, value)
-    return None if kept is None else float(results.select(kept)[value].median())
-
-
-def _figure(results: Results) -> Plot | None:
-    """Time of a solve against neighbours, one panel per problem."""
-    from coopoc.study.lines import Line, Panel, panels
-
-    def line(backend: str, problem: str) -> Line:
-        at = {"method": backend, "problem": problem}
-        return Line({"method": backend}, {k: _median(results, {**at, "max_neighbours": k}, "whole_ms") for k in KS})
-
-    shown = [Panel([line(b, p) for b in BACKENDS], WORDS[p].capitalize(), "Neighbours K", KS) for p in PROBLEMS]
-    text = "Milliseconds of one solve() from its first guess, checks and covariance included, median."
-    return panels(shown, scene.caption(results, text, runs=1), 9.6, ylabel="Time [ms]", log=True)
+    return selections(("Problem", "Backend"), rows, columns, text, at={"runs": 1})
 
 
 def _findings(results: Results) -> dict[str, str]:
@@ -219,8 +167,43 @@ STUDY = lineup.study(
     settings={**scene.TOWN, "samples": 12, "train_seeds": 0},
     scored=False,
     shares=("max_neighbours",),
-    tables={"agreement": _agreement, "cost": _cost},
-    figures={"cost": _figure},
+    tables={
+        "agreement": _table(
+            {
+                "Solves": _column("gap_m", len),
+                "At a minimum": _column("solved", _percent),
+                "The referee's": _column("same", _percent),
+                "Farthest [µm]": _column("gap_m", lambda gaps: f"{1e6 * gaps.max():.2g}", agreed=True),
+                "Cost differs": _column("cost_gap", lambda gaps: f"{gaps.abs().max():.0e}", agreed=True),
+                "Lower": _column("cost_gap", lambda gaps: int((gaps < -1e-6).sum())),
+                "Higher": _column("cost_gap", lambda gaps: int((gaps > 1e-6).sum())),
+            },
+            "Answers beside SciPy's trust-region least squares from the same start. The referee's: less than 1 mm "
+            "away; of those, the farthest and the largest relative difference of cost. Lower, higher: solves that "
+            "ended in a better or a worse minimum than the referee.",
+        ),
+        "cost": _table(
+            across(_median["solve_ms"], {f"Solver, K = {k}": {"max_neighbours": k} for k in KS})
+            | across(_median["whole_ms"], {f"All, K = {k}": {"max_neighbours": k} for k in KS}),
+            "Milliseconds of one solve() from its first guess, median. Solver: the backend alone. All: with structure, "
+            "checks, cost and covariance. Batches and streams, which keep the structure, are in docs/performance.md; "
+            "times depend on the machine.",
+        ),
+    },
+    figures={
+        "cost": curves(
+            [
+                Panel({k: {"max_neighbours": k} for k in KS}, {"problem": p}, WORDS[p].capitalize(), "Neighbours K")
+                for p in PROBLEMS
+            ],
+            [{"method": backend} for backend in BACKENDS],
+            "Milliseconds of one solve() from its first guess, checks and covariance included, median.",
+            at={"runs": 1},
+            number=_median["whole_ms"],
+            ylabel="Time [ms]",
+            log=True,
+        )
+    },
     findings=_findings,
     limitations=(
         "The reference solver is local, too: where there are several minima it does not show which is the lowest.",

@@ -3,104 +3,95 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coopoc.study.numbers import listed, mean, ratio, rms
+import numpy as np
+
+from coopoc.evaluate.ledger import Kind, Ledger, Way, break_even
+from coopoc.evaluate.scores import BYTES
+from coopoc.study.numbers import Number, Where, across, difference, interval, listed, mean, present, ratio, rms
 from coopoc.study.style import look
+from coopoc.study.tables import Table
 from coopoc.world.v2x import CHANNELS
 
-from . import budget_tables, lineup, scene, weights
-from .budget_tables import AXES, CAPS, SCHEDULED, SCHEDULES, SHARED, TRAINED, under, way
-from .lineup import PAST, of
+from . import lineup, scene, weights
+from .lineup import PAST
+from .views import of, selections
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-SOLO = (
-    ("gnss", "none"),
-    ("kalman", "fitted"),
-    ("kalman", "nominal"),
-    ("fedokf", "trained"),
-    ("fedkalmannet", "trained"),
-    ("recursive", "trained"),
+TRAINED = ("fedokf", "recursive", "fedkalmannet")
+"""Trained by federation, in the order of their bytes."""
+SOLO = (("gnss", "none"), ("kalman", "fitted"), ("kalman", "nominal"), *((name, "trained") for name in TRAINED))
+SHARED = (
+    ("lkf-sa", "identity"),
+    ("lkf-sa", "fitted"),
+    ("joint", "fitted"),
+    ("joint", "nominal"),
+    ("split-ci", "nominal"),
+    ("cooperative", "trained"),
 )
+SCHEDULED = (("joint", "nominal"), ("split-ci", "nominal"))
+"""Which of them run under every schedule."""
 NEIGHBOURS = (1, 2, 4, 10)
+MOST = NEIGHBOURS[-1]
 RATES = (1.0, 2.0, 5.0)
-HOURS = (1, 10, 100)
+CAPS = (100.0, 200.0, 400.0, 800.0)
+SCHEDULES = ("nearest", "round robin")
+FREE = {"rate_hz": 0.0, "cap_bytes_per_second": 0.0, "schedule": SCHEDULES[0]}
+AXES = ("channel", "max_neighbours", *FREE)
+"""Parameters of a channel."""
+WORDS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cpm": "CPM, 5 Hz"}
 PAYLOAD = "payload_bytes_per_second"
 LIMITS = (0.0, 300.0, 1000.0, 5000.0)
 """B/s, under which the best method is named."""
+COUNTS: tuple[tuple[Kind, Way], ...] = (
+    ("payload", "per receiver"),
+    ("payload", "broadcast"),
+    ("on air", "per receiver"),
+    ("on air", "broadcast"),
+)
+
+
+def over(channel: str, k: int, **limits: Any) -> dict[str, Any]:
+    """A channel as parameters or as a selection; its own rate, no cap and the nearest first, but for the limits."""
+    return {"channel": channel, "max_neighbours": k, **FREE, **limits}
+
+
+def under(cap: float, schedule: str, method: str, known: str) -> dict[str, Any]:
+    """The selection of a method under a cap and a schedule."""
+    return of(method, known, **over("ideal", MOST, cap_bytes_per_second=cap, schedule=schedule))
 
 
 def _grid() -> list[dict[str, Any]]:
     """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; two
-    of them under caps with other schedules."""
-    channels = [way(name, k) for name in CHANNELS for k in NEIGHBOURS]
-    rates = [way("ideal", 10, rate_hz=rate) for rate in RATES]
-    caps = [way("ideal", 10, cap_bytes_per_second=cap) for cap in CAPS]
+    of them under caps with the other schedule."""
+    channels = [over(name, k) for name in CHANNELS for k in NEIGHBOURS]
+    rates = [over("ideal", MOST, rate_hz=rate) for rate in RATES]
+    caps = [over("ideal", MOST, cap_bytes_per_second=cap) for cap in CAPS]
     return [
-        *(of(*pair, **way("ideal", 0)) for pair in (*SOLO, PAST)),
+        *(of(*pair, **over("ideal", 0)) for pair in (*SOLO, PAST)),
         *(of(*pair, **each) for each in (*channels, *rates, *caps) for pair in SHARED),
-        *(under(cap, each, *pair) for cap in CAPS for each in SCHEDULES[1:] for pair in SCHEDULED),
-        *(of(*PAST, **way("ideal", k)) for k in NEIGHBOURS),
+        *(under(cap, SCHEDULES[1], *pair) for cap in CAPS for pair in SCHEDULED),
+        *(of(*PAST, **over("ideal", k)) for k in NEIGHBOURS),
     ]
 
 
-def _pareto(results: Results) -> Plot | None:
-    """RT-LE against payload bytes per second; a training's bytes are spread over hours of driving."""
-    from coopoc.study.lines import Line, draw
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
+def _figure(results: Results) -> Plot | None:
+    from coopoc.study import figures
 
-    drawn, ran = list[Mapping[str, Any]](), choices(results)
-    with canvas(1, 2, width=8.6, height=3.9, sharey=True, gridspec_kw={"width_ratios": [1.0, 1.3]}) as (
-        figure,
-        (left, right),
-    ):
-        for pair in SOLO:
-            error = mean(results, of(*pair))
-            if error is not None and pair[0] in TRAINED:
-                total = weights.training_bytes(results.settings, [pair[0]])[pair[0]]
-                drawn += draw(left, [Line(of(*pair), {total / (3600 * hours): error for hours in HOURS})])
-            else:
-                level = [Line(of(*pair), error, {"alpha": 0.75})]
-                drawn += draw(left, level) and draw(right, level)
-        for pair in SHARED:
-            found = sorted((one.size, one.error) for one in ran if _pair(one) == pair and one.size)
-            if found:
-                right.plot(*zip(*found, strict=True), **{**strokes(of(*pair), thin=True), "linestyle": "none"})
-                drawn += draw(right, [Line(of(*pair), dict(front(found)), {"marker": ""})])
-        least = min((one.error for one in ran if _pair(one) == PAST), default=None)
-        if least is not None:
-            drawn += draw(right, [Line(of(*PAST), least)])
-        if not drawn:
-            return None
-        for panel in (left, right):
-            plain_log(panel.yaxis)
-            plain_log(panel.xaxis)
-        left.set(ylabel="RT-LE [m]", xlabel="Training bytes per second of driving", title="solo")
-        right.set(xlabel="Received online, payload [B/s]", title="online cooperation")
-        legend(right, drawn)
+    where = present(results, {"channel": "ideal"})
+    if where is None:
+        return None
     text = (
-        "RT-LE against bytes. Left: what each vehicle sends and receives in training, spread over 1, 10 and 100 hours "
-        "of driving (right to left). Right: payload that an ego receives over a channel that loses nothing, at each K, "
-        "rate, cap and schedule; lines: the best for the bytes. Horizontal: what costs no bytes. The bound is that of "
-        "most neighbours at every step, with what newcomers did before: no message brings more, whatever its bytes."
+        "RT-LE against the payload that an ego receives over a channel that loses nothing, at each K, rate, cap and "
+        "schedule; lines: the best for the bytes. Horizontal: methods that receive nothing, and the bound of most "
+        "neighbours at every step with what newcomers did before: no message brings more, whatever its bytes."
     )
-    return Plot(figure, scene.caption(results, text))
-
-
-def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Of points (bytes, error) in order of bytes, those with a lower error than every cheaper one.
-
-    >>> front([(1.0, 3.0), (2.0, 4.0), (3.0, 2.0)])
-    [(1.0, 3.0), (3.0, 2.0)]
-    """
-    best: list[tuple[float, float]] = []
-    for point in points:
-        if not best or point[1] < best[-1][1]:
-            best.append(point)
-    return best
+    return figures.pareto(results, PAYLOAD, where=where, caption=scene.caption(results, text))
 
 
 class Choice(NamedTuple):
@@ -111,38 +102,20 @@ class Choice(NamedTuple):
     where: Mapping[str, Any]
 
 
-def _pair(choice: Choice) -> tuple[str, str]:
-    return choice.where["method"], choice.where["noise_model"]
-
-
 def choices(results: Results) -> list[Choice]:
-    """All that was run over an ideal channel, and the bound."""
-    names, found = [*AXES, "method", "noise_model"], list[Choice]()
-    for each, _ in results.frame.groupby(names, sort=False) if set(names) <= set(results.frame) else ():
-        where = dict(zip(names, each, strict=True))
-        if where["channel"] == "ideal" and (error := mean(results, where)) is not None:
-            found.append(Choice(error, mean(results, where, PAYLOAD) or 0.0, where))
-    return [one for one in found if _pair(one) in (*SOLO, *SHARED, PAST)]
+    """All methods that were run over an ideal channel."""
+    names, each = [*AXES, "method", "noise_model"], list[Choice]()
+    for key, _ in results.frame.groupby(names, sort=False) if set(names) <= set(results.frame) else ():
+        where = dict(zip(names, key, strict=True))
+        error = mean(results, where) if where["channel"] == "ideal" and where["method"] != "bound" else None
+        if error is not None:
+            each.append(Choice(error, mean(results, where, PAYLOAD) or 0.0, where))
+    return each
 
 
-def best_under(found: Sequence[Choice], limit: float) -> Choice | None:
+def best_under(each: Sequence[Choice], limit: float) -> Choice | None:
     """The best method of them within `limit` bytes per second."""
-    able = [one for one in found if one.size <= limit and _pair(one) != PAST]
-    return min(able, key=lambda one: one.error, default=None)
-
-
-def _findings(results: Results) -> dict[str, str]:
-    found, ran = {}, choices(results)
-    for limit in LIMITS:
-        best = best_under(ran, limit)
-        if best is not None:
-            where, k = best.where, best.where["max_neighbours"]
-            first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
-            at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
-            words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
-            how = f"{look(where['method']).label} ({where['noise_model']}){at}"
-            found[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{gap(results, where)}."
-    return found | {f"schedules, {method}": _scheduled(results, method, known) for method, known in SCHEDULED}
+    return min((choice for choice in each if choice.size <= limit), key=lambda choice: choice.error, default=None)
 
 
 def gap(results: Results, where: Mapping[str, Any]) -> str:
@@ -151,16 +124,117 @@ def gap(results: Results, where: Mapping[str, Any]) -> str:
     return f", {times:.2f} times the bound" if times else ""
 
 
-def _scheduled(results: Results, method: str, known: str) -> str:
-    """RT-LE of a method under each cap, by the schedule of its neighbours."""
-    parts = []
-    for cap in CAPS:
-        errors = {each: mean(results, under(cap, each, method, known)) for each in SCHEDULES}
-        if None not in errors.values():
-            parts.append(f"at {cap:g} B/s {listed(errors)}")
-    return f"Heard first under a cap ({look(method).label}, {known}): {'; '.join(parts)}." if parts else ""
+def _findings(results: Results) -> dict[str, str]:
+    texts, each = {}, choices(results)
+    for limit in LIMITS:
+        best = best_under(each, limit)
+        if best is not None:
+            where, k = best.where, best.where["max_neighbours"]
+            first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
+            at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
+            words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
+            how = f"{look(where['method']).label} ({where['noise_model']}){at}"
+            texts[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{gap(results, where)}."
+    for method, known in SCHEDULED:
+        parts = []
+        for cap in CAPS:
+            errors = {name: mean(results, under(cap, name, method, known)) for name in SCHEDULES}
+            if None not in errors.values():
+                parts.append(f"at {cap:g} B/s {listed(errors)}")
+        text = f"Heard first under a cap ({look(method).label}, {known}): {'; '.join(parts)}."
+        texts[f"schedules, {method}"] = text if parts else ""
+    return texts
 
 
+def _account(results: Results, where: Where) -> Ledger | None:
+    """The ledger of one second of the drive; None where the method was not run."""
+    kept = present(results, where)
+    if kept is None:
+        return None
+    egos = sorted(results.select(kept)["ego"].unique())
+    rates = {counted: results.values(name, kept).T for name, counted in BYTES.items()}
+    moved = np.zeros((2, 2, 2, *next(iter(rates.values())).shape))
+    for (kind, way), rate in rates.items():
+        moved[int(way == "per receiver"), 1, int(kind == "on air")] = rate
+    return Ledger(tuple(egos), np.ones(len(egos)), moved[0], moved[1])
+
+
+def _rate(results: Results, where: Where, kind: Kind = "payload") -> int | None:
+    account = _account(results, where)
+    return None if account is None else round(account.rate(kind))
+
+
+def _trainings(results: Results) -> dict[str, Ledger]:
+    """The ledgers of the trainings that the study has run, by label."""
+    ran = [name for name in TRAINED if present(results, {"method": name})]
+    return {look(name).label: weights.ledger(results.settings, name) for name in ran}
+
+
+def even(results: Results) -> Table | None:
+    """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
+
+    def time(total: Ledger) -> Number:
+        def column(results: Results, where: Where) -> str | None:
+            account = _account(results, where)
+            return None if account is None else duration(break_even(total, account))
+
+        return column
+
+    trainings = _trainings(results)
+    once = {f"{name}, {t.per_vehicle('training') / 1e3:,.0f} kB": time(t) for name, t in trainings.items()}
+    rows = [row for row in METHODS if row[1]["noise_model"] in ("nominal", "trained")] if once else []
+    text = (
+        f"Driving time after which online cooperation (K = {MOST}) has moved as many bytes as each training moved per "
+        "vehicle, once: payload, per receiver."
+    )
+    head = ("Channel", "Online", "Noise model")
+    return selections(head, rows, {"Payload [B/s]": _rate, **once}, text)(results)
+
+
+def ledger(results: Results) -> Table | None:
+    """The same for the joint filter as payload and on air, sent once and per receiver."""
+    trainings, (method, known), body = _trainings(results), SCHEDULED[0], list[tuple[Any, ...]]()
+    for channel, make in CHANNELS.items() if trainings else ():
+        account = _account(results, of(method, known, **over(channel, MOST)))
+        for kind, way in COUNTS if account is not None else ():
+            if account is not None and (kind == "payload" or make(MOST).overhead):
+                times = (duration(break_even(total, account, kind, way)) for total in trainings.values())
+                body.append((WORDS[channel], f"{kind}, {way}", round(account.rate(kind, way)), *times))
+    for kind, way in COUNTS[:2] if body else ():
+        once = (f"{total.per_vehicle('training', kind, way) / 1e3:,.0f} kB" for total in trainings.values())
+        body.append(("a training, once", f"{kind}, {way}", None, *once))
+    text = (
+        f"The ledger per vehicle: {look(method).label.lower()}, {known}, K = {MOST}, and the driving time after which "
+        "it has moved as many bytes as a training. Broadcast: what is sent, each message once, a server's included; "
+        "per receiver: a copy for each that receives it. Nothing is added to the payload of a training, which goes by "
+        "another network."
+    )
+    header = ("Channel", "Counted", "Online [B/s]", *trainings)
+    return Table(header, tuple(body), scene.caption(results, text)) if body else None
+
+
+def duration(seconds: float) -> str:
+    """Seconds in a unit that suits them.
+
+    >>> duration(0.3), duration(5), duration(600), duration(7300), duration(float("inf"))
+    ('< 1 s', '5 s', '10 min', '2.0 h', 'never')
+    """
+    if seconds < 60:
+        return f"{seconds:.0f} s" if seconds >= 1 else "< 1 s"
+    if not np.isfinite(seconds):
+        return "never"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def _less(results: Results, where: Where) -> Any:
+    return difference(results, where, {**where, "schedule": SCHEDULES[0]})
+
+
+METHODS = [
+    ((WORDS[name], look(pair[0]).label, pair[1]), of(*pair, **over(name, MOST))) for name in CHANNELS for pair in SHARED
+]
+"""Each method over each channel: labels and selection."""
+BY_SCHEDULE = {name: {"schedule": name} for name in SCHEDULES}
 STUDY = lineup.study(
     "budget",
     "What does accuracy cost in bytes: once for training, or in every second of a drive?",
@@ -168,13 +242,28 @@ STUDY = lineup.study(
     settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 3},
     shares=AXES,
     tables={
-        "channels": budget_tables.channels,
-        "load": budget_tables.load,
-        "schedules": budget_tables.schedules,
-        "break_even": budget_tables.even,
-        "ledger": budget_tables.ledger,
+        "channels": selections(
+            ("Channel", "Method", "Noise model"),
+            METHODS,
+            {"RT-LE [m]": mean, "Payload [B/s]": _rate, "On air [B/s]": partial(_rate, kind="on air")},
+            f"K = {MOST} over field channels (CAM, BSM, CPM): rate, latency, bursts of loss, and what a message "
+            "carries anyway. Payload is what a method adds.",
+            decimals=3,
+        ),
+        "schedules": selections(
+            ("Cap [B/s]", "Method"),
+            [((int(cap), look(pair[0]).label), under(cap, SCHEDULES[0], *pair)) for cap in CAPS for pair in SCHEDULED],
+            {**across(interval, BY_SCHEDULE), "Difference": across(_less, BY_SCHEDULE)[SCHEDULES[1]]},
+            "RT-LE [m] when an ego receives no more than the cap, by schedule; differences are paired, with 95 % "
+            f"intervals. K = {MOST} at 10 Hz.",
+            best="min",
+            unranked=("Difference",),
+            decimals=3,
+        ),
+        "break_even": even,
+        "ledger": ledger,
     },
-    figures={"pareto": _pareto},
+    figures={"pareto": _figure},
     findings=_findings,
     limitations=(
         "Only messages of the K neighbours are counted; those of other vehicles also occupy the channel.",

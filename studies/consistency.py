@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.methods.catalogue import METHODS
-from coopoc.study.numbers import Number, Where, mean
-from coopoc.study.pivot import crossed
+from coopoc.study.numbers import Where, mean
 from coopoc.study.style import look
 
 from . import lineup, scene
-from .lineup import HEAD, labelled, of
+from .views import HEAD, labelled, of, selections
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 SILENT = ("gnss", "mds", "cooperative-map-gnc")
 """Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
@@ -43,29 +41,22 @@ def _inside(results: Results, where: Where) -> float:
     return mean(results, where, "nees_inside") or 0.0
 
 
+def _consistent(results: Results, where: Where) -> str:
+    return "yes" if _inside(results, where) >= GATE else "no"
+
+
 def _ran(results: Results) -> list[tuple[str, str]]:
     """Methods and noise models that were run and claim a covariance, the most credible first."""
-    frame = results.frame
-    kept = frame[frame["nees"].notna()] if "nees" in frame else frame.iloc[:0].assign(method=[], noise_model=[])
-    return sorted(
-        dict.fromkeys(zip(kept["method"], kept["noise_model"], strict=True)),
-        key=lambda pair: -_inside(results, of(*pair)),
-    )
-
-
-def _table(results: Results) -> Table | None:
-    columns: list[tuple[str, Number]] = [
-        ("NEES", partial(mean, value="nees")),
-        ("In band", partial(mean, value="nees_inside")),
-        (f"At least {GATE:g}", lambda results, where: "yes" if _inside(results, where) >= GATE else "no"),
-        ("RT-LE [m]", mean),
-    ]
-    return crossed(results, HEAD, labelled(_ran(results)), columns, scene.caption(results, NOTE))
+    if "nees" not in results.frame:
+        return []
+    kept = results.frame[results.frame["nees"].notna()]
+    pairs = dict.fromkeys(zip(kept["method"], kept["noise_model"], strict=True))
+    return sorted(pairs, key=lambda pair: -_inside(results, of(*pair)))
 
 
 def _figure(results: Results) -> Plot | None:
-    """One row per method: its NEES per ego on a logarithmic axis, and the band of a single ego's mean."""
-    from coopoc.study.plot import Plot, canvas, plain_log
+    """One row per method: its NEES per ego on a logarithmic axis, and the mean of a consistent filter."""
+    from coopoc.study.plot import Plot, canvas, plain_log, strokes
 
     ran = _ran(results)
     if not ran:
@@ -73,9 +64,10 @@ def _figure(results: Results) -> Plot | None:
     with canvas(1, 1, width=6.2, height=0.9 + 0.2 * len(ran)) as (figure, panel):
         panel.axvline(3.0, color="black", linewidth=0.9)
         for row, pair in enumerate(ran):
-            shown, each = look(pair[0]), np.nanmean(results.values("nees", of(*pair)), axis=1)
-            style = {"linestyle": "none", "marker": shown.marker or "o", "color": shown.color, "alpha": 0.8}
-            panel.plot(each, np.full(len(each), row), **style)
+            each = np.nanmean(results.values("nees", of(*pair)), axis=1)
+            panel.plot(
+                each, np.full(len(each), row), **{**strokes({"method": pair[0]}), "linestyle": "none"}, alpha=0.8
+            )
         plain_log(panel.xaxis)
         labels = [look(method).label + ("" if known in USUAL else f", {known}") for method, known in ran]
         panel.set(yticks=range(len(ran)), yticklabels=labels, ylim=(len(ran) - 0.4, -0.6), xlabel="NEES, one per ego")
@@ -93,7 +85,19 @@ STUDY = lineup.study(
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "backend": "gauss-newton", "runs": 20, "train_seeds": 1},
     shares=("max_neighbours",),
-    tables={"nees": _table},
+    tables={
+        "nees": selections(
+            HEAD,
+            lambda results: labelled(_ran(results)),
+            {
+                "NEES": partial(mean, value="nees"),
+                "In band": partial(mean, value="nees_inside"),
+                f"At least {GATE:g}": _consistent,
+                "RT-LE [m]": mean,
+            },
+            NOTE,
+        )
+    },
     figures={"nees": _figure},
     findings=_findings,
     limitations=(

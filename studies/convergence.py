@@ -10,18 +10,17 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
 from coopoc.study.numbers import listed, present
-from coopoc.study.pivot import pivot
 from coopoc.study.study import Params, Row
 
 from . import lineup, scene, weights
+from .views import table
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
-NAMES = {"federated": FEDERATED, "centralised": CENTRALISED}
+BOTH = {"method": [FEDERATED, CENTRALISED]}
 NEAR = 0.03
 """Share of the centralised net's RT-LE within which the federated net has reached it."""
 
@@ -35,19 +34,19 @@ def cell(p: Params) -> list[Row]:
     """
     made, federated = (weights.checkpoint(name, p, p["train_seed"]) for name in (p["method"], FEDERATED))
     last, rounds = (len(one.card["history"]) - 1 for one in (made, federated))
-    recording, who, drive = scene.trial(p)
+    recording, egos, drive = scene.trial(p)
     alone, start = p["method"] in weights.INDIVIDUAL, lineup.start(p)
 
     @lru_cache
     def score(row: int) -> Floats:
-        return rt_le(made.after(row).method(p["method"], start)(recording, who), drive)
+        return rt_le(made.after(row).method(p["method"], start)(recording, egos), drive)
 
-    found: list[Row] = []
+    rows: list[Row] = []
     for number in (rounds,) if alone else range(rounds + 1):
         at = last if alone else round(number * last / rounds)
         columns = {"rt_le_m": score(made.kept(at)), "raw_rt_le_m": score(at)}
-        found += [{"round": number, **row} for row in rows_of(columns, who)]
-    return found
+        rows += [{"round": number, **row} for row in rows_of(columns, egos)]
+    return rows
 
 
 def key(p: Params) -> dict[str, str]:
@@ -72,64 +71,42 @@ def _curve(results: Results, method: str) -> list[float]:
     return [results.interval("rt_le_m", method=method, round=number).mean for number in rounds]
 
 
-def _caption(results: Results, text: str) -> str:
-    return scene.caption(results, text, train_seeds=results.frame["train_seed"].nunique())
-
-
 def _figure(results: Results) -> Plot | None:
     from coopoc.study import figures
 
-    where = present(results, {"method": [FEDERATED, CENTRALISED]})
+    where = present(results, BOTH)
     if where is None:
         return None
-    ends = {f"individual {c}": _curve(results, name) for c, name in enumerate(weights.INDIVIDUAL, start=1)}
+    ends = [curve[-1] for name in weights.INDIVIDUAL if (curve := _curve(results, name))]
     text = (
         "RT-LE after every round with the weights that validated best so far (mean over training seeds, band from the "
-        "lowest to the highest); dashed: individual nets at their end."
+        "lowest to the highest); dashed: the individual nets at their end."
     )
-    return figures.convergence(
-        results,
-        where=where,
-        levels={name: curve[-1] for name, curve in ends.items() if curve},
-        caption=_caption(results, text),
-    )
-
-
-def _clients(results: Results) -> Plot:
-    from coopoc.study import figures
-
-    drives = scene.fleet(results.settings["clients"])
-    shown = drives.select(drives.ids[: len(weights.INDIVIDUAL)])
-    few = f" The first {len(shown.ids)} of {len(drives.ids)} clients." if len(shown.ids) < len(drives.ids) else ""
-    return figures.paths(shown, caption=f"Paths and speeds of {drives.name}; a dot marks each start.{few}")
-
-
-def _table(results: Results) -> Table | None:
-    where = present(results, {"method": [FEDERATED, CENTRALISED]})
-    if where is None:
-        return None
-    caption = _caption(results, "RT-LE [m] after every round.")
-    return pivot(results, "round", "method", "rt_le_m", where, caption, decimals=3, intervals=False)
+    return figures.convergence(results, where=where, levels=ends, caption=scene.caption(results, text))
 
 
 def _findings(results: Results) -> dict[str, str]:
     fed, centralised = _curve(results, FEDERATED), _curve(results, CENTRALISED)
-    found = {}
+    texts = {}
     if fed and centralised:
-        last, end = len(fed) - 1, centralised[-1]
+        end = centralised[-1]
         reached = settled([value / end for value in fed])
         within = f"within {100 * NEAR:g} % of it"
         when = f"not {within}" if reached is None else f"{within} from round {reached} on"
-        found["centralised"] = (
-            f"After {last} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
+        texts["centralised"] = (
+            f"After {len(fed) - 1} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
             f"({100 * (fed[-1] / end - 1):+.1f} %); federated is {when}."
         )
-    worst = listed({words: _worst(results, name) for words, name in NAMES.items()})
-    if worst:
+    if fed or centralised:
+        frame = results.select(present(results, BOTH))
+        frame = frame[frame["round"] > 0]
+        worst = frame.groupby(["method", "round", "train_seed"])["raw_rt_le_m"].mean().groupby("method").max()
+        names = {"federated": FEDERATED, "centralised": CENTRALISED}
+        each = listed({words: worst.get(name) for words, name in names.items()})
         text = "Weights as they are after a round, not the best so far, the worst of any round and seed"
-        found["worst"] = f"{text}: {worst}."
-        found["untrained"] = f"The untrained net: {(fed or centralised)[0]:.2f} m."
-    return found
+        texts |= {"worst": f"{text}: {each}."} if each else {}
+        texts["untrained"] = f"The untrained net: {(fed or centralised)[0]:.2f} m."
+    return texts
 
 
 def settled(ratios: Sequence[float]) -> int | None:
@@ -141,15 +118,6 @@ def settled(ratios: Sequence[float]) -> int | None:
     outside = [number for number, ratio in enumerate(ratios) if not abs(ratio - 1) <= NEAR]
     first = outside[-1] + 1 if outside else 0
     return first if first < len(ratios) else None
-
-
-def _worst(results: Results, method: str) -> float | None:
-    """Largest mean RT-LE of the raw weights over rounds and training seeds; None if the net was not run."""
-    where = present(results, {"method": method})
-    if where is None:
-        return None
-    frame = results.select(where)
-    return float(frame[frame["round"] > 0].groupby(["round", "train_seed"])["raw_rt_le_m"].mean().max())
 
 
 STUDY = lineup.study(
@@ -170,8 +138,12 @@ STUDY = lineup.study(
         "runs": 30,
         "train_seeds": 5,
     },
-    tables={"rounds": _table},
-    figures={"rounds": _figure, "clients": _clients},
+    tables={
+        "rounds": table(
+            "RT-LE [m] after every round.", rows="round", columns="method", where=BOTH, decimals=3, intervals=False
+        )
+    },
+    figures={"rounds": _figure},
     findings=_findings,
     limitations=("The centralised net has no rounds: its schedule is divided into as many equal parts.",),
     minutes=2,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,36 +10,32 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Floats
+from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
-from coopoc.plugins import find
 from coopoc.study.numbers import interval, mean, present, seed_std, verdict
-from coopoc.study.pivot import pivot
 from coopoc.study.study import Params, Row
+from coopoc.study.style import Panel
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 
-from . import lineup, scene, weights
-from .lineup import of
+from . import lineup, scene
+from .lineup import PAST
+from .views import curves, of, table
 
 if TYPE_CHECKING:
-    from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 NEIGHBOURS = (0, 2, 6, 10)
 LOSSES = (0.0, 0.3, 0.7)
-TRAINED = {"cooperative": True, "cooperative-newest": False}
-"""Learned methods, whose weights are the same -> whether their messages are sums."""
 LINES = (
     ("cooperative", "trained"),
-    ("cooperative-newest", "trained"),
     ("joint", "nominal"),
     ("split-ci", "nominal"),
     ("joint", "fitted"),
     ("lkf-sa", "identity"),
 )
-BOUNDS = (("bound", "star"), lineup.PAST)
+BOUNDS = (("bound", "star"), PAST)
 RECEIVERS = ("mixed", "changing")
 """Two receivers in five are POOR and the others GOOD; all are POOR in the middle third of the drive and else GOOD."""
 GOOD, POOR = 1.5, 5.0
@@ -61,24 +57,9 @@ def _grid() -> list[dict[str, Any]]:
             of(*line, receivers=which, max_neighbours=k, loss=0.0)
             for which in RECEIVERS
             for k in (0, 6)
-            for line in (*LINES[:3], ("joint", "per-fix"))
+            for line in (*LINES[:2], ("joint", "per-fix"))
         ),
     ]
-
-
-def _trained(p: Params) -> Params:
-    """The parameters with the name of the weights as the method."""
-    return {**p, "method": "cooperative"} if p["method"] in TRAINED else p
-
-
-def key(p: Params) -> dict[str, str]:
-    """Digests that change the numbers of a cell beyond its parameters."""
-    return lineup.key(_trained(p))
-
-
-def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
-    """Train the net that the cells need, once for both kinds of messages."""
-    weights.prepare(map(_trained, cells), jobs)
 
 
 def cell(p: Params) -> list[Row]:
@@ -89,18 +70,14 @@ def cell(p: Params) -> list[Row]:
     return lineup.rows(p, made=_methods(p, seen), seen=seen)
 
 
-def _methods(p: Params, seen: Recording) -> list[tuple[int | None, Method]]:
-    from coopoc.learned.nets.cooperative import CooperativeGain, NetNoise
+def _methods(p: Params, seen: Recording) -> Sequence[tuple[int | None, Method]]:
+    from coopoc.learned.nets.cooperative import NetNoise
 
-    if p["method"] in TRAINED:
-        nets: list[tuple[int, Any]] = [(s, weights.checkpoint("cooperative", p, s).model) for s in weights.seeds(p)]
-        return [(seed, CooperativeGain(net, TRAINED[p["method"]], p["method"])) for seed, net in nets]
     if p["noise_model"] != "per-fix":
         return lineup.methods(p, seen)
     process = NoiseModel.nominal(seen.sensors).process_variance(seen)
     fix = np.square(gnss_std(p, scene.fleet(p["data"])))[None]
-    known = NetNoise("per-fix", seen.sensors, fix=fix, process=process)
-    return [(None, find("coopoc.methods", p["method"])(known))]
+    return [(None, JointFilter(NetNoise("per-fix", seen.sensors, fix=fix, process=process)))]
 
 
 def gnss_std(p: Params, drive: Fleet) -> Floats:
@@ -131,47 +108,20 @@ INPUTS = (
 )
 BOUND = (
     "Bounds are for the rms over runs and a channel that loses nothing; with its past, a new neighbour's messages "
-    "carry what it measured before, as sums and split CI's estimates do."
+    "carry what it measured before, as split CI's estimates do."
 )
-METHOD = ("loss", "method", "noise_model")
 FILTERS = {**ALIKE, "method": list(dict.fromkeys(method for method, _ in LINES))}
+k_table = partial(table, rows=("loss", "method", "noise_model"), best=None)
 
 
-def _table(
-    results: Results,
-    value: str,
-    text: str,
-    where: Mapping[str, Any] = FILTERS,
-    rows: Sequence[str] = METHOD,
-    **options: Any,
-) -> Table | None:
-    kept = present(results, where, value)
-    if kept is None:
-        return None
-    caption = scene.caption(results, text, INPUTS)
-    return pivot(results, rows, "max_neighbours", value, kept, caption, best=None, **options)
+def _interval(results: Results, where: Any) -> Any:
+    return (mean if where["method"] == "bound" else interval)(results, where)
 
 
-def _figure(results: Results) -> Plot | None:
-    """RT-LE against K, one panel per loss; K = 0, where nothing can be lost, in all of them."""
-    from coopoc.study.lines import Line, Panel, panels
-
-    shown = []
-    for loss in LOSSES:
-        if present(results, {**ALIKE, "loss": loss}):
-            lines = []
-            for pair in (*LINES[:-1], *BOUNDS):
-                number = mean if pair in BOUNDS else interval
-                at = {k: loss if k and pair not in BOUNDS else 0.0 for k in NEIGHBOURS}
-                points = {k: number(results, of(*pair, **ALIKE, max_neighbours=k, loss=lost)) for k, lost in at.items()}
-                lines.append(Line(of(*pair), points))
-            shown.append(Panel(lines, f"{100 * loss:g} % of messages lost", "Neighbours K", NEIGHBOURS))
-    text = "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs. LKF-SA lies far above."
-    return panels(shown, scene.caption(results, text, INPUTS, BOUND), 2.1 + 2.0 * len(shown), 3.2)
-
-
-def _findings(results: Results) -> dict[str, str]:
-    return {f"{100 * loss:g} % loss": _finding(results, loss) for loss in LOSSES}
+def _panel(loss: float) -> Panel:
+    """K = 0, where nothing can be lost, is in all panels."""
+    x = {k: {"max_neighbours": k, "loss": loss if k else 0.0} for k in NEIGHBOURS}
+    return Panel(x, ALIKE, f"{100 * loss:g} % of messages lost", "Neighbours K")
 
 
 def _finding(results: Results, loss: float) -> str:
@@ -180,58 +130,66 @@ def _finding(results: Results, loss: float) -> str:
     if where is None:
         return ""
     most = int(results.select(where)["max_neighbours"].max())
-    one, other = (of(*line, **ALIKE, loss=loss, max_neighbours=most) for line in (LINES[0], LINES[2]))
+    one, other = (of(*line, **ALIKE, loss=loss, max_neighbours=most) for line in LINES[:2])
     if not present(results, other):
         return ""
-    mine, std = results.interval("rt_le_m", one).mean, seed_std(results, one)
+    level, std = results.interval("rt_le_m", one).mean, seed_std(results, one)
     seeds = f", seed std {std:.4f} m" if std is not None else ""
     judged = verdict(results, one, other, "the joint filter that knows the noise")
-    return f"{100 * loss:g} % loss, K = {most}: the cooperative gain has {mine:.3f} m{seeds} and {judged}."
+    return f"{100 * loss:g} % loss, K = {most}: the cooperative gain has {level:.3f} m{seeds} and {judged}."
 
 
 STUDY = lineup.study(
     "cooperative_gain",
     "Can transmitted noise estimates replace known noise parameters, also when messages are lost?",
     cell=cell,
-    key=key,
-    prepare=prepare,
     recipe=None,
     grid=_grid(),
     settings={**scene.TOWN, **scene.WEIGHTS, "burst": 1.0, "runs": 30, "train_seeds": 3},
     shares=("receivers", "max_neighbours", "loss"),
     tables={
-        "rt_le": partial(_table, value="rt_le_m", text=f"RT-LE [m] against K. {BOUND}", where=ALIKE, decimals=3),
-        "bytes": partial(
-            _table,
+        "rt_le": k_table("RT-LE [m] against K.", BOUND, INPUTS, where=ALIKE, decimals=3),
+        "bytes": k_table(
+            "Payload that an ego receives [B/s].",
+            INPUTS,
             value="bytes_per_second",
-            text="Payload that an ego receives [B/s].",
+            where=FILTERS,
             decimals=0,
             intervals=False,
         ),
-        "nees": partial(_table, value="nees", text="NEES (3 is consistent).", intervals=False),
-        "nees_inside": partial(
-            _table,
+        "nees": k_table("NEES (3 is consistent).", INPUTS, value="nees", where=FILTERS, intervals=False),
+        "nees_inside": k_table(
+            "Share of steps whose run-averaged NEES is in its 99 % band (gate: 0.95).",
+            INPUTS,
             value="nees_inside",
-            text="Share of steps whose run-averaged NEES is in its 99 % band (gate: 0.95).",
+            where=FILTERS,
             intervals=False,
         ),
-        "receivers": partial(
-            _table,
-            value="rt_le_m",
-            text=f"RT-LE [m] where two receivers in five have {POOR:g} m and the others {GOOD:g} m (mixed), and where "
+        "receivers": k_table(
+            f"RT-LE [m] where two receivers in five have {POOR:g} m and the others {GOOD:g} m (mixed), and where "
             f"all have {POOR:g} m in the middle third of the drive (changing); nominal filters know the rms, "
             "'per-fix' ones the noise of each fix.",
+            INPUTS,
             where={"receivers": list(RECEIVERS)},
             rows=("receivers", "method", "noise_model"),
             decimals=3,
         ),
     },
-    figures={"rt_le": _figure},
-    findings=_findings,
+    figures={
+        "rt_le": curves(
+            [_panel(loss) for loss in LOSSES],
+            [*(of(*line) for line in LINES[:-1]), *(of(*line, loss=0.0) for line in BOUNDS)],
+            "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs. LKF-SA is far above.",
+            INPUTS,
+            BOUND,
+            number=_interval,
+        )
+    },
+    findings=lambda results: {f"{100 * loss:g} % loss": _finding(results, loss) for loss in LOSSES},
     limitations=(
         "The noise of range and angles is the nominal one, since solo training drives contain no such measurement.",
         "Messages arrive within the step in which they are sent, or never.",
-        "Numbers count as float32; on long drives the sums would have to be restarted.",
+        "Numbers count as float32.",
     ),
     minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},

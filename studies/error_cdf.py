@@ -5,27 +5,20 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, ratio, seed_std, verdict
-from coopoc.study.pivot import crossed
-from coopoc.study.study import Params, Row
+from coopoc.study.numbers import Where, interval, listed, mean, present, ratio, seed_std, verdict
+from coopoc.study.study import Params
 
 from . import lineup, scene, weights
-from .lineup import HEAD, labelled, of
+from .views import HEAD, TableView, labelled, of, selections
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
 CLASSIC = (("gnss", "none"), ("kalman", "identity"), ("kalman", "fitted"), ("kalman", "nominal"), ("kalman", "oracle"))
 LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER))
-
-
-def cell(p: Params) -> list[Row]:
-    """Rows of one method in one case, with the quantiles of its errors."""
-    return lineup.rows(p, quantiles=51)
 
 
 def meaningful(p: Params) -> bool:
@@ -35,37 +28,41 @@ def meaningful(p: Params) -> bool:
     return weights.trainable(p)
 
 
-def case(scenario: int, ratio: float, **more: Any) -> dict[str, Any]:
+def case(scenario: int, ratio: float) -> dict[str, Any]:
     """A case as a selection."""
-    return {"scenario": scenario, "velocity_ratio": ratio, **more}
+    return {"scenario": scenario, "velocity_ratio": ratio}
 
 
-def worse_than_gnss(results: Results, where: Where) -> float | None:
+def _worse(results: Results, where: Where) -> float | None:
     """Percentage of egos and runs with a larger RT-LE than their fixes."""
     share = mean(results, where, "worse_than_gnss")
     return None if share is None else 100 * share
 
 
-def _table(results: Results, at: dict[str, Any]) -> Table | None:
-    gnss = mean(results, {**at, "method": "gnss"}, "max_error_m")
+def _reduction(results: Results, where: Where) -> float | None:
+    """Mean maximum of the fixes' errors less that of a method, m."""
+    of_fixes = mean(results, {**where, **of("gnss", "none")}, "max_error_m")
+    worst = mean(results, where, "max_error_m")
+    return None if of_fixes is None or worst is None else of_fixes - worst
 
-    def less(results: Results, where: Where) -> float | None:
-        worst = mean(results, where, "max_error_m")
-        return None if gnss is None or worst is None else gnss - worst
 
-    filters = less(results, of("kalman", "fitted", **at))
-    columns: list[tuple[str, Number]] = [
-        ("RT-LE [m]", interval),
-        ("Seed std [m]", seed_std),
-        ("Maximum [m]", partial(interval, value="max_error_m")),
-        ("Reduction [m]", less),
-        ("Reduction / fitted KF's", lambda results, where: ratio(less(results, where), filters)),
-        ("Worse than GNSS [%]", worse_than_gnss),
-    ]
+def _relative(results: Results, where: Where) -> float | None:
+    return ratio(_reduction(results, where), _reduction(results, {**where, **of("kalman", "fitted")}))
+
+
+COLUMNS = {
+    "RT-LE [m]": interval,
+    "Seed std [m]": seed_std,
+    "Maximum [m]": partial(interval, value="max_error_m"),
+    "Reduction [m]": _reduction,
+    "Reduction / fitted KF's": _relative,
+    "Worse than GNSS [%]": _worse,
+}
+
+
+def _table(at: dict[str, Any]) -> TableView:
     text = "Errors; reduction: of the mean maximum against GNSS, and its ratio to that of the fitted KF."
-    rows = labelled(LINEUP, **at)
-    digits = scene.decimals(results.settings)
-    return crossed(results, HEAD, rows, columns, scene.caption(results, text, **at), decimals=digits)
+    return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
 
 
 def _cdf(results: Results, at: dict[str, Any]) -> Plot | None:
@@ -75,28 +72,24 @@ def _cdf(results: Results, at: dict[str, Any]) -> Plot | None:
     known = ["none", "identity", "fitted", "oracle", "trained"]
     where = present(results, {**at, "method": methods, "noise_model": known}, "error_quantiles_m")
     text = "Distribution of the error over all steps; markers: mean of the per-run maxima."
-    return figures.cdf(results, where=where, log=True, caption=scene.caption(results, text, **at)) if where else None
-
-
-def _findings(results: Results) -> dict[str, str]:
-    return {f"scenario {s}": _finding(results, case(s, r)) for s, r in CASES[:2]}
+    return figures.cdf(results, where=where, caption=scene.caption(results, text, **at)) if where else None
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
     """RT-LE of each method in a case, and the verdict on the federated net; nothing where nothing was run."""
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     names |= {f"client {client}'s net": name for client, name in enumerate(weights.INDIVIDUAL, start=1)}
-    found = {words: mean(results, {**at, "method": name}) for words, name in names.items()}
+    means = {words: mean(results, {**at, "method": name}) for words, name in names.items()}
     filters = {f"{known} KF": of("kalman", known, **at) for known in ("fitted", "oracle")}
-    found |= {words: mean(results, where) for words, where in filters.items()}
-    if not listed(found):
+    means |= {words: mean(results, where) for words, where in filters.items()}
+    if not listed(means):
         return ""
-    fed, centralised, oracle = (found[words] for words in ("federated", "centralised", "oracle KF"))
+    fed, centralised, oracle = (means[words] for words in ("federated", "centralised", "oracle KF"))
     p = scene.shown(results, **at)
-    text = [scene.heading(p), f"RT-LE: {listed(found)}"]
+    text = [scene.heading(p), f"RT-LE: {listed(means)}"]
     if fed and centralised:
         text.append(f"Federated against centralised: {100 * (fed / centralised - 1):+.1f} %")
-    if fed and found["fitted KF"]:
+    if fed and means["fitted KF"]:
         net = of("fedkalmannet", "trained", **at)
         text.append(f"The federated net {verdict(results, net, filters['fitted KF'], 'the fitted KF')}")
     if fed and oracle:
@@ -108,14 +101,14 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
 STUDY = lineup.study(
     "error_cdf",
     "How do federated, centralised and individual nets compare with each other and a fitted Kalman filter?",
-    cell=cell,
+    cell=partial(lineup.rows, quantiles=51),
     grid=[of(*pair, **case(*at)) for at in CASES for pair in LINEUP],
     settings={**scene.DRAWN, **scene.WEIGHTS, **scene.SOLO, "runs": 100, "train_seeds": 5},
     where=meaningful,
     shares=("scenario", "velocity_ratio"),
-    tables={f"scenario{s}_{100 * r:g}": partial(_table, at=case(s, r)) for s, r in CASES},
+    tables={f"scenario{s}_{100 * r:g}": _table(case(s, r)) for s, r in CASES},
     figures={f"cdf_scenario{s}_{100 * r:g}": partial(_cdf, at=case(s, r)) for s, r in CASES},
-    findings=_findings,
+    findings=lambda results: {f"scenario {s}": _finding(results, case(s, r)) for s, r in CASES[:2]},
     limitations=("The nets and the fitted noise model come from drives with 1.5 m and 10 %; the test noise differs.",),
     minutes=3,
     metrics={"rt_le_m": "lower"},

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,8 +17,11 @@ from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_start import pose_start
 from coopoc.methods.track import Track
-from coopoc.study.environment import revision
+from coopoc.study.numbers import Number, Where, across, mean, rms, sentence
+from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row, Study
+from coopoc.study.style import Panel, look
+from coopoc.study.tables import Table, crossed
 from coopoc.world.body_frames import in_world, turned
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
@@ -26,11 +29,19 @@ from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
-from . import heading_views as views
-from .heading_views import ALWAYS, FIRST, NONE
 from .lineup import reference
 from .scene import CODE
+from .views import of
 
+if TYPE_CHECKING:
+    from coopoc.study.plot import Plot
+    from coopoc.study.results import Results
+
+NONE, ALWAYS, FIRST = "none", "nominal", "first compass"
+"""No compass; its whole error taken as white noise of each heading; only its first heading taken."""
+COMPASSES, NEIGHBOURS = ("exact", "1", "3", "10", NONE), (0, 2, 10)
+SPEEDS, AFTER, SPEED = (0.0, 1.0, 3.0, 10.0, 20.0), (1.0, 3.0, 10.0, 30.0), 10.0
+TITLES = {word: "no compass" if word == NONE else f"{word}°".replace("exact°", "exact") for word in COMPASSES}
 VEHICLES, WIDTH, AHEAD, BEND, COURSE, DT = 11, 4.0, 10.0, 25.0, 2.0, 0.1
 """Of the convoy: vehicles, m between its two lanes and from row to row, m of a bend, rad of its road, s of a step."""
 WHITE, EXACT = np.deg2rad(1.0), np.deg2rad(0.01)
@@ -124,29 +135,143 @@ def key(p: Params) -> Mapping[str, str]:
         InputError: parameters of which no cell can be made.
     """
     sensors(p), channel(p)
-    if not DT <= float(p["score_s"]) <= min(views.AFTER):
-        raise InputError("score_s", p["score_s"], f"must be {DT:g}..{min(views.AFTER):g} s", "0.5 is the default.")
+    if not DT <= float(p["score_s"]) <= min(AFTER):
+        raise InputError("score_s", p["score_s"], f"must be {DT:g}..{min(AFTER):g} s", "0.5 is the default.")
     return {"code": revision(*CODE)}
+
+
+def pose(k: int) -> str:
+    """The pose filter of one state, or of a vehicle alone."""
+    return "pose-fleet" if k else "pose-solo"
 
 
 def _grid() -> list[dict[str, Any]]:
     """All compasses at one speed after a long drive; without a compass all speeds after all times."""
-    compass = {"speed": views.SPEED, "after_s": max(views.AFTER)}
-    cases = [{**compass, "compass": word} for word in views.COMPASSES]
+    cases = [{"speed": SPEED, "after_s": AFTER[-1], "compass": word} for word in COMPASSES]
     cases += [
         {"speed": speed, "after_s": after, "compass": NONE}
-        for speed in views.SPEEDS
-        for after in views.AFTER
-        if (speed, after) != tuple(compass.values())
+        for speed in SPEEDS
+        for after in AFTER
+        if (speed, after) != (SPEED, AFTER[-1])
     ]
     rows = []
     for case in cases:
-        for k in views.NEIGHBOURS:
-            pose, errs = "pose-fleet" if k else "pose-solo", case["compass"] not in (NONE, "exact")
-            lines = [(pose, ALWAYS), *([(pose, FIRST)] if errs else []), ("bound", "bound")]
+        for k in NEIGHBOURS:
+            lines = [(pose(k), ALWAYS), ("bound", "bound")]
+            lines += [(pose(k), FIRST)] if case["compass"] not in (NONE, "exact") else []
             lines += [("joint", ALWAYS)] if case["compass"] != NONE else []
-            rows += [{**case, "max_neighbours": k, "method": m, "noise_model": known} for m, known in lines]
+            rows += [of(*line, **case, max_neighbours=k) for line in lines]
     return rows
+
+
+NOTE = (
+    "Eleven vehicles in two lanes, fixes of {gnss_std_m:g} m, range 1 m, angles 4°, speed 10 %, yaw rate "
+    "{yaw_rate_std:g} rad/s, {runs} runs. A compass has a bias for each vehicle and run, and 1° of white noise."
+)
+DRIVEN = {"speed": SPEED, "after_s": AFTER[-1]}
+heading = partial(rms, value="heading_deg")
+
+
+def _note(results: Results, text: str) -> str:
+    return f"{text} {NOTE.format(**results.settings)}"
+
+
+def _compasses(results: Results, number: Number, text: str, decimals: int) -> Table | None:
+    """Methods and K down, compasses across."""
+    rows = []
+    for k in NEIGHBOURS:
+        for method, known in ((pose(k), ALWAYS), (pose(k), FIRST), ("joint", ALWAYS), ("bound", "bound")):
+            label = "Position filter" if method == "joint" else look(method).label
+            labels = (k, label, "" if method == "bound" else known)
+            rows.append((labels, of(method, known, **DRIVEN, max_neighbours=k)))
+    columns = across(number, {TITLES[word]: {"compass": word} for word in COMPASSES})
+    text = _note(results, f"{text} after {AFTER[-1]:g} s at {SPEED:g} m/s, by the compass.")
+    return crossed(results, ("K", "Method", "Noise model"), rows, columns, text, decimals=decimals)
+
+
+def _estimated(results: Results) -> Table | None:
+    """Heading errors without a compass, speeds and K down, times across, the bound beside each."""
+    rows = [
+        ((f"{speed:g}", k), of(pose(k), ALWAYS, compass=NONE, speed=speed, max_neighbours=k))
+        for speed in SPEEDS
+        for k in NEIGHBOURS
+    ]
+    columns: dict[str, Number] = {}
+    for after in AFTER:
+        columns |= across(heading, {f"{after:g} s": {"after_s": after}})
+        columns |= across(heading, {f"{after:g} s (bound)": of("bound", "bound", after_s=after)})
+    text = _note(results, "Rms heading error [°] without a compass, after a time.")
+    return crossed(results, ("Speed [m/s]", "K"), rows, columns, text, best=None, decimals=1)
+
+
+def _over_time(results: Results) -> Plot | None:
+    """Heading error over time without a compass, K = 0 and 10, a line per speed; dotted the bound."""
+    from matplotlib import colormaps
+
+    from coopoc.study import figures
+
+    lines: list[Where] = []
+    for i, speed in enumerate(SPEEDS):
+        look = {"color": colormaps["viridis"](i / len(SPEEDS)), "speed": speed}
+        lines += [of(pose(k), ALWAYS, **look, label=f"{speed:g} m/s" * bool(k)) for k in (0, 10)]
+        lines += [of("bound", "bound", **look, linestyle=":", marker="")]
+    x = {after: {"after_s": after} for after in AFTER}
+    panels = [Panel(x, {"compass": NONE, "max_neighbours": k}, f"K = {k}", "Time [s]") for k in (0, 10)]
+    caption = _note(results, "Heading error over the time that is driven without a compass; dotted: the bound.")
+    options: dict[str, Any] = {"number": heading, "ylabel": "Heading error [°]", "log": True, "logx": True}
+    return figures.curves(results, panels, lines, caption, width=7.4, **options)
+
+
+def _cost(results: Results) -> Plot | None:
+    """RT-LE over the compass's error."""
+    from coopoc.study import figures
+
+    x = {i: {**DRIVEN, "compass": word} for i, word in enumerate(COMPASSES)}
+    ticks = {i: TITLES[word].replace("no compass", "none") for i, word in enumerate(COMPASSES)}
+    panels = [Panel(x, {"max_neighbours": k}, f"K = {k}", "Compass", ticks) for k in (0, 10)]
+    names = [(pose(k), known) for k in (0, 10) for known in (ALWAYS, FIRST)]
+    lines = [of(*pair) for pair in (*names, ("joint", ALWAYS), ("bound", "bound"))]
+    caption = _note(results, "RT-LE by the error of the compass.")
+    return figures.curves(results, panels, lines, caption, number=rms, log=True)
+
+
+COST = (
+    "K = {k}, {speed:g} m/s: {exact:.2f} m with an exact heading, {none:.2f} m with one that is estimated; with a "
+    "compass of 10° taken as white noise {noise:.2f} m, by its first heading alone {first:.2f} m, and by a position "
+    "filter {joint:.2f} m."
+)
+ESTIMATED = (
+    "Without a compass, K = {k}: heading error after {long:g} s {still:.1f}° standing, {slow:.1f}° at 1 m/s, "
+    "{fast:.1f}° at {speed:g} m/s (bound {bound:.1f}°); after {short:g} s {early:.1f}° at {speed:g} m/s."
+)
+
+
+def _findings(results: Results) -> dict[str, str]:
+    texts = {}
+    for k in NEIGHBOURS:
+        fixed: Where = {"k": k, "speed": SPEED, "long": AFTER[-1], "short": AFTER[1]}
+        at = of(pose(k), ALWAYS, **DRIVEN, max_neighbours=k)
+        ten = {**at, "compass": "10"}
+        texts[f"cost, K = {k}"] = sentence(
+            COST,
+            **fixed,
+            exact=rms(results, {**at, "compass": "exact"}),
+            none=rms(results, {**at, "compass": NONE}),
+            noise=rms(results, ten),
+            first=rms(results, {**ten, "noise_model": FIRST}),
+            joint=rms(results, {**ten, "method": "joint"}),
+        )
+        blind = {**at, "compass": NONE}
+        texts[f"found, K = {k}"] = sentence(
+            ESTIMATED,
+            **fixed,
+            still=heading(results, {**blind, "speed": 0.0}),
+            slow=heading(results, {**blind, "speed": 1.0}),
+            fast=heading(results, blind),
+            bound=heading(results, {**blind, **of("bound", "bound")}),
+            early=heading(results, {**blind, "after_s": AFTER[1]}),
+        )
+    return texts
 
 
 STUDY = Study(
@@ -158,13 +283,14 @@ STUDY = Study(
     key=key,
     shares=("compass", "max_neighbours", "speed", "after_s"),
     tables={
-        "compass": partial(views.compasses, value="rt_le_m", text="RT-LE [m]", decimals=2),
-        "compass_heading": partial(views.compasses, value="heading_deg", text="Heading error [°]", decimals=2),
-        "nees": partial(views.compasses, value="nees", text="NEES of a pose (3 is consistent)", decimals=1),
-        "found": views.found,
+        "compass": partial(_compasses, number=rms, text="RT-LE [m]", decimals=2),
+        "nees": partial(
+            _compasses, number=partial(mean, value="nees"), text="NEES of a pose (3 is consistent)", decimals=1
+        ),
+        "found": _estimated,
     },
-    figures={"heading": views.figure},
-    findings=views.findings,
+    figures={"heading": _over_time, "cost": _cost},
+    findings=_findings,
     limitations=(
         "One convoy: the value of a bearing depends on its geometry.",
         "A joint state of all vehicles needs a centre; its bound uses all measurements of all vehicles.",

@@ -4,31 +4,30 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import mean, present, ran
-from coopoc.study.style import look
-from coopoc.study.tables import Table
+from coopoc.study.numbers import Where, across, mean, ran
+from coopoc.study.style import Panel, look
 
 from . import lineup, scene
-from .lineup import BOUND, of
+from .lineup import BOUND
+from .views import curves, of, selections
 
 if TYPE_CHECKING:
-    from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-LATENCIES = (0.0, 0.1, 0.3, 0.5, 1.0)
-LOSSES = (0.0, 0.1, 0.3, 0.6, 0.9)
-BURSTS = (1.0, 10.0)
 METHODS = ("kalman", "lkf-sa", "joint", "split-ci", "fixed-lag", "mhe")
 PERFECT = {"latency_s": 0.0, "loss": 0.0, "burst": 1.0}
-LOSSY = [
-    {100 * loss: {**PERFECT, "loss": loss, "burst": burst if loss else 1.0} for loss in LOSSES} for burst in BURSTS
-]
-WAYS: dict[str, tuple[str, dict[float, dict[str, Any]]]] = {
-    "late": ("Latency [s]", {late: {**PERFECT, "latency_s": late} for late in LATENCIES}),
-    "lost one by one": ("Lost [%]", LOSSY[0]),
-    f"lost in runs of {BURSTS[1]:g}": ("Lost [%]", LOSSY[1]),
+LATE = {late: {**PERFECT, "latency_s": late} for late in (0.0, 0.1, 0.3, 0.5, 1.0)}
+LOST, IN_RUNS = (
+    {100 * loss: {**PERFECT, "loss": loss, "burst": burst if loss else 1.0} for loss in (0.0, 0.1, 0.3, 0.6, 0.9)}
+    for burst in (1.0, 10.0)
+)
+CHANNELS: dict[str, tuple[str, dict[float, dict[str, Any]]]] = {
+    "late": ("s", LATE),
+    "lost one by one": ("%", LOST),
+    "lost in runs of 10": ("%", IN_RUNS),
 }
-"""Title -> label of the axis, and channel by its value there."""
+"""What happens to messages -> its unit, and channel by how much of it."""
+LABELS = {"s": "Latency [s]", "%": "Lost [%]"}
 NOTE = (
     "K = 6. The moving horizon puts a late message at its true time; the others bring it forward with the velocity "
     "that came with it. What is older than 1 s is forgotten."
@@ -37,70 +36,45 @@ NOTE = (
 
 def _grid() -> list[dict[str, Any]]:
     """Latency without loss, and loss without latency; the solo filter once."""
-    ways = [PERFECT, *(way for _, found in WAYS.values() for value, way in found.items() if value)]
+    each = [PERFECT, *(channel for _, by in CHANNELS.values() for value, channel in by.items() if value)]
     return [
         of("kalman", "nominal", **PERFECT, max_neighbours=0),
         of(*BOUND, **PERFECT, max_neighbours=6),
-        *({**way, "max_neighbours": 6, "noise_model": "nominal", "method": m} for way in ways for m in METHODS[1:]),
+        *(of(method, "nominal", **channel, max_neighbours=6) for channel in each for method in METHODS[1:]),
     ]
 
 
-def _at(method: str, way: dict[str, Any]) -> dict[str, Any]:
-    return {"method": method} if method == "kalman" else {"method": method, **way}
+def at(method: str, **channel: Any) -> dict[str, Any]:
+    """A selection; the solo filter ran once."""
+    return {"method": method} if method == "kalman" else {"method": method, **channel}
 
 
-def _unit(label: str) -> str:
-    return label.partition("[")[2].rstrip("]")
+def _rows(results: Results) -> list[tuple[tuple[str, str], Where]]:
+    """Channels over which a cooperative method was run."""
+    rows = [((how, f"{x:g} {unit}"), way) for how, (unit, by) in CHANNELS.items() for x, way in by.items()]
+    return [row for row in rows if any(mean(results, at(method, **row[1])) for method in METHODS[1:])]
 
 
-def _table(results: Results) -> Table | None:
-    """RT-LE of each method over each channel."""
-    body: list[tuple[Any, ...]] = []
-    methods = [method for method in METHODS if present(results, {"method": method})]
-    for title, (label, ways) in WAYS.items():
-        for value, way in ways.items():
-            found = {method: mean(results, _at(method, way)) for method in methods}
-            if set(ran(found)) - {"kalman"}:
-                body.append((title, f"{value:g} {_unit(label)}", *found.values()))
-    header = ("Messages are", "How much", *(look(method).label for method in methods))
-    return Table(header, tuple(body), scene.caption(results, "RT-LE [m].", NOTE), decimals=3) if body else None
-
-
-def _figure(results: Results) -> Plot | None:
-    from coopoc.study.lines import Line, Panel, panels
-
-    shown = []
-    for title, (label, ways) in WAYS.items():
-        lines = [
-            Line(of(m, "fitted"), {value: mean(results, _at(m, way)) for value, way in ways.items()}) for m in METHODS
-        ]
-        shown.append(Panel([*lines, Line(of(*BOUND), mean(results, {"method": "bound"}))], title, label))
-    text = "RT-LE against latency and loss; dashed: the bound of a perfect channel."
-    return panels(shown, scene.caption(results, text, NOTE), 8.2, 3.2)
+def _error(results: Results, where: Where) -> float | None:
+    return mean(results, at(**where))
 
 
 def _findings(results: Results) -> dict[str, str]:
-    found = {}
-    for title, (label, ways) in WAYS.items():
-        most, worst = list(ways.items())[-1]
-        alone, best, left = (
-            mean(results, _at(*pair)) for pair in (("kalman", PERFECT), ("joint", PERFECT), ("joint", worst))
-        )
-        if alone is not None and best is not None and left is not None:
-            kept = (alone - left) / (alone - best)
+    texts = {}
+    for how, (unit, by) in CHANNELS.items():
+        most, worst = list(by.items())[-1]
+        each = ran({method: mean(results, at(method, **worst)) for method in METHODS})
+        perfect, alone, left = mean(results, at("joint", **PERFECT)), each.get("kalman"), each.get("joint")
+        if alone is not None and perfect is not None and left is not None:
+            kept = (alone - left) / (alone - perfect)
             rest = f"keeps {100 * kept:.0f} % of what six neighbours bring" if kept > 0 else "is worse than alone"
-            found[title] = (
-                f"{most:g} {_unit(label)} {title}: the joint filter {rest} ({left:.2f} m; alone {alone:.2f}, perfect "
-                f"{best:.2f} m){_best(results, worst)}."
+            best = min(each, key=lambda method: round(each[method], 4))
+            other = "" if best == "joint" else f"; best is {look(best).label}, {each[best]:.2f} m"
+            texts[how] = (
+                f"{most:g} {unit} {how}: the joint filter {rest} ({left:.2f} m; alone {alone:.2f}, perfect "
+                f"{perfect:.2f} m){other}."
             )
-    return found
-
-
-def _best(results: Results, way: dict[str, Any]) -> str:
-    """The best method over a channel, if it is not the joint filter."""
-    each = ran({method: mean(results, _at(method, way)) for method in METHODS})
-    best = min(each, key=lambda method: round(each[method], 4), default="joint")
-    return "" if best == "joint" else f"; best is {look(best).label}, {each[best]:.2f} m"
+    return texts
 
 
 STUDY = lineup.study(
@@ -109,8 +83,28 @@ STUDY = lineup.study(
     grid=_grid(),
     settings={**scene.TOWN, "runs": 20, "train_seeds": 0},
     shares=tuple(PERFECT),
-    tables={"rt_le": _table},
-    figures={"rt_le": _figure},
+    tables={
+        "rt_le": selections(
+            ("Messages are", "How much"),
+            _rows,
+            across(_error, {look(method).label: {"method": method} for method in METHODS}),
+            "RT-LE [m].",
+            NOTE,
+            decimals=3,
+        )
+    },
+    figures={
+        "rt_le": curves(
+            [
+                Panel(by, title=how, xlabel="Latency [s]" if unit == "s" else "Lost [%]")
+                for how, (unit, by) in CHANNELS.items()
+            ],
+            [{"method": method} for method in METHODS[1:]],
+            "RT-LE against latency and loss; dashed: the bound of a perfect channel.",
+            NOTE,
+            levels=[{"method": "kalman"}, {"method": "bound"}],
+        )
+    },
     findings=_findings,
     limitations=("Latency is the same for all messages of a cell, in whole steps of the drive.",),
     minutes=15,

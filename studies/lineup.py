@@ -1,18 +1,20 @@
-"""The method of a cell by name and noise model, and its rows, which the studies of methods share."""
+"""The method of a cell by name and noise model, and its rows, also of vehicles that come and go or have no truth."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import Floats
+from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
-from coopoc.evaluate.scores import rows_of, scored
+from coopoc.evaluate.innovations import innovation_columns
+from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.scores import BYTES, rows_of, scored
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
@@ -20,13 +22,12 @@ from coopoc.methods.sliding_window import CooperativeMAP
 from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
-from coopoc.study.style import look
+from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
-from .presence import complete, scored_where_present
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
 BOUND = ("bound", "bound")
@@ -53,19 +54,6 @@ def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = 
 def reference(name: str) -> Path:
     """File of a study's reference values."""
     return Path(__file__).parent / "reference" / f"{name}.json"
-
-
-def of(method: str, known: str, /, **at: Any) -> dict[str, Any]:
-    """A method under a noise model, as parameters of a cell or as a selection."""
-    return {**at, "method": method, "noise_model": known}
-
-
-HEAD = ("Method", "Noise model")
-
-
-def labelled(pairs: Iterable[tuple[str, str]], **at: Any) -> list[tuple[tuple[str, str], dict[str, Any]]]:
-    """Rows of a table under HEAD: labels and selection of each method under its noise model."""
-    return [((look(method).label, known), of(method, known, **at)) for method, known in pairs]
 
 
 def cell(p: Params) -> list[Row]:
@@ -122,8 +110,7 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
             return [(seed, model.method(name, known)) for seed, model in models]
         from coopoc.learned import CooperativeGain
 
-        # sums where messages are in time, else the newest fix
-        return [(seed, CooperativeGain(model, scene.channel(p).latency == 0, name)) for seed, model in models]
+        return [(seed, CooperativeGain(model, name)) for seed, model in models]
     method: Method = find("coopoc.methods", name)(noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=known)
@@ -186,3 +173,98 @@ def bound_rows(p: Params) -> list[Row]:
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
         found.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
     return found
+
+
+RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")
+"""Columns that are not averaged over the stretches of a vehicle: root mean squares, maxima and sums."""
+
+
+def complete(recording: Recording, who: Sequence[str], drive: Fleet) -> bool:
+    """Whether all egos are there, with a truth, throughout."""
+    columns = [recording.ids.index(ego) for ego in who]
+    whole = np.isfinite(recording.velocity[0][:, columns]).all() and np.isfinite(recording.gnss[:, 0, columns]).all()
+    return bool(whole and drive.present[:, [drive.index(ego) for ego in who]].all())
+
+
+def scored_where_present(
+    method: Method, recording: Recording, who: Sequence[str], drive: Fleet, quantiles: int = 0, metric: str = ""
+) -> dict[str, AnyArray]:
+    """Columns (R, E) as of `scored`, over the stretches in which an ego and its truth are there.
+
+    A filter starts anew in each stretch. Without a truth the columns are innovations and bytes.
+
+    Args:
+        method: that follows the egos.
+        recording: its measurements and messages.
+        who: ids of the egos.
+        drive: the truth, NaN where it is unknown.
+        quantiles: number of quantiles of the distances, of egos that are there in one stretch.
+        metric: one more, by its name or "mine.py:NAME"; not used without a truth.
+
+    Raises:
+        InputError: an ego that is never there at two steps in a row.
+    """
+    each = [_ego(method, recording, ego, drive, quantiles, metric) for ego in who]
+    names = [name for name in each[0] if all(name in columns for columns in each)]
+    return {name: np.concatenate([columns[name] for columns in each], axis=1) for name in names}
+
+
+def _ego(
+    method: Method, recording: Recording, ego: str, drive: Fleet, quantiles: int, metric: str
+) -> dict[str, AnyArray]:
+    known = drive.present[:, drive.index(ego)]
+    parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
+    stretches = recording.stretches(ego)
+    cuts = [(a + i, a + j) for a, b in stretches for i, j in _runs(known[a:b])] if known.any() else stretches
+    for start, stop in cuts:
+        seen = recording.between(start, stop)
+        # a truth that begins between two fixes leaves a start without one
+        begin = next(iter(seen.stretches(ego)), None)
+        if begin is None or begin[1] - begin[0] < 2:
+            continue
+        seen, truth = seen.between(*begin), drive.between(start + begin[0], start + begin[1])
+        if known.any():
+            columns = scored(method, seen, [ego], truth, quantiles, metric)
+        else:
+            columns = _without_truth(method, seen, ego)
+        parts.append(columns)
+        lengths.append(len(seen.t))
+    if not parts:
+        raise InputError("egos", repr(ego), "is never there at two steps in a row, with a fix", "Choose another ego.")
+    return {name: _merged(name, [part[name] for part in parts], lengths) for name in parts[0]}
+
+
+def _without_truth(method: Method, recording: Recording, ego: str) -> dict[str, AnyArray]:
+    track = method(recording, [ego])
+    account = of_track(track, recording, method.message)
+    near = len(recording.links.of(recording.ids.index(ego))) / len(recording.t)
+    shape = (recording.runs, 1)
+    return {
+        **innovation_columns(track, recording),
+        **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
+        "neighbours_mean": np.full(shape, near),
+        "seconds": np.full(shape, track.seconds / recording.runs),
+    }
+
+
+def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> AnyArray:
+    if len(parts) == 1:
+        return parts[0]
+    if name in MAXIMA:
+        return np.asarray(np.max(parts, axis=0))
+    if name in SUMS:
+        return np.asarray(np.sum(parts, axis=0))
+    power = 2 if name in RMS else 1
+    values, weights = np.stack(parts).astype(float) ** power, np.array(lengths, dtype=float)
+    weights = weights.reshape(-1, *[1] * (values.ndim - 1)) * np.isfinite(values)
+    total = weights.sum(axis=0)
+    mean = np.divide(
+        (np.nan_to_num(values) * weights).sum(axis=0), total, out=np.full(total.shape, np.nan), where=total > 0
+    )
+    return np.asarray(mean ** (1 / power))
+
+
+def _runs(known: Bools) -> list[tuple[int, int]]:
+    """(start, stop) of the runs of True."""
+    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    return [(int(a), int(b)) for a, b in edges if b - a >= 2]

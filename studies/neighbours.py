@@ -2,44 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.arrays import robust_std
-from coopoc.study.numbers import present
-from coopoc.study.pivot import pivot
+import numpy as np
+
+from coopoc.study.numbers import difference, listed, mean, present, ran, rms, three
 from coopoc.study.study import Params
 
-from . import lineup, scene, weights
-from .lineup import BOUND, of
-from .neighbours_findings import IDEAL, findings, ks
+from . import lineup, scene
+from .lineup import BOUND
+from .views import of, table
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
+IDEAL: dict[str, Any] = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
+"""The channel that passes a message at every step."""
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
-RATES_HZ = (5.0, 2.0, 1.0)
+LIMITS = [{**IDEAL, "rate_hz": rate} for rate in (5.0, 2.0, 1.0)]
+LIMITS += [{**IDEAL, "cap_bytes_per_second": cap} for cap in (300.0, 600.0, 1200.0)]
 WINDOWED = (0, 2)
 """K at which the sliding window is solved, too: one cell of it takes as long as ten others."""
-CAPS = (300.0, 600.0, 1200.0)
 TRAINED = ("okf", "fedkalmannet", "centralised")
 KNOWN = ["identity", "nominal", "fitted"]
 BUDGETED = ["lkf-sa", "joint"]
+FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
 
 
 def _grid() -> list[dict[str, Any]]:
     """Every method at every K over an ideal channel, then the cooperative ones at K = 10 under rates and byte caps."""
     solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), BOUND, *(("kalman", known) for known in KNOWN)]
     shared = [(m, known) for m in lineup.COOPERATIVE for known in KNOWN]
-    tight = [{**IDEAL, "rate_hz": rate} for rate in RATES_HZ]
-    tight += [{**IDEAL, "cap_bytes_per_second": cap} for cap in CAPS]
     return [
         *(of(*pair, max_neighbours=k, **IDEAL) for k in NEIGHBOURS for pair in (*solo, *shared)),
         *(of("cooperative-map-5", "nominal", max_neighbours=k, **IDEAL) for k in WINDOWED),
-        *(of(*pair, max_neighbours=10, **way) for way in tight for pair in shared if pair[0] in BUDGETED),
+        *(of(*pair, max_neighbours=10, **limit) for limit in LIMITS for pair in shared if pair[0] in BUDGETED),
     ]
 
 
@@ -53,44 +53,22 @@ def _meaningful(p: Params) -> bool:
     )
 
 
-def _of(*noise_model: str, **more: Any) -> dict[str, Any]:
+def _under(*noise_model: str, **more: Any) -> dict[str, Any]:
     """Cells over the ideal channel with these noise models, and those of methods that have none."""
     return {"noise_model": [*noise_model, "none", "trained", "bound"], **IDEAL, **more}
 
 
-FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
-
-
-def _caption(results: Results, text: str, where: dict[str, Any]) -> str:
-    note = " The bound is for the rms over runs of causal estimates, over an ideal channel and without the bias."
-    return scene.caption(results, text) + (note if "bound" in results.select(where)["method"].values else "")
-
-
-def _table(
-    results: Results,
-    wanted: dict[str, Any],
-    text: str,
-    value: str = "rt_le_m",
-    rows: str | Sequence[str] = "method",
-    columns: str | Sequence[str] = "max_neighbours",
-    **options: Any,
-) -> Table | None:
-    """Methods down, K across, unless other rows and columns are named."""
-    where = present(results, wanted, value)
-    if where is None:
-        return None
-    shown = {"intervals": False, "decimals": scene.decimals(results.settings), **options}
-    return pivot(results, rows, columns, value, where, _caption(results, text, where), **shown)
+BOUND_NOTE = "The bound is for the rms over runs of causal estimates, over an ideal channel and without the bias."
+k_table = partial(table, intervals=False)
 
 
 def _sweep(results: Results, known: str) -> Plot | None:
     from coopoc.study import figures
 
-    where = present(results, _of(known))
-    if where is None:
-        return None
+    where = present(results, _under(known))
     text = f"RT-LE against the number of neighbours, {known} noise model; bands: 95 % intervals over egos, then runs."
-    return figures.sweep(results, x="max_neighbours", where=where, log=True, caption=_caption(results, text, where))
+    caption = scene.caption(results, text, BOUND_NOTE)
+    return figures.sweep(results, x="max_neighbours", where=where, log=True, caption=caption) if where else None
 
 
 def _pareto(results: Results) -> Plot | None:
@@ -101,46 +79,76 @@ def _pareto(results: Results) -> Plot | None:
     where = present(results, {"method": chosen, "noise_model": ["fitted", "identity", "none", "trained", "bound"]})
     if where is None or not (results.select(where)["bytes_per_second"] > 0).any():
         return None
-    names = [name for name in weights.trained(results) if name in TRAINED]
-    text = f"RT-LE against the payload that an ego receives: {'; '.join(_budgets(results, where))}."
-    if names:
-        text += " Right: what a vehicle sends and receives in training, once."
-    return figures.pareto(
-        results,
-        along=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
-        where=where,
-        training=weights.training_bytes(results.settings, names),
-        caption=_caption(results, text, where),
-    )
+    text = "RT-LE against the payload that an ego receives, at each K, rate and cap; lines: the best for the bytes."
+    return figures.pareto(results, where=where, caption=scene.caption(results, text, BOUND_NOTE))
 
 
-def _budgets(results: Results, where: dict[str, Any]) -> list[str]:
-    """The channels that were run, each with its K."""
-    found = []
-    for (rate, cap), rows in results.groups(["rate_hz", "cap_bytes_per_second"], where):
-        received = rows[rows["bytes_per_second"] > 0]["max_neighbours"].unique()
-        if len(received):
-            found.append(f"{ks(received)} at {rate:g} Hz" + (f" and at most {cap:g} B/s" if cap else ""))
-    return found
+def findings(results: Results) -> dict[str, str]:
+    """The paper's order under identity covariances, and orders under fitted and known ones."""
+    return {"identity": _identity(results), "fitted": _fitted(results), "known": _known(results)}
 
 
-def _innovations(results: Results) -> Plot | None:
-    """Real measurements against the truth and the figures that were published for them; None for simulated data."""
-    data = results.settings["data"]
-    if not scene.is_real(data):
-        return None
-    from coopoc.data.mrclam import innovations, read_mrclam
-    from coopoc.study import figures
-
-    ranges, bearings = innovations(read_mrclam(data))
-    return figures.innovations(
-        {"Range": (ranges, 0.095, "m"), "Bearing": (bearings, 0.007, "rad")},
-        caption=f"Innovations of the real robot-to-robot measurements against Vicon, and the Gaussian of 0.095 m and "
-        f"0.007 rad; robust standard deviations {robust_std(ranges):.4f} m and {robust_std(bearings):.5f} rad.",
-    )
+def _at(method: str, known: str, k: int) -> dict[str, Any]:
+    return of(method, known, **IDEAL, max_neighbours=k)
 
 
-NEES: dict[str, Any] = {"wanted": _of("nominal", method=FILTERS), "best": None}
+def _steps(results: Results, known: str, *methods: str) -> list[int]:
+    """The K >= 1 at which one of the methods was run with this noise model."""
+    where = present(results, {"method": list(methods), "noise_model": known, **IDEAL})
+    return sorted(int(k) for k in results.select(where)["max_neighbours"].unique() if k) if where else []
+
+
+def _identity(results: Results) -> str:
+    steps = _steps(results, "identity", "lkf-sa")
+    if not steps:
+        return ""
+    lkf = {k: results.interval("rt_le_m", _at("lkf-sa", "identity", k)).mean for k in steps}
+    fed, gnss = (mean(results, _at(m, k, steps[0])) for m, k in (("fedkalmannet", "trained"), ("gnss", "none")))
+    ends = {f"LKF-SA ({ks([k])})": lkf[k] for k in (steps[0], steps[-1])}
+    text = f"Identity covariances, as the paper's baselines: {listed({'federated': fed, **ends, 'GNSS': gnss})}."
+    if fed is not None and gnss is not None:
+        holds = [k for k in steps if fed < lkf[k] < gnss]
+        parts = {"holds": holds, "does NOT hold": [k for k in steps if k not in holds]}
+        verdicts = " and ".join(f"{verb} at {ks(which)}" for verb, which in parts.items() if which)
+        text += f" The paper's order, federated < LKF-SA < GNSS, {verdicts}."
+    gap = difference(results, *(_at("lkf-sa", "identity", k) for k in (steps[-1], steps[0])))
+    if len(steps) > 1 and gap is not None:
+        claim = "falls" if gap.high < 0 else "does NOT fall for certain"
+        interval = f", 95 % [{gap.low:+.3g}, {gap.high:+.3g}]" if np.isfinite(gap.high) else " of one ego and run"
+        text += f" LKF-SA {claim} from K = {steps[0]} to {steps[-1]}: paired difference {gap.mean:+.3g} m{interval}."
+    return text
+
+
+def _fitted(results: Results) -> str:
+    steps = _steps(results, "fitted", *lineup.COOPERATIVE)
+    if not steps:
+        return ""
+    names = {
+        "FedKalmanNet": ("fedkalmannet", "trained"),
+        "fitted KF": ("kalman", "fitted"),
+        "fitted joint filter": ("joint", "fitted"),
+        "fitted LKF-SA": ("lkf-sa", "fitted"),
+    }
+    means = ran({words: mean(results, _at(*pair, steps[-1])) for words, pair in names.items()})
+    order = " < ".join(f"{words} {three(value)} m" for value, words in sorted((v, w) for w, v in means.items()))
+    return f"Fitted covariances, K = {steps[-1]}: {order}."
+
+
+def _known(results: Results) -> str:
+    """With the bound, which is for the rms over runs."""
+    steps = _steps(results, "nominal", *lineup.COOPERATIVE)
+    if not steps:
+        return ""
+    names = {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND}
+    each = ran({words: rms(results, _at(*pair, steps[-1])) for words, pair in names.items()})
+    return f"Known covariances, K = {steps[-1]}, rms over runs: {listed(each)}." if each else ""
+
+
+def ks(steps: Iterable[int]) -> str:
+    """[1, 2] as "K = 1, 2"."""
+    return "K = " + ", ".join(str(k) for k in sorted(steps))
+
+
 STUDY = lineup.study(
     "neighbours",
     "What does another neighbour bring online, at what cost, and can collaborative training replace it?",
@@ -150,36 +158,38 @@ STUDY = lineup.study(
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
         **{
-            f"rt_le_{known}": partial(_table, wanted=_of(known), text=f"RT-LE [m] against K, {known} noise model.")
+            f"rt_le_{known}": k_table(f"RT-LE [m] against K, {known} noise model.", BOUND_NOTE, where=_under(known))
             for known in ("identity", "fitted", "nominal")
         },
-        "budget": partial(
-            _table,
-            wanted={"method": BUDGETED, "max_neighbours": 10, "noise_model": KNOWN},
-            text="RT-LE [m] at K = 10 under rates and caps (0: no cap).",
+        "budget": k_table(
+            "RT-LE [m] at K = 10 under rates and caps (0: no cap).",
             rows=["rate_hz", "cap_bytes_per_second"],
             columns=["method", "noise_model"],
+            where={"method": BUDGETED, "max_neighbours": 10, "noise_model": KNOWN},
         ),
-        "nees": partial(_table, value="nees", text="NEES against K (3 is consistent), nominal noise model.", **NEES),
-        "nees_inside": partial(
-            _table,
+        "nees": k_table(
+            "NEES against K (3 is consistent), nominal noise model.",
+            value="nees",
+            where=_under("nominal", method=FILTERS),
+            best=None,
+        ),
+        "nees_inside": k_table(
+            "Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal noise model.",
             value="nees_inside",
-            text="Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal noise model.",
-            **NEES,
+            where=_under("nominal", method=FILTERS),
+            best=None,
         ),
-        "neighbours_errors": partial(
-            _table,
+        "neighbours_errors": k_table(
+            "Error of what the egos think of their neighbours [m].",
             value="neighbour_rt_le_m",
-            wanted=_of("identity", "fitted", method=FILTERS[1:], max_neighbours=list(NEIGHBOURS[1:])),
-            text="Error of what the egos think of their neighbours [m].",
             rows=("method", "noise_model"),
+            where=_under("identity", "fitted", method=FILTERS[1:], max_neighbours=list(NEIGHBOURS[1:])),
         ),
     },
     figures={
         "rt_le_identity": partial(_sweep, known="identity"),
         "rt_le_fitted": partial(_sweep, known="fitted"),
         "bytes": _pareto,
-        "innovations": _innovations,
     },
     findings=findings,
     limitations=(

@@ -1,4 +1,4 @@
-"""Real drives whose headings are estimated: what was measured, where filters start, the truth, and what is scored."""
+"""Real drives whose headings are estimated: measurements, first poses, truth, and the part that is scored."""
 
 from __future__ import annotations
 

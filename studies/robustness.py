@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import mean, present, sentence
-from coopoc.study.pivot import across, crossed
-from coopoc.study.style import look
+from coopoc.study.numbers import Number, Where, across, mean, sentence
+from coopoc.study.style import Panel, look
 
 from . import lineup, scene
-from .lineup import BOUND, of
+from .lineup import BOUND
+from .views import curves, of, selections
 
 if TYPE_CHECKING:
-    from coopoc.study.figures import Plot
     from coopoc.study.results import Results
-    from coopoc.study.tables import Table
 
 SHARES = (0.0, 0.1, 0.2, 0.4)
 METHODS = ("kalman", "lkf-sa", "joint", "split-ci", "ci", "cooperative-map-5", "cooperative-map-gnc")
@@ -40,43 +36,30 @@ def _grid() -> list[dict[str, Any]]:
     ]
 
 
-def at(method: str, k: int, share: float) -> dict[str, Any]:
+def at(method: str, max_neighbours: int, spoofed_share: float) -> dict[str, Any]:
     """A selection; the solo filter, which receives no message, ran once."""
     if method == "kalman":
         return {"method": method}
-    return {"method": method, "max_neighbours": k, "spoofed_share": share}
+    return {"method": method, "max_neighbours": max_neighbours, "spoofed_share": spoofed_share}
 
 
-def _table(results: Results, value: str, text: str, decimals: int) -> Table | None:
-    def number(results: Results, where: Mapping[str, Any]) -> float | None:
+def _table(text: str, value: str, decimals: int) -> Any:
+    def number(results: Results, where: Where) -> float | None:
         return mean(results, at(**where), value)
 
-    rows = [((k, look(method).label), {"method": method, "k": k}) for k in _ks(results) for method in METHODS]
-    shares = [share for share in SHARES if present(results, {"spoofed_share": share})]
-    columns = across(number, {f"{100 * share:g} % spoofed": {"share": share} for share in shares})
-    return crossed(results, ("K", "Method"), rows, columns, scene.caption(results, text, NOTE), decimals=decimals)
+    columns: dict[str, Number] = across(number, {f"{100 * s:g} % spoofed": {"spoofed_share": s} for s in SHARES})
+    rows = [
+        ((k, look(method).label), {"method": method, "max_neighbours": k}) for k in NEIGHBOURS for method in METHODS
+    ]
+    return selections(("K", "Method"), rows, columns, text, NOTE, decimals=decimals)
 
 
-def _ks(results: Results) -> list[int]:
-    return [k for k in NEIGHBOURS if present(results, {"max_neighbours": k})]
-
-
-def _figure(results: Results) -> Plot | None:
-    from coopoc.study.lines import Line, Panel, panels
-
-    shown = []
-    for k in _ks(results):
-        wide = {"lkf-sa": {"linewidth": 3.5, "markersize": 9.0, "zorder": 1.5}}  # beside the joint filter
-        lines = [
-            Line(of(m, "fitted"), {100 * share: mean(results, at(m, k, share)) for share in SHARES}, wide.get(m, {}))
-            for m in METHODS
-        ]
-        lines.append(Line(of(*BOUND), mean(results, {"method": "bound", "max_neighbours": k})))
-        shown.append(Panel(lines, f"K = {k}", "Spoofed vehicles [%]", [100 * share for share in SHARES]))
-    text = "RT-LE against the share of spoofed vehicles; dashed: the bound without an attack."
-    return panels(shown, scene.caption(results, text, NOTE), 2.4 + 2.3 * len(shown), 3.2, log=True)
-
-
+PANELS = [
+    Panel({100 * s: {"spoofed_share": s} for s in SHARES}, {"max_neighbours": k}, f"K = {k}", "Spoofed vehicles [%]")
+    for k in NEIGHBOURS
+]
+WIDE = {"linewidth": 3.5}
+"""Of the line that the joint filter's covers."""
 FINDING = (
     "K = {k}, 20 % spoofed: the joint filter has {trusting:.2f} m, the window with GNC {careful:.2f} m, the solo "
     "filter {alone:.2f} m; without an attack GNC costs {cost:+.3f} m."
@@ -84,10 +67,10 @@ FINDING = (
 
 
 def _findings(results: Results) -> dict[str, str]:
-    found = {}
+    texts = {}
     for k in NEIGHBOURS:
         window, same = (mean(results, at(m, k, 0.0)) for m in ("cooperative-map-5", "cooperative-map-gnc"))
-        found[f"K = {k}"] = sentence(
+        texts[f"K = {k}"] = sentence(
             FINDING,
             k=k,
             trusting=mean(results, at("joint", k, 0.2)),
@@ -95,7 +78,7 @@ def _findings(results: Results) -> dict[str, str]:
             alone=mean(results, at("kalman", k, 0.2)),
             cost=None if window is None or same is None else same - window,
         )
-    return found
+    return texts
 
 
 STUDY = lineup.study(
@@ -105,10 +88,19 @@ STUDY = lineup.study(
     settings={**scene.TOWN, "backend": "gauss-newton", "runs": 10, "train_seeds": 0},
     shares=("max_neighbours", "spoofed_share"),
     tables={
-        "rt_le": partial(_table, value="rt_le_m", text="RT-LE [m].", decimals=2),
-        "nees": partial(_table, value="nees", text="NEES (3 is consistent).", decimals=1),
+        "rt_le": _table("RT-LE [m].", "rt_le_m", 2),
+        "nees": _table("NEES (3 is consistent).", "nees", 1),
     },
-    figures={"rt_le": _figure},
+    figures={
+        "rt_le": curves(
+            PANELS,
+            [{"method": method, **(WIDE if method == "lkf-sa" else {})} for method in METHODS[1:]],
+            "RT-LE against the share of spoofed vehicles; dashed: the bound without an attack.",
+            NOTE,
+            levels=[{"method": "kalman", "max_neighbours": 0}, {"method": "bound"}],
+            log=True,
+        )
+    },
     findings=_findings,
     limitations=(
         "Velocities and relative measurements stay true; a spoofer that also forges its motion is not detected.",

@@ -18,7 +18,7 @@ from coopoc.data.registry import kind_of, load_fleet, load_log, recorder
 from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
-from coopoc.study.environment import revision
+from coopoc.study.provenance import revision
 from coopoc.study.study import Params
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.evaluate.innovations import dimensions
 from coopoc.study.numbers import present, ran, rms
-from coopoc.study.pivot import pivot
 from coopoc.study.style import look
 
 from . import lineup, scene
-from .lineup import of
+from .views import TableView, of, table
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -37,24 +34,24 @@ CONDITIONS: dict[str, Any] = {
 """Other conditions: the channel (None: its own), spoofing, time-correlated errors, errors of the heading, the start."""
 
 
-def _table(results: Results, value: str, text: str, **options: Any) -> Table | None:
-    if present(results, {}, value) is None:
-        return None
-    methods = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
-    where, rows = {"method": methods}, ["method", "noise_model"]
-    return pivot(results, rows, "max_neighbours", value, where, _caption(results, text), **options)
-
-
-def _nees(results: Results) -> Table | None:
-    real = scene.measured(results.settings["data"])
-    text = f"NEES against K ({3 if real is None else dimensions(real)} is consistent)."
-    return _table(results, "nees", text, best=None, intervals=False)
-
-
-def _caption(results: Results, text: str) -> str:
+def _changed(results: Results) -> str:
     kept = results.settings
     differs = [f"{name} {kept[name]}" for name, usual in CONDITIONS.items() if kept[name] != usual]
-    return scene.caption(results, text, *([f"With {', '.join(differs)}."] if differs else []))
+    return f"With {', '.join(differs)}." if differs else ""
+
+
+def _table(text: str, value: str, **options: Any) -> TableView:
+    """Methods that have the metric, and K across."""
+
+    def view(results: Results) -> Table | None:
+        if value not in results.frame:
+            return None
+        methods = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
+        texts = (text, *([_changed(results)] if _changed(results) else []))
+        rows, where = ("method", "noise_model"), {"method": methods}
+        return table(*texts, value=value, rows=rows, where=where, **{"decimals": 2, **options})(results)
+
+    return view
 
 
 def _figure(results: Results) -> Plot | None:
@@ -64,11 +61,12 @@ def _figure(results: Results) -> Plot | None:
         return None
     text = "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs."
     facet = "noise_model" if results.frame["noise_model"].nunique() > 1 else ""
-    return figures.sweep(results, x="max_neighbours", log=True, caption=_caption(results, text), facet=facet)
+    caption = scene.caption(results, text, _changed(results)).replace("  ", " ")
+    return figures.sweep(results, x="max_neighbours", log=True, caption=caption, facet=facet)
 
 
 def _findings(results: Results) -> dict[str, str]:
-    found = {}
+    texts = {}
     for k in results.frame["max_neighbours"].unique() if len(results.frame) else ():
         pairs = results.frame[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
         each = ran({(m, known): rms(results, of(m, known, max_neighbours=k)) for m, known in pairs})
@@ -77,8 +75,8 @@ def _findings(results: Results) -> dict[str, str]:
         if ranked:
             value, (method, known) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
-            found[f"K = {k}"] = f"K = {k}: {look(method).label} ({known}) has the lowest rms, {value:.3g} m{gap}."
-    return found
+            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({known}) has the lowest rms, {value:.3g} m{gap}."
+    return texts
 
 
 STUDY = lineup.study(
@@ -89,23 +87,13 @@ STUDY = lineup.study(
     reference=None,
     shares=("max_neighbours",),
     tables={
-        "rt_le": partial(_table, value="rt_le_m", text="RT-LE [m] against K."),
-        "nees": _nees,
-        "innovation": partial(
-            _table,
-            value="innovation_m",
-            text="RMS innovation of the fixes [m] against K: how well a method predicts the next fix.",
+        "rt_le": _table("RT-LE [m] against K.", "rt_le_m"),
+        "nees": _table("NEES against K (3 is consistent; 2 in the plane).", "nees", best=None, intervals=False),
+        "innovation": _table(
+            "RMS innovation of the fixes [m] against K: how well a method predicts the next fix.", "innovation_m"
         ),
-        "nis": partial(
-            _table,
-            value="nis",
-            text="NIS of the fixes per dimension against K (1 is consistent).",
-            best=None,
-            intervals=False,
-        ),
-        "bytes": partial(
-            _table, value="bytes_per_second", text="Received per ego [B/s].", best=None, intervals=False, decimals=0
-        ),
+        "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False),
+        "bytes": _table("Received per ego [B/s].", "bytes_per_second", best=None, intervals=False, decimals=0),
     },
     figures={"rt_le": _figure},
     findings=_findings,

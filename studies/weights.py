@@ -1,12 +1,15 @@
-"""The weights that a study needs: trained once for a setting, found again by a hash of everything that changes them."""
+"""coopoc train, and the weights that studies need: trained once for a setting, found by a hash of all that counts."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+
+from tyro.conf import Positional, arg
 
 from coopoc.data.registry import load_log
 from coopoc.errors import InputError
@@ -30,7 +33,7 @@ INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
-LEARNED = (*PAPER, "fedokf", "magnitude", "split", "recursive", "cooperative")
+LEARNED = (*PAPER, "fedokf", "split", "recursive", "cooperative")
 """Methods that are trained."""
 
 
@@ -163,50 +166,75 @@ def ledger(p: Params, name: str) -> Ledger:
     return card_ledger(checkpoint(name, p, 0).card, fleet(p["clients"]))
 
 
-def training_bytes(p: Params, names: Sequence[str]) -> dict[str, float]:
-    """Payload bytes that one vehicle sends and receives in training, on average over the clients."""
-    return {name: ledger(p, name).per_vehicle("training") for name in names}
-
-
 def described(results: Results) -> Mapping[str, str]:
     """Descriptions of the training of the methods that were run, from the cards of the first seed."""
-    cards = {name: checkpoint(name, results.settings, 0).card for name in trained(results)}
-    nets = [card for name, card in cards.items() if name in PAPER and card["kind"] == "gain_net"]
-    texts = {"nets": _nets(nets[0], len(seeds(results.settings)))} if nets else {}
-    for name, card in cards.items():
-        plan = card["settings"]
-        text = f"{plan['schedule']['epochs']} optimiser steps"
+    texts = {}
+    for name in trained(results):
+        card = checkpoint(name, results.settings, 0).card
+        plan, how = card["settings"], card["settings"]["schedule"]
+        steps = f"{how['epochs']} optimiser steps"
         if plan["kind"] == "federated":
-            text = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
-        seconds, clients = f"{card['seconds']:.0f} s per net", ", ".join(card["clients"])
-        own = "" if name in PAPER else f"; {_own(card)}"
-        texts[name] = f"{text}{own}; clients {clients}; {seconds}; key {card['key'][:12]}"
+            steps = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
+        texts[name] = (
+            f"{steps}; {card['parameters']} parameters, AdamW at {how['learning_rate']:g}, decoupled decay "
+            f"{how['weight_decay']:g}, batch {how['batch']}, pieces of {plan['piece']} steps "
+            f"{'mirrored' if how['mirror'] else 'as they are'}, {plan['noise']} noise; {len(seeds(results.settings))} "
+            f"training seeds; clients {', '.join(card['clients'])}; {card['seconds']:.0f} s per net; key "
+            f"{card['key'][:12]}"
+        )
     return texts
-
-
-def _own(card: Mapping[str, Any]) -> str:
-    """Training of a net that the paper does not have."""
-    plan, how = card["settings"], card["settings"]["schedule"]
-    pieces = "mirrored" if how["mirror"] else "as they are"
-    return (
-        f"{card['parameters']} parameters, AdamW at {how['learning_rate']:g}, decoupled decay {how['weight_decay']:g}, "
-        f"batch {how['batch']}, pieces of {plan['piece']} steps {pieces}, {plan['noise']} noise"
-    )
-
-
-def _nets(card: Mapping[str, Any], count: int) -> str:
-    """Training that the paper's nets have in common, from the card of one."""
-    plan, how = card["settings"], card["settings"]["schedule"]
-    pieces = "mirrored at random" if how["mirror"] else "as they are"
-    which = f"seeds 0 to {count - 1}" if count > 1 else "seed 0"
-    return (
-        f"{card['parameters']} parameters, AdamW at {how['learning_rate']:g} falling as a half cosine, decoupled decay "
-        f"{how['weight_decay']:g}, batch {how['batch']}, gradient norm at most {how['clip']:g}, pieces of "
-        f"{plan['piece']} steps {pieces}, {plan['noise']} noise, {100 * plan['split']:.0f} % for training, best "
-        f"weights of {how['checks']} validations; training {which}"
-    )
 
 
 def fitted(p: Params) -> NoiseModel:
     """Noise fitted on the recording that the nets of training seed 0 saw, or on the measurements of real data."""
     return _fitted(p["clients"], p["velocity_reading"])
+
+
+def train(
+    recipe: Annotated[Positional[str], arg(metavar="RECIPE")],
+    /,
+    data: Annotated[str, arg(metavar="NAME_OR_PATH")] = "town10-clients",
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/weights"),
+    seed: Annotated[int, arg(metavar="N")] = 0,
+    start: Literal["gnss", "true"] = "gnss",
+    reading: Literal["axis", "speed"] = "axis",
+    aggregate: Annotated[str | None, arg(metavar="RULE")] = None,
+    flower: bool = False,
+    rounds: Annotated[int | None, arg(metavar="N")] = None,
+) -> None:
+    """Train a recipe, or find its checkpoint if the same was trained before.
+
+    Example: coopoc train fedkalmannet --seed 0
+
+    Example: coopoc train okf --data "mylog?until=300" --out runs/mylog
+
+    Args:
+        recipe: a name such as fedkalmannet (see coopoc list), or FILE.py:NAME of a recipe or a net.
+        data: fleet of the clients or a log with its truth, a name or a path; "mylog?until=300" takes 300 s.
+        out: folder of the checkpoints.
+        seed: seed of noise, split, start and batches.
+        start: start of the filter in training, the first fix or the true position.
+        reading: reading of "10 % of the velocity", per axis or of the speed on every axis.
+        aggregate: aggregation rule, a name or FILE.py:NAME, instead of the recipe's.
+        flower: train on Flower's simulation engine, every client in its own process.
+        rounds: number of rounds on Flower, instead of the recipe's.
+    """
+    from coopoc.learned.train import train_all
+
+    clients = drives(data)
+    if flower:
+        from coopoc.learned import flower as engine
+
+        config = {"recipe": recipe, "seed": seed, "start": start, "reading": reading}
+        changes = {"rounds": rounds, "aggregate": aggregate}
+        changes = {name: value for name, value in changes.items() if value is not None}
+        made = engine.train(engine.job_of(config | changes), clients, out)
+    elif rounds is not None:
+        raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
+    else:
+        made = train_all(
+            clients, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe], aggregate=aggregate
+        )
+    for label, checkpoint in made.items():
+        print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")
+    print(f"coopoc: {len(made)} checkpoints are in {out}", file=sys.stderr)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -58,6 +59,21 @@ def crossing_fleet(vehicles: int = 8, steps: int = 60, seed: int = 3) -> Fleet:
     position = start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1]
     velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
     return Fleet(tuple(f"c{i}" for i in range(vehicles)), t, position, velocity)
+
+
+def coming_and_going(fleet: Fleet) -> Fleet:
+    """Vehicles 2 to 4 come late, 4 to 6 leave early."""
+    position, velocity = fleet.position.copy(), fleet.velocity.copy()
+    late, early = len(fleet.t) // 3, 2 * len(fleet.t) // 3
+    for column, away in ((slice(2, 5), slice(0, late)), (slice(4, 7), slice(early, None))):
+        position[away, column] = velocity[away, column] = np.nan
+    return replace(fleet, position=position, velocity=velocity)
+
+
+def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
+    """Vehicles that stand."""
+    where = np.repeat(np.array(position, dtype=float)[None], steps, axis=0)
+    return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
 
 
 @pytest.fixture(scope="session")

@@ -1,21 +1,37 @@
-"""The posterior Cramer-Rao bound against GTSAM's marginals, a closed form, and the filters that it bounds."""
+"""Posterior Cramer-Rao bounds against GTSAM's marginals, closed forms, and the filters that they bound."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from conftest import coming_and_going
 from scipy import stats
+from test_pose_methods import convoy
 
+import coopoc as co
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, Sensors, observe
-from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
+from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, posterior_bound
 from coopoc.evaluate.metrics import rt_le
+from coopoc.world.body_frames import body_motion, midway, true_heading, turned
 from coopoc.world.links import spherical, vector_cov
 from coopoc.world.sensing import find_links
 
 S2 = replace(Sensors.paper_scenario2(), velocity_reading="speed")
+NOISE = co.Sensors(
+    gnss_std=(0.3, 0.3, 0.3),
+    velocity_reading="speed",
+    velocity_std_ratio=0.05,
+    heading_std=0.03,
+    yaw_rate_std=0.02,
+    range_std=0.1,
+    azimuth_std=0.01,
+    inclination_std=0.01,
+)
+NEAR = co.V2X(max_neighbours=2, radius=60.0)
 
 
 def test_solo_bound_tends_to_the_riccati_solution() -> None:
@@ -27,52 +43,55 @@ def test_solo_bound_tends_to_the_riccati_solution() -> None:
     )
 
 
-def gtsam_graph(fleet: Fleet, steps: int, v2x: V2X) -> gtsam.Marginals:
-    """Fixes, motions and converted measurements of the star of vehicle 0, all at the truth, as GTSAM factors."""
-    links = find_links(fleet, [0], v2x.max_neighbours, v2x.radius, S2.min_range)
+def point_marginals(fleet: Fleet, steps: int, v2x: V2X, observers: Any) -> gtsam.Marginals:
+    """Fixes, motions and converted measurements of observers and those they measure, at the truth, as GTSAM factors."""
+    links = find_links(fleet, observers, v2x.max_neighbours, v2x.radius, S2.min_range)
     graph, values, before = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
     for t in range(steps):
-        members = {0, *links.neighbour[links.step == t].tolist()}
+        mine = np.flatnonzero(links.step == t)
+        members = {*np.flatnonzero(fleet.present[t]).tolist()} & {*observers, *links.neighbour[mine].tolist()}
         for m in members:
             key, here = gtsam.symbol(chr(97 + m), t), fleet.position[t, m]
             values.insert(key, here)
-            graph.add(gtsam.PriorFactorPoint3(key, here, gtsam.noiseModel.Diagonal.Sigmas(np.array(S2.gnss_std))))
+            graph.add(gtsam.PriorFactorPoint3(key, here, sigmas(*S2.gnss_std)))
             if m in before:
-                motion = gtsam.noiseModel.Diagonal.Sigmas(0.1 * S2.velocity_std(fleet.velocity[t, m]))
-                graph.add(
-                    gtsam.BetweenFactorPoint3(
-                        gtsam.symbol(chr(97 + m), t - 1), key, here - fleet.position[t - 1, m], motion
-                    )
-                )
-            if m:
-                vector = here - fleet.position[t, 0]
-                cov = vector_cov(np.array(spherical(*vector)), S2.relative_std)
-                graph.add(
-                    gtsam.BetweenFactorPoint3(
-                        gtsam.symbol("a", t), key, vector, gtsam.noiseModel.Gaussian.Covariance(cov)
-                    )
-                )
+                gap, motion = here - fleet.position[t - 1, m], 0.1 * S2.velocity_std(fleet.velocity[t, m])
+                graph.add(gtsam.BetweenFactorPoint3(gtsam.symbol(chr(97 + m), t - 1), key, gap, sigmas(*motion)))
+        for i, j in zip(links.observer[mine], links.neighbour[mine], strict=True):
+            vector = fleet.position[t, j] - fleet.position[t, i]
+            noise = gtsam.noiseModel.Gaussian.Covariance(vector_cov(np.array(spherical(*vector)), S2.relative_std))
+            ends = gtsam.symbol(chr(97 + i), t), gtsam.symbol(chr(97 + j), t)
+            graph.add(gtsam.BetweenFactorPoint3(*ends, vector, noise))
         before = members
     return gtsam.Marginals(graph, values)
 
 
-@pytest.mark.parametrize("neighbours", [0, 2, 5])
-def test_bounds_equal_gtsam_marginals(neighbours: int, crossing: Fleet) -> None:
-    """Independent check: a graph up to step t gives the filtering bound at t, the whole graph the smoothing bound."""
-    v2x = V2X(max_neighbours=neighbours, radius=30.0)
-    filtering, smoothing = (posterior_bound(crossing, S2, 0, v2x, smoothing=s) for s in (False, True))
-    for t in (1, 17, 40):
-        expected = gtsam_graph(crossing, t + 1, v2x).marginalCovariance(gtsam.symbol("a", t))
+@pytest.mark.parametrize(("neighbours", "everyone"), [(0, False), (5, False), (3, True)])
+def test_bounds_equal_gtsam_marginals(neighbours: int, everyone: bool, crossing: Fleet) -> None:
+    """A graph up to step t gives the filtering bound at t, the whole graph the smoothing bound."""
+    v2x, ego = V2X(max_neighbours=neighbours, radius=30.0), 7 if everyone else 0
+    fleet = coming_and_going(crossing).between(15, 45) if everyone else crossing
+    who = range(8) if everyone else [0]
+    if everyone:
+        filtering, smoothing = (fleet_bound(fleet, S2, v2x, smoothing=s)[:, ego] for s in (False, True))
+    else:
+        filtering, smoothing = (posterior_bound(fleet, S2, ego, v2x, smoothing=s) for s in (False, True))
+    for t in (1, 17, 27):
+        expected = point_marginals(fleet, t + 1, v2x, who).marginalCovariance(gtsam.symbol(chr(97 + ego), t))
         assert filtering[t] == pytest.approx(expected, rel=1e-6, abs=1e-9)
-    whole = gtsam_graph(crossing, 60, v2x)
-    for t in (0, 13, 59):
-        assert smoothing[t] == pytest.approx(whole.marginalCovariance(gtsam.symbol("a", t)), rel=1e-6, abs=1e-9)
+    whole = point_marginals(fleet, len(fleet.t), v2x, who)
+    for t in (0, 13, 29):
+        expected = whole.marginalCovariance(gtsam.symbol(chr(97 + ego), t))
+        assert smoothing[t] == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 def test_more_information_lowers_the_bound(crossing: Fleet) -> None:
-    solo, star = (bound_rt_le(posterior_bound(crossing, S2, 0, V2X(max_neighbours=k))) for k in (0, 5))
-    smooth = bound_rt_le(posterior_bound(crossing, S2, 0, V2X(max_neighbours=5), smoothing=True))
-    assert smooth < star < solo
+    v2x = V2X(max_neighbours=5)
+    solo, star = (posterior_bound(crossing, S2, 0, v) for v in (None, v2x))
+    smooth, whole = posterior_bound(crossing, S2, 0, v2x, smoothing=True), fleet_bound(crossing, S2, v2x)[:, 0]
+    for more, less in ((star, solo), (whole, star), (smooth, star)):
+        assert np.linalg.eigvalsh(less - more).min() > -1e-9
+        assert bound_rt_le(more) < 0.95 * bound_rt_le(less)
 
 
 @pytest.mark.parametrize(
@@ -97,3 +116,149 @@ def test_exact_fixes_have_no_bound(crossing: Fleet) -> None:
         posterior_bound(crossing, S2, -1)
     with pytest.raises(InputError, match="gnss_std"):
         posterior_bound(crossing, Sensors(gnss_std=(0, 1, 1)), 0)
+
+
+def sigmas(*std: float) -> Any:
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array(std))
+
+
+def pose_marginals(fleet: co.Fleet, steps: int, everyone: bool, sensors: co.Sensors) -> Any:
+    """Fixes, compasses, odometry, bearings and ranges in the plane at the truth, as GTSAM's own factors."""
+    marks = [k for k, name in enumerate(fleet.ids) if name[0] == "m"]
+    watching = range(len(fleet.ids)) if everyone else [0]
+    links = find_links(fleet, watching, NEAR.max_neighbours, NEAR.radius, sensors.min_range, marks)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    heading, (u, _) = true_heading(fleet), body_motion(fleet)
+    middle, dt, before = midway(heading), fleet.dt, {}
+    for m in marks:
+        values.insert(gtsam.symbol("m", m), fleet.position[0, m, :2])
+        graph.add(gtsam.NonlinearEqualityPoint2(gtsam.symbol("m", m), fleet.position[0, m, :2]))
+    for t in range(steps):
+        mine = np.flatnonzero(links.step == t)
+        who = set(range(len(fleet.ids))) if everyone else {0, *links.neighbour[mine].tolist()}
+        now = {k: gtsam.Pose2(*fleet.position[t, k, :2], heading[t, k]) for k in who - set(marks)}
+        for k, pose in now.items():
+            key = gtsam.symbol(chr(97 + k), t)
+            values.insert(key, pose)
+            graph.add(gtsam.PoseTranslationPrior2D(key, pose, sigmas(*sensors.gnss_std[:2])))
+            if sensors.compass:
+                graph.add(gtsam.PoseRotationPrior2D(key, pose, sigmas(sensors.heading_std)))
+            if k in before:
+                moved, std = dt * turned(u[t, k], middle[t, k]), sensors.velocity_std(u[t, k])[:2]
+                c, s = np.cos(middle[t, k]), np.sin(middle[t, k])
+                effect = dt * np.array([[c, -s, -moved[1] / 2], [s, c, moved[0] / 2], [0, 0, 1]])
+                cov = effect @ np.diag(np.square([*std, sensors.yaw_rate_std])) @ effect.T
+                world = np.eye(3)
+                world[:2, :2] = pose.rotation().matrix()
+                noise = gtsam.noiseModel.Gaussian.Covariance(world.T @ cov @ world)
+                old = gtsam.symbol(chr(97 + k), t - 1)
+                graph.add(gtsam.BetweenFactorPose2(old, key, before[k].between(pose), noise))
+            else:  # a new member's heading lies within a turn
+                graph.add(gtsam.PoseRotationPrior2D(key, pose, sigmas(np.pi / 3**0.5)))
+        for i, j in zip(links.observer[mine], links.neighbour[mine], strict=True):
+            vector, own = fleet.position[t, j] - fleet.position[t, i], gtsam.symbol(chr(97 + i), t)
+            range_, azimuth, _ = spherical(*vector)
+            seen = gtsam.Rot2(azimuth - heading[t, i]), range_, sigmas(sensors.azimuth_std, sensors.range_std)
+            if j in marks:
+                graph.add(gtsam.BearingRangeFactor2D(own, gtsam.symbol("m", j), *seen))
+            else:
+                graph.add(gtsam.BearingRangeFactorPose2(own, gtsam.symbol(chr(97 + j), t), *seen))
+        before = now
+    return gtsam.Marginals(graph, values)
+
+
+@pytest.mark.parametrize("compass", [True, False])
+@pytest.mark.parametrize(("everyone", "masts"), [(False, 1), (True, 0)], ids=["star and landmark", "fleet"])
+def test_pose_bounds_equal_gtsam_marginals(everyone: bool, masts: int, compass: bool) -> None:
+    """A graph up to step t gives the filtering bound at t; GTSAM's covariance is of a step in the body."""
+    fleet, sensors = convoy(4, 16, masts), replace(NOISE, compass=compass)
+    flat = co.Fleet(fleet.ids, fleet.t, fleet.position * [1, 1, 0], fleet.velocity)
+    marks = [name for name in fleet.ids if name[0] == "m"]
+    if everyone:
+        found = co.fleet_pose_bound(flat, sensors, NEAR, landmarks=marks)[:, 0]
+    else:
+        found = co.pose_bound(flat, sensors, 0, NEAR, landmarks=marks)
+    for t in (0, 5, 15):
+        marginal = pose_marginals(flat, t + 1, everyone, sensors).marginalCovariance(gtsam.symbol("a", t))
+        world = np.eye(3)
+        h = true_heading(flat)[t, 0]
+        world[:2, :2] = [[np.cos(h), -np.sin(h)], [np.sin(h), np.cos(h)]]
+        own = found[t][np.ix_([0, 1, 3], [0, 1, 3])]
+        assert own == pytest.approx(world @ marginal @ world.T, rel=1e-6, abs=1e-9)
+
+
+def test_a_compass_and_a_gyro_alone_are_a_scalar_filter() -> None:
+    """Closed form at rest: p = -q/2 + sqrt(q^2/4 + q r); a bias of the compass adds its variance."""
+    fleet = co.Fleet(("a",), np.arange(2000) * 0.1, np.zeros((2000, 1, 3)), np.zeros((2000, 1, 3)))
+    sensors = co.Sensors(heading_std=0.1, yaw_rate_std=0.02)
+    q, r = (0.1 * 0.02) ** 2, 0.1**2
+    level = -q / 2 + np.sqrt(q * q / 4 + q * r)
+    assert co.pose_bound(fleet, sensors, 0)[-1, 3, 3] == pytest.approx(level, rel=1e-6)
+    biased = co.pose_bound(fleet, replace(sensors, heading_bias_std=0.05), 0)
+    assert biased.shape == (2000, 5, 5)
+    assert biased[-1, 3, 3] == pytest.approx(level + 0.05**2, rel=0.02)
+
+
+CASES = [
+    (co.PoseFilter("solo"), 0, 0),
+    (co.PoseFilter("solo", lasting=True), 0, 3),
+    (co.PoseFilter("fleet"), 2, 3),
+    (co.PoseFilter("fleet", fusion="naive"), 2, 0),
+    (co.PoseFilter("fleet", fusion="intersection"), 2, 0),
+]
+
+
+@pytest.mark.parametrize(("method", "k", "masts"), CASES, ids=lambda value: getattr(value, "name", value))
+def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method: co.PoseFilter, k: int, masts: int) -> None:
+    """Monte Carlo at small noise: mean squares of position and heading over 120 runs, t intervals of the runs."""
+    fleet = convoy(4, 120, masts)
+    lasting = (
+        {"speed_scale_std": 0.02, "yaw_rate_bias_std": 0.02, "odometry_error_time": 20.0} if method.lasting else {}
+    )
+    sensors, v2x = replace(NOISE, **lasting), co.V2X(max_neighbours=k, radius=60.0)
+    marks = [name for name in fleet.ids if name[0] == "m"]
+    seen = co.observe(fleet, sensors, v2x, runs=120, seed=3, frame="body", landmarks=marks)
+    track = method(seen, [0])
+    bound = co.fleet_pose_bound(fleet, sensors, v2x, landmarks=marks)[:, 0]
+    position = np.square(track.x - fleet.position[:, :1]).sum(axis=-1)[:, 10:, 0].mean(axis=1)
+    heading = np.square(co.heading_error(track, fleet))[:, 10:, 0].mean(axis=1)
+    for square, least in (
+        (position, np.trace(bound[10:, :3, :3], axis1=1, axis2=2).mean()),
+        (heading, bound[10:, 3, 3].mean()),
+    ):
+        half = stats.t.ppf(0.995, 119) * square.std(ddof=1) / np.sqrt(120)
+        assert square.mean() + half > least
+        if method.fusion == "joint":
+            assert square.mean() - half < 1.02 * least
+
+
+def test_more_knowledge_lowers_the_bound_of_poses() -> None:
+    fleet = convoy(4, 60, 1)
+    plain = replace(NOISE, compass=False)
+    worse = replace(NOISE, yaw_rate_bias_std=0.02, speed_scale_std=0.02)
+
+    def heading(sensors: co.Sensors, k: int, **more: Any) -> float:
+        return float(co.pose_bound(fleet, sensors, 0, co.V2X(k, 60.0), **more)[20:, 3, 3].mean())
+
+    alone, star = heading(plain, 0), heading(plain, 2)
+    whole = float(co.fleet_pose_bound(fleet, plain, co.V2X(2, 60.0))[20:, 0, 3, 3].mean())
+    assert whole < star < alone
+    assert heading(plain, 0, landmarks=["m0"]) < alone
+    assert heading(NOISE, 0) < heading(worse, 0)
+    assert heading(NOISE, 0) < alone
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda f: co.pose_bound(f, replace(NOISE, heading_std=0.0), 0), "heading_std"),
+        (lambda f: co.pose_bound(f, replace(NOISE, gnss_drift_std=1.0), 0), "gnss_drift_std"),
+        (lambda f: co.pose_bound(f, replace(NOISE, range_std=0.0), 0, landmarks=["m0"]), "relative_std"),
+        (lambda f: co.fleet_pose_bound(f, NOISE, landmarks=["m9"]), "landmarks"),
+        (lambda f: co.pose_bound(f, NOISE, "b"), "vehicle"),
+        (lambda f: co.pose_bound(f, NOISE, "m0", landmarks=["m0"]), "is a landmark"),
+    ],
+)
+def test_mistakes_are_named(make: Any, words: str) -> None:
+    with pytest.raises(co.InputError, match=words):
+        make(convoy(2, 5, 1))

@@ -21,7 +21,7 @@ import tyro
 import coopoc as co
 from coopoc import plugins
 from coopoc.cli import OWN, _status
-from coopoc.study.parse import assignments
+from coopoc.study.cell import assignments
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -127,7 +127,7 @@ def test_a_command_parses_and_names_what_exists(
     if name == "train" and given:
         assert plugins.find("coopoc.recipes", given["recipe"])
     if name == "benchmark":
-        from coopoc.studies.bench_cards import method, simulated
+        from coopoc.studies.benchmark import method, simulated
 
         assert all(method(one) for one in given.get("methods", ()) if simulated(one))
 

@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -63,16 +62,18 @@ def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
     assert float(alpha[1]) > float(bound[1])
 
 
-def test_a_cooperative_filter_with_a_4d_state(folder: Path, formation: Fleet) -> None:
-    """A compass that cannot err is the joint filter; one that does is found out, and the joint filter pays for it."""
-    compass = from_file(f"{folder}/compass.py:Compass")
-    fleet, sensors = formation.between(0, 100), Sensors.paper_scenario2()
-    exact = observe(fleet, sensors, V2X(max_neighbours=4, loss=0.2), runs=3, observers=[0])
-    known, joint = compass("nominal", prior_std=1e-9), JointFilter(exact=False)
-    np.testing.assert_allclose(known(exact, [0]).x, joint(exact, [0]).x, atol=1e-6)
-    turned = observe(fleet, replace(sensors, heading_bias_std=0.15), V2X(max_neighbours=4), runs=10, observers=[0])
-    found, paid = (rt_le(method(turned, [0]), fleet).mean() for method in (compass("nominal", prior_std=0.15), joint))
-    assert found < paid
+def test_a_cooperative_filter_in_thirty_lines(folder: Path, formation: Fleet) -> None:
+    """It errs as the joint filter does, through losses and delays, and alone it is the Kalman filter."""
+    ekf, fleet, sensors = (
+        from_file(f"{folder}/ekf.py:CooperativeEKF")(),
+        formation.between(0, 100),
+        Sensors.paper_scenario2(),
+    )
+    seen = observe(fleet, sensors, V2X(max_neighbours=4, loss=0.2, latency=0.1), runs=5, observers=[0])
+    ours, theirs = (rt_le(method(seen, [0]), fleet).mean() for method in (ekf, JointFilter()))
+    assert ours == pytest.approx(theirs, rel=0.03)
+    alone = observe(fleet, sensors, V2X(max_neighbours=0), runs=2)
+    np.testing.assert_allclose(ekf(alone, [0]).x, Kalman()(alone, [0]).x, atol=2e-4)
 
 
 def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

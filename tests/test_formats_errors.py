@@ -254,13 +254,3 @@ def test_an_information_matrix_is_positive_definite(tmp_path: Path) -> None:
             with pytest.raises(InputError, match=r"a\.g2o: line 3 = information .*positive definite"):
                 load_graph(tmp_path / "a.g2o")
     assert 10 < indefinite < 50
-
-
-def test_a_repeated_stamp_is_shown_with_all_digits_and_may_be_dropped(tmp_path: Path) -> None:
-    stamps = ("1311868230.100001", "1311868230.100002", "1311868230.100002", "1311868230.2")
-    (tmp_path / "a.tum").write_text("".join(f"{t} {k} 0 0 0 0 0 1\n" for k, t in enumerate(stamps)))
-    with pytest.raises(InputError, match=r"line 3, column t = 1311868230\.100002 s after 1311868230\.100002 s.*drop"):
-        read_tum(tmp_path / "a.tum")
-    assert read_tum(tmp_path / "a.tum", repeats="drop").position[:, 0].tolist() == [0, 1, 3]
-    with pytest.raises(InputError, match=r"repeats = 'dropp': .*Did you mean drop\?"):
-        read_tum(tmp_path / "a.tum", repeats="dropp")  # type: ignore[arg-type]

@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from oracles.fixed_lag import fixed_lag
-from oracles.moving_horizon import Drive, moving_horizon
+from oracles.moving_horizon import Drive, fixed_lag, moving_horizon
 from test_kernels_window import CHANNELS, S2
 
 from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, observe

@@ -35,7 +35,6 @@ ROOMS = {
         "assess",
         "descent",
         "starts",
-        "agents",
         "robust",
         "convex",
         "backends",

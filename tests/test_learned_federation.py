@@ -1,9 +1,12 @@
-"""Federation laws on gains that are no net: order, stacking, participation, guard, compression, privacy, topologies."""
+"""Federation: laws on gains that are no net; rules against Flower's own, SciPy and closed forms; Byzantine clients."""
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -12,28 +15,25 @@ import torch
 from scipy import stats
 from torch import Tensor, nn
 
-from coopoc import Fleet, InputError, Sensors, load_fleet
+from coopoc import Fleet, InputError, Sensors
 from coopoc.arrays import Floats
 from coopoc.learned import Client, GainNet, Schedule, clients, federate
-from coopoc.learned.federation.compression import Compression, Float16, Quantised, TopK
-from coopoc.learned.federation.federated import Plan, federate_many
-from coopoc.learned.federation.history import Federation, ledger
+from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
+from coopoc.learned.federation.federate import Plan, federate_many
+from coopoc.learned.federation.history import Federation, Round, ledger
 from coopoc.learned.federation.local import adapt, local_fit
-from coopoc.learned.federation.means import FedProx
 from coopoc.learned.federation.participation import Byzantine, Participation, heterogeneous, poisoned
-from coopoc.learned.federation.robust import Krum
-from coopoc.learned.federation.rule import Rule
-from coopoc.learned.federation.server import SERVER, Group, Standing
-from coopoc.learned.federation.topology import (
-    Complete,
-    Mesh,
-    Pairs,
-    Ring,
-    Topology,
-    V2XGraph,
-    connected,
-    disagreement,
-    metropolis,
+from coopoc.learned.federation.rules import (
+    RULES,
+    FedAdam,
+    FedAvgM,
+    Krum,
+    Rule,
+    TrimmedMean,
+    krum_scores,
+    mean,
+    rule,
+    uniform,
 )
 from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.stack import flatten
@@ -95,17 +95,7 @@ def trained(group: Sequence[Client], rounds: int = 3, model: Gain | None = None,
     return federate(start, group, rounds, **{"local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options})
 
 
-EVERYTHING: list[dict[str, Any]] = [
-    {},
-    {"aggregate": "uncertainty"},
-    {"aggregate": "geometric_median", "participation": Participation(0.75, 0.2, 0.5)},
-    {"aggregate": "fedadam", "compression": Quantised(6)},
-    {"compression": TopK(0.4), "participation": Participation(0.5)},
-    {"topology": Ring(), "participation": Participation(1.0, 0.3)},
-]
-
-
-@pytest.mark.parametrize("options", EVERYTHING, ids=str)
+@pytest.mark.parametrize("options", [{}, {"aggregate": "fedadam", "participation": Participation(0.5)}], ids=str)
 def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], options: dict[str, Any]) -> None:
     """Same seed, same weights, bit for bit, whatever the order of the clients."""
     one, other = trained(four, seed=3, **options), trained(four[::-1], seed=3, **options)
@@ -114,20 +104,19 @@ def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], opti
     for a, b, c in zip(one.history, other.history, together.history, strict=True):
         assert torch.equal(a.weights, b.weights)
         assert torch.equal(a.weights, c.weights)
-        assert (a.traffic, a.absent) == (b.traffic, b.absent) == (c.traffic, c.absent)
+        assert (a.sent, a.absent) == (b.sent, b.absent) == (c.sent, c.absent)
     assert not torch.equal(one.history[-1].weights, trained(four, seed=4, **options).history[-1].weights)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.3])
-def test_a_client_alone_is_its_row_of_the_stack(four: tuple[Client, ...], share: float) -> None:
+def test_a_client_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:
     """`local_fit` is what `adapt` makes of the client among others, bit for bit."""
     theta = flatten([Steady(0.2 + 0.1 * i) for i in range(4)])
     local = Schedule(epochs=2, epoch="pass", batch=3)
     stacked, (pool, members) = theta.clone(), pooled([c.training for c in four])
-    losses, broken = adapt(stacked, Steady(), pool, members, [(5, c.name) for c in four], 2, 6, local, [share] * 4)
+    losses, broken = adapt(stacked, Steady(), pool, members, [(5, c.name) for c in four], 2, 6, local)
     assert not broken
     for row, client in enumerate(four):
-        alone, loss, reason = local_fit(Steady(), theta[row], client, 5, 2, 6, local, share)
+        alone, loss, reason = local_fit(Steady(), theta[row], client, 5, 2, 6, local)
         assert torch.equal(alone, stacked[row])
         assert (loss, reason) == (float(losses[row]), None)
     assert torch.equal(theta[0], torch.full((3,), 0.2))
@@ -143,94 +132,13 @@ def test_a_client_alone_says_why_it_broke(four: tuple[Client, ...]) -> None:
     assert reason == "loss or gradient not finite at step 1"
 
 
-def test_the_proximal_term_is_that_of_fedprox(four: tuple[Client, ...]) -> None:
-    """Against torch's AdamW and clipping on the loss with mu / 2 ||theta - theta_g||^2 written out."""
-    local = Schedule(epochs=2, epoch="pass", batch=100, learning_rate=0.05, proximal=0.7, mirror=False, clip=2.0)
-    start = torch.tensor([0.2, 0.5, 0.4])
-    ours, _, _ = local_fit(Steady(), start, four[0], 0, 1, 1, local)
-    pieces = four[0].training
-    steps = -(-2 * len(pieces) // 100)
-    theirs = start.clone().requires_grad_()
-    optimiser = torch.optim.AdamW([theirs], lr=0.05, weight_decay=0.3)
-    cosine = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    for _ in range(steps):
-        loss = Steady().losses(theirs[None], pieces.batch(torch.arange(len(pieces))[None])).mean()
-        optimiser.zero_grad()
-        (loss + 0.35 * (theirs - start).square().sum()).backward()
-        torch.nn.utils.clip_grad_norm_([theirs], 2.0)
-        optimiser.step()
-        cosine.step()
-    torch.testing.assert_close(ours, theirs.detach(), rtol=1e-5, atol=1e-7)
-
-
-def test_fedprox_keeps_clients_near(four: tuple[Client, ...]) -> None:
-    """The rule sets the term by itself, as the schedule would."""
-    step = [
-        float((trained(four, 1, aggregate=rule).history[1].weights - 0.3).norm())
-        for rule in ("mean", FedProx(1.0), FedProx(1e3))
-    ]
-    assert step[0] >= step[1] > step[2]
-    by_schedule = trained(four, 1, schedule=Schedule(learning_rate=0.02, proximal=1.0))
-    assert torch.equal(by_schedule.history[1].weights, trained(four, 1, aggregate=FedProx(1.0)).history[1].weights)
-
-
-def test_who_is_asked_and_who_answers() -> None:
-    """Exactly the share is asked; dropouts and stragglers come as often as a binomial test allows."""
-    names = [f"v{i}" for i in range(40)]
-    given = Participation(share=0.5, dropout=0.3, straggle=0.4)
-    turns = [turn for number in range(1, 51) for turn in given.turns(7, number, names)]
-    asked = [turn for turn in turns if turn.asked]
-    assert len(asked) == 50 * 20
-    gone = sum(turn.absent is not None for turn in asked)
-    slow = [turn.share for turn in asked if 0 < turn.share < 1]
-    assert stats.binomtest(gone, 1000, 0.3).pvalue > 0.001
-    assert stats.binomtest(len(slow), 1000 - gone, 0.4).pvalue > 0.001
-    assert stats.kstest(slow, "uniform").pvalue > 0.001
-    assert given.turns(7, 3, names[::-1]) == given.turns(7, 3, names)[::-1]
-    assert given.turns(7, 3, names) != given.turns(7, 4, names)
-    assert Participation(share=0.01).count(4) == 1
-
-
-def test_the_history_names_the_absent_and_the_slow(four: tuple[Client, ...]) -> None:
-    fed = trained(four, 6, participation=Participation(0.5, 0.3, 0.6), seed=2)
-    for row in fed.history[1:]:
-        asked = {receiver for sender, receiver in row.traffic if sender == SERVER}
-        answered = {sender for sender, receiver in row.traffic if receiver == SERVER}
-        assert len(asked) == 2
-        assert {name for name, reason in row.absent.items() if reason == "not asked"} == set(fed.names) - asked
-        assert {n for n, reason in row.absent.items() if reason == "asked, but did not answer"} == asked - answered
-        assert set(row.stragglers) <= answered
-        assert [np.isnan(loss) for loss in row.training_loss] == [name not in answered for name in fed.names]
-    assert any("of its local steps" in reason for row in fed.history for reason in row.stragglers.values())
-
-
-def test_a_round_with_nobody_changes_nothing(four: tuple[Client, ...]) -> None:
-    for topology in (None, Ring()):
-        fed = trained(four, 2, participation=Participation(dropout=1.0), topology=topology)
-        assert all(torch.equal(row.weights, fed.history[0].weights) for row in fed.history)
-        assert fed.history[1].note == "no client answered: weights unchanged"
-        assert fed.best.number == 0
-        assert fed.history[1].sent_bytes == 0
-
-
-def test_a_straggler_makes_a_part_of_its_steps(four: tuple[Client, ...]) -> None:
-    """What arrives is `local_fit` with the share that the draw gives."""
-    slow = Participation(straggle=1.0)
-    fed = trained(four[:1], 1, participation=slow, seed=4)
-    (turn,) = slow.turns(4, 1, ["c0"])
-    local = Schedule(epochs=1, epoch="pass", learning_rate=0.02)
-    assert 0 < turn.share < 1
-    alone, _, _ = local_fit(Steady(), fed.history[0].weights, four[0], 4, 1, 1, local, turn.share)
-    assert torch.equal(fed.history[1].weights, alone)
-
-
 @dataclass(frozen=True)
 class Faulty(Participation):
     """Participation in which named clients answer wrongly."""
 
     faults: tuple[tuple[str, str], ...] = ()
 
-    def answer(self, name: str, number: int, theta: Tensor, weights: Tensor) -> Tensor:
+    def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
         """NaN, another shape, or a change a thousand times too large."""
         wrong = {"nan": weights + torch.nan, "shape": weights[:-1], "far": theta + 1000 * (weights - theta)}
         return wrong.get(dict(self.faults).get(name, ""), weights)
@@ -265,7 +173,7 @@ def test_a_client_that_never_answered_does_not_choose_the_weights(four: tuple[Cl
     fed = trained([*four[:3], broken], 3)
     assert fed.history[1].rejected == {"c3": "loss or gradient not finite at step 1"}
     assert fed.best.number == trained(four[:3], 3).best.number > 0
-    assert ("c3", SERVER) not in fed.history[1].traffic
+    assert "c3" not in fed.history[1].sent
 
 
 def test_absent_clients_count_with_their_last_answer(four: tuple[Client, ...]) -> None:
@@ -276,15 +184,9 @@ def test_absent_clients_count_with_their_last_answer(four: tuple[Client, ...]) -
 
 
 def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None:
-    group = clients(drives(5), piece=10)
-    fed = trained(group, 6, aggregate="krum", participation=Participation(dropout=0.3), seed=1)
-    stayed = [row for row in fed.history[1:] if row.note]
-    assert {row.note[1:] for row in stayed} == {
-        " answers accepted, Krum(byzantine=1, keep=1) takes at least 5: weights unchanged"
-    }
-    assert len(stayed) < 6
-    for before, row in zip(fed.history, fed.history[1:], strict=False):
-        assert torch.equal(before.weights, row.weights) == (row.note != "")
+    fed = trained(clients(drives(5), piece=10), 2, aggregate="krum", participation=Faulty(faults=(("c1", "nan"),)))
+    assert all(torch.equal(row.weights, fed.history[0].weights) for row in fed.history)
+    assert fed.history[1].note == "4 answers accepted, Krum(byzantine=1, keep=1) takes at least 5: weights unchanged"
 
 
 @pytest.mark.parametrize(
@@ -292,12 +194,6 @@ def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None
     [
         ({"aggregate": "krum"}, r"Krum\(byzantine=1, keep=1\) with 4 clients a round: takes at least 5"),
         ({"aggregate": Krum(0, keep=3), "participation": Participation(0.5)}, "with 2 clients a round"),
-        ({"topology": Ring(), "aggregate": "median"}, "aggregate = median"),
-        ({"topology": Ring(), "compression": Float16()}, "compression = Float16"),
-        ({"topology": Pairs((("c0", "c1"),))}, r"without a path from c0 to \['c2', 'c3'\]"),
-        ({"topology": Pairs((("c0", "x"),))}, "pairs = "),
-        ({"topology": Pairs((("c0", "c11"),))}, r"pairs = 'c11': must be one of c0, .* Did you mean c1\?"),
-        ({"topology": V2XGraph(drives(2), 1e9)}, "vehicle = 'c2'"),
         ({"rounds": 0}, "rounds = 0"),
     ],
 )
@@ -314,152 +210,34 @@ def test_clients_have_names_of_their_own(four: tuple[Client, ...]) -> None:
             trained([four[0], replace(four[1], name=name), replace(four[2], name=name)])
 
 
-@pytest.mark.parametrize(
-    ("field", "options"),
-    [("share", {"share": 0.0}), ("dropout", {"dropout": 1.1}), ("straggle", {"straggle": -0.1})],
-)
-def test_participation_refuses_what_cannot_be(field: str, options: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=field):
-        Participation(**options)
+def test_the_server_asks_a_share_of_the_clients(four: tuple[Client, ...]) -> None:
+    """As many each round, by lots that do not depend on the order of the names; the history names the others."""
+    names = [f"v{i}" for i in range(40)]
+    given = Participation(share=0.5)
+    asked = [given.asked(7, number, names) for number in range(1, 51)]
+    assert {len(chosen) for chosen in asked} == {20}
+    assert given.asked(7, 3, names[::-1]) == asked[2] != asked[3]
+    assert Participation(share=0.01).count(4) == 1
+    with pytest.raises(InputError, match="share"):
+        Participation(share=0.0)
+    fed = trained(four, 6, participation=given, seed=2)
+    for row in fed.history[1:]:
+        assert row.sent.keys() == row.received.keys() == set(fed.names) - row.absent.keys()
+        assert set(row.absent.values()) == {"not asked"}
+        assert [np.isnan(loss) for loss in row.training_loss] == [name in row.absent for name in fed.names]
 
 
-@pytest.mark.parametrize(
-    ("compression", "size"),
-    [(None, 12), (Float16(), 6), (TopK(0.4), 12), (Quantised(5), 6)],
-)
-def test_the_ledger_counts_every_byte(four: tuple[Client, ...], compression: Compression | None, size: int) -> None:
-    """Three weights and one loss up, three weights down, per round; who drops out has received and not sent."""
-    fed = trained(four, 3, compression=compression, participation=Participation(dropout=0.4), seed=1)
+def test_the_ledger_counts_every_byte(four: tuple[Client, ...]) -> None:
+    """Three weights and one loss up, three weights down, per round in which a client is asked."""
+    fed = trained(four, 3, participation=Participation(0.5), seed=1)
     account, air = ledger(fed), ledger(fed, overhead=100)
-    assert account.names == (*fed.names, SERVER)
-    assert account.servers == (SERVER,)
+    assert (account.names, account.servers) == ((*fed.names, SERVER), (SERVER,))
     sent, received = (account.of("training", way=way)[0] for way in ("broadcast", "per receiver"))
     rounds = np.array([sum(name not in row.absent for row in fed.history[1:]) for name in fed.names])
-    np.testing.assert_array_equal(sent, [*rounds * (size + 4), 3 * 12])  # the server broadcasts
-    np.testing.assert_array_equal(received, [3 * 12] * 4 + [rounds.sum() * (size + 4)])
+    np.testing.assert_array_equal(sent, [*rounds * 16, 3 * 12])  # the server broadcasts
+    np.testing.assert_array_equal(received, [*rounds * 12, rounds.sum() * 16])
     np.testing.assert_array_equal(air.of("training", "on air", "broadcast")[0] - sent, [*100 * rounds, 300])
-    np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [300] * 4 + [100 * rounds.sum()])
-    moved = sum(row.sent_bytes + row.received_bytes for row in fed.history)
-    assert account.per_vehicle("training") == moved / 4
-    assert 0 < min(sent[:4]) < max(sent[:4])
-
-
-def test_compression_changes_the_weights_as_little_as_it_promises(four: tuple[Client, ...]) -> None:
-    """TopK of everything is no compression; what TopK keeps back is sent in the end."""
-    plain = trained(four, 1).history[1].weights
-    torch.testing.assert_close(trained(four, 1, compression=TopK(1.0)).history[1].weights, plain, rtol=0, atol=1e-7)
-    torch.testing.assert_close(trained(four, 1, compression=Float16()).history[1].weights, plain, rtol=0, atol=1e-4)
-    bowl: dict[str, Any] = {"schedule": replace(PLAIN, learning_rate=0.05), "model": Bowl(0.0)}
-    whole, third = (trained(four, 60, compression=c, **bowl).history[-1].weights for c in (None, TopK(1 / 3)))
-    torch.testing.assert_close(third, whole, rtol=0, atol=0.05 * float(whole.abs().max()))
-
-
-@dataclass(frozen=True)
-class Clipped:
-    """The simplest protection: every update is clipped to a norm."""
-
-    norm: float
-
-    def protect(self, updates: Tensor, names: Sequence[str], seed: int, number: int) -> Tensor:
-        """Scaled down to the norm."""
-        assert updates.shape == (len(names), 3)
-        return updates * torch.clamp(self.norm / updates.norm(dim=1, keepdim=True), max=1.0)
-
-    def check(self, rule: Rule) -> None:
-        """Uniform weights only."""
-        if rule.mean_by != "uniform":
-            raise InputError("aggregate", rule, 'must be "uniform" with clipping', "Take uniform.")
-
-
-def test_protection_acts_before_anything_leaves(four: tuple[Client, ...]) -> None:
-    """Clipped updates of one client are as long as the clip; compression then acts on what was clipped."""
-    for compression in (None, TopK(1.0)):
-        fed = trained(four[:1], 4, aggregate="uniform", privacy=Clipped(0.003), compression=compression)
-        path = torch.stack([row.weights for row in fed.history])
-        torch.testing.assert_close(path.diff(dim=0).norm(dim=1), torch.full((4,), 0.003), rtol=1e-3, atol=0)
-    with pytest.raises(InputError, match="uniform"):
-        trained(four, privacy=Clipped(1.0))
-    with pytest.raises(InputError, match="privacy = "):
-        trained(four, privacy=Clipped(1.0), topology=Ring())
-
-
-def test_a_complete_graph_is_the_uniform_rule(four: tuple[Client, ...]) -> None:
-    """Metropolis weights of a complete graph are 1 / C: every client holds the uniform mean."""
-    mesh, server = trained(four, 4, topology=Complete()), trained(four, 4, aggregate="uniform")
-    for row, other in zip(mesh.history, server.history, strict=True):
-        torch.testing.assert_close(row.weights, other.weights, rtol=1e-5, atol=1e-7)
-        assert row.disagreement < 1e-6
-    assert mesh.own is not None
-    torch.testing.assert_close(mesh.own, server.history[-1].weights.expand(4, 3), rtol=1e-5, atol=1e-7)
-    assert server.own is None
-
-
-@pytest.mark.parametrize("topology", [Ring(), Pairs((("c0", "c1"), ("c0", "c2"), ("c0", "c3"), ("c3", "c4")))])
-def test_mixing_alone_agrees_as_fast_as_the_graph_allows(topology: Topology) -> None:
-    """Without training, k rounds are the k-th power of a doubly stochastic matrix: the mean stays, the rest shrinks
-    by its second eigenvalue (numpy)."""
-    names = tuple(f"c{i}" for i in range(5))
-    mix = metropolis(connected(topology, names))
-    np.testing.assert_allclose(mix, mix.T)
-    np.testing.assert_allclose(mix.sum(0), 1.0)
-    start = torch.randn((5, 7), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    standing = Standing(start.mean(0), start, (), start, (10.0,) * 5)
-    mesh, group, present = Mesh(connected(topology, names), Participation()), Group(names, (1,) * 5, 0), Participation()
-    for number in range(1, 21):
-        held = dict(zip(names, standing.held, strict=True))
-        standing, moved = mesh(group, standing, number, present.turns(0, number, names), held, [1.0] * 5)
-        assert not moved.rejected
-    np.testing.assert_allclose(standing.held, np.linalg.matrix_power(mix, 20) @ start.numpy(), atol=1e-12)
-    torch.testing.assert_close(standing.theta, start.mean(0))
-    second = np.sort(np.abs(np.linalg.eigvalsh(mix)))[-2]
-    assert disagreement(standing.held) <= 2 * second**20 * float((start - start.mean(0)).norm())
-
-
-def test_a_ring_agrees_where_the_server_ends(four: tuple[Client, ...]) -> None:
-    """Quadratics whose minima differ: all clients end at what the uniform rule finds, which no client finds alone."""
-    options: dict[str, Any] = {"model": Bowl(0.0), "schedule": replace(PLAIN, learning_rate=0.3)}
-    ring, server = trained(four, 80, topology=Ring(), **options), trained(four, 80, aggregate="uniform", **options)
-    minima = torch.stack([c.training.truth[:, 1:].mean((0, 1)) for c in four])
-    spread, found = disagreement(minima), server.history[-1].weights
-    assert ring.own is not None
-    assert float((ring.own - found).norm(dim=1).max()) < 0.02 * spread
-    assert ring.history[-1].disagreement < 0.01 * max(row.disagreement for row in ring.history)
-    assert float((minima - found).norm(dim=1).min()) > 0.1 * spread
-
-
-def test_bytes_of_a_mesh_are_counted_per_link_and_direction(four: tuple[Client, ...]) -> None:
-    fed = trained(four, 2, topology=Ring())
-    pairs = [("c0", "c1"), ("c1", "c2"), ("c2", "c3"), ("c3", "c0")]
-    assert fed.history[1].traffic == dict.fromkeys([*pairs, *((b, a) for a, b in pairs)], 12)
-    account = ledger(fed)
-    assert account.servers == ()
-    assert account.of("training").tolist() == [[48] * 4]
-    assert account.of("training", way="broadcast").tolist() == [[24] * 4]  # one message reaches both neighbours
-
-
-def test_a_neighbour_that_sends_nonsense_is_not_mixed_in(four: tuple[Client, ...]) -> None:
-    for fault in ("nan", "shape", "far"):
-        fed = trained(four, 3, topology=Ring(), participation=Faulty(faults=(("c1", fault),)))
-        assert all(set(row.rejected) == {"c1"} for row in fed.history[1:])
-        assert all(row.weights.isfinite().all() for row in fed.history)
-        assert fed.history[-1].disagreement < 1.0
-
-
-def test_whoever_is_absent_keeps_its_weights(four: tuple[Client, ...]) -> None:
-    fed = trained(four, 1, topology=Complete(), participation=Participation(0.5), seed=5)
-    assert fed.own is not None
-    away = [name in fed.history[1].absent for name in fed.names]
-    assert sum(away) == 2
-    assert [torch.equal(own, fed.history[0].weights) for own in fed.own] == away
-
-
-def test_the_training_fleet_is_a_connected_graph_within_the_papers_radius() -> None:
-    """Against distances taken pair by pair."""
-    fleet = load_fleet("town10-clients")
-    links = connected(V2XGraph(fleet, 30.0), fleet.ids)
-    for i, j in ((0, 1), (1, 2), (2, 3), (0, 3), (0, 2)):
-        gap = np.linalg.norm(fleet.position[:, i] - fleet.position[:, j], axis=-1)
-        assert links[i, j] == links[j, i] == (np.nanmin(gap) <= 30.0)
+    np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
 
 
 def test_clients_may_differ_in_sensors_and_in_amount() -> None:
@@ -506,7 +284,7 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
 def test_a_net_is_federated_the_same_way(aggregate: str) -> None:
     """GainNet with all options at once moves, stays finite and repeats to the last bit."""
     group, net = clients(drives(6), piece=10), GainNet(2, 1)
-    options: dict[str, Any] = {"participation": Participation(0.9, 0.1, 0.3), "compression": Quantised(8)}
+    options: dict[str, Any] = {"participation": Participation(0.9)}
     fed, again = (trained(group, 2, model=net, aggregate=aggregate, seed=1, **options) for _ in range(2))
     path = torch.stack([row.weights for row in fed.history])
     assert path.isfinite().all()
@@ -543,3 +321,264 @@ def test_a_net_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:
         assert torch.equal(alone, stacked[row])
         assert loss == float(losses[row])
         assert Judge([[client.validation], [client.long]], GainNet(2, 1))(alone[None]) == scores[row]
+
+
+SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])
+
+
+def answers(clients: int = 7, size: int = 40, seed: int = 0) -> Tensor:
+    """(C, P) weights in float64."""
+    return torch.randn((clients, size), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def combined(which: Rule, weights: Tensor, sizes: Tensor = SIZES) -> Tensor:
+    """What a rule makes of one round from zero."""
+    theta = torch.zeros_like(weights[0])
+    return which(which.start(theta), theta, weights, sizes)[0]
+
+
+@pytest.fixture(scope="module")
+def flower() -> ModuleType:
+    """Flower's strategies; its import warns about libraries of its own."""
+    pytest.importorskip("flwr")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import flwr.serverapp.strategy as strategy
+    return strategy
+
+
+def replies(weights: Tensor, sizes: Tensor) -> list[Any]:
+    """Flower's messages with these weights, split into two arrays as a net would be, and numbers of examples."""
+    from flwr.app import Array, ArrayRecord, Message, MetricRecord, RecordDict
+    from flwr.app.metadata import Metadata
+
+    def content(row: Tensor, count: int) -> RecordDict:
+        arrays = ArrayRecord({"a": Array(row[:9].reshape(3, 3).numpy()), "b": Array(row[9:].numpy())})
+        return RecordDict({"arrays": arrays, "metrics": MetricRecord({"num-examples": count})})
+
+    def about(node: int) -> Metadata:
+        return Metadata(
+            run_id=1,
+            message_id="",
+            src_node_id=node,
+            dst_node_id=99,
+            reply_to_message_id="",
+            group_id="",
+            created_at=0.0,
+            ttl=60.0,
+            message_type="train",
+        )
+
+    build: Any = Message
+    return [
+        build(content(row, int(n)), metadata=about(i)) for i, (row, n) in enumerate(zip(weights, sizes, strict=True))
+    ]
+
+
+def flat(record: Any) -> Tensor:
+    """Flower's arrays as one row."""
+    return torch.from_numpy(np.concatenate([record[name].numpy().ravel() for name in ("a", "b")]))
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "options"),
+    [
+        (RULES["mean"], "FedAvg", {}),
+        (RULES["median"], "FedMedian", {}),
+        (TrimmedMean(0.2), "FedTrimmedAvg", {"beta": 0.2}),
+        (TrimmedMean(0.4), "FedTrimmedAvg", {"beta": 0.4}),
+        (Krum(1), "Krum", {"num_malicious_nodes": 1}),
+        (Krum(2), "Krum", {"num_malicious_nodes": 2}),
+        (Krum(2, keep=3), "MultiKrum", {"num_malicious_nodes": 2, "num_nodes_to_select": 3}),
+    ],
+    ids=lambda value: value.name if isinstance(value, Rule) else str(value),
+)
+def test_rules_are_those_of_flower(flower: ModuleType, ours: Rule, theirs: str, options: dict[str, Any]) -> None:
+    """Against flwr.serverapp.strategy; Flower weighs what Multi-Krum keeps by examples, the paper does not."""
+    sizes = torch.ones_like(SIZES) if theirs == "MultiKrum" else SIZES
+    for seed in range(5):
+        weights = answers(seed=seed)
+        record, _ = getattr(flower, theirs)(**options).aggregate_train(1, replies(weights, sizes))
+        torch.testing.assert_close(combined(ours, weights, sizes), flat(record), rtol=1e-12, atol=1e-12)
+
+
+def test_server_momentum_is_that_of_flower(flower: ModuleType) -> None:
+    """Five rounds of flwr.serverapp.strategy.FedAvgM."""
+    ours, theirs = FedAvgM(0.3, 0.7), flower.FedAvgM(server_learning_rate=0.3, server_momentum=0.7)
+    theta = answers()[0]
+    state, theirs.current_arrays = ours.start(theta), replies(theta[None], SIZES[:1])[0].content["arrays"]
+    for number in range(1, 6):
+        weights = answers(seed=number)
+        theta, state = ours(state, theta, weights, SIZES)
+        record, _ = theirs.aggregate_train(number, replies(weights, SIZES))
+        torch.testing.assert_close(theta, flat(record), rtol=1e-12, atol=1e-12)
+
+
+def test_server_adam_is_that_of_flower(flower: ModuleType) -> None:
+    """flwr.serverapp.strategy.FedAdam scales its rate by round and starts v at 0: the same from there."""
+    theirs = flower.FedAdam(eta=0.05, beta_1=0.8, beta_2=0.95, tau=0.01)
+    theta = answers()[0]
+    state: tuple[Tensor, ...] = (torch.zeros_like(theta), torch.zeros_like(theta))
+    for number in range(1, 6):
+        weights = answers(seed=number)
+        arrays = replies(theta[None], SIZES[:1])[0].content["arrays"]
+        theirs.current_arrays = {name: array.numpy() for name, array in arrays.items()}
+        scaled = 0.05 * np.sqrt(1 - 0.95 ** (number + 1.0)) / (1 - 0.8 ** (number + 1.0))
+        theta, state = FedAdam(scaled, 0.8, 0.95, 0.01)(state, theta, weights, SIZES)
+        record, _ = theirs.aggregate_train(number, replies(weights, SIZES))
+        torch.testing.assert_close(theta, flat(record), rtol=1e-10, atol=1e-12)
+
+
+def test_server_adam_starts_as_published() -> None:
+    """Algorithm 2 by hand: v starts at tau^2, no bias correction."""
+    weights, which = answers(), FedAdam(0.05, 0.9, 0.99, 1e-3)
+    change = mean(weights, SIZES)
+    by_hand = 0.05 * 0.1 * change / ((0.99 * 1e-6 + 0.01 * change**2).sqrt() + 1e-3)
+    torch.testing.assert_close(combined(which, weights), by_hand)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 0.49])
+def test_trimmed_mean_is_that_of_scipy(share: float) -> None:
+    for count in (1, 4, 7):
+        weights = answers(count)
+        theirs = stats.trim_mean(weights.numpy(), share, axis=0)
+        np.testing.assert_allclose(combined(TrimmedMean(share), weights, SIZES[:count]), theirs, rtol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 7])
+def test_median_is_that_of_numpy(count: int) -> None:
+    weights = answers(count)
+    np.testing.assert_array_equal(combined(RULES["median"], weights), np.median(weights.numpy(), axis=0))
+
+
+@pytest.mark.parametrize("name", sorted(RULES))
+def test_every_rule_keeps_what_all_agree_on(name: str) -> None:
+    """Law: equal answers give themselves; the adaptive servers move towards them."""
+    theta, target = torch.zeros(6), torch.full((6,), 0.5)
+    which = RULES[name]
+    after, _ = which(which.start(theta), theta, target.repeat(7, 1), SIZES)
+    if name in ("fedavgm", "fedadam"):
+        assert (after > 0).all()
+        assert (after <= target).all()
+    else:
+        torch.testing.assert_close(after, target)
+
+
+@pytest.mark.parametrize("name", ["median", "trimmed_mean", "krum", "multi_krum"])
+def test_robust_rules_ignore_one_byzantine_client(name: str) -> None:
+    """One of seven sends 1e6: the result stays in the hull of the honest, the mean does not."""
+    weights = answers()
+    weights[3] = 1e6
+    honest = weights[[0, 1, 2, 4, 5, 6]]
+    found = combined(RULES[name], weights, torch.ones(7))
+    assert ((found <= honest.max(0).values) & (found >= honest.min(0).values)).all()
+    assert combined(RULES["mean"], weights).max() > 1e4
+
+
+def test_a_plain_function_is_a_rule() -> None:
+    weights = answers()
+    torch.testing.assert_close(combined(rule(lambda w, n: w[0]), weights), weights[0])
+    assert rule(uniform).name == "uniform"
+    assert rule(Krum(2)) == Krum(2)
+    torch.testing.assert_close(combined(FedAvgM(1.0, 0.0), weights), mean(weights, SIZES))
+
+
+@pytest.mark.parametrize(
+    ("make", "field"),
+    [
+        (lambda: TrimmedMean(0.5), "share"),
+        (lambda: Krum(-1), "byzantine"),
+        (lambda: Krum(1, keep=0), "keep"),
+        (lambda: FedAvgM(momentum=1.0), "momentum"),
+        (lambda: FedAdam(tau=0), "tau"),
+        (lambda: rule("vote"), "aggregation rule"),
+    ],
+)
+def test_impossible_parameters_are_named(make: Any, field: str) -> None:
+    with pytest.raises(InputError, match=f"^{field} = "):
+        make()
+
+
+def test_krum_says_how_many_clients_it_needs() -> None:
+    with pytest.raises(InputError, match=r"4 with byzantine = 1: Krum needs more than 2 f \+ 2 = 4 clients"):
+        krum_scores(answers(4), 1)
+    assert (Krum(1).least, Krum(1, keep=9).least, RULES["median"].least) == (5, 9, 1)
+
+
+UPDATE = answers(1, 19_938, seed=9)[0].float() * 1e-2
+
+
+def bad(theta: Tensor) -> dict[str, Tensor]:
+    """Three answers that cannot be right."""
+    return {"nan": theta + torch.nan, "shape": theta[:-1], "far": theta + 10.0 * UPDATE * 100}
+
+
+@pytest.mark.parametrize("honest", [1, 2, 5])
+@pytest.mark.parametrize("which", [("nan",), ("shape",), ("far",), ("nan", "shape", "far")])
+def test_the_guard_rejects_what_cannot_be_right_and_nothing_else(honest: int, which: tuple[str, ...]) -> None:
+    """A thousand times too large is found among five honest answers as beside one, alone and with other faults."""
+    theta = torch.randn(19_938, generator=torch.Generator().manual_seed(2)) * 0.1
+    answers_ = {f"honest{i}": theta + UPDATE.roll(i) for i in range(honest)}
+    reasons, usual = screen(theta, answers_ | {name: bad(theta)[name] for name in which})
+    assert set(reasons) == set(which)
+    assert usual == pytest.approx(float(UPDATE.norm()), rel=1e-3)
+    words = {
+        "nan": "19938 of 19938 weights are not finite",
+        "shape": "weights of shape (19937,), the net has (19938,)",
+        "far": f"changes the weights by {1000 * float(UPDATE.norm()):.3g}",
+    }
+    assert all(words[name] in reasons[name] for name in which)
+
+
+def test_the_guard_remembers_what_is_usual() -> None:
+    """With two answers the round before decides: a small change of huge weights is still seen as far too large."""
+    theta = torch.full((100,), 1e6)
+    honest, wrong = theta + 1.0, theta + 1000.0
+    assert screen(theta, {"a": honest, "b": wrong})[0] == {}
+    assert set(screen(theta, {"a": honest, "b": wrong}, usual=10.0)[0]) == {"b"}
+    assert screen(theta, {}, usual=10.0) == ({}, 10.0)
+
+
+def test_the_guard_lets_a_change_in_where_most_changed_nothing() -> None:
+    theta = torch.ones(3)
+    assert screen(theta, {"a": theta, "b": theta, "c": theta + 0.1})[0] == {}
+    assert set(screen(theta, {"a": theta, "b": theta, "c": theta + 1e3})[0]) == {"c"}
+
+
+def test_weights_that_are_not_finite_are_never_taken() -> None:
+    """Neither from a rule that divides by zero nor into the state of Adam; the round says why nothing changed."""
+    given = {name: Answer(torch.full((2,), 0.1), 1) for name in "ab"}
+    done, _, note = combine(rule(lambda w, n: w.sum(0) / 0.0), Standing(torch.zeros(2), ()), given)
+    assert done.theta.tolist() == [0.0, 0.0]
+    assert note == "<lambda> gives weights that are not finite: weights unchanged"
+    adam, far = rule("fedadam"), {name: Answer(torch.full((2,), 1e30), 1) for name in "abc"}
+    state = adam.start(torch.zeros(2))
+    after, _, note = combine(adam, Standing(torch.zeros(2), state, 1e30), far)
+    assert "not finite" in note
+    assert after.state is state
+    with pytest.raises(InputError, match=r"must have the shape \(2,\)"):
+        combine(rule(lambda w, n: w), Standing(torch.zeros(2), ()), given)
+
+
+def federation(losses: np.ndarray) -> Federation:  # type: ignore[type-arg]
+    """A history with these losses (rounds, C)."""
+    names = tuple(f"c{i}" for i in range(losses.shape[1]))
+    rows = [Round(k, torch.zeros(1), (math.nan,) * len(row), tuple(row)) for k, row in enumerate(losses.tolist())]
+    return Federation(GainNet(2, 1), tuple(rows), (5,) * len(names), 0.0, names)
+
+
+@pytest.mark.parametrize("false", [math.nan, math.inf, 1e308, 1e5, 0.0])
+@pytest.mark.parametrize("clients", [3, 4, 12])
+def test_one_client_cannot_select_the_untrained_round(false: float, clients: int) -> None:
+    """It praises the start and condemns every other round; the others' losses fall from 4 to 1 m^2."""
+    curve = np.linspace(4.0, 1.0, 8)[:, None] * np.linspace(0.8, 1.2, clients)
+    assert federation(curve).best.number == 7
+    curve[:, 0] = [1e-9, *[false] * 7]
+    assert federation(curve).best.number >= 6
+
+
+def test_honest_reports_select_the_least_mean() -> None:
+    """Within ten percent of the least median the mean decides, as it did before."""
+    curve = 1.0 + 0.04 * np.random.default_rng(3).random((20, 4))
+    assert federation(curve).best.number == int(curve.mean(1).argmin())
+    assert federation(curve[:, :2]).best.number == int(curve[:, :2].mean(1).argmin())

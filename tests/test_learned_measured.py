@@ -37,7 +37,7 @@ from coopoc.learned.training.drives import MeasuredDrives
 from coopoc.learned.training.measured import measured_clients
 from coopoc.learned.training.okf_fit import fit_okf
 
-NETS = (GainNet(2, 1), GainNet(2, 1, magnitudes=True), SplitGain(4), RecursiveGain(4), NoiseNet(4), NoiseParameters())
+NETS = (GainNet(2, 1), SplitGain(4), RecursiveGain(4), NoiseNet(4), NoiseParameters())
 
 
 def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> tuple[Recording, Fleet]:

@@ -1,5 +1,5 @@
-"""RecursiveGain: equals filterpy's filter before training, its compiled rollout equals plain torch, and its covariance
-is calibrated where the noise is not given."""
+"""RecursiveGain: equals filterpy's filter before training, and its covariance is calibrated where the noise is not
+given."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 import torch
 from filterpy.kalman import KalmanFilter
-from oracles import recursive_gain as oracle
 
 from coopoc import V2X, Fleet, Sensors, load_fleet, observe
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.learned import Schedule, clients, fit, load_method
-from coopoc.learned.nets.levels import POOL, after, first, noise
-from coopoc.learned.nets.recursive import RecursiveFilter, RecursiveGain
+from coopoc.learned.nets.recursive import POOL, RecursiveFilter, RecursiveGain, after, first, noise
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
 
@@ -66,29 +64,6 @@ def test_untrained_net_is_filterpys_filter() -> None:
         before = r
         np.testing.assert_allclose(track.x[0, t, 0], theirs.x, atol=1e-9)
         np.testing.assert_allclose(track.covariance[0, t, 0], theirs.P, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("dtype", "close"), [(torch.float64, 1e-10), (torch.float32, 2e-4)])
-def test_compiled_rollout_and_gradient_are_those_of_plain_torch(dtype: torch.dtype, close: float) -> None:
-    """Of `RecursiveGain.step`, and of torch's autograd through it."""
-    seen, like, found = batch(2, 2, 20, dtype), RecursiveGain(5), []
-    for rollout in (like.rollout, lambda theta, batch: oracle.rollout(theta, like, batch)):
-        theta = trained(2, dtype).requires_grad_()
-        x, variance = rollout(theta, seen)
-        losses = torch.nn.functional.gaussian_nll_loss(x, seen.truth, variance, reduction="none").sum(-1).mean(0)
-        (gradient,) = torch.autograd.grad(losses.sum(), theta)
-        found.append((x.detach(), variance.detach(), losses.detach(), gradient / gradient.abs().max()))
-    for ours, theirs in zip(*found, strict=True):
-        torch.testing.assert_close(ours, theirs, rtol=close, atol=close)
-
-
-def test_gradient_is_that_of_finite_differences() -> None:
-    seen, like = batch(2, 2, 6), RecursiveGain(2)
-    torch.manual_seed(3)
-    theta = flatten([RecursiveGain(2, seed=seed) for seed in range(2)]).double()
-    theta = (theta + 0.3 * torch.randn_like(theta)).requires_grad_()
-    assert torch.autograd.gradcheck(lambda weights: like.losses(weights, seen), (theta,))
 
 
 def test_loss_is_torchs_gaussian_likelihood() -> None:

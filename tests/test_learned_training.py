@@ -11,7 +11,7 @@ import torch
 import coopoc.learned.training.fit as train
 from coopoc import Fleet, InputError, Sensors
 from coopoc.learned import GainNet, Schedule, Segments, clients, federate, fit
-from coopoc.learned.federation.means import mean, uniform
+from coopoc.learned.federation.rules import mean, uniform
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import mirrored
 from coopoc.learned.training.fit import Task, fit_many

@@ -13,9 +13,7 @@ from scipy.optimize import least_squares
 from coopoc import InputError
 from coopoc.formats.graph import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
-from coopoc.optimize.agents.agent import agents_of
-from coopoc.optimize.agents.distributed import owners, solve_distributed
-from coopoc.optimize.agents.links import links_of
+from coopoc.optimize.distributed import owners, solve_distributed
 from coopoc.optimize.graphs import from_graph
 
 
@@ -95,26 +93,6 @@ def test_a_landmark_with_a_prior_goes_to_the_robot_that_measured_it_first() -> N
     for node, (name, owner) in enumerate(zip(problem.names, owners(problem), strict=True)):
         first = pairs[(pairs == node).any(axis=1)][0]
         assert owner == (name[0] if node in problem.poses else problem.names[first[first != node][0]][0])
-
-
-def test_a_pose_that_is_only_ranged_is_shared_without_its_rotation() -> None:
-    graph = random_graph(2, robots=2, steps=10, landmarks=0, seen=0, loops=0, ranges=15)
-    problem = from_graph(graph, start="odometry")
-    links = links_of(problem, owners(problem), 0.3)
-    assert {link.turns for link in links} == {False}
-    seen = sum(len(link.nodes) for link in links)
-    crossing = graph.ranges.nodes[:, 1][graph.ranges.nodes[:, 0] // 10 != graph.ranges.nodes[:, 1] // 10]
-    assert seen == len(set(crossing.tolist()) - {0})
-    agents = agents_of(problem, owners(problem), links)
-    assert sum(int((~agent.own).sum()) for agent in agents) == seen + (0 in crossing)
-
-
-def test_a_robot_that_meets_no_other_is_solved_alone() -> None:
-    graph = replace(random_graph(3, robots=2, steps=15, landmarks=0, seen=0, loops=0), ranges=RangeEdges())
-    problem = from_graph(graph, start="odometry")
-    found = solve_distributed(problem, rounds=3)
-    assert found.messages.tolist() == [0] * 4
-    assert found.cost[-1] == pytest.approx(solve(problem).cost, abs=1e-12)
 
 
 def test_a_robust_loss_rejects_what_one_robot_measured_wrongly() -> None:

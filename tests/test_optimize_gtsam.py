@@ -8,13 +8,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from random_graphs import random_graph
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.optimize import Loss, Problem, Status, pose, solve
 from coopoc.optimize.backends.gtsam_factors import forms, graph_of, tangent, values, which_turn
-from coopoc.optimize.graphs import from_graph
-from coopoc.optimize.incremental import Estimates, FixedLag, priors
+from coopoc.optimize.incremental import FixedLag
 
 LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 
@@ -129,31 +127,6 @@ def test_what_gtsam_lacks_is_named(dimension: int, kind: str, nodes: list, noise
     (form,) = forms(problem)
     assert isinstance(form, str)
     assert why in form
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_gtsams_between_of_poses_is_another_objective(dimension: int) -> None:
-    """The logarithm of the whole pose: equal where the residual is small, and not elsewhere."""
-    problem = measured(dimension, "relative_pose", BETWEEN[:1], {"std": 1.0})
-    graph, z = gtsam.NonlinearFactorGraph(), problem.factors[0].z[0]
-    space = gtsam.Pose3(gtsam.Rot3(z[3:].reshape(3, 3)), z[:3]) if dimension == 3 else None
-    between = getattr(gtsam, f"BetweenFactorPose{dimension}")
-    unit = gtsam.noiseModel.Unit.Create(3 * dimension - 3)
-    graph.add(between(0, 1, space or gtsam.Pose2(*z[:2], np.arctan2(z[4], z[2])), unit))
-    at = values(problem.space, which_turn(problem), problem.x0, range(5))
-    assert abs(graph.error(at) / problem.cost(problem.x0) - 1) > 0.01
-
-
-def test_a_lower_triangle_is_not_taken_for_a_diagonal() -> None:
-    """GTSAM's SqrtInformation(R, smart=True) looks above the diagonal only, and drops what is below."""
-    root = np.array([[2.0, 0, 0], [1.0, 3.0, 0], [0, 0, 1.0]])
-    at = gtsam.Values()
-    at.insert(0, np.ones(3))
-    error = gtsam.PriorFactorPoint3(0, np.zeros(3), gtsam.noiseModel.Gaussian.SqrtInformation(root, True)).error(at)
-    problem = Problem(("a",)).add("position", "a", [0, 0, 0], sqrt_information=root)
-    ours = graph_of(problem, forms(problem)).error(at)
-    assert ours == pytest.approx(0.5 * np.sum((root @ np.ones(3)) ** 2))
-    assert error != pytest.approx(ours)
 
 
 def range_star(seed: int = 0, loss: Loss | None = None, wrong: int = 0, height: float = 0.2) -> Problem:
@@ -275,17 +248,6 @@ def test_a_limit_of_iterations_is_kept(formation: Fleet, case: str) -> None:
     assert solution.iterations == 2
 
 
-def test_a_free_node_is_named() -> None:
-    problem = Problem(("a", "b"), x0=[[0, 0, 0], [3, 1, 0]]).add("range", ("a", "b"), [3.0], std=1.0)
-    with pytest.raises(InputError, match="can move freely"):
-        solve(problem.add("position", "a", [0, 0, 0], std=1.0), "gtsam")
-
-
-def test_unknown_optimizers_list_the_known() -> None:
-    with pytest.raises(InputError, match=r"auto.*elimination"):
-        solve(range_star(), "gtsam", optimizer="newton")
-
-
 def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
     """Ranges and bearings of a landmark, a prior of each pose; GTSAM's covariance is in the body: R C R^T."""
     rng = np.random.default_rng(8)
@@ -320,32 +282,6 @@ def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
         assert covariance[:2, 2] == pytest.approx(R @ own[:2, 2], abs=1e-6)
         assert covariance[2, 2] == pytest.approx(own[2, 2], abs=1e-6)
     assert solution.covariance[3, :2, :2] == pytest.approx(marginals.marginalCovariance(3), abs=1e-6)
-
-
-def test_marginals_of_poses_in_space_equal_gtsams() -> None:
-    """Priors and ranges; GTSAM has the rotation first and moves a position along the body's axes."""
-    rng = np.random.default_rng(10)
-    x = pose(rng.uniform(-9, 9, (3, 3)), rng.normal(size=(3, 3)))
-    z = pose(x[:, :3] + 0.2, rng.normal(size=(3, 3)) * 0.1)
-    z[:, 3:] = (x[:, 3:].reshape(3, 3, 3) @ z[:, 3:].reshape(3, 3, 3)).reshape(3, 9)
-    std = np.array([0.5, 0.6, 0.7, 0.05, 0.06, 0.07])
-    problem = Problem(tuple("abc"), x0=x, poses=range(3)).add("pose", [0, 1, 2], z, std=std)
-    problem = problem.add("range", [(0, 1), (1, 2), (0, 2)], [[9.0], [8.0], [7.0]], std=0.2)
-    solution = solve(problem, "gtsam")
-    graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
-    for i, (node, prior) in enumerate(zip(solution.x, z, strict=True)):
-        found.insert(i, gtsam.Pose3(gtsam.Rot3(node[3:].reshape(3, 3)), node[:3]))
-        turn = prior[3:].reshape(3, 3)
-        root = noise.Gaussian.SqrtInformation(np.diag(1 / std[:3]) @ turn.T, False)
-        graph.add(gtsam.PoseTranslationPrior3D(i, prior[:3], root))
-        graph.add(gtsam.PoseRotationPrior3D(i, gtsam.Rot3(turn), noise.Diagonal.Sigmas(std[3:])))
-    for i, j, far in ((0, 1, 9.0), (1, 2, 8.0), (0, 2, 7.0)):
-        graph.add(gtsam.RangeFactorPose3(i, j, far, noise.Isotropic.Sigma(1, 0.2)))
-    marginals = gtsam.Marginals(graph, found)
-    for i, covariance in enumerate(solution.covariance):
-        own, R = marginals.marginalCovariance(i), solution.rotation[i]
-        wide = np.block([[np.zeros((3, 3)), R], [np.eye(3), np.zeros((3, 3))]])
-        assert covariance == pytest.approx(wide @ own @ wide.T, abs=1e-6)
 
 
 def test_a_fixed_lag_is_exact_on_a_linear_chain() -> None:
@@ -441,98 +377,6 @@ def test_points_and_poses_in_space_are_linearised_in_gtsams_directions() -> None
     assert found.covariance == pytest.approx(whole.covariance, abs=1e-9)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_what_the_window_says_of_old_nodes_has_their_covariance(dimension: int) -> None:
-    """As factors: position in the world's directions, rotation in the body's; points and poses."""
-    problem = nodes_of(dimension)
-    dof = problem.space.dof
-    cov = np.stack([spd(dof, 0.01, seed) for seed in range(5)])
-    cov[3:, dimension:] = cov[3:, :, dimension:] = 0.0
-    found = priors(problem, np.arange(5), Estimates(problem.names, problem.x0, cov))
-    solution = solve(replace(problem, factors=tuple(found)))
-    assert solution.x == pytest.approx(problem.x0, abs=1e-12)
-    assert solution.covariance == pytest.approx(cov, rel=1e-6, abs=1e-12)
-
-
-def star_pieces(recording, steps: int) -> list[tuple[Problem, dict[str, float]]]:
-    """The ego's star step by step: fixes, odometry and spherical measurements of a window of two, without repeats."""
-    found = [(Problem.from_snapshot(recording, 0, 0), 0)]
-    for step in range(1, steps):
-        found.append((Problem.from_window(recording, step, 0, 2), step))
-    out = []
-    for problem, step in found:
-        names = [name if "@" in name else f"{name}@0" for name in problem.names]
-        here = np.array([name.endswith(f"@{step}") for name in names])
-        factors = [
-            replace(f, nodes=f.nodes[rows], z=f.z[rows], std=f.std if len(f.std) == 1 else f.std[rows])
-            for f in problem.factors
-            if (rows := here[f.nodes[:, -1]]).any()
-        ]
-        used = np.unique(np.concatenate([np.flatnonzero(here), *(f.nodes.ravel() for f in factors)]))
-        place = np.cumsum(np.isin(np.arange(len(names)), used)) - 1
-        factors = [replace(f, nodes=place[f.nodes]) for f in factors]
-        stamps = {name: float(step) for name, new in zip(names, here, strict=True) if new}
-        out.append((Problem([names[i] for i in used], tuple(factors)), stamps))
-    return out
-
-
-def exact_smoother(lag: float) -> tuple[gtsam.IncrementalFixedLagSmoother, Callable]:
-    """GTSAM's smoother with CustomFactors that are linearised afresh at every step."""
-    params = gtsam.ISAM2Params()
-    params.setRelinearizeThreshold(0.0)
-    params.relinearizeSkip = 1
-    smoother, keys = gtsam.IncrementalFixedLagSmoother(lag, params), {}
-
-    def error(known, z):
-        def of(factor, found, derivatives):
-            gap = found.atPoint3(factor.keys()[1]) - found.atPoint3(factor.keys()[0])
-            if derivatives is not None:
-                steps = 1e-6 * np.eye(3)
-                derivative = np.stack([(known.predict(gap + s) - known.predict(gap - s)) / 2e-6 for s in steps], axis=1)
-                derivatives[0], derivatives[1] = np.asfortranarray(-derivative), np.asfortranarray(derivative)
-            return known.difference(gap, None, z, np.empty(0))
-
-        return of
-
-    def update(piece: Problem, stamps: dict[str, float], start: np.ndarray) -> np.ndarray:
-        graph, new, diagonal = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel.Diagonal.Sigmas
-        for name, x in zip(piece.names, start, strict=True):
-            if name not in keys:
-                keys[name] = len(keys)
-                new.insert(keys[name], x)
-        for f in piece.factors:
-            for node, z, std in zip(f.nodes.tolist(), f.z, np.broadcast_to(f.std, f.z.shape), strict=True):
-                at, model = [keys[piece.names[i]] for i in node], diagonal(np.array(std))
-                if f.kind == "spherical":
-                    graph.add(gtsam.CustomFactor(model, at, error(f.measurement, np.array(z))))
-                else:
-                    make = gtsam.PriorFactorPoint3 if len(at) == 1 else gtsam.BetweenFactorPoint3
-                    graph.add(make(*at, z, model))
-        smoother.update(graph, new, {keys[name]: at for name, at in stamps.items()})
-        return smoother.calculateEstimate([keys[next(iter(stamps))]]).atPoint3(keys[next(iter(stamps))])
-
-    return smoother, update
-
-
-def test_measurements_linearised_once_are_as_good_as_exact_ones(crossing: Fleet) -> None:
-    """Against GTSAM's smoother with exact factors, linearised afresh at every step: RT-LE within 2 %."""
-    steps, ours, theirs, apart_by = 40, [], [], []
-    for seed in range(2):
-        channel = V2X(max_neighbours=6, radius=60)
-        recording = observe(crossing, Sensors.paper_scenario2(), channel, seed=seed, observers=[0])
-        smoother, (_, exact) = FixedLag(3.5), exact_smoother(3.5)
-        for step, (piece, stamps) in enumerate(star_pieces(recording, steps)):
-            newest = smoother.update(piece, stamps)
-            known = dict(zip(newest.names, newest.x, strict=True))
-            start = np.array([known.get(name, np.zeros(3)) for name in piece.names])
-            there, truth = exact(piece, stamps, start), crossing.position[step, 0]
-            ours.append(np.linalg.norm(newest.x[0] - truth))
-            theirs.append(np.linalg.norm(there - truth))
-            apart_by.append(np.linalg.norm(newest.x[0] - there))
-    assert np.mean(ours) == pytest.approx(np.mean(theirs), rel=0.02)
-    assert np.mean(apart_by) < 0.1 * np.mean(theirs)
-
-
 ONE = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0)
 TWO = Problem(("a", "b")).add("displacement", ("a", "b"), [1, 0, 0], std=1.0)
 FLAT = Problem(("b",), dimension=2).add("position", "b", [0, 0], std=1.0)
@@ -564,28 +408,3 @@ def test_a_smoother_names_what_is_wrong(call: Callable, words: str) -> None:
     smoother.update(ONE, {"a": 0.0})
     with pytest.raises(InputError, match=words):
         call(smoother)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_gtsam_is_gtsam_where_it_has_every_factor(dimension: int) -> None:
-    """By default its own optimiser finds the minimum; ours only adds the digits that its tolerance leaves."""
-    graph = random_graph(301, dimension, seen=0, steps=50)
-    problem = from_graph(graph, start="odometry")
-    found = solve(problem, "gtsam")
-    assert found.extras["method"] == "lm"
-    native = graph_of(problem, forms(problem))
-    posed = which_turn(problem)
-    at = values(problem.space, posed, problem.x0, range(len(problem.names)))
-    theirs = gtsam.LevenbergMarquardtOptimizer(native, at, gtsam.LevenbergMarquardtParams())
-    end = native.error(theirs.optimize())
-    assert found.extras["lm_iterations"] == theirs.iterations()
-    patient = (
-        gtsam.LevenbergMarquardtParams()
-    )  # its own tolerance, 1e-5 a step, leaves 1.6e-4 in space: J^T J overshoots
-    patient.setRelativeErrorTol(1e-12)
-    patient.setAbsoluteErrorTol(1e-12)
-    least = native.error(gtsam.LevenbergMarquardtOptimizer(native, at, patient).optimize())
-    assert found.cost == pytest.approx(least, rel=1e-9)
-    assert found.cost <= end
-    seen = from_graph(random_graph(302, dimension, steps=20), start="odometry")
-    assert solve(seen, "gtsam").extras["method"] == "elimination"  # it has no landmark in the body of a pose

@@ -12,7 +12,7 @@ import pytest
 from scipy.optimize import approx_fprime, least_squares
 from scipy.stats import chi2
 
-from coopoc.optimize import MEASUREMENTS, Loss, Problem, Status, solve, solve_gnc
+from coopoc.optimize import MEASUREMENTS, Loss, Problem, solve, solve_gnc
 from coopoc.optimize.assess.curvature import is_minimum
 
 M = gtsam.noiseModel.mEstimator
@@ -155,18 +155,6 @@ def test_the_robust_curvature_is_casadis() -> None:
     assert 3 < sum(signs) < len(signs) - 3
 
 
-def test_between_two_fixes_there_is_a_saddle() -> None:
-    """Two robust fixes 6 m apart disagree: half-way the cost is stationary and curves downwards along their line."""
-    apart = Problem(("a",), x0=[[3.0, 0, 0]])
-    apart = apart.add("position", ["a", "a"], [[0, 0, 0], [6, 0, 0]], std=1.0, loss=Loss("cauchy", 1.0))
-    stuck = solve(apart, throw=False)
-    assert stuck.status is Status.SADDLE
-    assert np.linalg.eigvalsh(casadis_hessian(apart, stuck.x))[0] == pytest.approx(-0.16, abs=1e-6)  # 2 (1 - 9) / 10^2
-    aside = solve(replace(apart, x0=[[2.0, 0, 0]]))
-    assert aside.x[0, 0] == pytest.approx(3 - np.sqrt(8), abs=1e-6)  # roots of u^2 = 8, u from the middle
-    assert is_minimum(apart, aside.x)
-
-
 @pytest.mark.parametrize("wrong", [0, 1, 5, 9])
 def test_gtsam_doubts_the_same_measurements(wrong: int) -> None:
     """GncLMOptimizer at the same probability, all but the second fixes known inliers."""
@@ -219,11 +207,3 @@ def test_any_backend_and_any_weighting_may_solve_the_rounds(backend: str) -> Non
     kept = np.flatnonzero(ours.extras["weights"]).tolist()
     inside = inside.add("position", kept, problem.factors[3].z[kept], std=1.0)
     assert solve(inside, backend).covariance == pytest.approx(ours.covariance, abs=1e-9)
-
-
-def test_a_saddle_far_from_the_origin_is_one() -> None:
-    """Two fixes that disagree by three standard deviations under a tight loss: halfway between them is no minimum."""
-    z = np.array([[0, 0, 0], [0.15, 0, 0]]) + 1e5
-    problem = Problem(("a",), x0=[[1e5 + 0.075, 1e5, 1e5]])
-    problem = problem.add("position", ["a", "a"], z, std=0.05, loss=Loss("cauchy", 0.8))
-    assert solve(problem, throw=False).status is Status.SADDLE

@@ -120,20 +120,6 @@ def test_the_gate_keeps_outliers_out() -> None:
     assert error(seen, 5.0) == pytest.approx(clean, rel=0.01)
 
 
-def test_turning_the_world_turns_the_estimate() -> None:
-    """Closed form: a rotation of fixes, compasses and landmarks about z rotates positions and headings."""
-    fleet = convoy(3, 60, masts=1)
-    seen, angle = observed(fleet, runs=2), 0.7
-    assert seen.body is not None
-    turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    body = co.Body(seen.body.yaw_rate, seen.body.heading + angle)
-    there = replace(seen, gnss=seen.gnss @ turn, body=body)
-    for unit in ("solo", "fleet"):
-        here, turned = (co.PoseFilter(unit)(one, [1]) for one in (seen, there))
-        assert np.allclose(turned.x, here.x @ turn, atol=1e-6)
-        assert np.allclose(np.exp(1j * (turned.heading - here.heading)), np.exp(1j * angle), atol=1e-7)  # type: ignore[operator]
-
-
 def test_a_lost_message_is_a_measurement_less() -> None:
     fleet = convoy(4, 120)
     errors = []

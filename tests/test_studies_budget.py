@@ -1,6 +1,9 @@
-"""The study of bytes: payload and air, the front, driving time until deciding has cost as much as training."""
+"""The study of bytes, and the survey that answers by it: payload, air, schedules, and the break-even with training."""
 
 from __future__ import annotations
+
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +16,9 @@ from coopoc.learned import Checkpoint, save
 from coopoc.learned import load as load_weights
 from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of
 from coopoc.studies import budget as study
-from coopoc.studies import budget_tables as tables
-from coopoc.studies import scene
+from coopoc.studies import scene, survey
 from coopoc.study import numbers
+from coopoc.study.report import report
 from coopoc.study.tables import Table
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import CHANNELS
@@ -56,7 +59,7 @@ def rows(table: Table | None) -> list[tuple[object, ...]]:
 
 
 def at(**where: object) -> dict[str, object]:
-    return {"max_neighbours": 2, **tables.FREE, "method": "joint", "noise_model": "nominal", **where}
+    return {"max_neighbours": 2, **study.FREE, "method": "joint", "noise_model": "nominal", **where}
 
 
 @pytest.mark.slow
@@ -104,12 +107,12 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
     """The row of a cap, by hand."""
     fleet = load_fleet(short_town)
     egos, errors = scene.egos(short_town, "2"), []
-    for schedule in tables.SCHEDULES:
+    for schedule in study.SCHEDULES:
         channel = V2X(10, bytes_per_second=200.0, schedule=schedule)
         seen = observe(fleet, scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
         errors.append(rt_le(JointFilter()(seen, egos), fleet).T)
-    table = tables.schedules(tight)
-    assert [row[0] for row in rows(table)] == list(tables.CAPS)
+    table = study.STUDY.tables["schedules"](tight)
+    assert [row[0] for row in rows(table)] == list(study.CAPS)
     (row,) = [row for row in rows(table) if row[0] == 200]
     found = [entry for entry in row if isinstance(entry, Interval)]
     assert [entry.mean for entry in found[:2]] == pytest.approx([error.mean() for error in errors])
@@ -118,7 +121,7 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
         assert [gap.mean, gap.low, gap.high] == pytest.approx([wanted.mean, wanted.low, wanted.high])
         assert gap.mean != 0.0
     said = study.STUDY.found(tight)["schedules, joint"]
-    for schedule, error in zip(tables.SCHEDULES, errors, strict=True):
+    for schedule, error in zip(study.SCHEDULES, errors, strict=True):
         assert f"{schedule} {error.mean():.3g} m" in said
 
 
@@ -131,22 +134,44 @@ def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short
     account = of_track(JointFilter()(seen, egos), seen, JointFilter().message)
     card = load_weights(WEIGHTS / "fedokf.safetensors").card
     once = (len(card["history"]) - 1) * 4 * (2 * card["parameters"] + 1)
-    (row,) = [row for row in rows(tables.even(tight)) if row[0] == tables.WORDS["cam"]]
-    assert row[2:] == (round(account.rate()), tables.duration(once / account.rate()))
-    body = {row[:2]: row[2:] for row in rows(tables.ledger(tight))}
+    (row,) = [row for row in rows(study.even(tight)) if row[0] == study.WORDS["cam"]]
+    assert row[3:] == (round(account.rate()), study.duration(once / account.rate()))
+    body = {row[:2]: row[2:] for row in rows(study.ledger(tight))}
     assert body["a training, once", "payload, per receiver"] == (None, f"{once / 1e3:,.0f} kB")
-    for kind, way in tables.COUNTS:
-        assert body[tables.WORDS["cam"], f"{kind}, {way}"][0] == round(account.rate(kind, way))
-    assert (tables.WORDS["ideal"], "on air, broadcast") not in body  # it has no air of its own
+    for kind, way in study.COUNTS:
+        assert body[study.WORDS["cam"], f"{kind}, {way}"][0] == round(account.rate(kind, way))
+    assert (study.WORDS["ideal"], "on air, broadcast") not in body  # it has no air of its own
 
 
 @pytest.mark.slow
-def test_the_load_of_a_channel(tight: Results) -> None:
-    """By hand: 300 x 8 x 350 B x 2.2 Hz of 6 Mb/s."""
-    found = {row[:2]: row[2:] for row in rows(tables.load(tight))}
-    size, town, crowd = found[tables.WORDS["cam"], "alone"]
-    assert size == 350
-    assert crowd == pytest.approx(100 * 300 * 8 * 350 * 2.2 / 6e6)
-    assert town == pytest.approx(crowd * 60 / 300)  # 60 vehicles, none farther than 300 m
-    assert found[tables.WORDS["bsm"], "and a fix"][0] == 244
-    assert (tables.WORDS["ideal"], "alone") not in found
+def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str) -> None:
+    few = {
+        "data": short_town,
+        "runs": 2,
+        "egos": "2",
+        "method": "gnss,kalman,joint,bound",
+        "max_neighbours": "0,4",
+        "train_seeds": 1,
+    }
+    two = {"runs": 1, "max_neighbours": "2", "after_s": "3,30", "speed": "0,1,10"}
+    found = {"budget": run_study("budget", tmp_path, settings={**few, "channel": "ideal"}, progress=False)}
+    found |= {"heading_error": run_study("heading_error", tmp_path, settings=two, progress=False)}
+    said = survey.survey_answers(found)
+    alone, together, bound = (
+        numbers.rms(found["budget"], {"method": method, "noise_model": known, "max_neighbours": k, "rate_hz": 0.0})
+        for method, known, k in (("kalman", "nominal", 0), ("joint", "nominal", 4), ("bound", "with its past", 4))
+    )
+    assert alone is not None
+    assert together is not None
+    assert bound is not None
+    limits = [f"Which method with {words}?" for words in survey.LIMITS.values()]
+    assert list(said) == [*limits, "If the heading is not known?"]
+    rich, poor, none, heading = said.values()
+    assert rich.startswith("With the noise known, Joint filter with K = 4 and ")
+    assert f"{together / bound:.2f} times the bound" in rich
+    assert none.startswith("With the noise known, KF: ")
+    assert "with the noise fitted elsewhere, KF" in none
+    assert poor != rich  # 4 neighbours at 10 Hz take more than 300 B/s
+    assert heading.startswith("K = 2, 10 m/s: ")
+    page = report([tmp_path / "budget"], tmp_path / "report.html", answers=said).read_text()
+    assert f"<dt>Which method with no V2X?</dt><dd>{none}</dd>" in re.sub("</?abbr[^>]*>", "", page)

@@ -1,16 +1,25 @@
-"""The studies of choices (backend, window, rounds, knowledge), and any methods side by side."""
+"""Studies of choices on few cells: backends, windows, aggregation rules, any methods side by side."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+import torch
 
+import coopoc as co
 from coopoc.errors import InputError
+from coopoc.evaluate.metrics import rt_le
 from coopoc.fleets import load_fleet
+from coopoc.learned import GainNet
+from coopoc.learned.federation.federate import federate
 from coopoc.methods.catalogue import METHODS
-from coopoc.studies import ablation, backends, scene
+from coopoc.studies import ablation, aggregation, backends, scene
+from coopoc.study.publish import views as published
+from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.world.sensing import observe
 
@@ -63,16 +72,6 @@ def test_the_referee_solves_a_linear_problem_as_lstsq_does(short_town: str) -> N
     assert backends.referee(problem) == pytest.approx(closed, abs=1e-6)
 
 
-def test_ranges_keep_their_noise_and_lose_their_angles(short_town: str) -> None:
-    p = {**backends.STUDY.settings, "data": short_town, "max_neighbours": 6, "runs": 1}
-    seen, ego = scene.recording(p), scene.egos(short_town, "1")[0]
-    whole, less = (backends.PROBLEMS[name](seen, 40, ego, 0) for name in ("snapshot", "ranges"))
-    sighted, ranged = (next(f for f in made.factors if f.kind != "position") for made in (whole, less))
-    assert (sighted.kind, ranged.kind) == ("spherical", "range")
-    assert np.array_equal(ranged.z, sighted.z[..., :1])
-    assert ranged.std == pytest.approx(seen.sensors.range_std)
-
-
 @pytest.mark.slow
 def test_side_by_side_takes_any_methods_and_conditions(tmp_path: Path, short_town: str) -> None:
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
@@ -98,3 +97,105 @@ def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path: Path,
         with pytest.raises(InputError, match=said):
             run_study("side_by_side", tmp_path, settings={"data": short_town, **wrong}, progress=False)
     assert not (tmp_path / "side_by_side").exists()
+
+
+TINY = {
+    "members": 6,
+    "runs": 2,
+    "egos": "2",
+    "train_seeds": 2,
+    "rounds": 2,
+    "local_epochs": 1,
+    "steps": 4,
+    "in_mult": 2,
+    "out_mult": 1,
+}
+
+
+def given(**more: Any) -> dict[str, Any]:
+    """Parameters of a tiny cell."""
+    return {**aggregation.STUDY.settings, **TINY, "condition": "iid", "method": "mean", "scenario": 1, **more}
+
+
+def test_every_condition_is_what_it_says() -> None:
+    """Noise of each client against its sensors, amounts, the moved truth."""
+    plain, unlike = (aggregation.clients(given(condition=c, members=12), 0) for c in ("iid", "heterogeneous"))
+    noise = aggregation.noise(given(condition="heterogeneous", members=12))
+    assert len({(s.gnss_std, s.velocity_std_ratio) for s in noise}) == 12
+    for client, sensors in zip(unlike, noise, strict=True):
+        off = torch.cat([part.gnss - part.truth for part in (client.training, client.validation)])
+        assert float(off.std()) == pytest.approx(sensors.gnss_std[0], rel=0.1)
+    assert [len(c.training) for c in plain] == [6] * 12
+    assert [len(c.training) for c in unlike] == [6, 4, 2] * 4
+    misled = aggregation.clients(given(condition="poisoned data", members=12), 0)
+    shift = [float((a.training.truth - b.training.truth).mean()) for a, b in zip(misled, plain, strict=True)]
+    assert shift == pytest.approx([0.0] * 6 + [10.0] + [0.0] * 5, abs=1e-4)
+
+
+def test_no_cell_for_a_rule_without_enough_clients() -> None:
+    cells = aggregation.STUDY.override({"members": "6"}).cells()
+    there = {(c.given["condition"], c.given["method"]) for c in cells}
+    assert ("iid", "krum") in there
+    assert ("half absent", "krum") not in there
+    assert ("half absent", "median") in there
+    with pytest.raises(co.InputError, match="members = 61"):
+        aggregation.STUDY.override({"members": "61"}).cells()
+
+
+def test_a_cell_is_the_federation_of_its_seed() -> None:
+    """Its rows are the RT-LE of `federate` by hand, on the noise that all methods share."""
+    p = given(scenario=2)
+    rows = aggregation.cell(p)
+    fed = federate(GainNet(2, 1, seed=1), aggregation.clients(p, 1), 2, "mean", 1, seed=1)
+    fleet = co.load_fleet("town10")
+    seen = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(0), runs=2, observers=["town10-00", "town10-30"])
+    by_hand = rt_le(fed.model.method("x")(seen, ["town10-00", "town10-30"]), fleet)
+    aggregation.trained.cache_clear()
+    assert [row["rt_le_m"] for row in aggregation.cell(p)] == [row["rt_le_m"] for row in rows]
+    mine = [row["rt_le_m"] for row in rows if row["train_seed"] == 1]
+    assert mine == pytest.approx(by_hand.T.ravel().tolist(), rel=1e-6)
+
+
+def test_the_kalman_filter_is_fitted_to_what_the_clients_saw() -> None:
+    """Root mean square over all clients' own noise, taken by hand from their keyed recordings."""
+    p = given(condition="heterogeneous")
+    fleet, square = aggregation.members(p), []
+    for column, sensors in enumerate(aggregation.noise(p)):
+        seen = co.observe(fleet, sensors, co.V2X(0), seed=0)
+        square.append((seen.gnss[0, :, column] - fleet.position[:, column]) ** 2)
+    found = aggregation.fitted(p)
+    np.testing.assert_allclose(found.gnss_std, np.sqrt(np.mean(square, axis=(0, 1))), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
+    wanted = {**TINY, "runs": 1, "method": "mean,centralised,kalman,bound", "condition": "iid,poisoned update"}
+    study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
+    results = run_study(study, out=tmp_path, progress=False)
+    assert results.failed == 0
+    shown = published(tmp_path / "aggregation")
+    assert [t["name"] for t in shown["tables"]] == [*aggregation.STUDY.tables]
+    assert "equal sensors, equal amounts of data" in shown["tables"][0]["caption"]
+    assert shown["findings"]["scenario 2, poisoned update"].startswith("Scenario 2, poisoned update: mean")
+
+
+@pytest.mark.parametrize(
+    ("gaps", "words"),
+    [
+        ((-0.1, -0.11, -0.12), "Better than the mean over training seeds (95 %): median -0.110 m; worse: no rule."),
+        ((0.1, 0.11, 0.12), "Better than the mean over training seeds (95 %): no rule; worse: median +0.110 m."),
+        ((-0.1, 0.12, 0.05), "Better than the mean over training seeds (95 %): no rule; worse: no rule."),
+    ],
+)
+def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps: tuple[float, ...], words: str) -> None:
+    at = {"condition": "iid", "scenario": 1}
+    places: list[dict[str, Any]] = [
+        {"train_seed": s, "ego": e, "run": r} for s in range(3) for e in range(2) for r in range(3)
+    ]
+    rows = [{**at, **place, "method": "mean", "rt_le_m": 1.0 + 0.1 * place["ego"]} for place in places]
+    rows += [{**row, "method": "median", "rt_le_m": row["rt_le_m"] + gaps[row["train_seed"]]} for row in rows]
+    axes, settings = ("condition", "method", "scenario"), dict(aggregation.STUDY.settings)
+    results = Results("aggregation", "", axes, settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
+    found = aggregation.STUDY.found(results)
+    assert list(found) == ["scenario 1, iid"]
+    assert words in found["scenario 1, iid"]

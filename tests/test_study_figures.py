@@ -7,12 +7,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from coopoc.errors import InputError
 from coopoc.study import figures
 from coopoc.study.figures import Plot
 from coopoc.study.results import Results
-from coopoc.study.style import METHODS, look
-from coopoc.world.fleet import Fleet
+from coopoc.study.style import METHODS, Panel, look
 
 
 @pytest.fixture(scope="module")
@@ -59,26 +57,23 @@ def rounds() -> Results:
     return Results("demo", "?", ("method", "train_seed", "round"), {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
 
 
-def fleet(vehicles: int = 4) -> Fleet:
-    t = 0.1 * np.arange(50)
-    velocity = np.ones((50, vehicles, 3)) * np.arange(1, vehicles + 1)[:, None] * [1.0, 0.5, 0.0]
-    return Fleet(tuple(map(str, range(vehicles))), t, velocity * t[:, None, None], velocity)
+GNSS = {"method": "gnss", "noise_model": "identity", "max_neighbours": 0}
+LINES = [{"method": "joint"}, {"method": "bound"}]
 
 
 def all_plots(results: Results, rounds: Results) -> dict[str, Callable[[], Plot]]:
-    noise = np.random.default_rng(1).normal(0, 0.1, 500)
     return {
         "sweep": lambda: figures.sweep(results, "max_neighbours", log=True),
         "facets": lambda: figures.sweep(results, "max_neighbours", facet="noise_model"),
-        "pareto": lambda: figures.pareto(results, training={"fedkalmannet": 3e6}),
+        "pareto": lambda: figures.pareto(results),
+        "curves": lambda: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
+        "multiples": lambda: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
         "cdf": lambda: figures.cdf(results, where={"max_neighbours": 2}),
-        "convergence": lambda: figures.convergence(rounds, levels={"client 1": 1.4, "client 2": 1.41}),
-        "paths": lambda: figures.paths(fleet()),
-        "innovations": lambda: figures.innovations({"Range": (noise, 0.095, "m")}),
+        "convergence": lambda: figures.convergence(rounds, levels=(1.4, 1.41)),
     }
 
 
-@pytest.mark.parametrize("name", ["sweep", "facets", "pareto", "cdf", "convergence", "paths", "innovations"])
+@pytest.mark.parametrize("name", ["sweep", "facets", "pareto", "cdf", "convergence", "curves", "multiples"])
 def test_the_same_numbers_give_the_same_bytes(results: Results, rounds: Results, tmp_path: Path, name: str) -> None:
     make = all_plots(results, rounds)[name]
     assert make().save(tmp_path / "a") == make().save(tmp_path / "b") != ""
@@ -87,8 +82,7 @@ def test_the_same_numbers_give_the_same_bytes(results: Results, rounds: Results,
         assert first == second
     assert (tmp_path / "a.pdf").read_bytes().startswith(b"%PDF")
     assert b"/Type /Font" in (tmp_path / "a.pdf").read_bytes()  # text stays text
-    bitmaps = (tmp_path / "a.svg").read_bytes().count(b"<image")
-    assert bitmaps == (1 if name == "paths" else 0)  # vectors, but for the shades of a colour bar
+    assert b"<image" not in (tmp_path / "a.svg").read_bytes()
 
 
 def test_no_two_methods_look_alike() -> None:
@@ -144,15 +138,6 @@ def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
     assert np.all(np.diff(share) > 0)
 
 
-def test_what_receives_nothing_stands_at_the_left(results: Results) -> None:
-    figure = figures.pareto(results, where={"max_neighbours": [0, 2, 10]}, training={"fedkalmannet": 3e6}).figure
-    left, right, bars = figure.axes
-    assert {float(x) for line in left.lines for x in np.atleast_1d(line.get_xdata())} == {0.0}
-    assert {float(x) for line in right.lines for x in np.atleast_1d(line.get_xdata())} == {640.0, 3200.0}
-    assert right.get_xscale() == "log"
-    assert [patch.get_height() for patch in bars.patches] == [3e6]
-
-
 def test_convergence_bands_reach_from_seed_to_seed(rounds: Results) -> None:
     axes = figures.convergence(rounds).figure.axes[0]
     band = axes.collections[0].get_paths()[0].vertices[:, 1]
@@ -170,6 +155,25 @@ def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, su
     assert plot.figure.axes[0].get_legend().get_window_extent().x1 <= plot.figure.bbox.x1
 
 
-def test_too_many_paths_are_refused() -> None:
-    with pytest.raises(InputError, match="7 vehicles: must be at most 6"):
-        figures.paths(fleet(7))
+def test_a_front_joins_what_no_cheaper_method_beats(results: Results) -> None:
+    axes = figures.pareto(results, where={"method": ["joint", "gnss"]}).figure.axes[0]
+    level, marks, front = axes.lines
+    means = (
+        results.frame.query("method == 'joint' and max_neighbours > 0").groupby("bytes_per_second")["rt_le_m"].mean()
+    )
+    assert dict(zip(*marks.get_data(), strict=True)) == pytest.approx(means.to_dict())
+    assert (np.diff(front.get_ydata()) < 0).all()
+    assert level.get_ydata()[0] == pytest.approx(
+        results.select(method="gnss").groupby("max_neighbours")["rt_le_m"].mean().min()
+    )
+
+
+def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
+    panel = Panel({k: {"max_neighbours": k} for k in (0, 2, 10, 99)}, {"noise_model": "fitted"}, "a title")
+    plot = figures.curves(results, [panel], LINES, "c", levels=[GNSS])
+    assert plot is not None
+    joint, level = plot.figure.axes[0].lines  # the bound has another noise model, and no K = 99 was run
+    expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()
+    np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
+    assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
+    assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None

@@ -5,7 +5,7 @@ import hashlib
 import pytest
 
 from coopoc.errors import InputError
-from coopoc.study.parse import assignments, parse
+from coopoc.study.cell import assignments, parse
 from coopoc.study.study import Study, digest
 
 

@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from coopoc.errors import InputError
-from coopoc.study.pivot import pivot
 from coopoc.study.results import Results
+from coopoc.study.tables import pivot
 
 
 def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "noise_model", "k")) -> Results:

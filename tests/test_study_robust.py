@@ -15,10 +15,9 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.cell import Params, Row
 from coopoc.study.manifest import read
 from coopoc.study.run import plan, run_study
-from coopoc.study.study import Study
+from coopoc.study.study import Params, Row, Study
 
 DISTRIBUTION = Path(__file__).parent / "distribution"
 ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}

@@ -11,12 +11,11 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.lock import locked
-from coopoc.study.manifest import Manifest, read
+from coopoc.study.compute import part_of
+from coopoc.study.manifest import Manifest, locked, read
 from coopoc.study.merge import merge
 from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
-from coopoc.study.shard import Shard
 from coopoc.study.study import Cell, Study
 
 DISTRIBUTION = Path(__file__).parent / "distribution"
@@ -53,7 +52,7 @@ def start(out: Path, *words: str) -> "subprocess.Popen[str]":
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 20])
 def test_shards_are_disjoint_whole_and_of_equal_size(count: int) -> None:
     grid = [Cell({}, {"k": k, "m": m}, f"{k}{m}") for m in "abc" for k in range(4)]
-    parts = [[c.name for c in Shard(i, count).of(grid, ("k",))] for i in range(1, count + 1)]
+    parts = [[c.name for c in part_of(grid, ("k",), f"{i}/{count}")] for i in range(1, count + 1)]
     assert sorted(name for part in parts for name in part) == sorted(c.name for c in grid)
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
     recordings = [{name[0] for name in part} for part in parts]
@@ -172,7 +171,7 @@ def test_what_does_not_belong_together_is_not_merged(study: Study, tmp_path: Pat
 def test_a_cell_with_two_sets_of_numbers_is_named(study: Study, tmp_path: Path) -> None:
     for name in "ab":
         run_study(study, tmp_path / name, progress=False, shard="1/9")
-    cell = Shard(1, 9).of(study.cells(), study.shares)[0]
+    cell = part_of(study.cells(), study.shares, "1/9")[0]
     rows = store.load(tmp_path / "b/small", cell.name).to_pylist()
     own = {*store.OWN_COLUMNS, *cell.params}
     merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "same")

@@ -9,8 +9,9 @@ import numpy as np
 
 from ..arrays import Floats
 from ..kernels.solo import FixNoise
-from ..kernels.stars import lkf_sa, msmv
+from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.messages import Assumptions
+from ..kernels.stars.pseudo_fixes import run_msmv
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
@@ -51,7 +52,7 @@ class LKFSA:
         assumed = assumptions(recording, known)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = lkf_sa.run_filter(measurements(recording, ego, box), assumed)
+            x, cov, neighbours = run_lkf_sa(measurements(recording, ego, box), assumed)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)
@@ -90,7 +91,7 @@ class MSMV:
         assumed = assumed._replace(growth=(0.0, 1.0), acceleration=0.0)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = msmv.run_filter(measurements(recording, ego, box, own), assumed)
+            x, cov, theirs = run_msmv(measurements(recording, ego, box, own), assumed)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
         return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION), missing=True)
@@ -102,6 +103,6 @@ def solo_estimates(recording: Recording, known: NoiseModel, egos: Sequence[int])
     links = recording.links
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
     x, p, _ = solo_filter(recording, members, known, FixNoise(known.gnss_variance))
-    all_x, all_p = np.full((2, *recording.gnss.shape), np.nan)
+    all_x, all_p = np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)  # of others nothing is read
     all_x[:, :, members], all_p[:, :, members] = x, p
     return assumptions(recording, known)._replace(broadcast=all_p), all_x

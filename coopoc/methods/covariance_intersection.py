@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from ..kernels.stars.intersection import run_filter
+from ..kernels.stars.pseudo_fixes import run_intersection
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
@@ -65,7 +65,7 @@ class CovarianceIntersection:
         assumed = assumed._replace(growth=ESTIMATE_GROWTH)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = run_filter(measurements(recording, ego, box, own), assumed, self.split)
+            x, cov, theirs = run_intersection(measurements(recording, ego, box, own), assumed, self.split)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)

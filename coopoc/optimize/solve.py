@@ -16,9 +16,8 @@ from .assess.assess import Assessment, assess
 from .assess.curvature import is_constrained_minimum, newton_decrease
 from .backend import Backend, Options, require_backend
 from .descent.descend import MAX_ITERATIONS
-from .model.fuse import fused
-from .model.problem import Problem
-from .model.search import Search
+from .model.parts import fused
+from .model.problem import Problem, Search
 from .solution import Solution, SolveError, Status
 from .starts.initial import initial_guess, somewhere
 

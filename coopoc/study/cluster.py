@@ -18,7 +18,7 @@ from uuid import uuid4
 from ..errors import InputError, MissingLibraryError
 from .cell import Cell
 from .compute import Function, Outcome, WorkerDiedError, attempt
-from .environment import environment
+from .provenance import environment
 
 PATIENCE = 30.0
 """Seconds without any worker until a run gives up: one that is restarted is back by then."""

@@ -1,4 +1,4 @@
-"""Figures for every study, in one style; the Pareto front and the scenes are in files of their own."""
+"""Figures of a study: a metric over an axis, its distribution, its convergence, its bytes, and methods over a case."""
 
 from __future__ import annotations
 
@@ -7,29 +7,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
-from .front import pareto
-from .plot import Plot, apart, canvas, groups, legend, line_names, plain_log, strokes
-from .results import SEED
-from .scenes import innovations, paths
-from .style import SYMBOLS, label, look, title, words
+from ..escapes import picture
+from ..evaluate.statistics import Interval
+from .numbers import Number, Where, mean, ran
+from .plot import Plot, canvas, legend, name_of, plain_log, strokes
+from .style import NEUTRAL, SYMBOLS, Panel, label, look, title, words
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from .results import Results
 
-__all__ = ["Plot", "cdf", "convergence", "innovations", "pareto", "paths", "sweep"]
-
-Where = Mapping[str, Any] | None
+__all__ = ["Plot", "cdf", "convergence", "curves", "multiples", "pareto", "sweep"]
 
 
 def sweep(
     results: Results,
     x: str,
     y: str = "rt_le_m",
-    where: Where = None,
+    where: Where | None = None,
     caption: str = "",
     log: bool = False,
     facet: str = "",
@@ -50,53 +48,27 @@ def sweep(
     Raises:
         InputError: as `Results.summary`.
     """
-    by = [name for name in line_names(results, x, facet) if name != facet]
+    by = [name for name in _line_names(results, x, facet) if name != facet]
     summary = results.summary([*by, *([facet] if facet else []), x], y, where)
     panels = list(summary.groupby(facet)) if facet else [("", summary)]
     drawn: list[dict[str, Any]] = []
     size = {"width": 6.4 if len(panels) == 1 else 2.2 + 2.6 * len(panels)}
     with canvas(1, len(panels), squeeze=False, sharex=True, sharey=True, **size) as (figure, ((*grid,),)):
         for axes, (value, part) in zip(grid, panels, strict=True):
-            drawn += [names for names in _bands(axes, part, by, x) if names not in drawn]
+            for names, group in _groups(part, by):
+                rows = group.set_index(x)[["mean", "low", "high", "n"]].sort_index().T.to_dict("list")
+                drawn += [names] if _draw(axes, names, {k: Interval(*row) for k, row in rows.items()}) else []
             axes.set(xlabel=words(x), title=title(facet, value) if facet else "")
         ticks = sorted(summary[x].unique())
         if len(ticks) <= 12:
             grid[0].set_xticks(ticks)
-        if log:
-            plain_log(grid[0].yaxis)
-        else:
-            grid[0].set_ylim(bottom=0)
-        grid[0].set(ylabel=words(y))
+        _vertical(grid[0], words(y), log)
         legend(grid[-1], drawn)
     text = f"{words(y)} against {words(x)}{_selected(where)}. Bands: 95 % intervals over egos, then runs."
     return Plot(figure, caption or text)
 
 
-def _bands(axes: Axes, summary: pd.DataFrame, by: Sequence[str], x: str) -> list[dict[str, Any]]:
-    """Draw the lines of a panel with their bands; their names."""
-    drawn = []
-    for names, group in groups(summary, by):
-        group = group.sort_values(x)
-        options = strokes(names)
-        axes.plot(group[x], group["mean"], **options)
-        band = {"color": options["color"], "gid": options["gid"], "linewidth": 0}
-        axes.fill_between(group[x], group["low"], group["high"], alpha=0.15, **band)
-        drawn.append(names)
-    return drawn
-
-
-def _selected(where: Where) -> str:
-    """What a figure is restricted to, for its caption."""
-    found = []
-    for column, value in (where or {}).items():
-        values = value if isinstance(value, list | tuple) else [value]
-        found.append(f"{SYMBOLS.get(column, words(column))} = {' or '.join(label(column, one) for one in values)}")
-    return f" at {', '.join(found)}" if found else ""
-
-
-def cdf(
-    results: Results, value: str = "error_quantiles_m", where: Where = None, caption: str = "", log: bool = False
-) -> Plot:
+def cdf(results: Results, value: str = "error_quantiles_m", where: Where | None = None, caption: str = "") -> Plot:
     """Plot the share of errors below each value, with a marker at the mean of the per-run maxima.
 
     Args:
@@ -104,43 +76,36 @@ def cdf(
         value: column of lists: equally likely quantiles of the errors of one run and ego, the last its maximum.
         where: column -> value or values.
         caption: under the figure.
-        log: logarithmic horizontal axis.
 
     Raises:
         InputError: an unknown column or value.
     """
     drawn: list[dict[str, Any]] = []
-    text: dict[str, str] = {}
+    maxima: dict[str, list[str]] = {}
     with canvas() as (figure, axes):
-        for key, frame in results.groups(by := line_names(results), where):
+        for key, frame in results.groups(by := _line_names(results), where):
             names = dict(zip(by, key, strict=True))
             errors = np.sort(np.concatenate(frame[value].to_list()))
             share = np.arange(1, len(errors) + 1) / len(errors)
             worst = float(np.mean([np.max(q) for q in frame[value]]))
-            options = strokes(names)
-            axes.plot(errors, share, **{**options, "marker": None})
-            axes.plot(worst, np.interp(worst, errors, share), **{**options, "linestyle": "none"}, zorder=3)
+            axes.plot(errors, share, **{**strokes(names), "marker": None})
+            axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
             drawn.append(names)
-            text[names["method"]] = _maximum(text.get(names["method"], ""), worst)
+            maxima.setdefault(name_of(names), []).append(f"{worst:.1f}")
         axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
-        if log:
-            plain_log(axes.xaxis)
-            axes.set_xlim(left=0.1)
-        else:
-            axes.set_xlim(left=0)
-        legend(axes, drawn, text)
-    return Plot(
-        figure,
-        caption or f"Cumulative distribution of the error{_selected(where)}. Markers: mean of the per-run maxima.",
-    )
+        plain_log(axes.xaxis)
+        axes.set_xlim(left=0.1)
+        legend(axes, drawn, {method: f" (max {' / '.join(each)} m)" for method, each in maxima.items()})
+    text = f"Cumulative distribution of the error{_selected(where)}. Markers: mean of the per-run maxima."
+    return Plot(figure, caption or text)
 
 
 def convergence(
     results: Results,
     x: str = "round",
     y: str = "rt_le_m",
-    where: Where = None,
-    levels: Mapping[str, float] | None = None,
+    where: Where | None = None,
+    levels: Sequence[float] = (),
     caption: str = "",
 ) -> Plot:
     """Plot a metric after every round: mean over training seeds, band from the lowest to the highest seed.
@@ -150,34 +115,26 @@ def convergence(
         x: column of rounds.
         y: metric.
         where: column -> value or values.
-        levels: label -> constant value, such as the error of an individual net.
+        levels: constant values across, such as the error of each individual net.
         caption: under the figure.
 
     Raises:
         InputError: as `Results.summary`; no column "train_seed".
     """
-    by = line_names(results)
-    seeds = results.summary([*by, SEED, x], y, where)
+    by = _line_names(results)
     drawn = []
     with canvas() as (figure, axes):
-        for names, group in groups(seeds, by):
-            table = group.pivot(index=x, columns=SEED, values="mean").sort_index()
-            options = strokes(names)
-            axes.plot(table.index, table.mean(axis=1), **options, markevery=max(1, len(table) // 10))
-            axes.fill_between(
-                table.index,
-                table.min(axis=1),
-                table.max(axis=1),
-                color=options["color"],
-                gid=options["gid"],
-                alpha=0.18,
-                linewidth=0,
-            )
+        for names, group in _groups(results.summary([*by, "train_seed", x], y, where), by):
+            table = group.pivot(index=x, columns="train_seed", values="mean").sort_index()
+            ends = zip(table.index, table.mean(axis=1), table.min(axis=1), table.max(axis=1), strict=True)
+            style = {"markevery": max(1, len(table) // 10)}
+            _draw(axes, names, {k: Interval(middle, low, high, 0) for k, middle, low, high in ends}, style)
             drawn.append(names)
+        for level in levels:
+            axes.axhline(level, color=look("individual").color, linewidth=0.9, linestyle=(0, (6, 2)))
         axes.set(xlabel=words(x), ylabel=words(y))
         axes.set_xlim(left=0)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        _levels(axes, levels or {})
         low, high = axes.get_ylim()
         axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend above the curves
         legend(axes, drawn, inside=True)
@@ -185,23 +142,203 @@ def convergence(
     return Plot(figure, caption or text)
 
 
-def _maximum(before: str, worst: float) -> str:
-    return f"{before[:-3]} / {worst:.1f} m)" if before else f" (max {worst:.1f} m)"
+def pareto(
+    results: Results,
+    x: str = "bytes_per_second",
+    y: str = "rt_le_m",
+    where: Where | None = None,
+    caption: str = "",
+) -> Plot:
+    """Plot a metric against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
+
+    Methods that receive nothing are horizontal lines.
+
+    Args:
+        results: of the study.
+        x: bytes per second of online cooperation.
+        y: metric.
+        where: column -> value or values.
+        caption: under the figure.
+
+    Raises:
+        InputError: as `Results.summary`.
+    """
+    names = _line_names(results)
+    summary = results.summary(axes := [a for a in results.axes if a != "train_seed"], y, where)
+    summary["bytes"] = results.summary(axes, x, where)["mean"]
+    drawn = []
+    with canvas(width=7.0) as (figure, panel):
+        for of, group in _groups(summary.dropna(subset=["mean"]), names):
+            points = sorted(zip(group["bytes"], group["mean"], strict=True))
+            if points[-1][0] == 0 or of["method"] == "bound":
+                _draw(panel, of, min(value for _, value in points))
+            else:
+                sent = [point for point in points if point[0] > 0]
+                panel.plot(*zip(*sent, strict=True), **{**strokes(of), "linestyle": "none"})
+                best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
+                panel.plot(*zip(*best, strict=True), **{**strokes(of), "marker": "", "linewidth": 0.8})
+            drawn.append(of)
+        plain_log(panel.xaxis)
+        plain_log(panel.yaxis)
+        panel.set(xlabel=words(x), ylabel=words(y))
+        legend(panel, drawn)
+    return Plot(figure, caption or f"{words(y)} against {words(x)}.")
 
 
-def _levels(axes: Axes, levels: Mapping[str, float]) -> None:
-    color = look("individual").color
-    low, high = axes.get_ylim()
-    heights = apart(levels, 0.045 * (max(high, *levels.values()) - low) if levels else 0.0)
-    for name, level in levels.items():
-        axes.axhline(level, color=color, linewidth=0.9, linestyle=(0, (6, 2)))
-        axes.annotate(
-            name,
-            (1.0, level),
-            (1.015, heights[name]),
-            ("axes fraction", "data"),
-            fontsize=7,
-            va="center",
-            textcoords=("axes fraction", "data"),
-            color=color,
-        )
+STYLE = ("label", "color", "marker", "linestyle", "linewidth")
+"""Entries of a line that say how it looks and select nothing."""
+
+
+def curves(
+    results: Results,
+    panels: Sequence[Panel],
+    lines: Sequence[Where],
+    caption: str,
+    number: Number = mean,
+    levels: Sequence[Where] = (),
+    ylabel: str = "RT-LE [m]",
+    width: float | None = None,
+    height: float = 3.1,
+    log: bool = False,
+    logx: bool = False,
+) -> Plot | None:
+    """Plot a number of selections over a parameter, in panels that share the vertical axis; None if none was run.
+
+    The selection of a point is that of its panel, its place and its line, where the later name wins. Lines are told
+    apart by method; their style shows the noise model where they have several.
+
+    Args:
+        results: of the study.
+        panels: at least one; a panel in which nothing was run is left out.
+        lines: method, noise model and other columns -> value, and entries of STYLE.
+        caption: under the figure.
+        number: of a selection; an interval gets a band.
+        levels: lines that do not depend on the place and are drawn across.
+        ylabel: label of the vertical axis.
+        width: inches.
+        height: inches.
+        log: logarithmic vertical axis; a linear one starts at zero.
+        logx: logarithmic horizontal axes.
+    """
+    every, found = [*lines, *levels], []
+    models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
+    for panel in panels:
+        drawn: list[tuple[Where, Any]] = []
+        for of in lines:
+            columns = {name: value for name, value in of.items() if name not in STYLE}
+            points = {x: number(results, {**panel.where, **also, **columns}) for x, also in panel.x.items()}
+            drawn += [(of, ran(points))] if ran(points) else []
+        if drawn or len(panels) == 1:
+            flat = [(of, number(results, {**panel.where, **of})) for of in levels]
+            found.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
+    if not any(drawn for _, drawn in found):
+        return None
+    named: list[dict[str, Any]] = []
+    size = {"width": width or 2.2 + 2.1 * len(found) + (len(found) == 1), "height": height}
+    with canvas(1, len(found), sharey=True, squeeze=False, **size) as (figure, (axes,)):
+        for axis, (panel, drawn) in zip(axes, found, strict=True):
+            for of, points in drawn:
+                names = {name: of[name] for name in ("method", "noise_model") if name in of}
+                if len(models) < 2 and of.get("method") != "bound":
+                    names["noise_model"] = "none"
+                _draw(axis, names, points, {name: of[name] for name in STYLE if name in of})
+                named += [names] if names not in named else []
+            axis.set(title=picture(panel.title), xlabel=panel.xlabel)
+            if logx:
+                plain_log(axis.xaxis)
+            if panel.ticks or len(panel.x) <= 8:
+                axis.set_xticks(list(panel.ticks or panel.x), list(panel.ticks.values()) or [f"{x:g}" for x in panel.x])
+                axis.minorticks_off()
+        _vertical(axes[0], ylabel, log)
+        if any("label" in of for of in every):
+            axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
+        else:
+            legend(axes[-1], named)
+    return Plot(figure, caption)
+
+
+NEAR, BOTH, FAR = (0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 2.0), (0.8, 1.0, 1.25, 1.6, 2.0), (0.5, 1.0, 2.0, 5.0, 10.0)
+"""Ticks of an axis from about 1 to 2, of one that begins well below 1, and of a longer one."""
+
+
+def multiples(
+    rows: Mapping[tuple[str, str], Mapping[str, Sequence[float]]],
+    caption: str,
+    target: Mapping[str, float] | None = None,
+) -> Plot | None:
+    """Plot value / reference of each method in each case as dots; a line marks 1, a band ends at the case's target.
+
+    Args:
+        rows: (method, noise model) -> case -> multiples, one per training seed.
+        caption: under the figure.
+        target: case -> upper end of the band.
+
+    Returns:
+        None if there is nothing to draw.
+    """
+    rows = {pair: {case: values for case, values in each.items() if len(values)} for pair, each in rows.items()}
+    rows = {pair: each for pair, each in rows.items() if each}
+    cases = list(dict.fromkeys(case for each in rows.values() for case in each))
+    if not cases:
+        return None
+    size = {"width": 1.9 + 1.75 * len(cases), "height": 0.9 + 0.21 * len(rows)}
+    with canvas(1, len(cases), sharex=True, sharey=True, squeeze=False, **size) as (figure, (axes,)):
+        for panel, case in zip(axes, cases, strict=True):
+            panel.axvspan(1.0, (target or {}).get(case, 1.0), color=NEUTRAL, alpha=0.35, linewidth=0)
+            panel.axvline(1.0, color="black", linewidth=0.9)
+            for row, ((method, _), each) in enumerate(rows.items()):
+                values = each.get(case, ())
+                style = {**strokes({"method": method}), "linestyle": "none", "markersize": 4, "alpha": 0.8}
+                panel.plot(values, np.full(len(values), row), **style)
+            panel.set(title=case, xscale="log", xlabel="× reference")
+            low, high = panel.get_xlim()
+            panel.xaxis.set_major_locator(FixedLocator(FAR if high > 2.1 else BOTH if low < 0.85 else NEAR))
+            panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+            panel.xaxis.set_minor_formatter(NullFormatter())
+        labels = [look(m).label + ("" if known in ("trained", "none") else f", {known}") for m, known in rows]
+        axes[0].set(yticks=range(len(rows)), yticklabels=labels, ylim=(len(rows) - 0.4, -0.6))
+    return Plot(figure, caption)
+
+
+def _line_names(results: Results, *across: str) -> list[str]:
+    """Columns that identify a line of a figure: method and noise model, or all axes but those of the figure."""
+    usual = [name for name in ("method", "noise_model") if name in results.frame]
+    return usual if "method" in usual else [name for name in results.axes if name not in across]
+
+
+def _groups(frame: pd.DataFrame, by: Sequence[str]) -> list[tuple[dict[str, Any], pd.DataFrame]]:
+    """Rows of each combination of the columns `by`, with its names, in order of first appearance."""
+    if not by:
+        return [({}, frame)]
+    return [(dict(zip(by, k, strict=True)), g) for k, g in frame.groupby(list(by), sort=False, dropna=False)]
+
+
+def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> bool:
+    """Draw a line through points, an Interval with its band, or a number across the panel; False without a number."""
+    options = {**strokes(names), **(style or {})}
+    if not isinstance(points, Mapping):
+        value = points.mean if isinstance(points, Interval) else points
+        axes.axhline(value, **{**options, "marker": ""})
+        return True
+    means = {x: one.mean if isinstance(one, Interval) else one for x, one in points.items()}
+    bands = {x: one for x, one in points.items() if isinstance(one, Interval)}
+    axes.plot(list(means), list(means.values()), **options)
+    if bands:
+        ends = [one.low for one in bands.values()], [one.high for one in bands.values()]
+        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
+    return bool(means)
+
+
+def _vertical(axes: Axes, text: str, log: bool) -> None:
+    axes.set(ylabel=text, **({} if log else {"ylim": (0, None)}))
+    if log:
+        plain_log(axes.yaxis)
+
+
+def _selected(where: Where | None) -> str:
+    """What a figure is restricted to, for its caption."""
+    texts = []
+    for column, value in (where or {}).items():
+        values = value if isinstance(value, list | tuple) else [value]
+        texts.append(f"{SYMBOLS.get(column, words(column))} = {' or '.join(label(column, one) for one in values)}")
+    return f" at {', '.join(texts)}" if texts else ""

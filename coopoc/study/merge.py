@@ -13,8 +13,7 @@ from ..arrays import listed
 from ..errors import InputError
 from ..file_names import given_path, inside
 from . import store
-from .lock import locked
-from .manifest import NAME, different, environments, read
+from .manifest import NAME, different, environments, locked, read
 
 
 @dataclass(frozen=True)

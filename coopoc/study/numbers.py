@@ -36,8 +36,7 @@ def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str,
         kept = kept & rows[name].isin(wanted).to_numpy()
     if not kept.any():
         return None
-    ran = {name: set(rows[name][kept].unique()) for name in lists}
-    return {name: [v for v in wanted if v in ran[name]] for name, wanted in lists.items()}
+    return {name: [v for v in wanted if v in set(rows[name][kept])] for name, wanted in lists.items()}
 
 
 def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
@@ -68,6 +67,20 @@ def difference(results: Results, one: Where, other: Where) -> Interval | None:
     if first is None or second is None:
         return None
     return paired_difference(results.values("rt_le_m", first), results.values("rt_le_m", second))
+
+
+def across(number: Number, selections: Mapping[str, Where]) -> dict[str, Number]:
+    """Columns of `coopoc.study.tables.crossed` that show one number.
+
+    Args:
+        number: of a selection.
+        selections: title -> what the column adds to the selection of a row.
+    """
+
+    def column(also: Where) -> Number:
+        return lambda results, where: number(results, {**where, **also})
+
+    return {title: column(also) for title, also in selections.items()}
 
 
 def ran(numbers: Mapping[Any, float | None]) -> dict[Any, float]:
@@ -115,31 +128,33 @@ def ratio(one: float | None, other: float | None) -> float | None:
     return one / other if one is not None and other else None
 
 
+def _seeds(results: Results, where: Where) -> list[Any]:
+    kept = present(results, where)
+    frame = results.select(kept) if kept else results.frame.iloc[:0]
+    return sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
+
+
 def per_seed(results: Results, where: Where) -> Floats:
     """(S, E, R) m, RT-LE for each training seed; S = 0 for a method that is not trained."""
-    frame = results.select(where)
-    seeds = sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
+    seeds = _seeds(results, where)
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where) -> list[float]:
-    """Mean RT-LE of each training seed, m; of a method that is not trained its mean, and nothing if it was not run."""
-    if not present(results, where):
-        return []
-    each = per_seed(results, where)
-    return list(each.mean(axis=(1, 2))) if len(each) else [float(results.values("rt_le_m", where).mean())]
+def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
+    """A number for each training seed; of a method that is not trained one, and none if it was not run."""
+    seeds = _seeds(results, where)
+    wheres = [{**where, "train_seed": seed} for seed in seeds] or [where]
+    return [value for each in wheres if (value := number(results, each)) is not None]
 
 
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
-    each = per_seed(results, where) if present(results, where) else np.empty(0)
+    each = per_seed(results, where)
     return float(over_seeds(each).means.std(ddof=1)) if len(each) > 1 else None
 
 
 def verdict(results: Results, one: Where, other: Where, name: str) -> str:
     """Sentence on the RT-LE of `one`, which is trained, against `other`, which is not, with the evidence.
-
-    A difference is claimed if its 95 % intervals over egos and runs, and over training seeds, all exclude zero.
 
     Args:
         results: of the study.
@@ -155,15 +170,15 @@ def verdict(results: Results, one: Where, other: Where, name: str) -> str:
         text += f"{_ends(gaps[1])} over {len(each)} training seeds"
     else:
         text += "of one training seed, whose spread is unknown"
-    return f"{_claim(gaps, name)} ({text})"
-
-
-def _claim(gaps: list[Interval], name: str) -> str:
     if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
-        return f"cannot be judged against {name}: too few seeds, egos or runs"
-    if all(gap.high < 0 for gap in gaps):
-        return f"beats {name}"
-    return f"is worse than {name}" if all(gap.low > 0 for gap in gaps) else f"cannot be distinguished from {name}"
+        claim = f"cannot be judged against {name}: too few seeds, egos or runs"
+    elif all(gap.high < 0 for gap in gaps):
+        claim = f"beats {name}"
+    elif all(gap.low > 0 for gap in gaps):
+        claim = f"is worse than {name}"
+    else:
+        claim = f"cannot be distinguished from {name}"
+    return f"{claim} ({text})"
 
 
 def _ends(gap: Interval) -> str:

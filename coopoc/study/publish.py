@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import json
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,26 +45,44 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
     folder = given_path(folder)
     results.to_parquet(folder / "results.parquet")
     missing: dict[str, str] = {}
-    made: dict[str, list[dict[str, Any]]] = {"tables": [], "figures": []}
+
+    def made(name: str, view: Callable[[Results], Any] | None) -> Any:
+        try:
+            return view(results) if view else None
+        except Exception as error:
+            if not results.failed:
+                raise
+            missing[name] = f"{type(error).__name__}: {error}"
+            return None
+
+    shown: dict[str, list[dict[str, Any]]] = {"tables": [], "figures": []}
     total = len(study.tables) + len(study.figures)
     with tqdm(total=total, desc=f"{study.name}: views", unit="view", disable=not progress, leave=False) as bar:
-        for kind, found, save in (("tables", study.tables, _save_table), ("figures", study.figures, _save_figure)):
-            for name, view in found.items():
-                shown = _made(view, results, missing, name)
-                if shown is not None:
-                    made[kind].append({"name": name, **save(shown, folder / kind / name)})
-                bar.update()
-    findings = _made(study.found, results, missing, "findings") or {}
-    recipe = _made(study.recipe, results, missing, "recipe") if study.recipe else None
+        for name, view in study.tables.items():
+            if (table := made(name, view)) is not None:
+                for form, suffix in FORMATS.items():
+                    store.write(folder / "tables" / f"{name}.{suffix}", table.render(form))
+                shown["tables"].append({"name": name, "caption": " ".join(table.words), "table": vars(table)})
+            bar.update()
+        for name, view in study.figures.items():
+            if (plot := made(name, view)) is not None:
+                shown["figures"].append({"name": name, "caption": plot.save(folder / "figures" / name)})
+            bar.update()
+    with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers
+        before = views(folder)
+        for kind, listed in shown.items():
+            old = {view["name"] for view in before[kind]} - {view["name"] for view in listed}
+            for path in (folder / kind).glob("*.*"):
+                if path.stem in old:
+                    path.unlink()
     content = {
-        **made,
-        "findings": {**findings, **_reference(study, results)},
-        "recipe": dict(recipe or {}),
+        **shown,
+        "findings": {**(made("findings", study.found) or {}), **_reference(study, results)},
+        "recipe": dict(made("recipe", study.recipe) or {}),
         "missing": missing,
         "limitations": list(study.limitations),
         "minutes": study.minutes,
     }
-    _remove_others(folder, made)
     store.write(folder / VIEWS, json.dumps(content, indent=1, default=_data, ensure_ascii=False) + "\n")
 
 
@@ -79,9 +97,6 @@ def views(folder: str | Path) -> Mapping[str, Any]:
     for view in (*found["tables"], *found["figures"]):
         if not isinstance(view, dict) or not isinstance(view.get("caption"), str):
             raise store.damaged(path, "a view without a caption")
-        marks = view.get("marks", [])
-        if not isinstance(marks, list) or not all(map(_is_mark, marks)):
-            raise store.damaged(path, "a mark without its series, place or text")
         file_name("view", view.get("name"), f"Run the study again: {path} was not written by coopoc run.")
     return found
 
@@ -103,16 +118,6 @@ def tables(folder: str | Path, form: str = "markdown", name: str | None = None) 
     return [Table.from_data(known[n].get("table")).render(form) for n in (known if name is None else [name])]
 
 
-def _made(view: Callable[[Results], Any], results: Results, missing: dict[str, str], name: str) -> Any:
-    if not results.failed:
-        return view(results)
-    try:
-        return view(results)
-    except Exception as error:
-        missing[name] = f"{type(error).__name__}: {error}"
-        return None
-
-
 def _reference(study: Study, results: Results) -> dict[str, str]:
     """How many reference values hold; nothing for a run of other settings."""
     if study.reference is None or not Path(study.reference).is_file():
@@ -122,35 +127,6 @@ def _reference(study: Study, results: Results) -> dict[str, str]:
         return {}
     found = reference.check(results, known)
     return {"reference": f"{reference.summary(found)[:-1]} (coopoc reference)."} if found else {}
-
-
-def _remove_others(folder: Path, made: Mapping[str, list[dict[str, Any]]]) -> None:
-    """Remove the files of views that an earlier run made here and this one does not: they show other numbers."""
-    try:
-        before = views(folder)
-    except InputError:
-        return
-    for kind, now in made.items():
-        for name in {view["name"] for view in before[kind]} - {view["name"] for view in now}:
-            for path in (folder / kind).glob(f"{glob.escape(name)}.*"):
-                path.unlink()
-
-
-def _save_table(table: Table, path: Path) -> dict[str, Any]:
-    for form, suffix in FORMATS.items():
-        store.write(Path(f"{path}.{suffix}"), table.render(form))
-    return {"caption": " ".join(table.words), "table": vars(table)}
-
-
-def _save_figure(plot: Any, path: Path) -> dict[str, Any]:
-    return {"caption": str(plot.save(path)), "marks": plot.marks() if hasattr(plot, "marks") else []}
-
-
-def _is_mark(mark: Any) -> bool:
-    if not isinstance(mark, dict) or not all(isinstance(mark.get(key), str) for key in ("series", "text")):
-        return False
-    at = mark.get("at")
-    return isinstance(at, list) and len(at) == 2 and all(isinstance(share, int | float) for share in at)
 
 
 def _data(value: Any) -> Any:

@@ -1,22 +1,26 @@
-"""Reference values: the committed numbers of a study, their tolerances, and which direction of a change is worse."""
+"""Reference values: the committed numbers of a study, their tolerances, and the command that checks results by them."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from tyro.conf import Positional, arg
 
 from ..arrays import instance, number
 from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..file_names import given_path
-from . import changes, store
-from .changes import Change, Direction, plain
+from ..plugins import names
+from . import store
+from .compare import Change, Direction, change_table, plain
 from .results import SEED, Results, ego_by_run
+from .study import find_study
 from .tables import Table
 
 TOLERANCE, TRAINED = 0.01, 0.05
@@ -72,15 +76,10 @@ class Reference:
 
     @classmethod
     def load(cls, path: str | Path) -> Reference:
-        """Read what `save` wrote.
-
-        Raises:
-            InputError: no such file, or a damaged one.
-        """
+        """Read what `save` wrote; InputError without such a file, or for a damaged one."""
         path, hint = given_path(path), "Write them with coopoc reference --write."
-        given = store.content(
-            path, {"study": str, "settings": dict, "numbers": list}, "holds no reference numbers", hint
-        )
+        fields = {"study": str, "settings": dict, "numbers": list}
+        given = store.content(path, fields, "holds no reference numbers", hint)
         try:
             numbers = tuple(_sound(Number(**each)) for each in given["numbers"])
         except (TypeError, InputError) as error:
@@ -114,7 +113,7 @@ def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
     for name, better in metrics.items():
         if not (better in ("lower", "higher") or isinstance(better, float)):
             raise InputError("metrics", f"{name}: {better!r}", "must be 'lower', 'higher' or a number", "Give one.")
-    found = []
+    numbers = []
     for point, rows in results.groups(results.axes) if len(results.frame) else ():
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
         tolerance = TRAINED if SEED in rows and rows[SEED].notna().any() else TOLERANCE
@@ -123,8 +122,9 @@ def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
             if each.size:
                 runs = each.shape[1]
                 std = float(each.mean(axis=0).std(ddof=1)) if runs > 1 else 0.0
-                found.append(Number(where, metric, _rounded(each.mean()), runs, _rounded(std), tolerance, better))
-    return Reference(results.study, {k: plain(v) for k, v in results.settings.items()}, tuple(found))
+                mean, std = (float(f"{value:.6g}") for value in (each.mean(), std))  # more depends on the machine
+                numbers.append(Number(where, metric, mean, runs, std, tolerance, better))
+    return Reference(results.study, {k: plain(v) for k, v in results.settings.items()}, tuple(numbers))
 
 
 def differing(results: Results, reference: Reference) -> list[str]:
@@ -157,21 +157,60 @@ def _change(was: Number, now: Number) -> Change:
     return Change(was.where, was.metric, was.value, now.value, interval, was.better)
 
 
-def summary(found: Sequence[Change]) -> str:
+def summary(changes: Sequence[Change]) -> str:
     """One sentence: the number of reference values that hold, and of those that are worse or better."""
-    counts = {word: sum(change.verdict == word for change in found) for word in ("within noise", "worse", "better")}
+    counts = {word: sum(change.verdict == word for change in changes) for word in ("within noise", "worse", "better")}
     moved = [f"{counts[word]} {word}" for word in ("worse", "better") if counts[word]]
-    return f"{counts['within noise']} of {len(found)} reference numbers hold" + "".join(f"; {m}" for m in moved) + "."
+    return f"{counts['within noise']} of {len(changes)} reference numbers hold" + "".join(f"; {m}" for m in moved) + "."
 
 
-def table(found: Sequence[Change], everything: bool = False) -> Table | None:
+def table(changes: Sequence[Change], everything: bool = False) -> Table | None:
     """The numbers that have moved, or all; None if there are none."""
-    shown = [change for change in found if everything or change.verdict != "within noise"]
-    names = [*dict.fromkeys(name for change in shown for name in change.at), "metric"]
-    text = f"{summary(found)} A number may move by a share of it and, where runs differ, by {SIGMA:g} standard errors."
-    return changes.table(shown, "Reference", "Now", text, names, 4) if shown else None
+    shown = [change for change in changes if everything or change.verdict != "within noise"]
+    columns = [*dict.fromkeys(name for change in shown for name in change.at), "metric"]
+    text = (
+        f"{summary(changes)} A number may move by a share of it and, where runs differ, by {SIGMA:g} standard errors."
+    )
+    return change_table(shown, ("Reference", "Now"), text, columns, 4) if shown else None
 
 
-def _rounded(value: float) -> float:
-    """Six digits: more would depend on the machine."""
-    return float(f"{value:.6g}")
+def reference(
+    folder: Annotated[Positional[Path], arg(metavar="FOLDER")],
+    /,
+    study: Annotated[str, arg(metavar="NAME")] = "",
+    file: Annotated[Path | None, arg(metavar="FILE")] = None,
+    write: bool = False,
+    all: bool = False,
+) -> int:
+    """Check the results of a study against its committed reference values; the status is 1 if one is worse.
+
+    Example: coopoc reference runs/budget
+
+    Example: coopoc reference runs/mine --study mine.py:STUDY
+
+    Args:
+        folder: folder of the study.
+        study: the study, FILE.py:NAME, if it is not an installed one.
+        file: file of the reference values, instead of the study's own.
+        write: write the reference values from these results.
+        all: show every value, not only those that moved.
+    """
+    results = Results.load(folder)
+    if not study and results.study not in names("coopoc.studies"):
+        hint = f"If it is a file of your own, name it: coopoc reference {folder} --study FILE.py:NAME."
+        raise InputError("study", repr(results.study), "is not installed", hint)
+    of = find_study(study or results.study)
+    if of.name != results.study:
+        raise InputError("study", repr(of.name), f"must be {results.study}, as in the folder", "Name that study.")
+    file = file or (Path(of.reference) if of.reference else None)
+    if file is None or not of.metrics:
+        raise InputError("study", of.name, "has no reference numbers", "Name its metrics, and give --file.")
+    if write:
+        made = measure(results, of.metrics)
+        made.save(file)
+        print(f"coopoc: {len(made.numbers)} numbers are in {file}", file=sys.stderr)
+        return 0
+    changes = check(results, Reference.load(file))
+    shown = table(changes, everything=all)
+    print(shown.to_markdown() if shown else summary(changes))
+    return int(any(change.verdict == "worse" for change in changes))

@@ -104,61 +104,6 @@
     (figure.querySelector(".files") ?? figure.querySelector("figcaption")).append(button);
   }
 
-  // A pointer near a mark shows its numbers; buttons hide and show the lines of a method, marks and legend with them.
-  const NEAR = 0.05; // of the figure's width
-  function explorable(drawing) {
-    const marks = JSON.parse(drawing.dataset.marks);
-    const [spot, tip] = ["spot", "tip"].map((name) => {
-      const part = document.createElement("div");
-      Object.assign(part, { className: name, hidden: true });
-      drawing.append(part);
-      return part;
-    });
-    const absent = new Set();
-    drawing.addEventListener("pointermove", (event) => {
-      const box = drawing.getBoundingClientRect();
-      const x = (event.clientX - box.left) / box.width;
-      const y = (event.clientY - box.top) / box.height;
-      let best = NEAR;
-      let found;
-      for (const mark of marks) {
-        const far = Math.hypot(mark.at[0] - x, ((mark.at[1] - y) * box.height) / box.width);
-        if (far < best && !absent.has(mark.series)) [best, found] = [far, mark];
-      }
-      spot.hidden = tip.hidden = !found;
-      if (!found) return;
-      tip.textContent = found.text;
-      const centre = Math.min(Math.max(found.at[0] * box.width, 100), box.width - 100);
-      spot.style.left = `${100 * found.at[0]}%`;
-      tip.style.left = `${centre}px`;
-      tip.classList.toggle("below", found.at[1] * box.height < 48);
-      spot.style.top = tip.style.top = `${100 * found.at[1]}%`;
-    });
-    drawing.addEventListener("pointerleave", () => (spot.hidden = tip.hidden = true));
-    const names = new Map(marks.map((mark) => [mark.series, mark.name]));
-    if (names.size < 2) return;
-    const list = document.createElement("div");
-    list.className = "chosen";
-    list.setAttribute("role", "group");
-    list.setAttribute("aria-label", "Lines of the figure");
-    for (const [series, name] of names) {
-      const button = document.createElement("button");
-      Object.assign(button, { type: "button", textContent: name });
-      button.setAttribute("aria-pressed", "true");
-      button.addEventListener("click", () => {
-        const away = button.getAttribute("aria-pressed") === "true";
-        button.setAttribute("aria-pressed", String(!away));
-        if (away) absent.add(series);
-        else absent.delete(series);
-        drawing.querySelectorAll("[data-series]").forEach((part) => {
-          if (part.dataset.series === series) part.classList.toggle("absent", away);
-        });
-      });
-      list.append(button);
-    }
-    drawing.closest(".wide").after(list);
-  }
-
   // The last section whose head has come past the upper third of the window is the one that is read.
   function mark() {
     const links = [...document.querySelectorAll("nav a")];
@@ -172,7 +117,6 @@
   [...document.querySelectorAll("table")].filter((table) => table.tHead).forEach(sortable);
   const blocks = [...document.querySelectorAll(".block")].map(tabs);
   document.querySelectorAll("figure").forEach(enlargeable);
-  document.querySelectorAll(".drawing").forEach(explorable);
   document.addEventListener("scroll", mark, { passive: true });
   mark();
 })();

@@ -3,39 +3,66 @@
 from __future__ import annotations
 
 import base64
+import re
+import shutil
+import subprocess
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jinja2
-import markupsafe
+from markupsafe import Markup, escape
 
 from ..arrays import listed
-from ..errors import InputError
+from ..errors import InputError, MissingLibraryError
 from ..escapes import uncontrolled
 from ..file_names import given_path, inside
 from . import store
-from .inline_svg import inline
-from .marks import described
-from .pdf import printed
+from .manifest import environments
 from .publish import views
 from .results import Results
 from .style import look, title, words
-from .tables import FORMATS, Table
-from .terms import explained
+from .tables import Table
 
+OWN = Path(__file__).parent
 _MIME = {
     "csv": "text/csv",
     "tex": "text/x-tex",
-    "md": "text/markdown",
     "pdf": "application/pdf",
     "png": "image/png",
     "svg": "image/svg+xml",
 }
-_FORMS = {word: FORMATS[word] for word in ("csv", "latex", "markdown")}
 _LARGEST_SVG = 1_000_000
 NOISE_MODELS = ("identity", "fitted", "nominal", "oracle")
 """Ends of the names of views that differ in nothing else: the page shows one of them at a time."""
+
+
+TERMS = {
+    "RT-LE": "root of the time-averaged squared localization error, in metres, per run and ego",
+    "NEES": "normalised estimation error squared: 3 on average for a consistent filter of a position",
+    "NIS": "normalised innovation squared per dimension: 1 on average for a consistent filter",
+    "egos": "the vehicles whose positions a method estimates",
+    "ego": "the vehicle whose position a method estimates",
+    "GNSS": "satellite navigation: fixes of each vehicle's position",
+    "V2X": "messages between vehicles, and between vehicles and road-side units",
+    "OKF": "a Kalman filter whose noise parameters are trained on the error (Greenberg et al. 2023)",
+    "KF": "Kalman filter",
+    "LKF-SA": "the paper's cooperative Kalman filter, which exchanges measurements in real time",
+    "MSMV": "the paper's cooperative baseline that weighs neighbours by their variances; a reconstruction",
+    "FedKalmanNet": "a KalmanNet trained by federated averaging over vehicles (arXiv 2411.05847)",
+    "KalmanNet": "a Kalman filter whose gain is a trained net (Revach et al. 2022)",
+    "GNC": "graduated non-convexity: a robust loss approached from a convex one",
+    "CI": "covariance intersection: fusion that is consistent whatever the correlation",
+    "Cramér-Rao bound": "no unbiased filter with the same information has a smaller mean squared error",
+    "identity": "noise model: unit covariances, as the paper's baselines have",
+    "fitted": "noise model: covariances estimated on the training recordings",
+    "nominal": "noise model: the standard deviations that act",
+    "consistent": "errors as large as the filter's covariance claims",
+    "over-confident": "errors larger than the filter's covariance claims",
+}
+"""Term -> meaning, which the page shows where a reader points at it."""
+_TERM = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(TERMS, key=len, reverse=True)))})(?![\w-])")
 
 
 def report(
@@ -75,9 +102,9 @@ def report(
         first=first if len(sections) > 1 else None,
         sections=sections,
         cards=cards or {},
-        environment=_environment(sections),
-        css=markupsafe.Markup(_own("report.css")),
-        script=markupsafe.Markup(_own("report.js")),
+        environment=environments([section["environment"] for section in sections]),
+        css=Markup((OWN / "report.css").read_text()),
+        script=Markup((OWN / "report.js").read_text()),
     )
     store.write(out, printed(page) if out.suffix.lower() == ".pdf" else page)
     return out
@@ -96,7 +123,10 @@ def _section(folder: Path) -> dict[str, Any]:
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
         "tables": _blocks([_table(view, results.study) for view in shown["tables"]]),
         "figures": _blocks([_figure(folder, view, results.study) for view in shown["figures"]]),
-        "failures": _failures(results),
+        "failures": [
+            {"cell": ", ".join(title(axis, row[axis]) for axis in results.axes if axis in row), "reason": row["reason"]}
+            for _, row in results.failures.iterrows()
+        ],
     }
 
 
@@ -113,26 +143,22 @@ def _blocks(shown: Sequence[Mapping[str, Any]]) -> list[list[dict[str, Any]]]:
 def _table(view: Mapping[str, Any], study: str) -> dict[str, Any]:
     """A table, made anew from its numbers: HTML on the disk is never embedded."""
     table = Table.from_data(view.get("table"))
-    files = [_file(f"{study}-{view['name']}", form, table.render(word).encode()) for word, form in _FORMS.items()]
-    return {**view, "html": markupsafe.Markup(table.to_html()), "files": files}
+    texts = {"csv": table.to_csv(), "tex": table.to_latex()}
+    files = [_file(f"{study}-{view['name']}", form, text.encode()) for form, text in texts.items()]
+    return {**view, "html": Markup(table.to_html()), "files": files}
 
 
 def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]:
-    content = {form: _bytes(folder, f"figures/{view['name']}.{form}") for form in ("pdf", "png", "svg")}
+    content = {}
+    for form in ("pdf", "png", "svg"):
+        path = inside(folder, folder / "figures" / f"{view['name']}.{form}")
+        if not path.is_file():
+            hint = "Repeat coopoc run: it writes the views again."
+            raise InputError("folder", str(folder), f"lacks figures/{path.name}", hint)
+        content[form] = path.read_bytes()
     name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= _LARGEST_SVG else "png"
     files = [_file(name, form, content[form]) for form in ("pdf", "png")]
-    found = {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files, "svg": None, "marks": []}
-    if drawn == "svg" and view.get("marks"):  # a figure without lines of methods has nothing to choose
-        svg = inline(content["svg"], name)
-        found |= {"svg": svg, "marks": [{**mark, "name": described(mark["series"])} for mark in view["marks"]]}
-    return found
-
-
-def _bytes(folder: Path, name: str) -> bytes:
-    path = inside(folder, folder / name)
-    if not path.is_file():
-        raise InputError("folder", str(folder), f"lacks {name}", "Repeat coopoc run: it writes the views again.")
-    return path.read_bytes()
+    return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
 
 
 def _file(name: str, form: str, content: bytes) -> dict[str, str]:
@@ -140,30 +166,9 @@ def _file(name: str, form: str, content: bytes) -> dict[str, str]:
     return {"form": form.upper(), "name": f"{name}.{form}", "uri": uri}
 
 
-def _failures(results: Results) -> list[dict[str, str]]:
-    found = []
-    for _, row in results.failures.iterrows():
-        params = ", ".join(title(axis, row[axis]) for axis in results.axes if axis in row)
-        found.append({"cell": params, "reason": str(row["reason"])})
-    return found
-
-
-def _environment(sections: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    """Each field once; where the studies differ, all values with their studies."""
-    merged: dict[str, dict[str, list[str]]] = {}
-    for section in sections:
-        for field, value in section["environment"].items():
-            merged.setdefault(field, {}).setdefault(value, []).append(section["name"])
-    return {
-        field: next(iter(found)) if len(found) == 1 else "; ".join(f"{v} ({', '.join(n)})" for v, n in found.items())
-        for field, found in merged.items()
-    }
-
-
 def _template() -> jinja2.Template:
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
     jinja = jinja2.Environment(
-        loader=loader,
+        loader=jinja2.FileSystemLoader(OWN),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
@@ -188,5 +193,57 @@ def _shown(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _own(name: str) -> str:
-    return (Path(__file__).parent / name).read_text()
+def explained(text: object) -> Markup:
+    """Text as HTML whose terms carry their meaning, each where it first stands.
+
+    >>> explained("KF < KF")
+    Markup('<abbr title="Kalman filter">KF</abbr> &lt; KF')
+    """
+    seen: set[str] = set()
+
+    def one(match: re.Match[str]) -> str:
+        term = match[0]
+        if term in seen:
+            return term
+        seen.add(term)
+        return f'<abbr title="{escape(TERMS[term])}">{term}</abbr>'
+
+    return Markup(_TERM.sub(one, str(escape(uncontrolled(str(text))))))
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+"""Names of the program in Linux distributions, in the order in which they are tried."""
+
+
+def printed(page: str) -> bytes:
+    """A page as a PDF, printed by Chromium, which draws it as a reader's browser does.
+
+    Raises:
+        MissingLibraryError: no Chromium. InputError: it could not print the page, with its last words.
+    """
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        raise MissingLibraryError("chromium", "a PDF of the report", "chromium", "apt-get install")
+    with tempfile.TemporaryDirectory(prefix="coopoc-", ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        (folder / "page.html").write_text(page)
+        out = folder / "page.pdf"
+        # --no-sandbox: as root, as in a container, Chromium refuses to start without it, and the page is our own;
+        # a profile of its own: a browser that is already open would take the page and print nothing
+        flags = [
+            "--headless",
+            "--disable-gpu",
+            "--no-pdf-header-footer",
+            "--no-first-run",
+            "--disable-extensions",
+            "--no-sandbox",
+        ]
+        places = [f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={out}", (folder / "page.html").as_uri()]
+        try:
+            done = subprocess.run([program, *flags, *places], capture_output=True, text=True, timeout=180)
+            ended = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
+        except subprocess.TimeoutExpired:
+            ended = ["not done after 180 s"]
+        if not out.is_file():
+            raise InputError("PDF", program, f"could not print the page: {ended[0]}", "Write report.html and print it.")
+        return out.read_bytes()

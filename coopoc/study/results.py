@@ -19,8 +19,8 @@ from ..file_names import given_path
 from ..plugins import unknown
 from ..short_repr import short_repr
 from . import store
+from .cell import assignments, parse
 from .manifest import read
-from .parse import assignments, parse
 
 SEED = "train_seed"
 """Column of the training seed: means are taken over it, and intervals are not."""

@@ -10,25 +10,21 @@ from typing import Any
 
 from tqdm import tqdm
 
-from .. import plugins
 from ..arrays import instance
 from ..errors import InputError
 from ..file_names import given_path
-from ..one_file import in_file
+from ..world.fleet import Fleet
+from ..world.recording import Recording
+from ..world.storage import digest, save_recording
 from . import store
 from .cell import Cell
 from .cluster import Cluster, connected
-from .compute import Outcome, compute, schedule
-from .data_path import data_path
-from .environment import environment
-from .file_study import file_study
-from .lock import locked, one_at_a_time
-from .manifest import Manifest, environments
+from .compute import compute, part_of, schedule
+from .manifest import Manifest, environments, locked, one_at_a_time
+from .provenance import environment
 from .publish import publish
 from .results import Results
-from .shard import Shard
-from .specification import check_views
-from .study import Study
+from .study import Study, find_study
 
 
 def run_study(
@@ -54,7 +50,7 @@ def run_study(
         settings: changes of the study's settings or axes, see `Study.override`. A Recording, a Log of `read_log`, or
             (Recording, Fleet of its truth) is stored in `out/data` and its path taken.
         progress: show a bar on stderr.
-        shard: "i/n" computes the i-th of n parts and publishes nothing, see `Shard.of`. Shards of the same settings may
+        shard: "i/n" computes the i-th of n parts and publishes nothing, see `part_of`. Shards of the same settings may
             share a folder at the same time. A run without it completes and publishes what they have computed.
         retry_failed: compute failed cells once more.
         cluster: address of a Dask scheduler, whose workers compute instead of processes here. `study.prepare` still
@@ -71,13 +67,15 @@ def run_study(
         WorkerDiedError: a worker process was killed, mostly for want of memory, or no worker of a cluster is left;
             finished cells are kept.
     """
-    study, cells, folder = _resolve(study, out, settings)
+    study, cells, part, folder = _resolve(study, out, settings, shard)
     if jobs < 1:
         raise InputError("jobs", jobs, "must be >= 1", "Give the number of worker processes.")
-    part = _part(study, cells, shard)
     with ExitStack() as stack:
         workers = stack.enter_context(connected(cluster, study.cell)) if cluster else None
-        stack.enter_context(locked(folder, _manifest(study, cells, workers), shard))
+        used = environments([environment(), *(workers.environments.values() if workers else ())])
+        params = {cell.name: dict(cell.params) for cell in cells}
+        manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, used)
+        stack.enter_context(locked(folder, manifest.as_stored(), shard))
         _work(study, part, folder, jobs, progress, retry_failed, workers)
         if shard:
             return Results.load(folder, {cell.name for cell in part})
@@ -105,8 +103,7 @@ def plan(
         shard: "i/n", or nothing for all cells.
         retry_failed: count failed cells among those to compute.
     """
-    study, cells, folder = _resolve(study, out, settings)
-    part = _part(study, cells, shard)
+    study, _, part, folder = _resolve(study, out, settings, shard)
     new, failed = _unfinished(part, folder)
     return {
         "study": study.name,
@@ -119,12 +116,6 @@ def plan(
         "failures": [{**cell.params, "reason": reason, "repeated": retry_failed} for cell, reason in failed],
         "settings": dict(study.settings),
     }
-
-
-def _manifest(study: Study, cells: Sequence[Cell], workers: Cluster | None) -> Manifest:
-    params = {cell.name: dict(cell.params) for cell in cells}
-    used = environments([environment(), *(workers.environments.values() if workers else ())])
-    return Manifest(study.name, study.question, study.axes, dict(study.settings), params, used).as_stored()
 
 
 def _unfinished(cells: Sequence[Cell], folder: Path) -> tuple[list[Cell], list[tuple[Cell, str]]]:
@@ -157,48 +148,49 @@ def _work(
             study.prepare([cell.given for cell in todo], jobs)
     todo = schedule(todo, study.shares, workers.jobs if workers else jobs)
     failed = 0 if retry_failed else len(before)
-    bar = tqdm(
-        total=len(cells),
-        initial=len(cells) - len(todo),
-        desc=study.name,
-        unit="cell",
-        smoothing=0.05,
-        disable=not progress,
-    )
     outcomes = workers.compute(study.cell, todo) if workers else compute(study.cell, todo, jobs)
-    with bar, closing(outcomes):
+    total, done = len(cells), len(cells) - len(todo)
+    with (
+        tqdm(total=total, initial=done, desc=study.name, unit="cell", smoothing=0.05, disable=not progress) as bar,
+        closing(outcomes),
+    ):
         bar.set_postfix_str(f"{failed} failed" if failed else "")
         for outcome in outcomes:
-            failed += not _keep(folder, outcome)
+            if outcome.rows is None:
+                store.save_failure(folder, outcome.cell, outcome.reason, outcome.trace, outcome.seconds)
+                failed += 1
+            else:
+                store.save(folder, outcome.cell, outcome.rows, outcome.seconds)
             bar.set_postfix_str(f"{failed} failed" if failed else "", refresh=False)
             bar.update()
 
 
-def _keep(folder: Path, outcome: Outcome) -> bool:
-    if outcome.rows is None:
-        store.save_failure(folder, outcome.cell, outcome.reason, outcome.trace, outcome.seconds)
-    else:
-        store.save(folder, outcome.cell, outcome.rows, outcome.seconds)
-    return outcome.rows is not None
-
-
-def _resolve(study: Study | str, out: str | Path, settings: Mapping[str, Any] | None) -> tuple[Study, list[Cell], Path]:
-    found = find_study(study) if isinstance(study, str) else instance("study", study, Study)
+def _resolve(
+    study: Study | str, out: str | Path, settings: Mapping[str, Any] | None, shard: str
+) -> tuple[Study, list[Cell], list[Cell], Path]:
+    """The study under its settings, all its cells, those of the shard, and its folder."""
+    named = find_study(study) if isinstance(study, str) else instance("study", study, Study)
     given_path(out)
-    check_views(found)
-    found = found.override({name: data_path(name, value, out) for name, value in (settings or {}).items()})
-    return found, found.cells(), Path(out) / found.name
+    changed = named.override({name: _as_path(name, value, out) for name, value in (settings or {}).items()})
+    cells = changed.cells()
+    return changed, cells, part_of(cells, changed.shares, shard) if shard else cells, Path(out) / changed.name
 
 
-def find_study(name: str) -> Study:
-    """The study of an installed distribution, or of a file of one's own, "folder/mine.py:STUDY".
-
-    Raises:
-        InputError: an unknown name, or an object that is no Study.
-    """
-    study: Study = file_study(name) if in_file(name) else plugins.find("coopoc.studies", name)
-    return study
-
-
-def _part(study: Study, cells: list[Cell], shard: str) -> list[Cell]:
-    return Shard.parse(shard).of(cells, study.shares) if shard else cells
+def _as_path(name: str, value: Any, out: str | Path) -> Any:
+    """The value of a setting; of a Recording, a Log, or a pair (Recording, Fleet of its truth) a path in `out/data`."""
+    pair = (value.recording, value.truth) if hasattr(value, "recording") and hasattr(value, "truth") else value
+    if isinstance(pair, Recording):
+        pair = (pair, None)
+    if isinstance(pair, Fleet):
+        hint = "Give the path of its file, or mine.py:NAME of a function that makes it."
+        raise InputError(name, repr(pair), "must be a name or a path, or a Recording", hint)
+    if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[0], Recording)):
+        return value
+    recording, truth = pair
+    file = Path(out) / "data" / f"{digest(recording)[:12]}{truth.digest[:8] if truth is not None else ''}.npz"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        part = file.with_suffix(".part.npz")
+        save_recording(recording, part, truth)
+        part.replace(file)
+    return str(file)

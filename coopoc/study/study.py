@@ -1,7 +1,8 @@
-"""Study: a question, a grid of cells, and the views of its results."""
+"""Study: a question, a grid of cells named by a hash of all that changes their numbers, and views of the results."""
 
 from __future__ import annotations
 
+import inspect
 import itertools
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -12,19 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
 from ..file_names import file_name
-from ..one_file import file_digest, in_file
-from ..plugins import unknown
-from .cell import Cell, Params, Row, Scalar, digest
-from .parse import parse
-from .reached import code_of
+from ..one_file import file_digest, from_file, in_file
+from ..plugins import find, unknown
+from .cell import Cell, Params, Row, Scalar, digest, parse
+from .provenance import code_of
 
 if TYPE_CHECKING:
     from .plot import Plot
     from .results import Results
     from .tables import Table
-
-
-__all__ = ["Cell", "Params", "Row", "Scalar", "Study"]
 
 
 def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:
@@ -67,8 +64,8 @@ class Study:
         reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
 
     Raises:
-        InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, or
-            a name of the study that is no file name.
+        InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, a
+            name of the study or of a view that is no file name, or a view that cannot be called with results alone.
 
     >>> Study("demo", "Does x matter?", cell=dict, grid={"x": (1, 2)}, settings={"runs": 3}).cells()[1].params
     {'x': 2}
@@ -97,6 +94,10 @@ class Study:
         both = sorted(set(self.axes) & set(self.settings))
         if both:
             raise InputError("settings", both, "must not name an axis of the grid", "Keep it in one of the two.")
+        for kind, views in (("tables", self.tables), ("figures", self.figures)):
+            for name, view in views.items():
+                file_name(kind, name, "Rename it: its file has this name.")
+                _check_view(f"{kind}[{name!r}]", view)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -108,13 +109,13 @@ class Study:
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
         code = code_of(self.cell)
-        found = [_named(self, params, code) for params in _expand(self)]
-        if not found:
+        cells = [_named(self, params, code) for params in _expand(self)]
+        if not cells:
             raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
-        count = Counter(cell.name for cell in found)
-        if twice := [dict(cell.params) for cell in found if count[cell.name] > 1]:
+        count = Counter(cell.name for cell in cells)
+        if twice := [dict(cell.params) for cell in cells if count[cell.name] > 1]:
             raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
-        return found
+        return cells
 
     def found(self, results: Results) -> dict[str, str]:
         """Findings by key: those whose numbers were run.
@@ -138,10 +139,57 @@ class Study:
                 grid = _narrow(grid, name, value)
             else:
                 raise unknown("setting", name, [*settings, *self.axes])
-        found = replace(self, settings=settings, grid=grid)
+        changed = replace(self, settings=settings, grid=grid)
         for name in changes.keys() - settings.keys():
-            _check_used(found, name)
-        return found
+            _check_used(changed, name)
+        return changed
+
+
+def find_study(name: str) -> Study:
+    """The study of an installed distribution, or of a file of one's own, "folder/mine.py:STUDY".
+
+    The code of a file's cell names the cells, and workers load the file by its path.
+
+    Raises:
+        InputError: an unknown name, no such file, or an object that is no Study.
+    """
+    if not in_file(name):
+        installed: Study = find("coopoc.studies", name)
+        return installed
+    study = from_file(name, "study")
+    if not isinstance(study, Study):
+        hint = "Give STUDY = coopoc.Study(...) in the file."
+        raise InputError("study", repr(name), f"is a {type(study).__name__}, no Study", hint)
+    path, _, attribute = name.rpartition(":")
+    code, own = code_of(study.cell), study.key
+
+    def key(params: Params) -> Mapping[str, Any]:
+        return {**own(params), "cell": code}
+
+    cell = _FileCell(f"{Path(path).resolve()}:{attribute}", file_digest(name, "study"))
+    return replace(study, cell=cell, key=key)
+
+
+@dataclass(frozen=True)
+class _FileCell:
+    """The study's cell, for processes that cannot import the file: by path, as long as its contents are these."""
+
+    name: str
+    contents: str
+
+    def __call__(self, params: Params) -> list[Row]:
+        if file_digest(self.name, "study") != self.contents:
+            raise InputError("study", repr(self.name), "has changed since the run began", "Repeat the command.")
+        study: Study = from_file(self.name, "study")
+        return study.cell(params)
+
+
+def _check_view(where: str, view: Any) -> None:
+    try:
+        inspect.signature(view).bind(object())
+    except (TypeError, ValueError) as error:
+        hint = "Give functools.partial(view, name=...) with the names of the view's own arguments."
+        raise InputError(where, str(error), "must be a function of the Results alone", hint) from None
 
 
 def _named(study: Study, params: Mapping[str, Scalar], code: str) -> Cell:

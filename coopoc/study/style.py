@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILLION, PURPLE = (
@@ -25,6 +26,25 @@ class Look:
     label: str
     color: str
     marker: str
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A panel of `curves`.
+
+    Args:
+        x: place on the horizontal axis -> what it adds to the selection of a line.
+        where: what the panel adds.
+        title: over it.
+        xlabel: under it.
+        ticks: place -> text; default matplotlib's ticks, or the places if there are at most eight.
+    """
+
+    x: Mapping[float, Mapping[str, Any]]
+    where: Mapping[str, Any] = field(default_factory=dict)
+    title: str = ""
+    xlabel: str = ""
+    ticks: Mapping[float, str] = field(default_factory=dict)
 
 
 NEUTRAL = "#9DB0C3"
@@ -53,21 +73,17 @@ METHODS = {
     "central-filter": Look("Whole-fleet filter", "#444E86", "s"),
     "batch-smoother": Look("Whole-fleet smoother", "#111E6C", "D"),
     "pose-solo": Look("Pose filter, solo", "#C98A00", "v"),
-    "pose-star": Look("Pose filter, star", "#00785A", "h"),
     "pose-fleet": Look("Pose filter, one state", BLUE, "o"),
     "pose-learned": Look("Pose filter, learned noise", "#009E73", "s"),
     "pose-naive": Look("Decentralised, naive", VERMILLION, "X"),
     "pose-intersection": Look("Decentralised, CI", "#7A3E1D", "<"),
-    "pose-invariant": Look("Invariant EKF", PURPLE, "d"),
     "fedkalmannet": Look("FedKalmanNet", PURPLE, "*"),
     "centralised": Look("Centralised KalmanNet", "#8A2F63", "X"),
     "kalman-adaptive": Look("Adaptive KF", "#B8860B", "v"),
     "fedokf": Look("Federated OKF", "#FF8C61", "D"),
-    "magnitude": Look("Magnitude-aware net", "#5E3C99", "P"),
     "split": Look("Split-KalmanNet", "#3B7080", "<"),
     "recursive": Look("Recursive gain", "#C2185B", "o"),
     "cooperative": Look("Cooperative gain", "#B71C1C", "H"),
-    "cooperative-newest": Look("Cooperative gain, newest fix", "#E57373", "h"),
     "individual": Look("Individual KalmanNet", "#9370C9", "h"),
     "oracle": Look("Oracle KF", "#5B3A1E", "d"),
     "gauss-newton": Look("gauss-newton", GREEN, "^"),
@@ -81,6 +97,8 @@ _SPARE = tuple((color, marker) for marker in "<>d8H" for color in (BLUE, VERMILL
 _LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1, 1, 1)), "fitted": "-", "trained": "-"}
 
 UNITS = {
+    "correlated_gnss": ("Correlated GNSS", ""),
+    "latency_loss": ("Latency and loss", ""),
     "rt_le_m": ("RT-LE", "m"),
     "max_error_m": ("Maximum error", "m"),
     "bytes_per_second": ("Received", "B/s"),
@@ -97,25 +115,13 @@ UNITS = {
     "latency": ("Latency", "s"),
     "heading_std_deg": ("Heading noise", "°"),
     "heading_bias_deg": ("Heading bias", "°"),
-    "epsilon": ("Epsilon", ""),
-    "auc": ("AUC of the probe", ""),
-    "radius_m": ("Radius of V2X", "m"),
-    "correlated_gnss": ("Correlated GNSS", ""),
-    "latency_loss": ("Latency and loss", ""),
-    "velocity_ratio": ("Velocity noise, share", ""),
-    "velocity_reading": ("Velocity noise is per", ""),
     "drift_time_s": ("Time of the GNSS drift", "s"),
     "heading_deg": ("Heading error", "°"),
-    "landmarks": ("Landmarks", ""),
-    "offset_m": ("Offset of false data", "m"),
-    "train_seeds": ("Training seeds", ""),
-    "train_seed": ("Training seed", ""),
-    "in_mult": ("Input width of the net, multiple", ""),
-    "out_mult": ("Output width of the net, multiple", ""),
-    "backend": ("Optimisation backend", ""),
-    "spoofed_share": ("Share of spoofed vehicles", ""),
 }
 """Column -> (words, unit)."""
+
+SUFFIXES = {"m": "m", "s": "s", "hz": "Hz", "deg": "°"}
+"""End of a column's name -> unit."""
 
 SYMBOLS = {"max_neighbours": "K"}
 """Column -> the short form that fits over a column of numbers."""
@@ -176,7 +182,9 @@ def words(name: str) -> str:
     >>> words("rt_le_m"), words("window")
     ('RT-LE [m]', 'Window')
     """
-    text, unit = UNITS.get(name, (name.replace("_", " ").capitalize(), ""))
+    stem, _, suffix = name.rpartition("_")
+    plain = (stem, SUFFIXES[suffix]) if stem and suffix in SUFFIXES else (name, "")
+    text, unit = UNITS.get(name, (plain[0].replace("_", " ").capitalize(), plain[1]))
     return f"{text} [{unit}]" if unit else text
 
 

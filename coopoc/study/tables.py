@@ -1,13 +1,14 @@
-"""Table: numbers with intervals that go into a paper as they are; Markdown, CSV, LaTeX and HTML."""
+"""Tables with intervals for papers and pages (Markdown, CSV, LaTeX, HTML), and tables of a study's results."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from tabulate import tabulate
 
@@ -15,7 +16,11 @@ from ..errors import InputError
 from ..escapes import markdown, spreadsheet, tex, visible
 from ..evaluate.statistics import Interval
 from ..plugins import one_of
-from .style import METHODS
+from .numbers import Number, Where
+from .style import METHODS, label, title, words
+
+if TYPE_CHECKING:
+    from .results import Results
 
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
@@ -66,11 +71,7 @@ class Table:
 
     @classmethod
     def from_data(cls, given: Any) -> Table:
-        """The table whose `vars` were stored as JSON.
-
-        Raises:
-            InputError: it is no table.
-        """
+        """The table whose `vars` were stored as JSON; InputError if it is none."""
         try:
             rows = tuple(tuple(map(_entry, row)) for row in given["rows"])
             texts: dict[str, Any] = {name: tuple(map(str, given[name])) for name in ("header", "unranked", "notes")}
@@ -84,37 +85,31 @@ class Table:
 
     def render(self, form: str) -> str:
         """The table in one of FORMATS; InputError for another."""
-        one_of("format", form, FORMATS)
-        text: str = getattr(self, f"to_{form}")()
+        text: str = getattr(self, f"to_{one_of('format', form, FORMATS)}")()
         return text
 
     def to_markdown(self) -> str:
         """GitHub Markdown, best in bold, the caption above and notes below."""
-        bold = self._bold()
-        body = [
-            [_mark(markdown(self.text(e)), (i, j) in bold, "**{}**") for j, e in enumerate(row)]
-            for i, row in enumerate(self.rows)
-        ]
+        body = self._body(markdown, "**{}**", " {}")
         header, sides = [markdown(title) for title in self.header], self._sides("left", "right")
         grid = tabulate(body, header, "pipe", disable_numparse=True, colalign=sides)
-        above, below = [markdown(self.caption)] if self.caption else [], map(markdown, self.notes)
-        return "\n\n".join([*above, grid, *below])
+        above = [markdown(self.caption)] if self.caption else []
+        return "\n\n".join([*above, grid, *map(markdown, self.notes)])
 
     def to_csv(self) -> str:
         """Full precision; an interval takes three columns: mean, low, high. No text is a formula of a spreadsheet."""
         wide = [any(isinstance(row[j], Interval) for row in self.rows) for j in range(len(self.header))]
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\n")
-        ends = ("", " low", " high")
-        titles = [(title, end) for title, w in zip(self.header, wide, strict=True) for end in (ends if w else ends[:1])]
-        writer.writerow([spreadsheet(title) + end for title, end in titles])
+        titles = [(spreadsheet(title), w) for title, w in zip(self.header, wide, strict=True)]
+        writer.writerow([text + end for text, w in titles for end in (("", " low", " high") if w else ("",))])
         for row in self.rows:
             writer.writerow([n for e, w in zip(row, wide, strict=True) for n in _columns(e, w)])
         return out.getvalue()
 
     def to_latex(self) -> str:
         r"""A table for \usepackage{booktabs,graphicx}, not wider than the line; best in bold, text escaped."""
-        bold = self._bold()
+        body = self._body(tex, r"\textbf{{{}}}", r" {{\scriptsize {}}}")
         lines = [
             r"\begin{table}",
             r"\centering",
@@ -125,25 +120,21 @@ class Table:
             r"\toprule",
             " & ".join(map(tex, self.header)) + r" \\",
             r"\midrule",
+            *(" & ".join(row) + r" \\" for row in body),
         ]
-        for i, row in enumerate(self.rows):
-            entries = [self._latex(e, (i, j) in bold) for j, e in enumerate(row)]
-            lines.append(" & ".join(entries) + r" \\")
         return "\n".join([*lines, r"\bottomrule", r"\end{tabular}}", r"\end{table}", ""])
 
     def to_html(self) -> str:
         """A <table> without styling of its own."""
-        bold = self._bold()
-        titles = [
-            escape(visible(title)).replace(" = ", "&nbsp;=&nbsp;") for title in self.header
-        ]  # K = 4 stays in one line
+        titles = [escape(visible(title)).replace(" = ", "&nbsp;=&nbsp;") for title in self.header]  # on one line
         head = "".join(f"<th scope=col>{title}</th>" for title in titles)
-        body = []
-        for i, row in enumerate(self.rows):
-            cells = [self._html(e, (i, j) in bold) for j, e in enumerate(row)]
-            body.append("<tr>" + "".join(cells) + "</tr>")
+        shown = self._body(lambda text: escape(visible(text)), "<strong>{}</strong>", " <span class=interval>{}</span>")
+        body = ""
+        for row, texts in zip(self.rows, shown, strict=True):
+            kinds = ("" if isinstance(entry, str) else " class=number" for entry in row)
+            body += f"<tr>{''.join(f'<td{kind}>{text}</td>' for kind, text in zip(kinds, texts, strict=True))}</tr>"
         caption = f"<caption>{escape(visible(' '.join(self.words)))}</caption>"
-        return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+        return f"<table>{caption}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
     def _repr_html_(self) -> str:
         """HTML for a notebook."""
@@ -152,39 +143,38 @@ class Table:
     def text(self, entry: Entry) -> str:
         """One entry as text."""
         if isinstance(entry, Interval):
-            ends = (
-                ""
-                if math.isnan(entry.low) or not self.intervals
-                else (f" [{_number(entry.low, self.decimals)}, {_number(entry.high, self.decimals)}]")
-            )
+            low, high = (_number(end, self.decimals) for end in (entry.low, entry.high))
+            ends = f" [{low}, {high}]" if self.intervals and not math.isnan(entry.low) else ""
             return _number(entry.mean, self.decimals) + ends
         if isinstance(entry, float):
             return _number(entry, self.decimals)
         return "–" if entry is None else str(entry)
-
-    def _latex(self, entry: Entry, bold: bool) -> str:
-        if isinstance(entry, str):
-            return tex(entry)
-        mean, _, ends = self.text(entry).partition(" ")
-        return _mark(tex(mean), bold, r"\textbf{{{}}}") + (rf" {{\scriptsize {ends}}}" if ends else "")
-
-    def _html(self, entry: Entry, bold: bool) -> str:
-        if isinstance(entry, str):
-            return f"<td>{escape(visible(entry))}</td>"
-        mean, _, ends = self.text(entry).partition(" ")
-        small = f" <span class=interval>{escape(ends)}</span>" if ends else ""
-        return f"<td class=number>{_mark(escape(mean), bold, '<strong>{}</strong>')}{small}</td>"
-
-    def _sides(self, words: str, numbers: str) -> tuple[str, ...]:
-        columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.header)
-        return tuple(words if any(isinstance(e, str) for e in column) else numbers for column in columns)
 
     @property
     def words(self) -> list[str]:
         """Caption and notes."""
         return [text for text in (self.caption, *self.notes) if text]
 
+    def _body(self, escaped: Callable[[str], str], strong: str, ends: str) -> list[list[str]]:
+        """Entries in a format: `strong` is the pattern of the best mean, `ends` that of an interval's ends."""
+        bold, body = self._bold(), []
+        for i, row in enumerate(self.rows):
+            texts = []
+            for j, entry in enumerate(row):
+                text = self.text(entry)
+                mean, _, interval = text.partition(" ") if isinstance(entry, Interval) else (text, "", "")
+                shown = strong.format(escaped(mean)) if (i, j) in bold else escaped(mean)
+                texts.append(shown + (ends.format(interval) if interval else ""))
+            body.append(texts)
+        return body
+
+    def _sides(self, left: str, right: str) -> tuple[str, ...]:
+        """Alignment of each column: text at the left, numbers at the right."""
+        columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(self.header)
+        return tuple(left if any(isinstance(e, str) for e in column) else right for column in columns)
+
     def _bold(self) -> set[tuple[int, int]]:
+        """(row, column) of the best numbers, as far as they are shown."""
         if self.best is None:
             return set()
         places: dict[int, list[tuple[float, int, int]]] = {}
@@ -196,6 +186,89 @@ class Table:
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         pick = min if self.best == "min" else max
         return {(i, j) for group in places.values() if len(group) > 1 for mean, i, j in group if mean == pick(group)[0]}
+
+
+def pivot(
+    results: Results,
+    rows: str | Sequence[str],
+    columns: str | Sequence[str],
+    value: str,
+    where: Mapping[str, Any] | None = None,
+    caption: str = "",
+    best: Best = "min",
+    along: Literal["row", "column"] | None = None,
+    decimals: int = 2,
+    intervals: bool = True,
+) -> Table:
+    """Table of one metric over a study's results: mean over egos and runs, with its 95 % interval.
+
+    Args:
+        results: of the study.
+        rows: column or columns of the frame that label the rows.
+        columns: column or columns whose values become columns.
+        value: the metric.
+        where: column -> value or values.
+        caption: under the table; default the metric.
+        best: "min", "max" or None.
+        along: where the best is sought; default among the methods.
+        decimals: of numbers.
+        intervals: show the ends.
+
+    Raises:
+        InputError: as `Results.summary`.
+    """
+    down, across = ([names] if isinstance(names, str) else list(names) for names in (rows, columns))
+    summary = results.summary([*down, *across], value, where)
+    summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
+    titles = list(dict.fromkeys(summary["_title"]))
+    body = []
+    for names, group in summary.groupby(down, sort=False, dropna=False):
+        entries = {
+            row["_title"]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
+            for _, row in group.iterrows()
+            if row["n"]
+        }
+        body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(entries.get, titles)))
+    missing = int(summary["missing"].sum())
+    return Table(
+        (*map(words, down), *titles),
+        tuple(body),
+        caption or f"{words(value)}: mean and 95 % interval.",
+        best,
+        along or ("column" if "method" in down else "row"),
+        decimals=decimals,
+        intervals=intervals,
+        notes=(f"{missing} egos are left out because a run of theirs failed.",) if missing else (),
+    )
+
+
+def crossed(
+    results: Results,
+    head: Sequence[str],
+    rows: Iterable[tuple[Sequence[Entry], Where]],
+    columns: Mapping[str, Number],
+    caption: str,
+    **options: Any,
+) -> Table | None:
+    """Table with a row per selection and a column per number; rows that were not run are left out.
+
+    Args:
+        results: of the study.
+        head: titles over the labels of a row.
+        rows: labels and selection of each.
+        columns: title -> number of a selection, such as `coopoc.study.numbers.mean`.
+        caption: under the table.
+        options: of `Table`.
+
+    Returns:
+        The table, or None if no row was run.
+    """
+    body = []
+    for labels, where in rows:
+        entries = [number(results, where) for number in columns.values()]
+        if any(entry is not None for entry in entries):
+            body.append((*labels, *entries))
+    return Table((*head, *columns), tuple(body), caption, **options) if body else None
 
 
 def _number(value: float, decimals: int) -> str:
@@ -214,10 +287,3 @@ def _entry(stored: Any) -> Entry:
     if isinstance(stored, dict):
         return Interval(float(stored["mean"]), float(stored["low"]), float(stored["high"]), int(stored["n"]))
     return stored if isinstance(stored, float | int | None) else str(stored)
-
-
-def _mark(text: str, bold: bool, pattern: str) -> str:
-    if not bold:
-        return text
-    mean, space, ends = text.partition(" ")
-    return pattern.format(mean) + space + ends

@@ -24,7 +24,7 @@ print({name: int(drives.present[:, k].sum()) for k, name in enumerate(drives.ids
 # ## Five rounds of federated averaging
 #
 # `clients` cuts every drive into pieces of 100 steps and draws the noise of its sensors. `federate` needs a net, the
-# clients and a number of rounds; rules, participation, compression, topology and privacy are arguments
+# clients and a number of rounds; rules and participation are arguments
 # ([federation](../federation.md)).
 
 # %%

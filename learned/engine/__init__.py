@@ -1,1 +1,1 @@
-"""GainNet compiled: the rollout, its backward pass, and the memory between the two."""
+"""GainNet compiled: rollout, backpropagation through time and optimiser step without Python in the time loop."""

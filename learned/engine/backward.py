@@ -1,294 +1,237 @@
-"""Compiled backpropagation through time of GainNets, from the tape of `forward.follow`."""
+"""Compiled training step of GainNets: rollout, loss, backpropagation through time and AdamW."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.learned.engine.arguments import Matrices
-
-from . import places as on
-from .arithmetic import ONE, PAD, THREE, TWO, ZERO, Index, aligned, borrowed, carry, inside, part, window
-from .forward import blend, layer, missing
-from .places import LOG_FLOOR, SHORTEST
-from .product import add_outer, add_product, dots, gated_product
-from .tape import Net, Nets, Tape, bias, matrix, net_of, pack, rows, span, unpack
-
-
-class Adjoint(NamedTuple):
-    """Gradient with respect to the state after a step (`State` of the forward pass), changed in place."""
-
-    process: Floats
-    prior: Floats
-    innovation: Floats
-    x: Floats
-    x_before: Floats
-    prior_before: Floats
+from coopoc.kernels.compiling.compile import compiled, part, storage
+from coopoc.learned.engine import layers as on
+from coopoc.learned.engine.forward import Drives, State, follow, missing, new_state
+from coopoc.learned.engine.layers import (
+    CELLS,
+    LANES,
+    PAD,
+    SHORTEST,
+    Index,
+    Net,
+    Plan,
+    backward_layer,
+    columns_of,
+    unpack,
+)
+from coopoc.learned.engine.optimiser import Found, Moments, Update, advance_row
 
 
-class Inner(NamedTuple):
-    """Gradients within a step: new GRU states (B, PAD), innovation, inputs of the first layers; and a GRU's gates."""
+@compiled
+def descend(
+    moments: Moments, plan: Plan, drives: Drives, target: Floats, found: Found, update: Update, span: tuple[int, int]
+) -> None:
+    """Losses (R,) m^2 and gradients (R, P) of the models `update.rows`, and with step > 0 one step of AdamW.
 
-    process: Floats
-    prior: Floats
-    innovation: Floats
-    residual: Floats
-    observed: Floats
-    evolved: Floats
-    updated: Floats
-    gates: Floats
-
-
-class Scratch(NamedTuple):
-    """Memory of a backward pass: untransposed matrices, all gradients, those within a step, those of positions."""
-
-    straight: Floats
-    grown: Floats
-    inner: Floats
-    positions: Floats
+    Args:
+        moments: (S, P) weights and moments.
+        plan: layers and tape of the nets.
+        drives: of the R models.
+        target: (T, R, B, 3) true positions m; with step -1 the gradient with respect to the estimates.
+        found: outputs.
+        update: the optimiser step.
+        span: first and last + 1 of the rows to compute.
+    """
+    theta, (steps, _, lanes, _) = moments.theta, drives.gnss.shape
+    net = Net(np.empty(plan.parameters, theta.dtype), plan.layers, plan.columns)
+    most = min(LANES, lanes)
+    tape, gradient = (
+        np.zeros((steps * most, plan.width), theta.dtype),
+        np.zeros((steps * most, plan.width), theta.dtype),
+    )
+    x, state, adjoint = np.empty_like(drives.gnss), new_state(theta), new_state(theta)
+    for r in range(span[0], span[1]):
+        unpack(theta[update.rows[r]], net)
+        found.gradient[r] = 0.0
+        loss = 0.0
+        for first in range(0, lanes, LANES):
+            rows = (r, first, min(LANES, lanes - first))
+            follow(net, tape, drives, x, rows, state, 1)
+            for lane in range(first, first + rows[2]):
+                if update.step < 0:
+                    for t in range(steps):
+                        for i in range(3):
+                            x[t, r, lane, i] = target[t, r, lane, i]
+                else:
+                    loss += score(x, target, r, lane)
+            gradient[:] = 0.0
+            back(net, tape, gradient, drives.gnss, x, rows, adjoint)
+            collect(net, tape[: steps * rows[2]], gradient, found.gradient[r])
+        found.losses[r] = loss
+        if update.step > 0:
+            advance_row(moments, found, update, r)
 
 
 @part
-def scratch(lanes: Index, size: Index, like: Floats) -> Scratch:
-    """Memory for B lanes and matrices of this size."""
-    return Scratch(
-        aligned(size, like), aligned(size, like), aligned(lanes * 14 * PAD, like), np.empty(3 * lanes * 3, like.dtype)
-    )
+def score(x: Floats, truth: Floats, r: Index, lane: Index) -> float:
+    """Squared error m^2 of a drive, sum over components, mean over the steps with a truth, over the number of drives; x
+    becomes its gradient in x, 0 where the truth is not known (NaN)."""
+    known, squares, zero = 0, 0.0, x.dtype.type(0.0)
+    for t in range(x.shape[0]):
+        known += not np.isnan(truth[t, r, lane, 0])
+    share = 1.0 / (max(known, 1) * x.shape[2])
+    scale = x.dtype.type(2.0 * share)
+    for t in range(x.shape[0]):
+        for i in range(3):
+            error = zero if np.isnan(truth[t, r, lane, i]) else x[t, r, lane, i] - truth[t, r, lane, i]
+            x[t, r, lane, i] = scale * error
+            squares += float(error * error)
+    return share * squares
 
 
-@inside
-def nets(ahead: Net, matrices: Matrices, room: Scratch, gradient: Floats) -> Nets:
-    """The three forms of a net whose gradient (P,) is wanted."""
-    straight = net_of(ahead.theta, room.straight, matrices, ONE)
-    return Nets(ahead, straight, net_of(gradient, room.grown, matrices, TWO))
+@storage
+def collect(net: Net, tape: Floats, gradient: Floats, total: Floats) -> None:
+    """Add to the gradient (P,) of the weights that of every layer: dW = dy^T x and db = dy, summed over the steps."""
+    steps = len(tape)
+    for layer in range(len(net.layers)):
+        weight, bias, outputs, inputs, _, source, to, _ = columns_of(net, layer)
+        dy, x = np.empty((steps, outputs), tape.dtype), np.empty((steps, inputs), tape.dtype)
+        copy(gradient, to, dy)
+        copy(tape, source, x)
+        accumulate(np.dot(dy.T, x).reshape(-1), total[weight : weight + outputs * inputs])
+        for t in range(steps):
+            accumulate(dy[t], total[bias : bias + outputs])
+
+
+@part
+def copy(source: Floats, first: Index, target: Floats) -> None:
+    """Columns (T, n) of an array from `first` on."""
+    for t in range(len(target)):
+        row, into = source[t, first : first + target.shape[1]], target[t]
+        for j in range(len(into)):
+            into[j] = row[j]
+
+
+@part
+def accumulate(values: Floats, total: Floats) -> None:
+    """total (n,) += values (n,)."""
+    for i in range(len(total)):
+        total[i] += values[i]
 
 
 @part
 def back(
-    nets: Nets, tape: Tape, deltas: Tape, gnss: Floats, adjoints: Floats, s: Index, slots: Index, room: Scratch
+    net: Net,
+    tape: Floats,
+    gradient: Floats,
+    gnss: Floats,
+    adjoints: Floats,
+    rows: tuple[Index, Index, Index],
+    adjoint: State,
 ) -> None:
-    """The gradient of one model from that of its estimates, from its tape and its matrices as `follow` left them.
+    """The gradient of the tape, zero before, from that of the estimates (T, S, B, 3); `rows` as in `forward.follow`.
 
-    The wide layers are computed again, which is faster than to fetch them from memory. They and the gradients of the
-    layers' outputs wait in fields with room for a few steps; when these are full, the gradient of each weight grows by
-    one product over all their rows.
-
-    Args:
-        nets: the model, and its gradient.
-        tape: of the forward pass.
-        deltas: gradients of the layers' outputs.
-        gnss: (T, S, B, 3) m.
-        adjoints: (T, S, B, 3) gradient of the loss with respect to the estimates.
-        s: index of the model.
-        slots: steps for which the fields have room.
-        room: memory.
+    `adjoint` is memory for the gradient with respect to the state after a step.
     """
-    ahead, net, made = nets
-    unpack(net)
-    made.padded[:] = 0.0
-    lanes, recompute, steps = tape.lanes, tape.fields[on.CORRECTED, 2] == 0, len(gnss)
-    fixes, flat, stride = gnss.reshape(-1), adjoints.reshape(-1), gnss.shape[1] * tape.lanes * 3
-    adjoint, inner = _nothing(lanes, room.inner, room.positions)
-    for t in range(steps - 1, -1, -1):
-        tape.now[0], tape.now[1], at = t % slots, t, s * lanes * 3 + t * stride
-        given = window(flat, at, lanes, THREE)
-        for b in range(lanes):
+    s, first, lanes = rows
+    for lane in range(lanes):
+        for j in range(CELLS):
+            adjoint.process[lane, j] = adjoint.prior[lane, j] = adjoint.innovation[lane, j] = 0.0
+        for i in range(3):
+            adjoint.x[lane, i] = adjoint.x_before[lane, i] = adjoint.prior_before[lane, i] = 0.0
+    for t in range(len(gnss) - 1, -1, -1):
+        row = t * lanes
+        for lane in range(lanes):
             for i in range(3):
-                adjoint.x[b, i] += given[b, i]
-        if recompute:
-            _again(ahead, tape)
-        _step(net, ahead, window(fixes, at, lanes, THREE), adjoint, tape, deltas, inner)
-        if t % slots == 0:
-            _collect(made, tape, deltas, min(slots, steps - t))
-    pack(made)
+                adjoint.x[lane, i] += adjoints[t, s, first + lane, i]
+            if not missing(gnss, (t, s, first + lane)):
+                move_back(net, tape[row + lane], gradient[row + lane], adjoint, lane)
+        think_back(net, tape, gradient, row, lanes)
+        for lane in range(lanes):
+            if missing(gnss, (t, s, first + lane)):
+                for i in range(3):
+                    adjoint.x[lane, i] += adjoint.x_before[lane, i]
+                    adjoint.x_before[lane, i] = 0.0
+            else:
+                look_back(net, tape[row + lane], gradient[row + lane], adjoint, lane)
 
 
 @part
-def _nothing(lanes: Index, work: Floats, positions: Floats) -> tuple[Adjoint, Inner]:
-    """No gradient yet, in this memory, and room for those within a step."""
-    wide, size, step = np.int64(PAD), lanes * PAD, lanes * THREE
-    work[:], positions[:] = 0.0, 0.0
-    adjoint = Adjoint(
-        window(work, ZERO, lanes, wide),
-        window(work, size, lanes, wide),
-        window(work, 2 * size, lanes, wide),
-        window(positions, ZERO, lanes, THREE),
-        window(positions, step, lanes, THREE),
-        window(positions, 2 * step, lanes, THREE),
-    )
-    inner = Inner(
-        window(work, 3 * size, lanes, wide),
-        window(work, 4 * size, lanes, wide),
-        window(work, 5 * size, lanes, wide),
-        window(work, 6 * size, lanes, wide),
-        window(work, 7 * size, lanes, wide),
-        window(work, 8 * size, lanes, wide),
-        window(work, 9 * size, lanes, wide),
-        window(work, 10 * size, lanes, 4 * wide),
-    )
-    return adjoint, inner
-
-
-@inside
-def _again(net: Net, tape: Tape) -> None:
-    """The outputs of the wide layers at the present step, and what stands beside them."""
-    moved, seen, wide = rows(tape, on.PRIOR_IN), rows(tape, on.INNOVATION_IN), net.layers[on.UPDATE, 2]
-    layer(net, on.UPDATE, tape, rows(tape, on.CORRECTED), on.FIRST)
-    layer(net, on.EVOLUTION, tape, moved, on.FIRST)
-    layer(net, on.OBSERVATION, tape, seen, on.FIRST)
-    layer(net, on.HIDDEN, tape, rows(tape, on.HIDDEN_OUT), on.FIRST)
-    layer(net, on.EXPECTED, tape, seen, 2 * wide)
-    blend(tape, on.PROCESS_OLD, moved, wide)
+def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
+    """`forward.move` backwards: the gradient of gain, innovation and new states of a lane."""
+    columns = net.columns
+    gain, residual = columns[on.GAIN], columns[on.RESIDUAL]
+    process, innovation, posterior = columns[on.PROCESS], columns[on.INNOVATION], columns[on.POSTERIOR]
+    for i in range(3):
+        for j in range(3):
+            gradient[gain + 3 * i + j] = adjoint.x[lane, i] * tape[residual + j]
+            gradient[residual + j] += adjoint.x[lane, i] * tape[gain + 3 * i + j]
+    for j in range(CELLS):
+        gradient[process + j], gradient[innovation + j] = adjoint.process[lane, j], adjoint.innovation[lane, j]
+        gradient[posterior + j] = adjoint.prior[lane, j]
 
 
 @part
-def _collect(gradient: Net, tape: Tape, deltas: Tape, count: Index) -> None:
-    """Add what `count` steps from the present one on contribute to the gradient of every weight and bias.
-
-    The matrix of a layer with more outputs than inputs is transposed: the longer axis runs along the vectors.
-    """
-    one = np.ones((count * tape.lanes, 1), gradient.padded.dtype)
-    for name in range(len(gradient.layers)):
-        outputs, inputs = gradient.layers[name, 2], gradient.layers[name, 3]
-        given, at = span(tape, gradient.layers[name, 7], count), gradient.layers[name, 8]
-        delta, column = span(deltas, gradient.layers[name, 9], count), gradient.layers[name, 10]
-        if gradient.transposed[name]:
-            add_outer(given, at, inputs, delta, column, matrix(gradient, name))
-        else:
-            add_outer(delta, column, outputs, given, at, matrix(gradient, name))
-        add_outer(borrowed(one), ZERO, ONE, delta, column, bias(gradient, name))
-
-
-@inside
-def _step(net: Net, ahead: Net, gnss: Floats, adjoint: Adjoint, tape: Tape, deltas: Tape, inner: Inner) -> None:
-    """Back over a step: `adjoint` becomes the gradient with respect to the state before it."""
-    gain = _room(net, on.GAIN, deltas)
-    _begin(gnss, adjoint, tape, inner, gain, _room(net, on.POSTERIOR, deltas))
-    _gate(net, on.POSTERIOR, tape, on.CORE, on.BACK, deltas)
-    _add(net, on.POSTERIOR, deltas, on.SECOND, inner.prior)
-    _add(net, on.BACK, deltas, on.FIRST, inner.innovation)
-    _add(net, on.BACK, deltas, on.SECOND, gain)
-    _gate(net, on.GAIN, tape, on.HIDDEN_OUT, on.HIDDEN, deltas)
-    _add(net, on.HIDDEN, deltas, on.FIRST, inner.prior)
-    _add(net, on.HIDDEN, deltas, on.SECOND, inner.innovation)
-
-    _gru(net, on.INNOVATION_X, inner.innovation, inner.gates, tape, deltas)
-    _gate(net, on.INNOVATION_X, tape, on.INNOVATION_IN, on.OBSERVATION, deltas)
-    _add(net, on.EXPECTED, deltas, on.FIRST, inner.prior)
-    _gru(net, on.PRIOR_X, inner.prior, inner.gates, tape, deltas)
-    _gate(net, on.PRIOR_X, tape, on.PRIOR_IN, on.EVOLUTION, deltas)
-    _add(net, on.PRIOR_X, deltas, net.layers[on.UPDATE, 2], inner.process)
-    _gru(net, on.PROCESS_X, inner.process, inner.gates, tape, deltas)
-    _gate(net, on.PROCESS_X, tape, on.CORRECTED, on.UPDATE, deltas)
-    _end(net, ahead, gnss, adjoint, tape, deltas, inner)
+def think_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
+    """`forward.think` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
+    prior, copy = net.columns[on.PRIOR], net.columns[on.PRIOR_COPY]
+    backward_layer(net, on.L_POSTERIOR, tape, gradient, row, lanes)
+    for lane in range(row, row + lanes):
+        for j in range(CELLS):
+            gradient[lane, prior + j] = gradient[lane, copy + j]
+    backward_layer(net, on.L_BACK, tape, gradient, row, lanes)
+    backward_layer(net, on.L_GAIN, tape, gradient, row, lanes)
+    backward_layer(net, on.L_HIDDEN, tape, gradient, row, lanes)
+    gru_back(net, on.L_INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION, tape, gradient, row, lanes)
+    backward_layer(net, on.L_OBSERVATION, tape, gradient, row, lanes)
+    backward_layer(net, on.L_EXPECTED, tape, gradient, row, lanes)
+    gru_back(net, on.L_PRIOR_X, on.PRIOR_OLD, on.PRIOR, tape, gradient, row, lanes)
+    backward_layer(net, on.L_EVOLUTION, tape, gradient, row, lanes)
+    gru_back(net, on.L_PROCESS_X, on.PROCESS_OLD, on.PROCESS, tape, gradient, row, lanes)
+    backward_layer(net, on.L_UPDATE, tape, gradient, row, lanes)
 
 
-@inside
-def _begin(gnss: Floats, adjoint: Adjoint, tape: Tape, inner: Inner, gain: Floats, posterior: Floats) -> None:
-    """Gradients of what a step gives: new states, K and innovation by x = x_prior + K (z - x_prior), posterior.
-
-    None of them where there is no fix, so that all further ones of that lane are zero.
-    """
-    core, lengths, posterior_out = rows(tape, on.CORE), rows(tape, on.LENGTHS), rows(tape, on.POSTERIOR_OUT)
-    zero = core.dtype.type(0.0)
-    for b in range(tape.lanes):
-        gone = missing(gnss, b)
-        for i in range(3):
-            along = zero
-            for j in range(3):
-                gain[b, 3 * i + j] = zero if gone else adjoint.x[b, i] * lengths[b, on.RESIDUAL + j]
-                along += core[b, on.CORE_GAIN + 3 * j + i] * adjoint.x[b, j]
-            inner.residual[b, i] = zero if gone else along
-        for j in range(PAD):
-            inner.process[b, j] = zero if gone else adjoint.process[b, j]
-            inner.innovation[b, j] = zero if gone else adjoint.innovation[b, j]
-            inner.prior[b, j] = zero
-        for j in range(PAD):
-            posterior[b, j] = zero if gone or posterior_out[b, j] <= zero else adjoint.prior[b, j]
-
-
-@inside
-def _end(net: Net, ahead: Net, gnss: Floats, adjoint: Adjoint, tape: Tape, deltas: Tape, inner: Inner) -> None:
-    """Gradients of the four changes, and `adjoint` before the step; without a fix only x and x_before were moved on."""
-    wide = net.layers[on.UPDATE, 2]
-    dots(_room(net, on.OBSERVATION, deltas), 2 * wide, matrix(ahead, on.OBSERVATION), THREE, inner.observed)
-    dots(_room(net, on.EVOLUTION, deltas), wide, matrix(ahead, on.EVOLUTION), ZERO, inner.evolved)
-    dots(_room(net, on.UPDATE, deltas), wide, matrix(ahead, on.UPDATE), ZERO, inner.updated)
-    features, lengths = rows(tape, on.FEATURES), rows(tape, on.LENGTHS)
-    for b in range(tape.lanes):
-        _turn(features, lengths, b, ONE, inner.observed)
-        _turn(features, lengths, b, TWO, inner.evolved)
-        _turn(features, lengths, b, THREE, inner.updated)
-        if missing(gnss, b):
-            for i in range(3):
-                adjoint.x[b, i] += adjoint.x_before[b, i]
-                adjoint.x_before[b, i] = 0.0
-            continue
-        for i in range(3):
-            evolved, updated = inner.evolved[b, i], inner.updated[b, i]
-            in_residual = inner.residual[b, i] + inner.observed[b, i]
-            adjoint.x[b, i] += adjoint.prior_before[b, i] + adjoint.x_before[b, i] - in_residual + evolved + updated
-            adjoint.x_before[b, i], adjoint.prior_before[b, i] = -evolved, -updated
-        for j in range(9):
-            adjoint.process[b, j], adjoint.prior[b, j] = inner.process[b, j], inner.prior[b, j]
-            adjoint.innovation[b, j] = inner.innovation[b, j]
+@part
+def gru_back(
+    net: Net, layer: Index, field: Index, to: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index
+) -> None:
+    """`forward.gru` backwards."""
+    old, x, h = net.columns[field], net.columns[field + 1], net.columns[field + 2]
+    gates, new, one = net.columns[field + 3], net.columns[to], tape.dtype.type(1.0)
+    for lane in range(row, row + lanes):
+        gate, after = tape[lane, gates : gates + 3 * PAD], gradient[lane, new : new + CELLS]
+        before, kept = tape[lane, old : old + CELLS], tape[lane, h + 2 * CELLS : h + 3 * CELLS]
+        in_x, in_h = gradient[lane, x : x + 3 * CELLS], gradient[lane, h : h + 3 * CELLS]
+        in_old = gradient[lane, old : old + CELLS]
+        for j in range(CELLS):
+            reset, keep, fresh = gate[j], gate[PAD + j], gate[2 * PAD + j]
+            candidate = after[j] * (one - keep) * (one - fresh * fresh)
+            in_x[j] = in_h[j] = candidate * kept[j] * reset * (one - reset)
+            in_x[CELLS + j] = in_h[CELLS + j] = after[j] * (before[j] - fresh) * keep * (one - keep)
+            in_x[2 * CELLS + j], in_h[2 * CELLS + j] = candidate, candidate * reset
+            in_old[j] = after[j] * keep
+    backward_layer(net, layer, tape, gradient, row, lanes)
+    backward_layer(net, layer + 1, tape, gradient, row, lanes)
 
 
-@inside
-def _turn(features: Floats, lengths: Floats, b: Index, which: Index, values: Floats) -> None:
-    """Gradient of a change, in place, from that of its direction and of the logarithm of its length."""
-    real, at = values.dtype.type, on.CHANGES[which, 0]
-    u, v, w = features[b, at], features[b, at + 1], features[b, at + 2]
-    p, q, r = values[b, 0], values[b, 1], values[b, 2]
-    length, along = lengths[b, which], u * p + v * q + w * r
-    scale = real(0.0) if length <= real(SHORTEST) else real(1.0) / length
-    in_length = values[b, 3] / (length + real(LOG_FLOOR)) - along * scale
-    values[b, 0], values[b, 1] = p * scale + u * in_length, q * scale + v * in_length
-    values[b, 2] = r * scale + w * in_length
-
-
-@inside
-def _room(net: Net, name: Index, deltas: Tape) -> Floats:
-    """The field where the gradient of a layer's outputs stands."""
-    return rows(deltas, net.layers[name, 9])
-
-
-@inside
-def _add(net: Net, name: Index, deltas: Tape, at: Index, out: Floats) -> None:
-    """Add to out (B, PAD) the gradient of a layer's inputs from input `at` on."""
-    add_product(_room(net, name, deltas), net.layers[name, 10], net.layers[name, 2], matrix(net, name), at, out)
-
-
-@inside
-def _gate(net: Net, name: Index, tape: Tape, reached: Index, below: Index, deltas: Tape) -> None:
-    """The gradient of a layer's inputs, where these are positive, as that of the outputs of the layer below."""
-    gated_product(
-        _room(net, name, deltas),
-        net.layers[name, 10],
-        net.layers[name, 2],
-        matrix(net, name),
-        rows(tape, reached),
-        _room(net, below, deltas),
-    )
-
-
-@inside
-def _gru(net: Net, name: Index, after: Floats, work: Floats, tape: Tape, deltas: Tape) -> None:
-    """Gradients of a GRU's X and H; `after` (B, PAD), that of its new state, becomes its part in the old one's."""
-    old, one = net.layers[name + 1, 7], after.dtype.type(1.0)
-    before, gates = rows(tape, old), rows(tape, old + on.GATES_FROM_OLD)
-    given, kept = _room(net, name, deltas), _room(net, name + 1, deltas)
-    for b in range(tape.lanes):
-        for j in range(PAD):
-            reset, keep, fresh = gates[b, j], gates[b, on.KEEP + j], gates[b, on.FRESH + j]
-            in_fresh = after[b, j] * (one - keep) * (one - fresh * fresh)
-            work[b, j] = in_fresh * gates[b, on.KEPT + j] * reset * (one - reset)
-            work[b, on.KEEP + j] = after[b, j] * (before[b, j] - fresh) * keep * (one - keep)
-            work[b, on.FRESH + j], work[b, on.KEPT + j] = in_fresh, in_fresh * reset
-            after[b, j] *= keep
-        for third in range(3):
-            carry(work, third * PAD, given, third * 9, b)
-            carry(work, (third + third // 2) * PAD, kept, third * 9, b)
-    _add(net, name + 1, deltas, on.FIRST, after)
+@part
+def look_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
+    """`forward.look` backwards, and `adjoint` of the state of a lane before the step."""
+    real, at, columns = tape.dtype.type, net.columns[on.CHANGES], net.columns
+    residual, lengths = columns[on.RESIDUAL], columns[on.LENGTHS]
+    for change in range(1, 4):
+        c = at + 3 * change
+        u, v, w, p, q, r = tape[c], tape[c + 1], tape[c + 2], gradient[c], gradient[c + 1], gradient[c + 2]
+        length, along = tape[lengths + change], u * p + v * q + w * r
+        scale = real(0.0) if length <= real(SHORTEST) else real(1.0) / length
+        gradient[c], gradient[c + 1], gradient[c + 2] = (
+            (p - u * along) * scale,
+            (q - v * along) * scale,
+            (r - w * along) * scale,
+        )
+    for i in range(3):
+        evolved, updated = gradient[at + 6 + i], gradient[at + 9 + i]
+        in_residual = gradient[residual + i] + gradient[at + 3 + i]
+        adjoint.x[lane, i] += adjoint.prior_before[lane, i] + adjoint.x_before[lane, i]
+        adjoint.x[lane, i] += evolved + updated - in_residual
+        adjoint.x_before[lane, i], adjoint.prior_before[lane, i] = -evolved, -updated
+    process, prior, innovation = columns[on.PROCESS_OLD], columns[on.PRIOR_OLD], columns[on.INNOVATION_OLD]
+    for j in range(CELLS):
+        adjoint.process[lane, j], adjoint.prior[lane, j] = gradient[process + j], gradient[prior + j]
+        adjoint.innovation[lane, j] = gradient[innovation + j]

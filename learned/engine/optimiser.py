@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopoc.arrays import Floats
-from coopoc.kernels.compiling.compile import compiled, summing
-from coopoc.learned.engine.arguments import Found, Moments, Update
+from coopoc.arrays import Bools, Floats, Ints
+from coopoc.kernels.compiling.compile import compiled, part, summing
 
-from .arithmetic import Index, borrowed, part
+
+class Moments(NamedTuple):
+    """Weights, mean gradient and mean squared gradient, each (S, P)."""
+
+    theta: Floats
+    first: Floats
+    second: Floats
+
+
+class Update(NamedTuple):
+    """An optimiser step of the models `rows` (R,): its number, learning rates (R,), decoupled decay, gamma, clip.
+
+    Step 0 computes losses and gradients only, step -1 gradients only, for a given gradient in the estimates.
+    """
+
+    rows: Ints
+    step: int
+    rates: Floats
+    decay: float
+    l2: float
+    limit: float
+
+
+class Found(NamedTuple):
+    """Outputs of a step: gradients (R, P), losses (R,), whether both are finite (R,)."""
+
+    gradient: Floats
+    losses: Floats
+    finite: Bools
 
 
 @compiled
@@ -24,18 +51,17 @@ def advance(moments: Moments, found: Found, update: Update) -> None:
 
 
 @part
-def advance_row(moments: Moments, found: Found, update: Update, r: Index) -> None:
+def advance_row(moments: Moments, found: Found, update: Update, r: int) -> None:
     """`advance` of row r.
 
     References:
         Loshchilov and Hutter, ICLR 2019, algorithm 2.
     """
-    at, gradient = update.rows[r], borrowed(found.gradient[r])
-    theta, began = borrowed(moments.theta[at]), borrowed(moments.began[at])
-    first, second = borrowed(moments.first[at]), borrowed(moments.second[at])
+    at, gradient = update.rows[r], found.gradient[r]
+    theta, first, second = moments.theta[at], moments.first[at], moments.second[at]
     real = theta.dtype.type
-    l2, proximal = real(2.0 * update.l2), real(update.proximal)
-    square = _square(theta, gradient, began, l2, proximal)
+    l2 = real(2.0 * update.l2)
+    square = squared_norm(theta, gradient, l2)
     found.finite[r] = np.isfinite(found.losses[r]) and not np.isnan(square)
     if not found.finite[r]:
         return
@@ -43,25 +69,19 @@ def advance_row(moments: Moments, found: Found, update: Update, r: Index) -> Non
     keep = real(1.0 - update.rates[r] * update.decay)
     rate, size = real(-update.rates[r] / (1.0 - 0.9**update.step)), real(1.0 / (1.0 - 0.999**update.step))
     for i in range(len(theta)):
-        g = scale * _penalised(theta, gradient, began, l2, proximal, i)
+        g = scale * (gradient[i] + l2 * theta[i])
         first[i] += real(0.1) * (g - first[i])
         second[i] += real(0.001) * (g * g - second[i])
         theta[i] = keep * theta[i] + rate * first[i] / (np.sqrt(size * second[i]) + real(1e-8))
 
 
-@part
-def _penalised(theta: Floats, gradient: Floats, began: Floats, l2: Any, proximal: Any, i: Index) -> Any:
-    """Gradient of loss and penalties with respect to weight i."""
-    return gradient[i] + l2 * theta[i] + proximal * (theta[i] - began[i])
-
-
 @summing
-def _square(theta: Floats, gradient: Floats, began: Floats, l2: Any, proximal: Any) -> Any:
-    """Squared norm of the gradient with penalties, NaN if the gradient is not finite."""
+def squared_norm(theta: Floats, gradient: Floats, l2: Any) -> Any:
+    """Squared norm of the gradient of loss and penalty, NaN if the gradient is not finite."""
     real = theta.dtype.type
     square = poisoned = real(0.0)
     for i in range(len(theta)):
-        g = _penalised(theta, gradient, began, l2, proximal, i)
+        g = gradient[i] + l2 * theta[i]
         square += g * g
         poisoned += gradient[i] * real(0.0)  # NaN of NaN and of infinity
     return square + poisoned

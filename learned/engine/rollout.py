@@ -16,13 +16,14 @@ from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray, Floats, Ints
 from coopoc.errors import InputError
-from coopoc.learned.engine.arguments import Drives, Found, Moments, Update
 
 from ..training.clients import Batch
 from ..training.machine import threads
 from ..training.schedule import Moving, Schedule, update_of
-from . import descent, forward
-from .layout import Shapes, plan_of
+from . import backward, forward
+from .forward import Drives
+from .layers import Shapes, plan_of
+from .optimiser import Found, Moments, Update
 
 _NONE = np.empty(0)
 
@@ -85,8 +86,8 @@ def descend(
 
 def _descend(theta: Tensor, shapes: Shapes, batch: Batch, step: int) -> Found:
     """Gradients (S, P) without an optimiser step, for step 0 with losses."""
-    update = Update(np.arange(len(theta)), step, _NONE, 0.0, 0.0, 0.0, 0.0)
-    return _step(theta, shapes, batch, Moments(*[_array(theta, theta.dtype)] * 4), update)
+    update = Update(np.arange(len(theta)), step, _NONE, 0.0, 0.0, 0.0)
+    return _step(theta, shapes, batch, Moments(*[_array(theta, theta.dtype)] * 3), update)
 
 
 def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update: Update) -> Found:
@@ -96,10 +97,9 @@ def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update:
     truth = _array(batch.truth, theta.dtype)
     if truth.shape != drives.gnss.shape:
         raise InputError("truth", f"shape {truth.shape}", f"must be {drives.gnss.shape}", "Give one position per fix.")
-    memory = plan.memory(truth.shape[2], len(truth), True)
     gradient, losses = np.empty((models, plan.parameters), truth.dtype), np.empty(models, truth.dtype)
     found = Found(gradient, losses, np.empty(models, np.bool_))
-    _spread(descent.descend, models, moments, plan.matrices, drives, truth, memory, found, update)
+    _spread(backward.descend, models, moments, plan, drives, truth, found, update)
     return found
 
 
@@ -123,9 +123,8 @@ class _Rollout(torch.autograd.Function):
 
 def _forward(theta: Tensor, shapes: Shapes, drives: Drives) -> AnyArray:
     """Estimates (T, S, B, 3)."""
-    x, plan, (steps, models, lanes, _) = np.empty_like(drives.gnss), plan_of(shapes), drives.gnss.shape
-    weights, memory = _array(theta, theta.dtype), plan.memory(lanes, steps, False)
-    _spread(forward.forward, models, weights, plan.matrices, drives, memory, x)
+    x = np.empty_like(drives.gnss)
+    _spread(forward.forward, x.shape[1], _array(theta, theta.dtype), plan_of(shapes), drives, x)
     return x
 
 

@@ -18,7 +18,7 @@ from coopoc.world.fleet import Fleet
 
 from ..nets.gain import Gain
 from ..nets.stack import unflatten
-from .server import FLOAT32, SERVER
+from .combine import FLOAT32, SERVER
 
 AGREEMENT = 0.1
 """Excess of a round's median loss over the least one up to which the round may be selected."""
@@ -30,40 +30,38 @@ class Round:
 
     Args:
         number: of the round, 0 for the start.
-        weights: (P,) of the server, or without one the mean of the clients' weights.
+        weights: (P,) of the server.
         training_loss: (C,) m^2, of each client, NaN where its training did not complete.
         validation_loss: (C,) m^2, last report of each client: `Judge` of `weights` after this round where its answer
             was accepted, of an earlier round otherwise.
-        traffic: bytes by (sender, receiver), payload only.
+        sent: payload bytes by client.
+        received: payload bytes by client.
         rejected: reasons of rejected answers, by client.
         absent: reasons of absence, by client.
-        stragglers: share of local steps that was made, in words, by client.
         note: reason why the weights are unchanged, if they are.
-        disagreement: largest distance between the weights of two clients; 0 with a server.
     """
 
     number: int
     weights: Tensor
     training_loss: tuple[float, ...]
     validation_loss: tuple[float, ...]
-    traffic: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    sent: Mapping[str, int] = field(default_factory=dict)
+    received: Mapping[str, int] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)
     absent: Mapping[str, str] = field(default_factory=dict)
-    stragglers: Mapping[str, str] = field(default_factory=dict)
     note: str = ""
-    disagreement: float = 0.0
 
     __repr__ = short_repr
 
     @property
     def sent_bytes(self) -> int:
         """Bytes that all clients sent."""
-        return sum(size for (sender, _), size in self.traffic.items() if sender != SERVER)
+        return sum(self.sent.values())
 
     @property
     def received_bytes(self) -> int:
         """Bytes that all clients received."""
-        return sum(size for (_, receiver), size in self.traffic.items() if receiver != SERVER)
+        return sum(self.received.values())
 
     @property
     def card(self) -> dict[str, Any]:
@@ -77,12 +75,11 @@ class Federation:
     """A federated net.
 
     Args:
-        model: net of the best round; without a server, the mean of the clients' nets after it.
+        model: net of the best round.
         history: rounds, the start first.
         sizes: (C,) training pieces of each client.
         seconds: of training.
         names: (C,) of the clients.
-        own: (C, P) final weights of each client; None with a server.
     """
 
     model: Gain
@@ -90,7 +87,6 @@ class Federation:
     sizes: tuple[int, ...]
     seconds: float
     names: tuple[str, ...] = ()
-    own: Tensor | None = None
 
     __repr__ = short_repr
 
@@ -133,29 +129,22 @@ def _or_infinite(loss: float) -> float:
 
 
 def ledger(federation: Federation, overhead: int = 0) -> Ledger:
-    """Bytes of every client, and of the server if there is one, over all rounds.
-
-    Messages to several receivers in one round are sent once, the longest of them; each receiver gets its own copy.
+    """Bytes of every client and of the server over all rounds; the server broadcasts its weights once a round.
 
     Args:
         federation: with its traffic.
         overhead: bytes per message on air beyond the payload, as in `V2X`.
     """
-    instance("federation", federation, Federation, "Give what federate(...) returns.")
-    ends = {name for row in federation.history for pair in row.traffic for name in pair}
-    names = [*federation.names, *sorted(ends - set(federation.names))]
+    rounds = instance("federation", federation, Federation, "Give what federate(...) returns.").history
+    names = [*federation.names, SERVER]
     moved, messages = np.zeros((2, 2, len(names)))
-    for row in federation.history:
-        once: dict[str, int] = {}
-        for (sender, receiver), size in row.traffic.items():
-            once[sender] = max(size, once.get(sender, 0))
-            moved[1, names.index(receiver)] += size
-            messages[1, names.index(receiver)] += 1
-        for sender, size in once.items():
-            moved[0, names.index(sender)] += size
-            messages[0, names.index(sender)] += 1
-    servers = [name for name in names if name == SERVER]
-    return of_training(names, moved[0], moved[1], servers, messages, overhead)
+    for column, name in enumerate(federation.names):
+        for way, given in enumerate(([row.sent for row in rounds], [row.received for row in rounds])):
+            sizes = [row[name] for row in given if name in row]
+            moved[way, column], messages[way, column] = sum(sizes), len(sizes)
+    downloads = [max(row.received.values()) for row in rounds if row.received]
+    moved[:, -1], messages[:, -1] = (sum(downloads), moved[0].sum()), (len(downloads), messages[0].sum())
+    return of_training(names, moved[0], moved[1], [SERVER], messages, overhead)
 
 
 def card_ledger(card: Mapping[str, Any], drives: Fleet) -> Ledger:

@@ -18,8 +18,6 @@ from ..training.clients import Client, Segments
 from ..training.fit import Judge, descend, pooled
 from ..training.machine import one_core
 from ..training.schedule import Schedule, cosine, generator
-from .participation import Turn
-from .server import Group, Standing
 
 
 def local_fit(
@@ -30,7 +28,6 @@ def local_fit(
     number: int,
     rounds: int,
     local: Schedule,
-    share: float = 1.0,
 ) -> tuple[Tensor, float, str | None]:
     """The client's half of round `number`: its weights after local training, from theta (P,) and its own pieces.
 
@@ -43,15 +40,14 @@ def local_fit(
         seed: of the federation.
         number: of the round.
         rounds: in all.
-        local: schedule as `Rule.local` gives it, with the local epochs.
-        share: of the steps that are made.
+        local: schedule with the local epochs.
 
     Returns:
         Weights (P,), mean training loss m^2, and why the training failed (None: it did not).
     """
     weights, members, key = theta.detach().clone()[None], [np.arange(len(client.training))], [(seed, client.name)]
     with one_core():
-        loss, stopped = adapt(weights, model, client.training, members, key, number, rounds, local, [share])
+        loss, stopped = adapt(weights, model, client.training, members, key, number, rounds, local)
     return weights[0], float(loss[0]), stopped.get(0)
 
 
@@ -64,7 +60,6 @@ def adapt(
     number: int,
     rounds: int,
     local: Schedule,
-    shares: Sequence[float] | None = None,
 ) -> tuple[Tensor, dict[int, str]]:
     """Local training of every client in round `number`, in place: a pure function of weights, data and (seed, client).
 
@@ -76,8 +71,7 @@ def adapt(
         keys: (S,) seed and name of each client.
         number: of the round.
         rounds: in all.
-        local: schedule as `Rule.local` gives it.
-        shares: (S,) of the steps that each client makes, at least one; default all.
+        local: schedule with the local epochs.
 
     Returns:
         Mean training loss (S,) m^2, NaN for a row whose training failed, and the reasons of those.
@@ -86,8 +80,6 @@ def adapt(
     plans = [rows[local.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
     span = (number - 1) / rounds, number / rounds
     rates = [local.learning_rate * cosine(len(plan), *span) for plan in plans]
-    made = shares or [1.0] * len(plans)
-    plans = [plan[: math.ceil(share * len(plan))] for plan, share in zip(plans, made, strict=True)]
     draws, stopped = [generator(draw) for draw in streams], dict[int, str]()
     losses = torch.stack([loss for _, loss in descend(theta, like, pool, plans, rates, local, draws, stopped)], 1)
     means = [math.nan if r in stopped else losses[r, : len(plan)].mean() for r, plan in enumerate(plans)]
@@ -102,6 +94,14 @@ class Work(NamedTuple):
     failed: dict[str, str]
 
 
+class Group(NamedTuple):
+    """The clients of a federation: names, training pieces of each, and the seed of all draws."""
+
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+    seed: int
+
+
 class Stack(NamedTuple):
     """All clients of all federations as rows of one stack."""
 
@@ -111,31 +111,35 @@ class Stack(NamedTuple):
     members: Sequence[Ints]
     judge: Judge
 
-    def validated(self, standings: Sequence[Standing]) -> list[tuple[float, ...]]:
-        """Validation losses (C,) m^2 of each federation's weights, by its own clients."""
-        scores = self.judge(torch.cat([s.theta.expand_as(s.held) for s in standings]))
+    def validated(self, thetas: Sequence[Tensor]) -> list[tuple[float, ...]]:
+        """Validation losses (C,) m^2 of each federation's weights (P,), by its own clients."""
+        scores = self.judge(self._rows(thetas))
         return [tuple(part.tolist()) for part in scores.split([len(team.names) for team in self.teams])]
 
     def adapted(
-        self, standings: Sequence[Standing], turns: Sequence[Sequence[Turn]], number: int, rounds: int, local: Schedule
+        self, thetas: Sequence[Tensor], asked: Sequence[frozenset[str]], number: int, rounds: int, local: Schedule
     ) -> list[Work]:
-        """Local training of all clients that answer in a round, as one stack."""
-        keys = [(team.seed, name) for team in self.teams for name in team.names]
-        shares = [turn.share for group in turns for turn in group]
-        rows = [row for row, share in enumerate(shares) if share > 0]
-        theta, losses, stopped = torch.cat([s.held for s in standings]), torch.full((len(keys),), math.nan), {}
-        if rows:
-            active, members = theta[rows], [self.members[r] for r in rows]
-            names, made = [keys[r] for r in rows], [shares[r] for r in rows]
-            losses[rows], failed = adapt(active, self.like, self.pool, members, names, number, rounds, local, made)
-            theta[rows], stopped = active, {rows[i]: reason for i, reason in failed.items()}
-        found, at = [], 0
-        for team in self.teams:
-            span, at = range(at, at + len(team.names)), at + len(team.names)
-            done = {keys[r][1]: theta[r] for r in span if shares[r] > 0 and r not in stopped}
-            reasons = {keys[r][1]: stopped[r] for r in span if r in stopped}
-            found.append(Work(done, tuple(losses[span.start : span.stop].tolist()), reasons))
+        """Local training of all clients that are asked in a round, as one stack."""
+        keys = [(i, team.seed, name) for i, team in enumerate(self.teams) for name in team.names]
+        rows = [row for row, (i, _, name) in enumerate(keys) if name in asked[i]]
+        theta, members = self._rows(thetas)[rows], [self.members[row] for row in rows]
+        seeds = [keys[row][1:] for row in rows]
+        losses, stopped = adapt(theta, self.like, self.pool, members, seeds, number, rounds, local)
+        found = [Work({}, (), {}) for _ in self.teams]
+        trained = {keys[row][::2]: at for at, row in enumerate(rows)}
+        for i, team in enumerate(self.teams):
+            here = {name: trained[i, name] for name in team.names if name in asked[i]}
+            found[i] = Work(
+                {name: theta[at] for name, at in here.items() if at not in stopped},
+                tuple(float(losses[here[name]]) if name in here else math.nan for name in team.names),
+                {name: stopped[at] for name, at in here.items() if at in stopped},
+            )
         return found
+
+    def _rows(self, thetas: Sequence[Tensor]) -> Tensor:
+        """(S, P) weights of every client, those of its federation."""
+        pairs = zip(thetas, self.teams, strict=True)
+        return torch.cat([theta.expand(len(team.names), -1) for theta, team in pairs])
 
 
 def stacked(like: Gain, groups: Sequence[Sequence[Client]], teams: Sequence[Group]) -> Stack:

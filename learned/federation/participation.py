@@ -1,11 +1,11 @@
-"""Participation: sampling, drop-outs and stragglers of a round; heterogeneous and Byzantine clients."""
+"""Participation: the clients that a round asks; heterogeneous, poisoned and Byzantine clients."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 from torch import Tensor
 
@@ -15,65 +15,42 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, stream
 
 from ..training.clients import Client, Segments, clients
-from .rule import within
-
-
-class Turn(NamedTuple):
-    """A client's part in a round: whether it is asked, hence receives the weights, the share of its local steps that it
-    makes, and the reason of its absence (None: it answers)."""
-
-    asked: bool
-    share: float
-    absent: str | None
+from .rules import within
 
 
 @dataclass(frozen=True)
 class Participation:
-    """Random participation, drawn for every round and client from the training seed.
+    """Random participation, drawn for every round from the training seed.
 
     Args:
         share: of the clients that the server asks, at least one.
-        dropout: probability that an asked client does not answer.
-        straggle: probability that an answering client makes only a uniformly drawn share of its local steps, at least
-            one of them.
 
     Raises:
-        InputError: a number outside its range.
+        InputError: a share outside (0, 1].
 
     References:
-        McMahan et al., AISTATS 2017 (the share C); Li et al., MLSys 2020 (partial work).
+        McMahan et al., AISTATS 2017 (the share C).
 
-    >>> [turn.asked for turn in Participation(share=0.5).turns(0, 1, ["a", "b"])].count(True)
+    >>> len(Participation(share=0.5).asked(0, 1, ["a", "b"]))
     1
     """
 
     share: float = 1.0
-    dropout: float = 0.0
-    straggle: float = 0.0
 
     def __post_init__(self) -> None:
         check_options(self)
         within("share", self.share, 0 < self.share <= 1, "in (0, 1]", "1 asks all clients.")
-        for field in ("dropout", "straggle"):
-            within(field, getattr(self, field), 0 <= getattr(self, field) <= 1, "in [0, 1]", "0 for never.")
 
     def count(self, clients: int) -> int:
         """Number of clients, of so many, that are asked in a round."""
         return max(1, round(self.share * clients))
 
-    def turns(self, seed: int, number: int, names: Sequence[str]) -> list[Turn]:
-        """Turns of the named clients in round `number`; they do not depend on the order of the names."""
+    def asked(self, seed: int, number: int, names: Sequence[str]) -> frozenset[str]:
+        """The clients that are asked in round `number`; they do not depend on the order of the names."""
         lots = {name: float(stream(seed, "asked", number, name).random()) for name in names}
-        asked = set(sorted(names, key=lots.__getitem__)[: self.count(len(names))])
-        return [self._turn(seed, number, name) if name in asked else Turn(False, 0.0, "not asked") for name in names]
+        return frozenset(sorted(names, key=lots.__getitem__)[: self.count(len(names))])
 
-    def _turn(self, seed: int, number: int, name: str) -> Turn:
-        lots = stream(seed, "answer", number, name).random(3)
-        if lots[0] < self.dropout:
-            return Turn(True, 0.0, "asked, but did not answer")
-        return Turn(True, float(1.0 - lots[2]) if lots[1] < self.straggle else 1.0, None)
-
-    def answer(self, name: str, number: int, theta: Tensor, weights: Tensor) -> Tensor:
+    def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
         """Weights that the server receives from a client that trained `weights` (P,) from theta (P,): these weights."""
         return weights
 
@@ -90,14 +67,14 @@ class Byzantine(Participation):
         Blanchard et al., NeurIPS 2017, section 5; Bagdasaryan et al., How to Backdoor Federated Learning, AISTATS 2020.
 
     >>> import torch
-    >>> Byzantine(names=("a",), scale=-2.0).answer("a", 1, torch.ones(1), torch.tensor([2.0])).tolist()
+    >>> Byzantine(names=("a",), scale=-2.0).answer("a", torch.ones(1), torch.tensor([2.0])).tolist()
     [-1.0]
     """
 
     names: tuple[str, ...] = ()
     scale: float = -10.0
 
-    def answer(self, name: str, number: int, theta: Tensor, weights: Tensor) -> Tensor:
+    def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
         """Scaled if the client is Byzantine."""
         return theta + self.scale * (weights - theta) if name in self.names else weights
 

@@ -1,4 +1,4 @@
-"""Federation over Flower: a ClientApp and a ServerApp around the same local training and the same aggregation rules."""
+"""Federation over Flower: a ClientApp around the local training of `federate`, asked by Flower's own strategies."""
 
 from .client import client_app
 from .job import job_of

@@ -1,16 +1,17 @@
-"""ClientApp: a vehicle that trains on its own drive and sends a report."""
+"""ClientApp of a vehicle: it trains received weights on its own drive and answers with weights and numbers."""
 
 from __future__ import annotations
 
+import os
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, TypeAlias
 
-from torch import Tensor
+import torch
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, MissingLibraryError
 from coopoc.fleets import load_fleet, read_log
 
 from ..federation.local import local_fit
@@ -20,17 +21,32 @@ from ..training.drives import drives_of
 from ..training.fit import Judge
 from ..training.machine import one_core
 from .job import job_of, local
-from .wire import Report, answer, asked, require_flower
 
 if TYPE_CHECKING:
-    from flwr.app import Context, Message
+    from flwr.app import Context, Message, RecordDict
     from flwr.clientapp import ClientApp
 
 Source: TypeAlias = "Callable[[Context], tuple[Client, Job]]"
 
 
+def require_flower(needed_for: str) -> None:
+    """Import Flower with its telemetry off.
+
+    Raises:
+        MissingLibraryError: it is not installed.
+    """
+    os.environ.setdefault("FLWR_TELEMETRY_ENABLED", "0")
+    try:
+        import flwr.app  # noqa: F401
+    except ImportError:
+        raise MissingLibraryError("flwr", needed_for, "'coopoc[flower]'") from None
+
+
 def client_app(source: Source | None = None) -> ClientApp:
     """The ClientApp of one vehicle: `local_fit` on its own drive, hence the weights that `federate` would give it.
+
+    Any strategy of Flower's Message API can ask it: it reads "arrays" and "server-round", and answers with "arrays" and
+    "metrics", weighted by "num-examples".
 
     Args:
         source: function of the context that gives the vehicle with its pieces, and the job; default: by the
@@ -77,17 +93,29 @@ def configured(context: Context) -> tuple[Client, Job]:
 
 
 @one_core()
-def report(client: Client, job: Job, theta: Tensor, number: int, training: bool) -> Report:
-    """Validate theta (P,) on the client's own pieces and, if asked to, train on them: its half of round `number`."""
-    model = untrained(job)
-    validation = float(Judge([[client.validation], [client.long]], model)(theta[None]))
-    base = Report(client.name, len(client.training), validation)
+def answer(client: Client, job: Job, content: RecordDict, training: bool) -> RecordDict:
+    """The client's half of a round: the loss of the received weights on its own validation pieces or, if asked to
+    train, new weights and their training loss; its name, and the number of its training pieces.
+
+    Raises:
+        RuntimeError: local training failed; gives the reason.
+    """
+    from flwr.app import Array, ArrayRecord, ConfigRecord, MetricRecord, RecordDict
+
+    arrays, config, model = content["arrays"], content["config"], untrained(job)
+    theta = torch.from_numpy(next(iter(arrays.values())).numpy())  # type: ignore[union-attr]
+    metrics = MetricRecord({"num-examples": len(client.training)})
+    made = RecordDict({"metrics": metrics, "client": ConfigRecord({"name": client.name, "version": version("coopoc")})})
     if not training:
-        return base
+        metrics["validation-loss"] = float(Judge([[client.validation], [client.long]], model)(theta[None]))
+        return made
+    number: Any = config["server-round"]
     weights, loss, failure = local_fit(model, theta, client, job.setting.seed, number, job.recipe.rounds, local(job))
     if failure:
-        return replace(base, failure=failure)
-    return replace(base, weights=weights, training_loss=loss)
+        raise RuntimeError(failure)
+    metrics["training-loss"] = loss
+    made["arrays"] = ArrayRecord({"theta": Array(weights.numpy())})
+    return made
 
 
 def _replied(message: Message, context: Context, source: Source, training: bool) -> Message:
@@ -96,7 +124,7 @@ def _replied(message: Message, context: Context, source: Source, training: bool)
 
     try:
         client, job = source(context)
-        return Message(answer(report(client, job, *asked(message.content), training)), reply_to=message)
+        return Message(answer(client, job, message.content, training), reply_to=message)
     except Exception as error:
         traceback.print_exc(file=sys.stderr)
         reason = f"{type(error).__name__} in the client, see its own log"

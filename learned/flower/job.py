@@ -11,7 +11,6 @@ from typing import Any
 from coopoc.errors import InputError
 from coopoc.plugins import unknown
 
-from ..federation.aggregate import rule
 from ..recipes import Job, Recipe, Setting, recipe_of
 from ..training.schedule import Schedule
 
@@ -49,8 +48,7 @@ def job_of(config: Mapping[str, Any]) -> Job:
 
 def local(job: Job) -> Schedule:
     """The schedule of a client's round."""
-    recipe = job.recipe
-    return rule(recipe.aggregate).local(replace(recipe.schedule, epochs=recipe.local_epochs, epoch=recipe.local_epoch))
+    return replace(job.recipe.schedule, epochs=job.recipe.local_epochs, epoch=job.recipe.local_epoch)
 
 
 def _words(text: str) -> dict[str, Any]:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import logging
-import math
 import os
 import tempfile
-import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
 
 from coopoc.errors import MissingLibraryError
 from coopoc.file_names import given_path
@@ -23,12 +22,8 @@ from ..checkpoint import Checkpoint, load, read_card, save
 from ..recipes import Job, job_clients
 from ..training.clients import Client
 from ..training.drives import Drives
-from ..training.machine import watched
-from .ask import Wait
-from .client import Source, client_app
-from .rows import Row, checkpoint
-from .server import rounds, server_app
-from .wire import require_flower
+from .client import Source, client_app, require_flower
+from .server import Row, checkpoint, rounds, server_app
 
 if TYPE_CHECKING:
     from flwr.app import Context
@@ -67,7 +62,7 @@ def train(job: Job, fleet: Drives, out: Path | str, progress: bool = True) -> di
 
 
 def simulate(job: Job, fleet: Drives, progress: str | None = None, processes: int = 2) -> Checkpoint:
-    """The checkpoint of a federation on Flower's simulation engine, with the weights of `federate`.
+    """The checkpoint of a federation on Flower's simulation engine, with the weights of `federate`, to rounding.
 
     Args:
         job: recipe and setting.
@@ -79,22 +74,18 @@ def simulate(job: Job, fleet: Drives, progress: str | None = None, processes: in
         MissingLibraryError: Flower or its simulation engine is not installed.
     """
     require_flower("training with --flower")
-    rows, began, over = list[Row](), time.perf_counter(), threading.Event()
+    rows, began, fleet_size = list[Row](), time.perf_counter(), len(fleet.ids)
+    bar = tqdm(total=job.recipe.rounds + 1, desc=progress, unit="round", disable=progress is None)
 
-    def pause(seconds: float) -> None:
-        if over.wait(seconds):
-            raise InterruptedError("the simulation is over")
+    def keep(row: Row) -> None:
+        rows.append(row)
+        bar.update()
 
     def lead(grid: Grid, context: Context) -> None:
-        done = rounds(grid, job, len(fleet.ids), Wait(DAY, math.inf, pause))
-        rows.extend(watched(done, progress, "round", job.recipe.rounds + 1))
+        rounds(grid, job, fleet_size, DAY, keep)
 
-    source = partial(partition, fleet=fleet, job=job)
-    with ThreadPoolExecutor(1) as thread:  # not here: Flower's threads would outlive a Ctrl-C
-        try:
-            thread.submit(_simulate, lead, source, len(fleet.ids), processes).result()
-        finally:
-            over.set()
+    with bar:
+        _simulate(lead, partial(partition, fleet=fleet, job=job), fleet_size, processes)
     made = checkpoint(rows, job, time.perf_counter() - began)
     card = {**made.card, "key": job.key(fleet), "fleet": fleet.name, "digest": fleet.digest}
     return replace(made, model=made.model.calibrate([client.training for client in job_clients(job, fleet)]), card=card)

@@ -127,12 +127,6 @@ class Recurrent(Gain):
             rows.append(torch.func.functional_call(self, weights, given).transpose(0, 1))
         return torch.stack(rows, 1)
 
-    def by_rollout(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """`forward` by the `rollout` of one net, where that is the faster."""
-        theta = nn.utils.parameters_to_vector(self.parameters())
-        lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)
-        return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
-
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each segment, mean over time, sum over components, m^2.
 

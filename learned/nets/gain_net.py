@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, Ints, instance, number
+from coopoc.arrays import Floats, Ints, number
 
 from ..engine import rollout as engine
-from ..engine.places import CELLS, LOG_FLOOR, SHORTEST, SIZE
+from ..engine.layers import CELLS, SHORTEST, SIZE
 from ..training.clients import Batch
 from ..training.schedule import Moving, Schedule
 from .gain import Recurrent, seed_of, size
@@ -46,8 +46,6 @@ class GainNet(Recurrent):
         out_mult: width of the layer that forms the gain.
         start_gain: diagonal of the untrained gain; the last layer's random weights are then scaled by 0.1.
         seed: of the initial weights.
-        magnitudes: each direction comes with log(length + 0.01 m), which the paper's net does not see; 18 i more
-            parameters.
 
     References:
         Revach et al., KalmanNet, IEEE TSP 2022 (architecture 2).
@@ -63,19 +61,17 @@ class GainNet(Recurrent):
         out_mult: int = 5,
         start_gain: float | None = 0.1,
         seed: int = 0,
-        magnitudes: bool = False,
     ) -> None:
         super().__init__()
         self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
-        self.magnitudes = instance("magnitudes", magnitudes, bool, "Give True or False.")
         if start_gain is not None:
             start_gain = number("start_gain", start_gain, -np.inf, hint="KalmanNet's own start is None, ours 0.1.")
-        wide, both, seen = SIZE * in_mult, 2 * CELLS, SIZE + magnitudes
+        wide, both = SIZE * in_mult, 2 * CELLS
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_of(seed))
-            self.update = nn.Linear(seen, wide)
-            self.evolution = nn.Linear(seen, wide)
-            self.observation = nn.Linear(2 * seen, 2 * wide)
+            self.update = nn.Linear(SIZE, wide)
+            self.evolution = nn.Linear(SIZE, wide)
+            self.observation = nn.Linear(2 * SIZE, 2 * wide)
             self.process = nn.GRUCell(wide, CELLS)
             self.prior = nn.GRUCell(CELLS + wide, CELLS)
             self.prior_to_innovation = nn.Linear(CELLS, CELLS)
@@ -119,9 +115,9 @@ class GainNet(Recurrent):
         missing = gnss.isnan().all(1, keepdim=True)
         fix = torch.where(missing, memory.gnss_before, gnss)
         x_prior = memory.x + dt * velocity
-        observed = self._features(fix - memory.gnss_before, fix - x_prior)
-        evolved = self._features(memory.x - memory.x_before)
-        updated = self._features(memory.x - memory.prior_before)
+        observed = torch.cat([_direction(fix - memory.gnss_before), _direction(fix - x_prior)], 1)
+        evolved = _direction(memory.x - memory.x_before)
+        updated = _direction(memory.x - memory.prior_before)
 
         process = self.process(self.update(updated).relu(), memory.process)
         prior = self.prior(torch.cat([process, self.evolution(evolved).relu()], 1), memory.prior)
@@ -138,21 +134,20 @@ class GainNet(Recurrent):
         after = Memory(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True)))
         return after, matrix, (process, prior, innovation)
 
-    def _features(self, *changes: Tensor) -> Tensor:
-        """Directions of changes (B, 3) m, one after the other, and after them the logarithms of their lengths."""
-        lengths = [torch.linalg.vector_norm(change, dim=1, keepdim=True) for change in changes]
-        units = [
-            torch.where(length > SHORTEST, change / length.clamp_min(SHORTEST), 0.0)
-            for change, length in zip(changes, lengths, strict=True)
-        ]
-        logs = [(length + LOG_FLOOR).log() for length in lengths] if self.magnitudes else []
-        return torch.cat([*units, *logs], 1)
-
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (B, T, 3) m as in `Recurrent`; compiled, except for inputs with gradients or on another device."""
-        plain = any(a.requires_grad or a.device.type != "cpu" for a in (gnss, velocity, x0))
-        return super().forward(gnss, velocity, x0, dt) if plain else self.by_rollout(gnss, velocity, x0, dt)
+        if any(a.requires_grad or a.device.type != "cpu" for a in (gnss, velocity, x0)):
+            return super().forward(gnss, velocity, x0, dt)
+        theta = nn.utils.parameters_to_vector(self.parameters())
+        lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)
+        return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
 
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (T, S, B, 3) m as in `Recurrent`, compiled."""
         return engine.rollout(theta, self.shapes, gnss, velocity, x0, dt)
+
+
+def _direction(change: Tensor) -> Tensor:
+    """Changes (B, 3) m divided by their lengths, zero where there is none."""
+    length = torch.linalg.vector_norm(change, dim=1, keepdim=True)
+    return torch.where(length > SHORTEST, change / length.clamp_min(SHORTEST), 0.0)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from .gain import Recurrent, seed_of, size
-from .stack import Layer, layers
+from .stack import Layer, Layers, gru, layers
 
 SIZE = 3
 START_GAIN = 0.1
@@ -68,54 +68,43 @@ class SplitGain(Recurrent):
 
     def step(self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Memory, Tensor]:
         """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3)."""
-        missing = gnss.isnan().any(1, keepdim=True)
-        fix, prior = torch.where(missing, memory.gnss_before, gnss), memory.x + dt * velocity
-        changes = (memory.x - memory.x_before, memory.x - memory.prior_before), (fix - memory.gnss_before, fix - prior)
-        seen = [(torch.cat(pair, 1) / SCALE).asinh() / 2 for pair in changes]
-        parts = zip(self.see, self.cell, seen, memory.hidden, strict=True)
-        hidden = [cell(see(given).relu(), state) for see, cell, given, state in parts]
-        first, second = (part(h).view(-1, SIZE, SIZE) for part, h in zip(self.factor, hidden, strict=True))
-        gain = torch.where(missing[:, :, None], 0.0, first @ second)
-        x = prior + (gain @ (fix - prior).unsqueeze(-1)).squeeze(-1)
-        after = torch.where(missing, memory.hidden, torch.stack(hidden))
-        return Memory(after, x, memory.x, torch.where(missing, memory.prior_before, prior), fix), gain
+        net = self._layers(nn.utils.parameters_to_vector(self.parameters())[None])
+        stacked = Memory(memory.hidden, *(position[None] for position in memory[1:]))
+        after, gain = self._advance(net, stacked, gnss[None], (dt * velocity)[None])
+        return Memory(after.hidden, *(position[0] for position in after[1:])), gain[0]
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (B, T, 3) m as in `Recurrent`, by `rollout`."""
-        return self.by_rollout(gnss, velocity, x0, dt)
+        theta = nn.utils.parameters_to_vector(self.parameters())
+        lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)
+        return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
 
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (T, S, B, 3) m as in `Recurrent`: `step` with both nets of all S as rows of one product."""
-        models, lanes = x0.shape[:2]
-        names = ("see_{}", "cell_{}_ih", "cell_{}_hh", "factor_{}")
-        see, into, back, factor = (self._pair(theta, name) for name in names)
-        hidden = torch.zeros(2 * models, lanes, self.hidden, dtype=x0.dtype)
-        x = x_before = prior_before = gnss_before = x0
+        """Estimates (T, S, B, 3) m as in `Recurrent`, of all S nets at once."""
         spans = torch.as_tensor(dt, dtype=x0.dtype).expand(len(gnss))
-        estimates, whole = [], bool(gnss.isfinite().all())
-        for given, move in zip(gnss.unbind(), (spans[:, None, None, None] * velocity).unbind(), strict=True):
-            there = None if whole else given.isfinite().all(-1, keepdim=True)
-            fix, prior = given if there is None else torch.where(there, given, gnss_before), x + move
-            changes = torch.stack([x - x_before, x - prior_before, fix - gnss_before, fix - prior])
-            seen = ((changes / SCALE).asinh() / 2).view(2, 2, models, lanes, SIZE).permute(0, 2, 3, 1, 4)
-            seen = see(seen.reshape(2 * models, lanes, 2 * SIZE)).relu()
-            gates, fresh = into(seen).split([2 * self.hidden, self.hidden], 2)
-            more, kept = back(hidden).split([2 * self.hidden, self.hidden], 2)
-            reset, keep = (gates + more).sigmoid().chunk(2, 2)
-            after = torch.lerp(torch.addcmul(fresh, reset, kept).tanh(), hidden, keep)
-            first, second = factor(after).view(2, models, lanes, SIZE, SIZE)
-            correction = (first @ (second @ (fix - prior).unsqueeze(-1))).squeeze(-1)
-            if there is not None:
-                correction, prior_before = torch.where(there, correction, 0.0), torch.where(there, prior, prior_before)
-                after = torch.where(there.repeat(2, 1, 1), after, hidden)
-            hidden, prior_before = after, prior if there is None else prior_before
-            x_before, x, gnss_before = x, prior + correction, fix
-            estimates.append(x)
+        hidden = torch.zeros(2 * len(x0), x0.shape[1], self.hidden, dtype=x0.dtype)
+        net, memory, estimates = self._layers(theta), Memory(hidden, x0, x0, x0, x0), []
+        for fix, moved in zip(gnss, spans[:, None, None, None] * velocity, strict=True):
+            memory, _ = self._advance(net, memory, fix, moved)
+            estimates.append(memory.x)
         return torch.stack(estimates)
 
-    def _pair(self, theta: Tensor, name: str) -> Layer:
-        """A layer of both nets, one after the other, as 2 S rows."""
-        net = layers(theta, self)
-        both = [net[name.format(i)] for i in range(2)]
-        weight, bias = torch.cat([layer.weight for layer in both]), torch.cat([layer.bias for layer in both])
-        return Layer(weight, bias, weight.mT)
+    def _advance(self, net: Layers, memory: Memory, gnss: Tensor, moved: Tensor) -> tuple[Memory, Tensor]:
+        """One step of S nets, the two halves of each as 2 S rows: fix and motion (S, B, 3) m -> memory, gain."""
+        missing, (models, lanes) = gnss.isnan().any(-1, keepdim=True), gnss.shape[:2]
+        fix, prior = torch.where(missing, memory.gnss_before, gnss), memory.x + moved
+        changes = memory.x - memory.x_before, memory.x - memory.prior_before, fix - memory.gnss_before, fix - prior
+        seen = ((torch.stack(changes) / SCALE).asinh() / 2).view(2, 2, models, lanes, SIZE).permute(0, 2, 3, 1, 4)
+        seen = net["see"](seen.reshape(2 * models, lanes, 2 * SIZE)).relu()
+        hidden = torch.where(missing.repeat(2, 1, 1), memory.hidden, gru(net, "cell", seen, memory.hidden))
+        first, second = net["factor"](hidden).view(2, models, lanes, SIZE, SIZE)
+        gain = torch.where(missing[..., None], 0.0, first @ second)
+        x = prior + (gain @ (fix - prior).unsqueeze(-1)).squeeze(-1)
+        return Memory(hidden, x, memory.x, torch.where(missing, memory.prior_before, prior), fix), gain
+
+    def _layers(self, theta: Tensor) -> Layers:
+        """Layers of both halves, one after the other, as 2 S rows, under the names see, cell_ih, cell_hh, factor."""
+        net, names = layers(theta, self), ("see_{}", "cell_{}_ih", "cell_{}_hh", "factor_{}")
+        both = {name.replace("_{}", ""): [net[name.format(i)] for i in range(2)] for name in names}
+        joined = {name: [torch.cat(parts) for parts in zip(*pair, strict=True)] for name, pair in both.items()}
+        return {name: Layer(weight, bias, weight.mT) for name, (weight, bias, _) in joined.items()}

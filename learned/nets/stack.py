@@ -73,3 +73,15 @@ def layers(theta: Tensor, like: nn.Module) -> Layers:
         for name, weight in views.items()
         if "weight" in name
     }
+
+
+def gru(net: Layers, name: str, x: Tensor, h: Tensor) -> Tensor:
+    """State (S, B, H) of stacked GRU cells after an input x (S, B, n); torch's GRUCell is the same for one net.
+
+    r, z = sigmoid(W x + U h);  n = tanh(W x + r (U h));  h <- n + z (h - n), biases inside W and U.
+    """
+    size = h.shape[-1]
+    gates, fresh = net[f"{name}_ih"](x).split([2 * size, size], -1)
+    more, kept = net[f"{name}_hh"](h).split([2 * size, size], -1)
+    reset, keep = (gates + more).sigmoid().chunk(2, -1)
+    return torch.lerp(torch.addcmul(fresh, reset, kept).tanh(), h, keep)

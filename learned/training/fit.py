@@ -160,7 +160,7 @@ def descend(
     A model whose loss or gradient is not finite is left as it is from then on and its reason is put into `stopped`;
     models with shorter plans wait for the longest. Their loss is NaN.
     """
-    moving = Moving(theta, theta.clone(), torch.zeros_like(theta), torch.zeros_like(theta))
+    moving = Moving(theta, torch.zeros_like(theta), torch.zeros_like(theta))
     for step in range(max(map(len, plans))):
         rows = [row for row, plan in enumerate(plans) if step < len(plan) and row not in stopped]
         losses = np.full(len(plans), math.nan, np.float32)

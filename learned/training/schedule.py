@@ -11,18 +11,18 @@ import torch
 from torch import Tensor
 
 from coopoc.arrays import Floats, Ints
-from coopoc.learned.engine.arguments import Found, Moments, Update
 from coopoc.methods.options import Limits, check_options
 from coopoc.plugins import one_of
 
-from ..engine import optimiser
+from ..engine.optimiser import Found, Moments, Update
+from ..engine.optimiser import advance as advanced
 
 Epoch = Literal["step", "pass"]
 STEPS, SIZE = (1, 10**7, "> 0 and at most 10^7"), (sys.float_info.min, sys.float_info.max, "> 0 and finite")
 LIMITS: Limits = {
     **dict.fromkeys(("epochs", "batch", "checks"), STEPS),
     **dict.fromkeys(("learning_rate", "clip"), SIZE),
-    **dict.fromkeys(("weight_decay", "l2", "proximal"), (0.0, sys.float_info.max, ">= 0, and 0 for none")),
+    **dict.fromkeys(("weight_decay", "l2"), (0.0, sys.float_info.max, ">= 0, and 0 for none")),
 }
 """Of a Schedule's numbers."""
 
@@ -43,8 +43,6 @@ class Schedule:
     """Decoupled from the gradient (AdamW), the paper's number."""
     l2: float = 0.0
     """gamma of the paper's gamma ||theta||^2 in the loss; weaker than the decoupled decay under static noise."""
-    proximal: float = 0.0
-    """mu of FedProx's mu / 2 ||theta - theta_start||^2 in the loss: how far training may leave where it started."""
     clip: float = 1.0
     """Largest norm of a model's gradient."""
     mirror: bool = True
@@ -68,10 +66,9 @@ class Schedule:
 
 
 class Moving(NamedTuple):
-    """State of the optimiser for S models in rows (S, P): weights, their start, mean gradient, mean square."""
+    """State of the optimiser for S models in rows (S, P): weights, mean gradient, mean square."""
 
     theta: Tensor
-    began: Tensor
     first: Tensor
     second: Tensor
 
@@ -92,7 +89,7 @@ def advance(
 ) -> Tensor:
     """One optimiser step in place for `rows` of the weights and moments; whether each was taken, (R,) booleans.
 
-    The gradient of the penalties gamma ||theta||^2 + mu / 2 ||theta - began||^2 is added, the sum clipped, and AdamW
+    The gradient of the penalty gamma ||theta||^2 is added, the sum clipped, and AdamW
     (beta 0.9, 0.999) moves the weights; a row whose loss or gradient is not finite does not change.
 
     Args:
@@ -102,19 +99,19 @@ def advance(
         rows: (R,) models to move.
         step: number of the step, >= 1.
         rates: (R,) learning rates.
-        schedule: decay, penalties, clipping.
+        schedule: decay, penalty, clipping.
 
     References:
         Loshchilov and Hutter, ICLR 2019, algorithm 2.
     """
     found = Found(gradient.numpy(), losses.numpy(), np.empty(len(rows), np.bool_))
-    optimiser.advance(Moments(*(a.numpy() for a in moving)), found, update_of(rows, step, rates, schedule))
+    advanced(Moments(*(a.numpy() for a in moving)), found, update_of(rows, step, rates, schedule))
     return torch.from_numpy(found.finite)
 
 
 def update_of(rows: Ints, step: int, rates: Floats, schedule: Schedule) -> Update:
     """The step as the compiled optimiser takes it."""
-    law = schedule.weight_decay, schedule.l2, schedule.proximal, schedule.clip
+    law = schedule.weight_decay, schedule.l2, schedule.clip
     return Update(rows, step, rates, *map(float, law))
 
 

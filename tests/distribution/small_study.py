@@ -14,10 +14,9 @@ import numpy as np
 from coopoc.evaluate.metrics import max_error, rt_le
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.kalman import GNSS, Kalman
-from coopoc.study.pivot import pivot
 from coopoc.study.results import Results
 from coopoc.study.study import Params, Row, Study
-from coopoc.study.tables import Table
+from coopoc.study.tables import Table, pivot
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe

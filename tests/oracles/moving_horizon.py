@@ -138,3 +138,9 @@ def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bo
         covs[now] = cov[i : i + 3, i : i + 3]
         found.update({(v, now): x[v, now] for v in drive.star[now]})
     return found, covs
+
+
+def fixed_lag(drive: Drive, lag: int, exact: bool) -> Any:
+    """Points by (vehicle, step) and the ego's covariances of the newest step: messages count when they arrive, and each
+    step makes one Gauss-Newton step."""
+    return moving_horizon(drive, lag + 1, exact, 0, late=False)

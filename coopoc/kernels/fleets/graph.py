@@ -18,7 +18,7 @@ from ..stars.relative import at_measurement, completed, exact
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
-Measurement = tuple[float, float, float, float, float]
+Measurement = tuple[float, ...]
 Information = tuple[Matrix, Vector]
 VECTOR: Vector = (0.0, 0.0, 0.0)
 MATRIX: Matrix = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

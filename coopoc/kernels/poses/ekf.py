@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from .odometry import PoseNoise, join, predict
-from .scalar_update import COST, USED, Poses, settle, update_fix, update_heading, update_relative
+from .scalar_update import ALONE, COST, USED, ZERO, Poses, settle, update_fix, update_heading, update_relative
 
 UNPLACED = 7
 """Bits of all components: nothing is known of the position of one of the two."""
@@ -90,7 +90,7 @@ def run_filter(
                         x[run, t, k, i] = poses.x[d * k + i]
                         for j in range(d):
                             cov[run, t, k, i, j] = poses.cov[d * k + i, d * k + j]
-        cost[run, 0], cost[run, 1] = poses.count[COST], poses.count[USED]
+        cost[run, 0], cost[run, 1] = poses.totals[COST], poses.totals[USED]
     return x, cov, cost
 
 
@@ -109,7 +109,7 @@ def step(
     """One step of all members: prediction, then each one's compass and fix, then the relative measurements."""
     d = options.d
     if t == 0:
-        poses.count[COST] = poses.count[USED] = 0.0
+        poses.totals[COST] = poses.totals[USED] = 0.0
     for k in range(measured.own.shape[2]):
         own, member = measured.own[run, t, k], d * k
         if measured.active[t, k] and t > 0 and measured.active[t - 1, k]:
@@ -156,7 +156,8 @@ def update_jointly(
             poses.x[:], poses.cov[:] = poses.prior_x, poses.prior_cov
         for k in range(begin, end):
             ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
-            left_out[k - begin] = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])
+            bits = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])
+            left_out[k - begin] = bits
         settle(poses)
 
 
@@ -196,7 +197,7 @@ def fuse_pair(
         IROS 2013.
     """
     d, observer, other = options.d, options.d * measured.ends[k, 0], options.d * measured.ends[k, 1]
-    ends = (np.int64(0), np.int64(d) if other >= 0 else np.int64(-1))
+    ends = (ZERO, d if other >= 0 else ALONE)
     tries = TRIED if options.fusion == INTERSECTION and other >= 0 else 0
     best, chosen = math.inf, 1.0
     for attempt in range(tries + 1):
@@ -207,7 +208,7 @@ def fuse_pair(
             set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
-        add_relative(measured, noise, pair, ends, run, k, np.int64(0))
+        add_relative(measured, noise, pair, ends, run, k, ZERO)
         settle(pair)
         total = 0.0
         for i in range(d):

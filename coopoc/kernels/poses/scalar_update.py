@@ -25,6 +25,9 @@ NEAREST = 1e-3
 """m, least distance at which an angle is linearised."""
 Ends = tuple[int, int]
 """First number of the member and of the other, -1 for none."""
+ALONE: Any = np.int64(-1)
+ZERO: Any = np.int64(0)
+"""Numbers of the type of a variable: a literal would compile a function of ends once more."""
 Row = tuple[float, float, float, float]
 Three = tuple[float, float, float]
 
@@ -41,7 +44,7 @@ class Poses(NamedTuple):
         columns: (ROWS, size) P h of pending rows.
         gains: (ROWS, size) P h / s of these.
         weights: (ROWS,) 1 / s of these.
-        count: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
+        totals: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
     x: Floats
@@ -52,7 +55,7 @@ class Poses(NamedTuple):
     columns: Floats
     gains: Floats
     weights: Floats
-    count: Floats
+    totals: Floats
 
 
 COST, USED, PENDING = range(3)
@@ -83,9 +86,9 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     Returns:
         Whether the measurement is used.
     """
-    if poses.count[PENDING] == ROWS:
+    if poses.totals[PENDING] == ROWS:
         settle(poses)
-    cov, columns, pending, (k, o), (a, b, c, h) = poses.cov, poses.columns, int(poses.count[PENDING]), ends, row
+    cov, columns, pending, (k, o), (a, b, c, h) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
     tiles = len(poses.x) // LANES
     for tile in range(tiles):
         x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
@@ -102,7 +105,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     s = variance + along(columns, pending, ends, row)
     weight = 1.0 / s
     square = residual * residual * weight
-    poses.count[COST] += min(square, gate * gate) + math.log(s)
+    poses.totals[COST] += min(square, gate * gate) + math.log(s)
     if square > gate * gate:
         return False
     for tile in range(tiles):
@@ -110,8 +113,8 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
         put(poses.x, uint64(tile), plus(take(poses.x, uint64(tile)), residual * weight, column))
         put(poses.gains, uint64(pending * tiles + tile), weight * column)
     poses.weights[pending] = weight
-    poses.count[USED] += 1.0
-    poses.count[PENDING] += 1.0
+    poses.totals[USED] += 1.0
+    poses.totals[PENDING] += 1.0
     return True
 
 
@@ -135,7 +138,7 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
 def settle(poses: Poses) -> None:
     """Apply the pending rows to the covariance, which is read once for all of them."""
     size, tiles, gains = len(poses.x), len(poses.x) // LANES, poses.gains
-    pending = int(poses.count[PENDING])
+    pending = int(poses.totals[PENDING])
     for q in range(pending, ROWS if pending > 0 else 0):
         for i in range(size):
             gains[q, i] = 0.0
@@ -148,7 +151,7 @@ def settle(poses: Poses) -> None:
                 left = less(left, r, entries(poses.columns, 2, tile, tiles))
                 left = less(left, s, entries(poses.columns, 3, tile, tiles))
                 put(poses.cov, uint64(i * tiles + tile), left)
-    poses.count[PENDING] = 0.0
+    poses.totals[PENDING] = 0.0
 
 
 @part
@@ -161,7 +164,7 @@ def wrapped(angle: float) -> float:
 def update_heading(poses: Poses, member: int, heading: float, variance: float, gate: float) -> None:
     """A compass heading rad."""
     residual = wrapped(heading - poses.x[member + HEADING])
-    update_row(poses, (member, np.int64(-1)), (0.0, 0.0, 0.0, 1.0), residual, variance, gate)
+    update_row(poses, (member, ALONE), (0.0, 0.0, 0.0, 1.0), residual, variance, gate)
 
 
 @part
@@ -169,7 +172,7 @@ def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: flo
     """A position m."""
     for axis in range(3):
         row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0)
-        update_row(poses, (member, np.int64(-1)), row, fix[axis] - poses.x[member + axis], variance[axis], gate)
+        update_row(poses, (member, ALONE), row, fix[axis] - poses.x[member + axis], variance[axis], gate)
 
 
 @part

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import add, add_diagonal, first3, load, square, store, subtract, times, zeros
 from ..compiling.vectors import LANES, unrolled
 from .elimination import predict, rescale
 from .joint import Joint, block_of, joint_within, place_on_broadcast, predict_state, rearrange
-from .joint_filter import Estimates, update, write
+from .joint_filter import update, write
 from .messages import (
     MOVED,
     NEW,
@@ -25,11 +23,13 @@ from .messages import (
     ROW,
     VARIANCE,
     Assumptions,
+    Estimates,
     Measurements,
     Star,
     clear,
     gather,
     largest,
+    new_estimates,
     star_within,
 )
 from .relative import Numbers
@@ -51,7 +51,7 @@ class Drift(NamedTuple):
 def run_filter(seen: Measurements, known: Assumptions, refine: bool, drift: Drift) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
     runs, steps = seen.gnss.shape[:2]
-    out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
+    out = new_estimates(seen)
     most = largest(seen.start) + 1
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE

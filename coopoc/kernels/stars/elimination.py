@@ -37,7 +37,7 @@ def eliminate(
     Returns the last of them, -Cov of the last block. The next pivot is inverted as soon as its row is ready, while the
     rows below are still worked on. `memory` holds n blocks.
     """
-    p = negate(inverse(load(source, 0, block)))
+    p: Numbers = negate(inverse(load(source, 0, block)))
     for k in range(n):
         first = k * stride
         v = minus_apply(p, load(eta, k, row))

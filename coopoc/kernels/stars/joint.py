@@ -147,14 +147,16 @@ def predict_state(star: Star, joint: Joint, n: int, old: int, row: Numbers) -> N
 def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
     seen = load(star.relative, k, RELATIVE)
-    measured = add(ego, vector(seen))
+    measured: Numbers = add(ego, vector(seen))
     if not incomplete(seen):
         return measured
     lacks = seen[5] + seen[6] + seen[7] - (0.0 * seen[0] + 1e300)
     new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
     near = seen[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
-    return choose_each(lacks, choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere), measured)
+    broadcast = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere)
+    place: Numbers = choose_each(lacks, broadcast, measured)
+    return place
 
 
 @inner
@@ -176,7 +178,8 @@ def placed(joint: Joint, k: int, seen: Numbers, row: Numbers) -> float:
     own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
     whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
     one = 0.0 * own + 1.0
-    return choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    share: float = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    return share
 
 
 @inside

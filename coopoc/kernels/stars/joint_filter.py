@@ -5,11 +5,6 @@ No matrix is ever inverted as a whole. A drive and a stream call the same `step`
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
-import numpy as np
-
-from ...arrays import Floats
 from ..compiling.compile import as_written, inner
 from ..compiling.small import load, negate, square, store, subtract
 from ..compiling.vectors import LANES
@@ -36,17 +31,16 @@ from .messages import (
     ROW,
     VARIANCE,
     Assumptions,
+    Estimates,
     Measurements,
     Star,
     clear,
     gather,
     largest,
+    new_estimates,
     star_within,
 )
 from .relative import Numbers
-
-Estimates: TypeAlias = tuple[Floats, Floats, Floats]
-"""x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
 
 
 @as_written
@@ -59,7 +53,7 @@ def run_filter(seen: Measurements, known: Assumptions, refine: bool) -> Estimate
         refine: one Gauss-Newton step on range and angles.
     """
     runs, steps = seen.gnss.shape[:2]
-    out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
+    out = new_estimates(seen)
     most = largest(seen.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE

@@ -2,34 +2,34 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.small import add, add_diagonal, load, negate, scale, square, store, subtract
+from ..compiling.small import add, add_diagonal, load, negate, scale, square, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
 from .elimination import predict
-from .joint import Joint, joint_within, move, predict_state, rearrange, solve
-from .joint_filter import Estimates, add_fixes, write
+from .joint import Joint, add_relative, joint_within, move, predict_state, rearrange, solve
+from .joint_filter import add_fixes, write
 from .messages import (
     NONE,
     RELATIVE,
     ROW,
     Assumptions,
+    Estimates,
     Measurements,
     Star,
     clear,
     gather,
     largest,
+    new_estimates,
     star_within,
 )
 from .relative import Numbers, vector
 
 
 @as_written
-def run_filter(seen: Measurements, known: Assumptions) -> Estimates:
+def run_lkf_sa(seen: Measurements, known: Assumptions) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
     runs, steps = seen.gnss.shape[:2]
-    out = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
+    out = new_estimates(seen)
     most = largest(seen.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
@@ -79,16 +79,16 @@ def add_laplacian(star: Star, joint: Joint, known: Assumptions, n: int) -> None:
     if len(std):
         outer = choose(count, 3.0 * count / max(total, o + 1e-300), outer)
         central = outer / max(count, o + 1.0)
-    to_ego = count * central + outer
     for k in range(1, n):
         edge, gap = edge_to(star, joint, k)
-        store(joint.eta, k - 1, add(load(joint.eta, k - 1, ROW), add(scale(gap, outer), scale(gaps, edge * central))))
-        add_at(joint, (k - 1) * stride + k - 1, outer * edge)
-        add_at(joint, (k - 1) * stride + e, -edge * to_ego)
-        for j in range(k, n):
-            add_at(joint, (k - 1) * stride + j - 1, central * edge * edge_to(star, joint, j)[0])
-    store(joint.eta, e, subtract(load(joint.eta, e, ROW), scale(gaps, to_ego)))
-    add_at(joint, e * stride + e, count * to_ego)
+        weight = add_diagonal(zeros(o, square(ROW)), (outer * edge, outer * edge, outer * edge))
+        add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer), ROW)
+    for i in range(n):
+        row = count if i == e else -edge_to(star, joint, i + 1)[0]
+        store(joint.eta, i, subtract(load(joint.eta, i, ROW), scale(gaps, row * central)))
+        for j in range(i, n):
+            other = count if j == e else -edge_to(star, joint, j + 1)[0]
+            add_at(joint, i * stride + j, central * row * other)
 
 
 @inside

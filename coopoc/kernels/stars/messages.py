@@ -27,8 +27,12 @@ SENT, USES, AGE, HELD, NEW = range(5)
 age in steps, 1 if there is one, and 1 if its position counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
+Index: TypeAlias = Any
+"""An integer, NumPy's unsigned one where the compiler need not look for negative ones."""
 Three: TypeAlias = tuple[float, float, float]
 Five: TypeAlias = tuple[float, float, float, float, float]
+Estimates: TypeAlias = tuple[Floats, Floats, Floats]
+"""x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
 ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
@@ -128,6 +132,13 @@ def star_in(memory: Floats, columns: Ints, most: int) -> Star:
 def star_within(most: int) -> Star:
     """Room for `most` members, made by compiled code."""
     return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)
+
+
+@storage
+def new_estimates(seen: Measurements) -> Estimates:
+    """Room for the estimates of all runs and steps, made by compiled code."""
+    runs, steps = seen.gnss.shape[:2]
+    return np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
 
 
 def new_star(most: int) -> Star:
@@ -247,7 +258,7 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
 
 @inner
 def write_ego(
-    out: tuple[Floats, Floats, Floats],
+    out: Estimates,
     star: Star,
     x: Floats,
     cov: Floats,
@@ -288,16 +299,17 @@ def measured(relative: Floats, seen: Five, std: Floats, k: int, lane: int) -> No
 
 
 @inside
-def three_of(values: Floats, run: int, t: int, member: int) -> Three:
+def three_of(values: Any, run: Index, t: Index, member: Index) -> Three:
     """Three of what is broadcastable to (R, T, N, 3)."""
     one = uint64(1)
-    i, j = min(run, uint64(values.shape[0]) - one), min(t, uint64(values.shape[1]) - one)
-    k = min(member, uint64(values.shape[2]) - one)
+    i: Index = min(run, uint64(values.shape[0]) - one)
+    j: Index = min(t, uint64(values.shape[1]) - one)
+    k: Index = min(member, uint64(values.shape[2]) - one)
     return values[i, j, k, uint64(0)], values[i, j, k, one], values[i, j, k, uint64(2)]
 
 
 @inside
-def five_of(relative: Floats, run: int, link: int) -> Five:
+def five_of(relative: Any, run: int, link: int) -> Five:
     """The five numbers of a measurement of `components`."""
     i, j = uint64(run), uint64(link)
     return (
@@ -310,6 +322,6 @@ def five_of(relative: Floats, run: int, link: int) -> Five:
 
 
 @inside
-def put_lane(memory: Floats, at: int, lane: int, values: Three) -> None:
+def put_lane(memory: Floats, at: Index, lane: int, values: Three) -> None:
     """Write three numbers of one run."""
     memory[at, lane], memory[at + uint64(1), lane], memory[at + uint64(2), lane] = values

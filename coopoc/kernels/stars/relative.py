@@ -203,7 +203,7 @@ def incomplete(seen: Numbers) -> bool:
 
 
 @inner
-def completed(seen: Numbers, gap: Numbers) -> Numbers:
+def completed(seen: Numbers, gap: Numbers) -> tuple[float, float, float, float, float]:
     """The measurement, its missing components (of infinite deviation) those of the vector `gap`."""
     d, sa, ca, si, ci = direction(gap[0], gap[1], gap[2])
     limit = 0.0 * d + 1e300
@@ -218,7 +218,7 @@ def completed(seen: Numbers, gap: Numbers) -> Numbers:
 
 
 @inner
-def direction(x: float, y: float, z: float) -> Numbers:
+def direction(x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     """Length of a vector, sine and cosine of its azimuth and of its inclination."""
     flat2 = plus(x * x, y, y)
     flat, d = math.sqrt(flat2), math.sqrt(plus(x * x + y * y, z, z))

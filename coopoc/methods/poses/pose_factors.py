@@ -74,7 +74,7 @@ class PoseRun:
         first[0], start[0] = np.isfinite(given).any(axis=1), pose(filled[:, :2], filled[:, 2])
         turn = max(float(np.hypot(noise.heading_std, noise.heading_bias_std)), LEAST_HEADING_STD)
         return [
-            _kind("position", np.isfinite(fix).all(axis=2), fix, np.array(noise.fix_std[:2])),
+            _kind("position", np.isfinite(fix.sum(axis=2)), fix, np.array(noise.fix_std[:2])),
             _kind("pose", np.isfinite(heading), compass, np.array([np.inf, np.inf, turn])),
             _kind("pose", first, start, np.where(np.isnan(given), np.inf, self.spread[[0, 1, 3]])),
         ]
@@ -152,9 +152,9 @@ def pose_subgraph(run: PoseRun, step: int, known: Mapping[str, Floats]) -> Probl
         factors.append(of_recorded("position", fresh[:, None], x0[fresh, :2], np.array(LANDMARK_STD)))
     ends = np.stack([index[recording.links.observer], index[recording.links.neighbour]], axis=1)
     for kind, where, z, relative_std in run.relative:
-        on = links[where[links]]
-        if len(on):
-            factors.append(of_checked(kind, ends[on], z[on], relative_std))
+        rows = links[where[links]]
+        if len(rows):
+            factors.append(of_checked(kind, ends[rows], z[rows], relative_std))
     poses = tuple(range(len(stayed) + len(here)))
     return NOTHING.replace_unchecked(names=tuple(names), factors=tuple(factors), x0=x0, poses=poses)
 

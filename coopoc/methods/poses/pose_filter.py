@@ -119,7 +119,8 @@ class PoseFilter:
         """
         began, recording = time.perf_counter(), check_recording(recording, body=True)
         columns, links, notes = pose_egos(recording, egos), recording.links, tuple[str, ...]()
-        received, sent = np.zeros((2, recording.runs, len(columns)))
+        received: Floats = np.zeros((recording.runs, len(columns)))
+        sent: Floats = np.zeros(received.shape)
         if self.unit == "solo":
             begin = first_poses(recording, self.begin, columns)
             found = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]

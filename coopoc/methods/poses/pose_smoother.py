@@ -124,7 +124,7 @@ class PoseSmoother:
         known = dict[str, Floats]()
         for step, t in enumerate(recording.t.tolist()):
             piece = pose_subgraph(drive, step, known | landmarks)
-            poses = [node(recording, column, step) for column in np.flatnonzero(drive.present[step])]
+            poses = [node(recording, column, step) for column in np.flatnonzero(drive.present[step]).tolist()]
             assert piece.x0 is not None
             landmarks |= dict(zip(piece.names[len(piece.poses) :], piece.x0[len(piece.poses) :], strict=True))
             found = smoother.update(piece, dict.fromkeys([*poses, *landmarks], t), poses)

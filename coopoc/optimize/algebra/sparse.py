@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import numpy as np
@@ -15,8 +15,9 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..model.problem import Problem
 from ..model.space import Space
+from ..model.symbolic import Structure, numbers_of, structure_of
 from .cholesky import Cholesky, DenseCholesky
-from .tape import Kind, Model, kind_of, numbers_of, write
+from .tape import Model, write
 
 DENSE = 200
 """Unknowns up to which one dense matrix is as fast."""
@@ -151,20 +152,6 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
     return goal
 
 
-class Structure(NamedTuple):
-    """All of a problem that is no number.
-
-    Attributes:
-        shape: n and dof.
-        movable: (n, dof) as bytes; empty: all can move.
-        factors: the kind of each and its nodes (M, arity) as bytes.
-    """
-
-    shape: tuple[int, int]
-    movable: bytes
-    factors: tuple[tuple[Kind, bytes], ...]
-
-
 class Layout:
     """What problems of one structure share: the pattern of their Hessians, tapes, and analyses of the factorisation.
 
@@ -176,12 +163,8 @@ class Layout:
     """
 
     def __init__(self, structure: Structure) -> None:
-        self.kinds = tuple(kind for kind, _ in structure.factors)
-        self.nodes = tuple(
-            np.frombuffer(raw, np.int64).reshape(-1, kind.measurement.arity) for kind, raw in structure.factors
-        )
-        movable: Bools = np.frombuffer(structure.movable or b"\1" * int(np.prod(structure.shape)), bool)
-        self.entries: Entries = entries_of(movable.reshape(structure.shape), self.nodes)
+        self.terms = structure.factors
+        self.entries: Entries = entries_of(structure.movable, [term.nodes for term in self.terms])
         self._local = threading.local()
         self._tapes: dict[Model, list[tuple[Any, Ints, Ints]]] = {}
 
@@ -206,7 +189,7 @@ class Layout:
         from ...kernels.graphs.graph_tape import accumulate
 
         if model not in self._tapes:
-            written = [(write(kind, model), nodes) for kind, nodes in zip(self.kinds, self.nodes, strict=True)]
+            written = [(write(term.kind, model), term.nodes) for term in self.terms]
             self._tapes[model] = [(w.tape, nodes, places_of(self.entries, nodes, w.entries)) for w, nodes in written]
         out = np.zeros(2 if model == "cost" else self.entries.size + len(self.entries.indices) + 2)
         for (tape, nodes, goal), own in zip(self._tapes[model], numbers, strict=True):
@@ -222,13 +205,8 @@ _LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
 
 def layout_of(problem: Problem) -> Layout:
     """The layout of a single problem, shared with others of its structure."""
-    space, factors = problem.space, problem.factors
-    structure = Structure(
-        (len(problem.names), space.dof),
-        b"" if problem.movable is None else problem.movable.tobytes(),
-        tuple((kind_of(factor, space), factor.nodes.tobytes()) for factor in factors),
-    )
-    if len(problem.names) * space.dof <= DENSE:
+    structure = structure_of(problem.replace_unchecked(constraints=()) if problem.constraints else problem)
+    if len(problem.names) * problem.space.dof <= DENSE:
         return _small(structure)
     if (layout := _LARGE.get(structure)) is None:
         layout = _LARGE[structure] = Layout(structure)

@@ -83,7 +83,7 @@ def star_at(problem: Problem, linear: Linear) -> Star:
     separator = problem.separator[0]
     own, arm = np.zeros((2, count, n, d, d))
     gradient = np.zeros((count, n, d))
-    for factor, residual, (jacobian, *_) in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
+    for factor, residual, (*_, jacobian) in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
         nodes, transposed = factor.nodes, jacobian.swapaxes(-1, -2)
         square = np.broadcast_to(transposed @ jacobian, (len(jacobian), len(nodes), d, d))
         slope = (transposed @ residual[..., None])[..., 0]

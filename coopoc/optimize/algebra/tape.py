@@ -11,35 +11,15 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, Ints
+from ...arrays import Ints
 from ...errors import InputError
-from ..model.converted import is_converted
-from ..model.factor import Factor
-from ..model.losses import Loss
-from ..model.measurements import Measurement
-from ..model.space import Space
+from ..model.symbolic import Kind, cost_of
 
 if TYPE_CHECKING:
     from ...kernels.graphs.graph_tape import Tape
 
 Model = Literal["cost", "gauss-newton", "newton", "converted"]
 """What a tape gives: the cost alone, with J^T J, with the exact Hessian; or J^T J of the converted measurement."""
-
-
-class Kind(NamedTuple):
-    """All that the tape of a factor depends on.
-
-    Attributes:
-        measurement: of its kind.
-        space: of the problem.
-        full: its weight is a matrix.
-        loss: rho.
-    """
-
-    measurement: Measurement
-    space: Space
-    full: bool
-    loss: Loss | None
 
 
 class Written(NamedTuple):
@@ -55,22 +35,6 @@ class Written(NamedTuple):
     entries: Ints
 
 
-def kind_of(factor: Factor, space: Space) -> Kind:
-    """The kind of a factor."""
-    return Kind(factor.measurement, space, factor.std is None, factor.loss)
-
-
-def numbers_of(factor: Factor) -> Floats:
-    """(P, M) the tape's inputs that are no nodes: z, constants and weights of a single realisation."""
-    weight = 1.0 / factor.std if factor.std is not None else factor.sqrt_information
-    assert weight is not None
-    assert factor.constants is not None
-    first, second = factor.z.shape[1], factor.z.shape[1] + factor.constants.shape[1]
-    out = np.empty((second + weight[0].size, len(factor.nodes)))
-    out[:first], out[first:second], out[second:] = factor.z.T, factor.constants.T, weight.reshape(len(weight), -1).T
-    return out
-
-
 @lru_cache(maxsize=256)
 def write(kind: Kind, model: Model) -> Written:
     """The tape of a kind.
@@ -82,8 +46,8 @@ def write(kind: Kind, model: Model) -> Written:
 
     if model == "converted":
         kind = kind._replace(loss=None)
-    nodes, number, steps, parts = _cost(kind, model == "converted")
-    cost, white, square, rho = parts
+    nodes, number, steps, white, square, rho = cost_of(kind, model == "converted")
+    cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
     zero = ca.SX.zeros(steps.size1())
     outputs, entries = [cost], [(-1, -1)]
     if model != "cost":
@@ -106,36 +70,6 @@ def write(kind: Kind, model: Model) -> Written:
     found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
     tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found), kind.measurement.name)
     return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
-
-
-def _cost(kind: Kind, converted: bool) -> tuple[Any, Any, Any, tuple[Any, Any, Any, Any]]:
-    """Symbols of the nodes, the numbers and the steps; the cost, the whitened residual, and rho of its square.
-
-    Of converted measurements those without a linear form have no residual.
-    """
-    import casadi as ca
-
-    from ..model import symbolic
-
-    known, space = kind.measurement, kind.space
-    arity, size = known.arity, known.size(space.dimension)
-    nodes = ca.SX.sym("nodes", arity * space.ambient)
-    steps = ca.SX.sym("steps", arity * space.dof)
-    widths = known.given(space.dimension), known.constants, size ** (1 + kind.full)
-    number, square = ca.SX.sym("number", sum(widths)), ca.SX.sym("square")
-    given = [number[sum(widths[:k]) : sum(widths[: k + 1])] for k in range(3)]
-    try:
-        vectors = converted and is_converted(known)
-        white = symbolic.white(known, space, nodes, steps, given, kind.full, vectors)
-        if converted and not (vectors or known.linear):
-            white = ca.SX(size, 1)
-        rho = symbolic.robust(square, kind.loss)
-    except Exception as problem:  # the formula is the user's, who must learn what it raised
-        hint = "Take its functions from the namespace m, such as m.sqrt, and choose by m.where."
-        why = " ".join(str(problem).split())[:80]
-        raise InputError("kind", repr(known.name), f"must run on CasADi's numbers: {why}", hint) from problem
-    cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
-    return nodes, number, steps, (cost, white, square, rho)
 
 
 def _tape(function: Any, name: str) -> Tape:

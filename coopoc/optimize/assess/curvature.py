@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..algebra.cholesky import cholesky_of, with_still
 from ..algebra.sparse import sparse
-from ..model.local import chain, local
+from ..model.linear import chain, local
 from ..model.measurements import Measurement
 from ..model.problem import Problem
 from .active import Active, constraint_rows
@@ -116,7 +116,6 @@ def _second(problem: Problem, kind: Measurement, constants: Floats, z: Floats, a
         difference, inner = kind.differentiate(*measured, z, constants)
         inner = np.broadcast_to(inner, (*difference.shape, inner.shape[-1]))
         jacobians = chain(space, kind, moved, nodes, measured, inner)
-        jacobians = (-jacobians[0], jacobians[0]) if len(jacobians) < arity else jacobians
         # what has no weight may have no derivative
         kept = (np.where(weight[..., None] != 0.0, jacobian[0], 0.0) for jacobian in jacobians)
         return np.concatenate([np.einsum("mk,mkd->md", weight, jacobian) for jacobian in kept], axis=1)

@@ -135,9 +135,7 @@ def _rows(problem: Problem, linear: Linear) -> list[tuple[list[list[int]], list[
     The derivatives are read-only: GTSAM's wrapper takes those a tenth faster.
     """
     found = []
-    for factor, residual, jacobians in zip(
-        problem.factors, linear.residual, linear.by_node(problem.factors), strict=True
-    ):
+    for factor, residual, jacobians in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
         wide = [np.broadcast_to(jacobian, (*residual.shape, jacobian.shape[-1])) for jacobian in jacobians]
         found.append((factor.nodes.tolist(), wide, -residual))
     return found

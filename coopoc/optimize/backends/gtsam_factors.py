@@ -325,7 +325,7 @@ def linearised(problem: Problem, which: Sequence[int], x: Floats, keys: Sequence
     factors, posed = [problem.factors[f] for f in which], which_turn(problem)
     linear, found = linearise(problem.space, factors, None, x[None]), []
     turn, at = tangent(problem.space, posed, x), values(problem.space, posed, x, keys)
-    for factor, residual, jacobians in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+    for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
         unit = gtsam.noiseModel.Unit.Create(factor.size)
         wide = [np.broadcast_to(jacobian[0], (len(factor.nodes), *jacobian.shape[2:])) for jacobian in jacobians]
         for k in np.flatnonzero(factor.informative).tolist():

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +15,6 @@ from ...errors import InputError
 from ..backend import SolverResult
 from ..model.linear import Linear
 from ..model.problem import Problem
-from .progress import progress
 
 Step = Callable[[Linear, Floats], Floats]
 """(linearisation, damping (B, n, dof)) -> dx (B, n, dof): (J^T J + diag(damping)) dx = -J^T r, else LinAlgError."""
@@ -28,6 +30,8 @@ GIVE_UP = 1e12
 """Damping beyond which no step can help."""
 LEAST_DAMPING = 1e-9
 """Damping below which none is left: far below any diagonal it changes no digit of a step."""
+HIDDEN = 1e-9
+"""Share of the cost below which rounding hides how much of a promised decrease came true."""
 FLAT = 1e-15
 """Share of the cost below which a promised decrease is rounding: no step can be judged there."""
 
@@ -56,7 +60,6 @@ def descend(
     x: Floats,
     max_iterations: int = MAX_ITERATIONS,
     tolerance: float = TOLERANCE,
-    exact: bool = False,
 ) -> Descent:
     """Gauss-Newton steps, damped where the linear model does not hold (Levenberg-Marquardt with Marquardt's scaling).
 
@@ -71,7 +74,6 @@ def descend(
         x: (B, n, ambient) start.
         max_iterations: of linear steps.
         tolerance: m.
-        exact: the step's matrix is the exact Hessian, not J^T J.
 
     Raises:
         InputError: max_iterations that is no whole number >= 0, tolerance that is not > 0.
@@ -85,14 +87,15 @@ def descend(
     with progress("solve") as counted:
         for _ in range(max_iterations):
             counted(float(linear.cost.sum()))
-            dx, added, solved = _try(step, problem, linear, mu[active])
+            dx, solved = _try(step, problem, linear, mu[active])
             count[active] += 1
             with np.errstate(all="ignore"):
                 trial = now.linearise(problem.space.retract(linear.x, dx))
                 small = solved & (np.abs(dx).max(axis=(1, 2)) <= np.where(mu[active] > 0, tolerance, near))
                 better = solved & (trial.cost <= linear.cost * (1.0 + 1e-13)) | small & np.isfinite(trial.cost)
-            promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx, added, exact)
-            share = _share(linear.cost, trial.cost, promised, exact)
+            promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx)
+            telling = promised > HIDDEN * linear.cost
+            share = np.where(telling, (linear.cost - trial.cost) / np.where(telling, promised, 1.0), 0.5)
             if problem.batch is None:
                 record.append((linear.cost[0], mu[0], share[0]))
             mu[active] = _damping(mu[active], better, share)
@@ -113,21 +116,12 @@ def descend(
     return Descent(best, count, done, np.array(record).reshape(-1, 3))
 
 
-def one_step(problem: Problem, step: Step, x: Floats) -> SolverResult:
-    """The result from x (B, n, ambient) of all that a linear problem needs, one step; what is singular stays."""
-    count = np.ones(len(x), dtype=np.int64)
-    try:
-        dx = step(problem.linearise(x), np.zeros((*x.shape[:2], problem.space.dof)))
-    except np.linalg.LinAlgError:
-        return SolverResult(x, count)
-    dx[~np.isfinite(dx).all(axis=(1, 2))] = 0.0
-    return SolverResult(problem.space.retract(x, dx), count)
-
-
 def minimise(problem: Problem, step: Step, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
-    """The result from x (B, n, ambient) of one step where the problem is linear, else of `descend`."""
+    """The result from x (B, n, ambient) of one step where the problem is linear, else of `descend`; what is singular
+    stays."""
     if problem.linear and max_iterations:
-        return one_step(problem, step, x)
+        dx, _ = _try(step, problem, problem.linearise(x), np.zeros(len(x)))
+        return SolverResult(problem.space.retract(x, dx), np.ones(len(x), dtype=np.int64))
     end = descend(problem, step, x, max_iterations, tolerance)
     return SolverResult(end.x, end.iterations, extras={"record": end.record})
 
@@ -140,28 +134,13 @@ def check_limits(max_iterations: int, tolerance: float) -> None:
         raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
 
 
-def _promised(problem: Problem, linear: Linear, dx: Floats, added: Floats, exact: bool) -> Floats:
-    """(B,) decrease of the cost that the model expects of a step: J^T J, or the exact H dx = -g - added dx.
-
-    1/2 |r|^2 - 1/2 |r + J dx|^2 takes any step, of a constrained programme too; the other takes Newton's only.
-    """
-    directional, curvature = np.zeros(len(dx)), np.zeros(len(dx))
-    for factor, r, jacobians in zip(problem.factors, linear.residual, linear.by_node(problem.factors), strict=True):
+def _promised(problem: Problem, linear: Linear, dx: Floats) -> Floats:
+    """(B,) decrease of the cost that the linear model expects of any step: 1/2 |r|^2 - 1/2 |r + J dx|^2."""
+    promised = np.zeros(len(dx))
+    for factor, r, jacobians in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
         moved = sum((s @ dx[:, column, :, None])[..., 0] for s, column in zip(jacobians, factor.nodes.T, strict=True))
-        moved = np.broadcast_to(moved, r.shape)
-        directional += np.einsum("bmk,bmk->b", r, moved)
-        if not exact:
-            curvature += np.einsum("bmk,bmk->b", moved, moved)
-    if exact:
-        curvature = -directional - np.einsum("bni,bni->b", added, dx * dx)
-    return -directional - 0.5 * curvature
-
-
-def _share(before: Floats, after: Floats, promised: Floats, exact: bool) -> Floats:
-    """Share (B,) of the promised decrease that came true; where rounding hides it, what the model is worth there:
-    Newton's is right near a minimum, J^T J may not be."""
-    telling = promised > 1e-9 * before
-    return np.where(telling, (before - after) / np.where(telling, promised, 1.0), 1.0 if exact else 0.5)
+        promised -= np.einsum("bmk,bmk->b", r + 0.5 * moved, np.broadcast_to(moved, r.shape))
+    return promised
 
 
 def _damping(mu: Floats, better: Bools, share: Floats) -> Floats:
@@ -172,8 +151,8 @@ def _damping(mu: Floats, better: Bools, share: Floats) -> Floats:
     return np.where(better, kept, np.where(mu > 0, 10.0 * mu, 1e-3))
 
 
-def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Floats, Bools]:
-    """The step, its damping, and for which realisations it is finite; a singular system counts as none."""
+def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floats, Bools]:
+    """The step, and for which realisations it is finite; a singular system counts as none."""
     damping = np.zeros((*linear.x.shape[:2], problem.space.dof))
     if mu.any():
         damping = mu[:, None, None] * np.maximum(diagonal(problem, linear), 1e-9)
@@ -181,15 +160,46 @@ def _try(step: Step, problem: Problem, linear: Linear, mu: Floats) -> tuple[Floa
         with np.errstate(all="ignore"):
             dx = step(linear, damping)
     except np.linalg.LinAlgError:
-        return np.zeros_like(damping), damping, np.zeros(len(linear.x), dtype=bool)
+        return np.zeros_like(damping), np.zeros(len(linear.x), dtype=bool)
     finite = np.asarray(np.isfinite(dx).all(axis=(1, 2)))
-    return np.where(finite[:, None, None], dx, 0.0), damping, finite
+    return np.where(finite[:, None, None], dx, 0.0), finite
 
 
 def diagonal(problem: Problem, linear: Linear) -> Floats:
     """(B, n, dof) diagonal of J^T J."""
     total = np.zeros((*linear.x.shape[:2], problem.space.dof))
-    for factor, jacobians in zip(problem.factors, linear.by_node(problem.factors), strict=True):
+    for factor, jacobians in zip(problem.factors, linear.jacobian, strict=True):
         for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
             np.add.at(total.swapaxes(0, 1), column, np.square(jacobian).sum(axis=-2).swapaxes(0, 1))
     return total
+
+
+DELAY = 2.0
+"""s before the bar is shown: most solves are over by then, and a bar takes longer to make than a small one."""
+
+
+@contextmanager
+def progress(name: str) -> Iterator[Callable[[float], None]]:
+    """A function that counts a step and takes its cost.
+
+    >>> with progress("solve") as step:
+    ...     step(1.5)
+    """
+    began, count, bars = perf_counter(), 0, list[Any]()
+
+    def step(cost: float) -> None:
+        nonlocal count
+        count += 1
+        if not bars and perf_counter() - began > DELAY:
+            from tqdm import tqdm
+
+            bars.append(tqdm(desc=name, unit=" steps", initial=count - 1))
+        for bar in bars:
+            bar.set_postfix_str(f"cost {cost:.6g}", refresh=False)
+            bar.update()
+
+    try:
+        yield step
+    finally:
+        for bar in bars:
+            bar.close()

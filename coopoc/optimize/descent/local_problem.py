@@ -71,7 +71,7 @@ class LocalProblem:
         problem = self.problem
         bare = [unchecked(f, loss=None) for f in problem.factors]
         linear = linearise(problem.space, bare, problem.movable, self.point(v)[None])
-        residuals, jacobians = list(linear.residual), linear.by_node(bare)
+        residuals, jacobians = list(linear.residual), list(linear.jacobian)
         for k, factor in enumerate(problem.factors):
             if factor.loss is not None:
                 phi, scale = _scales(factor.loss, residuals[k])

@@ -9,8 +9,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Sparse
 from ..algebra.tape import Model
-from .descend import GIVE_UP, LEAST_DAMPING
-from .progress import progress
+from .descend import GIVE_UP, HIDDEN, LEAST_DAMPING, progress
 
 OFF = 0.2
 """A share of the promised decrease this far from 1 casts doubt on J^T J."""
@@ -29,8 +28,6 @@ LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 SLOW = 0.2
 """A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
-HIDDEN = 1e-9
-"""Share of the cost below which rounding hides how much of a promised decrease came true."""
 NEAR = 1e-3
 """Share of the cost from which on the exact Hessian makes the last steps."""
 STILL = 12

@@ -1,4 +1,4 @@
-"""Linear: a problem around a point, as whitened residuals and their derivatives."""
+"""Linear: a problem around a point, as whitened residuals and their derivatives by the steps of the nodes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from .factor import Factor
-from .local import chain, local
-from .space import Space
+from .measurements import Measurement
+from .space import Space, cross
 
 
 @dataclass(frozen=True, eq=False)
 class Linear:
     """A problem around x: per factor, whitened residuals and their derivative by the steps of its nodes.
 
-    Of a pair in the world frame only the second node's derivative is kept, the first's is minus it. A robust factor's
-    residual and derivatives carry the root of its weight rho'.
+    A robust factor's residual and derivatives carry the root of its weight rho'.
 
     Args:
         x: (B, n, ambient).
@@ -38,13 +37,6 @@ class Linear:
         jacobian = tuple(tuple(s[which] if len(s) > 1 else s for s in nodes) for nodes in self.jacobian)
         return Linear(self.x[which], tuple(r[which] for r in self.residual), jacobian, self.cost[which])
 
-    def by_node(self, factors: Sequence[Factor]) -> list[tuple[Floats, ...]]:
-        """Per factor one derivative for each of its nodes."""
-        return [
-            (-jacobian[0], jacobian[0]) if len(jacobian) < factor.nodes.shape[1] else jacobian
-            for factor, jacobian in zip(factors, self.jacobian, strict=True)
-        ]
-
 
 def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats) -> Linear:
     """Factors around x (B, n, ambient); what is not `movable` (n, dof) has no derivative."""
@@ -59,7 +51,7 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
             residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)
             cost += 0.5 * factor.loss.cost(square).sum(axis=1)
         if movable is not None:
-            jacobian = _masked(factor, jacobian, movable)
+            jacobian = tuple(s * movable[n][:, None] for s, n in zip(jacobian, factor.nodes.T, strict=True))
         residuals.append(residual)
         jacobians.append(jacobian)
     return Linear(x, tuple(residuals), tuple(jacobians), cost)
@@ -80,21 +72,6 @@ def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floa
     return factor.whiten(gap), chain(space, known, x, factor.nodes, seen, jacobian)
 
 
-def opposite(factor: Factor, movable: Bools | None) -> bool:
-    """Whether the two nodes of the factor's measurements have derivatives that differ in sign only."""
-    pair = factor.measurement.frame == "world" and factor.nodes.shape[1] == 2
-    return pair and (movable is None or bool(movable[factor.nodes].all()))
-
-
-def _masked(factor: Factor, jacobian: tuple[Floats, ...], movable: Bools) -> tuple[Floats, ...]:
-    nodes = factor.nodes.T
-    if opposite(factor, movable):
-        return jacobian
-    if len(jacobian) < len(nodes):
-        jacobian = (-jacobian[0], jacobian[0])
-    return tuple(s * movable[column][:, None, :] for s, column in zip(jacobian, nodes, strict=True))
-
-
 def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], which: int) -> Any:
     """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
     from scipy.sparse import csr_array
@@ -109,7 +86,7 @@ def entries(linear: Linear, factors: Sequence[Factor], dof: int) -> tuple[Floats
     batch, top = len(linear.x), 0
     data: list[Floats] = [np.empty((batch, 0))]
     rows, cols = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for factor, residual, jacobians in zip(factors, linear.residual, linear.by_node(factors), strict=True):
+    for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
         count, size = residual.shape[1:]
         row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
         for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
@@ -118,3 +95,57 @@ def entries(linear: Linear, factors: Sequence[Factor], dof: int) -> tuple[Floats
             cols.append((dof * column[:, None, None] + np.arange(dof) + np.zeros((size, 1), np.int64)).ravel())
         top += count * size
     return np.concatenate(data, axis=1), np.concatenate(rows), np.concatenate(cols)
+
+
+def local(space: Space, known: Measurement, x: Floats, nodes: Ints) -> tuple[Floats, Floats | None]:
+    """Vector (B, M, d) and rotation (B, M, d, d), or None, that the formula of a kind gets at x (B, n, ambient)."""
+    p = space.position(x)
+    here = p[:, nodes[:, -1]]
+    vector = here if known.arity == 1 else here - p[:, nodes[:, 0]]
+    if known.frame == "world":
+        return vector, None
+    turned = space.rotation(x)
+    if known.arity == 1:
+        return vector, turned[:, nodes[:, 0]]
+    back = np.swapaxes(turned[:, nodes[:, 0]], -1, -2)
+    vector = (back @ vector[..., None])[..., 0]
+    return vector, back @ turned[:, nodes[:, 1]] if known.frame == "relative" else None
+
+
+def chain(
+    space: Space, known: Measurement, x: Floats, nodes: Ints, seen: tuple[Floats, Floats | None], jacobian: Floats
+) -> tuple[Floats, ...]:
+    """Derivatives (B, M, size, dof) by the steps of the nodes, from those by what is seen.
+
+    Args:
+        seen: of `local`.
+        jacobian: (B, M, size, d), or (B, M, size, dof) if the frame is relative.
+    """
+    if known.frame == "world":
+        last = _wide(space, jacobian)
+        return (last,) if known.arity == 1 else (-last, last)
+    if known.arity == 1:
+        return (jacobian,)
+    vector, rotation = seen
+    d = space.dimension
+    back = np.swapaxes(space.rotation(x)[:, nodes[:, 0]], -1, -2)
+    moved = jacobian[..., :d] @ back
+    turning = jacobian[..., :d] @ _swing(vector)
+    if rotation is None:
+        return np.concatenate([-moved, turning], axis=-1), _wide(space, moved)
+    own = jacobian[..., d:]
+    turning -= own @ (np.swapaxes(rotation, -1, -2) if d == 3 else np.ones((1, 1)))
+    return np.concatenate([-moved, turning], axis=-1), np.concatenate([moved, own], axis=-1)
+
+
+def _swing(vector: Floats) -> Floats:
+    """d(Exp(-w) v)/dw = [v]x at w = 0: (..., 3, 3), or (..., 2, 1) in the plane."""
+    if vector.shape[-1] == 3:
+        return cross(vector)
+    return np.stack([vector[..., 1], -vector[..., 0]], axis=-1)[..., None]
+
+
+def _wide(space: Space, jacobian: Floats) -> Floats:
+    if space.angles == 0:
+        return jacobian
+    return np.concatenate([jacobian, np.zeros((*jacobian.shape[:-1], space.angles))], axis=-1)

@@ -4,38 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats, number
 from ...plugins import one_of
 
-Curve = Callable[[Floats, float], Floats]
-Shape = tuple[Curve, Curve, Curve]
-"""rho, rho' and rho'' of the squared residual."""
-
-LOSSES: dict[str, Shape] = {
+LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, float], Floats]]] = {
     "huber": (
-        lambda s, c: np.where(s <= c * c, s, 2.0 * c * np.sqrt(np.maximum(s, c * c)) - c * c),
+        lambda s, c, m: m.where(s > c * c, 2.0 * c * m.sqrt(m.fmax(s, c * c)) - c * c, s),
         lambda s, c: c / np.sqrt(np.maximum(s, c * c)),
-        lambda s, c: np.where(s <= c * c, 0.0, -0.5 * c * np.maximum(s, c * c) ** -1.5),
     ),
-    "cauchy": (
-        lambda s, c: c * c * np.log1p(s / (c * c)),
-        lambda s, c: 1.0 / (1.0 + s / (c * c)),
-        lambda s, c: -((1.0 + s / (c * c)) ** -2.0) / (c * c),
-    ),
-    "geman-mcclure": (
-        lambda s, c: s / (1.0 + s / (c * c)),
-        lambda s, c: (1.0 + s / (c * c)) ** -2.0,
-        lambda s, c: -2.0 * (1.0 + s / (c * c)) ** -3.0 / (c * c),
-    ),
+    "cauchy": (lambda s, c, m: c * c * m.log1p(s / (c * c)), lambda s, c: 1.0 / (1.0 + s / (c * c))),
+    "geman-mcclure": (lambda s, c, m: s / (1.0 + s / (c * c)), lambda s, c: (1.0 + s / (c * c)) ** -2.0),
     "truncated": (
-        lambda s, c: np.minimum(s, c * c),
+        lambda s, c, m: m.where(s > c * c, c * c, s),
         lambda s, c: (s <= c * c).astype(np.float64),
-        lambda s, c: np.zeros_like(s),
     ),
 }
+"""rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +52,8 @@ class Loss:
 
     def cost(self, square: Floats) -> Floats:
         """rho(s)."""
-        return LOSSES[self.name][0](square, self.scale)
+        return np.asarray(LOSSES[self.name][0](square, self.scale, np))
 
     def weight(self, square: Floats) -> Floats:
         """rho'(s), in [0, 1]."""
         return LOSSES[self.name][1](square, self.scale)
-
-    def second_derivative(self, square: Floats) -> Floats:
-        """rho''(s), at most 0; 0 at the kink of a truncated loss."""
-        return LOSSES[self.name][2](square, self.scale)

@@ -1,18 +1,17 @@
-"""A problem's cost and constraints as CasADi expressions, by the structure alone; the numbers are parameters."""
+"""Problems as CasADi expressions of their structure alone: costs of one measurement or of all, constraints."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from .constraint import steerable
-from .converted import converted_rows
-from .losses import Loss
+from ...errors import InputError
+from .factor import Factor, steerable
+from .kinds import converted_rows, is_converted
+from .losses import LOSSES, Loss
 from .measurements import Measurement
 from .problem import Problem
 from .space import Space
@@ -21,83 +20,108 @@ Columns = list[Any]
 """One CasADi column (M, 1) per number: a formula runs once for all M measurements, as it does on NumPy's arrays."""
 
 
-@dataclass(frozen=True)
-class Term:
-    """Structure of a factor or a constraint.
+class Kind(NamedTuple):
+    """All that the formula of a factor's cost depends on.
 
-    Args:
-        measurement: of the kind.
-        raw: nodes (M, arity) int64 as bytes.
-        full: the weight is a matrix.
-        loss: of a factor.
-        steered: (M, size) as bytes, see `steerable`.
+    Attributes:
+        measurement: of its kind.
+        space: of the problem.
+        full: its weight is a matrix.
+        loss: rho.
     """
 
     measurement: Measurement
-    raw: bytes
+    space: Space
     full: bool = False
     loss: Loss | None = None
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """How many numbers z, constants and weights a measurement has."""
+        known, d = self.measurement, self.space.dimension
+        return known.given(d), known.constants, known.size(d) ** (1 + self.full)
+
+
+class Term(NamedTuple):
+    """Structure of a factor or a constraint.
+
+    Attributes:
+        kind: of it.
+        raw: nodes (M, arity) int64 as bytes.
+        steered: (M, size) as bytes, see `steerable`; of a constraint.
+    """
+
+    kind: Kind
+    raw: bytes
     steered: bytes = b""
 
-    @cached_property
+    @property
     def nodes(self) -> Ints:
         """(M, arity)."""
-        return np.frombuffer(self.raw, np.int64).reshape(-1, self.measurement.arity)
+        return np.frombuffer(self.raw, np.int64).reshape(-1, self.kind.measurement.arity)
 
 
-@dataclass(frozen=True)
-class Structure:
+class Structure(NamedTuple):
     """All of a problem that is no number: problems that share it share one solver.
 
-    Args:
+    Attributes:
         nodes: n.
         space: where they live.
-        fixed: (n, dof) as bytes, True where a node cannot move; empty: all move.
+        still: (n, dof) as bytes, True where a node cannot move; empty: all move.
         factors: in the problem's order.
         constraints: as `factors`.
     """
 
     nodes: int
     space: Space
-    fixed: bytes
+    still: bytes
     factors: tuple[Term, ...]
     constraints: tuple[Term, ...]
 
-    @cached_property
+    @property
     def movable(self) -> Bools:
         """(n, dof) True where a node can move."""
         shape = (self.nodes, self.space.dof)
-        return ~np.frombuffer(self.fixed, bool).reshape(shape) if self.fixed else np.ones(shape, dtype=bool)
+        return ~np.frombuffer(self.still, bool).reshape(shape) if self.still else np.ones(shape, dtype=bool)
 
 
 def structure_of(problem: Problem) -> Structure:
     """The structure of a problem."""
-    factors = (Term(f.measurement, f.nodes.tobytes(), f.std is None, f.loss) for f in problem.factors)
+    space, movable = problem.space, problem.movable
+    factors = (Term(Kind(f.measurement, space, f.std is None, f.loss), f.nodes.tobytes()) for f in problem.factors)
     constraints = (
-        Term(c.measurement, c.nodes.tobytes(), steered=steerable(c, problem.movable).tobytes())
+        Term(Kind(c.measurement, space), c.nodes.tobytes(), steerable(c, movable).tobytes())
         for c in problem.constraints
     )
-    fixed = b"" if problem.movable is None else (~problem.movable).tobytes()
-    return Structure(len(problem.names), problem.space, fixed, tuple(factors), tuple(constraints))
+    still = b"" if movable is None else (~movable).tobytes()
+    return Structure(len(problem.names), space, still, tuple(factors), tuple(constraints))
 
 
-def numbers_of(problem: Problem, x: Floats) -> Floats:
-    """(B, .) parameters of `expressions`: the centres x (B, n, ambient), then z, constants, weights by columns."""
-    parts: list[Floats] = []
-    for f in problem.factors:
-        weight = 1.0 / f.std if f.std is not None else f.sqrt_information
+def numbers_of(factor: Factor) -> Floats:
+    """(P, M) or (B, P, M): z, constants and weights of the measurements of a factor."""
+    weight, batch = factor.sqrt_information, () if factor.batch is None else (factor.batch,)
+    if factor.std is not None:
+        weight = 1.0 / factor.std
+    else:
         assert weight is not None
-        assert f.constants is not None
-        own = weight.shape[-1 - (f.std is None) :]
-        weight = np.broadcast_to(weight, (*weight.shape[: -1 - len(own)], len(f.nodes), *own))
-        parts += [f.z, f.constants, weight.reshape(*weight.shape[: -len(own)], -1)]
-    parts += [c.constants for c in problem.constraints if c.constants is not None]
-    wide = (np.broadcast_to(part, (len(x), *part.shape[-2:])) for part in (x, *parts))
-    return np.concatenate([np.swapaxes(part, 1, 2).reshape(len(x), -1) for part in wide], axis=1)
+        weight = weight.reshape(*weight.shape[:-2], -1)
+    assert factor.constants is not None
+    first, second = factor.z.shape[-1], factor.z.shape[-1] + factor.constants.shape[1]
+    out = np.empty((*batch, second + weight.shape[-1], len(factor.nodes)))
+    out[..., :first, :], out[..., first:second, :] = factor.z.swapaxes(-1, -2), factor.constants.T
+    out[..., second:, :] = weight.swapaxes(-1, -2)
+    return out
+
+
+def parameters(problem: Problem, x: Floats) -> Floats:
+    """(B, .) parameters of `expressions`: the centres x (B, n, ambient), then `numbers_of` factors, and constants."""
+    parts = [x.swapaxes(1, 2), *map(numbers_of, problem.factors)]
+    parts += [c.constants.T for c in problem.constraints if c.constants is not None]
+    return np.concatenate([np.broadcast_to(p, (len(x), *p.shape[-2:])).reshape(len(x), -1) for p in parts], axis=1)
 
 
 def expressions(structure: Structure) -> dict[str, Any]:
-    """CasADi's x (the free steps), p (see `numbers_of`), f (cost) and g (what the constraints bound).
+    """CasADi's x (the free steps), p (see `parameters`), f (cost) and g (what the constraints bound).
 
     A step (dp, w) moves a node from the centre to (p + dp, R C(w)), C the Cayley map in space, which like Exp starts
     as I + [w]x but is rational, and the angle itself in the plane.
@@ -106,54 +130,84 @@ def expressions(structure: Structure) -> dict[str, Any]:
 
     space, n = structure.space, structure.nodes
     centre = ca.SX.sym("centre", n, space.ambient)
-    steps = ca.SX.sym("dx", int(structure.movable.sum()))
-    step = ca.SX.zeros(n, space.dof)
+    steps: Any = ca.SX.sym("dx", int(structure.movable.sum()))
+    step: Any = ca.SX.zeros(n, space.dof)
     for k, (i, j) in enumerate(np.argwhere(structure.movable).tolist()):
         step[i, j] = steps[k]
-    place = _moved(space, ca.horzsplit(centre), ca.horzsplit(step))
-    factors = [_factor(term, space, *place) for term in structure.factors]
-    bounds = [_constraint(term, space, *place) for term in structure.constraints]
-    numbers = [*(number for part in factors for number in part[0]), *(number for number, _ in bounds)]
-    return {
-        "x": steps,
-        "p": ca.veccat(centre, *numbers),
-        "f": sum(part[1] for part in factors),
-        "g": ca.vertcat(*(value for _, value in bounds)),
-    }
+    place, cost = _moved(space, ca.horzsplit(centre), ca.horzsplit(step)), 0.0
+    numbers, bounds = list[Any](), list[Any]()
+    for kind, nodes in ((term.kind, term.nodes) for term in structure.factors):
+        numbers.append(ca.SX.sym("number", len(nodes), sum(kind.widths)))
+        square = sum(w * w for w in _white(kind, *place, nodes, ca.horzsplit(numbers[-1])))
+        cost += 0.5 * ca.sum1(_robust(square, kind.loss))
+    for term in structure.constraints:
+        known, size = term.kind.measurement, term.kind.widths[2]
+        numbers.append(ca.SX.sym("number", len(term.nodes), known.constants))
+        constants = ca.horzsplit(numbers[-1]) if known.constants else []
+        value: Any = ca.horzcat(*_residual(known, _local(known, *place, term.nodes), [0.0] * size, constants))
+        bounds.append(ca.vec(value.T)[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
+    return {"x": steps, "p": ca.veccat(centre, *numbers), "f": cost, "g": ca.vertcat(*bounds)}
 
 
-def _factor(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tuple[Columns, Any]:
-    """z, constants and weights (M, .), and the cost."""
-    import casadi as ca
+class Cost(NamedTuple):
+    """What one measurement costs, by CasADi's symbols.
 
-    known, m = term.measurement, _namespace()
-    widths = known.given(space.dimension), known.constants, known.size(space.dimension) ** (1 + term.full)
-    numbers = [ca.SX.sym("number", len(term.nodes), width) for width in widths]
-    z, constants, weight = (ca.horzsplit(number) if number.size2() else [] for number in numbers)
-    gap = _residual(known, _seen(known, at, turned, term.nodes), z, constants, m)
-    white = _whitened(gap, weight, term.full)
-    square = sum(w * w for w in white)
-    return numbers, 0.5 * ca.sum1(square if term.loss is None else LOSSES[term.loss.name](square, term.loss.scale, m))
-
-
-def white(
-    known: Measurement, space: Space, nodes: Any, steps: Any, given: list[Any], full: bool, converted: bool = False
-) -> Any:
-    """Whitened residual (size,) of one measurement after steps of its nodes (arity dof,).
-
-    Args:
+    Attributes:
         nodes: (arity ambient,).
-        given: z, constants and weights.
-        converted: take the residual of `converted_rows`.
+        number: (P,) see `numbers_of`.
+        steps: (arity dof,) of the nodes.
+        white: (size,) whitened residual.
+        square: a symbol of its square.
+        rho: of `square`.
+    """
+
+    nodes: Any
+    number: Any
+    steps: Any
+    white: Any
+    square: Any
+    rho: Any
+
+
+def cost_of(kind: Kind, converted: bool) -> Cost:
+    """The cost of one measurement; of converted ones those without a linear form have no residual.
+
+    Raises:
+        InputError: CasADi cannot run the formula.
     """
     import casadi as ca
 
-    place, step = ca.horzsplit(ca.reshape(nodes, space.ambient, -1).T), ca.horzsplit(ca.reshape(steps, space.dof, -1).T)
-    at, turned = _moved(space, place, step)
-    z, constants, weight = ([v[k] for k in range(v.numel())] for v in given)
-    seen = _seen(known, at, turned, np.arange(known.arity)[None])
-    gap = _converted(seen, z) if converted else _residual(known, seen, z, constants, _namespace())
-    return ca.vertcat(*_whitened(gap, weight, full))
+    known, space = kind.measurement, kind.space
+    nodes = ca.SX.sym("nodes", known.arity * space.ambient)
+    steps = ca.SX.sym("steps", known.arity * space.dof)
+    number: Any = ca.SX.sym("number", sum(kind.widths))
+    square = ca.SX.sym("square")
+    rows = [ca.horzsplit(ca.reshape(v, width, -1).T) for v, width in ((nodes, space.ambient), (steps, space.dof))]
+    vectors = converted and is_converted(known)
+    try:
+        place = _moved(space, *rows)
+        given: Columns = [number[k] for k in range(number.numel())]
+        white: Any = ca.vertcat(*_white(kind, *place, np.arange(known.arity)[None], given, vectors))
+    except Exception as problem:  # the formula is the user's, who must learn what it raised
+        hint, why = "Take its functions from the namespace m, such as m.sqrt.", " ".join(str(problem).split())[:80]
+        raise InputError("kind", repr(known.name), f"must run on CasADi's numbers: {why}", hint) from problem
+    if converted and not (vectors or known.linear):
+        white = ca.SX(white.numel(), 1)
+    return Cost(nodes, number, steps, white, square, _robust(square, kind.loss))
+
+
+def _white(
+    kind: Kind, at: Columns, turned: list[Columns], nodes: Ints, number: Columns, converted: bool = False
+) -> Columns:
+    """Whitened residuals, one column per component; `converted`: those of `converted_rows`."""
+    known, (given, constants, _) = kind.measurement, kind.widths
+    z, assumed, weight = number[:given], number[given : given + constants], number[given + constants :]
+    local = _local(known, at, turned, nodes)
+    gap = _converted(local, z) if converted else _residual(known, local, z, assumed)
+    size = len(gap)
+    if not kind.full:
+        return [g * w for g, w in zip(gap, weight, strict=True)]
+    return [sum(weight[size * k + j] * gap[j] for j in range(size)) for k in range(size)]
 
 
 def _converted(vector: Columns, z: Columns) -> Columns:
@@ -162,26 +216,9 @@ def _converted(vector: Columns, z: Columns) -> Columns:
     return [along - d, *across]
 
 
-def robust(square: Any, loss: Loss | None) -> Any:
+def _robust(square: Any, loss: Loss | None) -> Any:
     """rho of the squared residual; that of a truncated loss has a kink, with nothing beyond."""
-    if loss is None:
-        return square
-    m = _namespace()
-    if loss.name == "truncated":
-        return m.where(square > loss.scale**2, loss.scale**2, square)
-    return LOSSES[loss.name](square, loss.scale, m)
-
-
-def _constraint(term: Term, space: Space, at: Columns, turned: list[Columns]) -> tuple[Any, Any]:
-    """Constants (M, .) and the numbers that are steered, row by row."""
-    import casadi as ca
-
-    known = term.measurement
-    number = ca.SX.sym("number", len(term.nodes), known.constants)
-    constants, nothing = ca.horzsplit(number) if known.constants else [], [0.0] * known.size(space.dimension)
-    seen = _seen(known, at, turned, term.nodes)
-    value: Any = ca.horzcat(*_residual(known, seen, nothing, constants, _namespace()))
-    return number, ca.vec(value.T)[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()]
+    return square if loss is None else LOSSES[loss.name][0](square, loss.scale, _namespace())
 
 
 def _namespace() -> Any:
@@ -199,13 +236,6 @@ def _namespace() -> Any:
         where=ca.if_else,
         remainder=ca.remainder,
     )
-
-
-LOSSES: dict[str, Any] = {
-    "huber": lambda s, c, m: m.where(s > c * c, 2.0 * c * m.sqrt(m.fmax(s, c * c)) - c * c, s),
-    "cauchy": lambda s, c, m: c * c * m.log1p(s / (c * c)),
-    "geman-mcclure": lambda s, c, m: s / (1.0 + s / (c * c)),
-}
 
 
 def _moved(space: Space, centre: Columns, step: Columns) -> tuple[Columns, list[Columns]]:
@@ -237,7 +267,7 @@ def _product(a: list[Columns], b: list[Columns]) -> list[Columns]:
     return [[sum(a[i][k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
 
 
-def _seen(known: Measurement, at: Columns, turned: list[Columns], nodes: Ints) -> Columns:
+def _local(known: Measurement, at: Columns, turned: list[Columns], nodes: Ints) -> Columns:
     """Inputs of the formula as by `local`: the vector's columns and, if the frame is relative, the rotation's."""
     first, last = nodes[:, 0].tolist(), nodes[:, -1].tolist()
     vector = [c[last] - c[first] if known.arity == 2 else c[last] for c in at]
@@ -254,18 +284,11 @@ def _seen(known: Measurement, at: Columns, turned: list[Columns], nodes: Ints) -
     return [*vector, *(c for row in _product(back, other) for c in row)]
 
 
-def _residual(known: Measurement, local: Columns, z: Columns, constants: Columns, m: Any) -> Columns:
+def _residual(known: Measurement, local: Columns, z: Columns, constants: Columns) -> Columns:
     """h - z, angles in [-pi, pi]: the derivative of the remainder is 1."""
-    dimension = 2 if len(local) in (2, 6) else 3
+    m, dimension = _namespace(), 2 if len(local) in (2, 6) else 3
     parts = known.residual(local, z, constants, m)
     return [
         m.remainder(part, 2.0 * np.pi) if angle else part
         for part, angle in zip(parts, known.angles(dimension), strict=True)
     ]
-
-
-def _whitened(gap: Columns, weight: Columns, full: bool) -> Columns:
-    size = len(gap)
-    if not full:
-        return [g * w for g, w in zip(gap, weight, strict=True)]
-    return [sum(weight[size * k + j] * gap[j] for j in range(size)) for k in range(size)]

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ...arrays import Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
 from ..model.factor import unchecked
-from ..model.local import local
+from ..model.linear import local
 from ..model.problem import Problem
 
 Candidates = Sequence[int | tuple[int, Sequence[int]]]

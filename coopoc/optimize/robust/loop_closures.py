@@ -13,7 +13,7 @@ from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..descent.trust_region import arrive
 from ..model.linear import linearise
-from ..model.part import restricted, rows_among, taken
+from ..model.parts import restricted, rows_among, taken
 from ..model.problem import Problem
 from ..model.space import carried
 from ..starts.initial import initial_guess
@@ -301,7 +301,7 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         with np.errstate(all="ignore"):
             linear = linearise(problem.space, [factor], None, x[None])
         shape = (len(factor.nodes), factor.size, problem.space.dof)
-        J = np.concatenate([np.broadcast_to(own[0], shape) for own in linear.by_node([factor])[0]], axis=2)
+        J = np.concatenate([np.broadcast_to(own[0], shape) for own in linear.jacobian[0]], axis=2)
         r = linear.residual[0][0]
         # an angle between nodes that coincide has no derivative
         lost = ~np.isfinite(r).all(axis=1) | ~np.isfinite(J).all(axis=(1, 2))

@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...formats.graph import Graph
 from ..algebra.sparse import sparse
 from ..descent.trust_region import arrive
-from ..model.part import restricted
+from ..model.parts import restricted
 from ..model.problem import Problem
 from ..model.space import Space, carried
 from .linear import linear_start

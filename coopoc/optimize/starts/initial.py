@@ -9,8 +9,8 @@ from ...errors import InputError
 from ..algebra.sparse import Sparse, sparse
 from ..algebra.star import is_star, star_at
 from ..algebra.tape import Model
-from ..model.converted import converted_rows, is_converted
 from ..model.factor import Factor, unchecked
+from ..model.kinds import converted_rows, is_converted
 from ..model.measurements import columns
 from ..model.problem import Problem
 

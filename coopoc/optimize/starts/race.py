@@ -9,8 +9,7 @@ import numpy as np
 from ...arrays import Floats, frozen
 from ..algebra.sparse import keep, sparse
 from ..descent.trust_region import Arrival, arrive
-from ..model.problem import Problem
-from ..model.search import Search
+from ..model.problem import Problem, Search
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""

@@ -1,0 +1,147 @@
+"""CasADi's and OSQP's rows of backends.py."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi
+import numpy as np
+import osqp
+from backends_star import Job, Row, as_good, ours, single
+from classical import KNOWN, NEIGHBOURS, SENSORS
+from scipy.sparse import csc_matrix, triu
+
+from coopoc.optimize import Problem
+from coopoc.optimize.starts.initial import initial_guess
+
+PLAIN: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
+    "fatrop": ("fatrop", {"print_time": False}, {"print_level": 0}),
+    "ipopt": ("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"}),
+}
+"""By our method: CasADi's plugin, its options, those of the solver behind it."""
+
+
+def casadi_exact(problem: Problem, method: str) -> Job:
+    """One programme whose measurements are parameters, by the same solver; fatrop is what `solve` takes by itself."""
+    (fixes, edges), runs = problem.factors, problem.batch or 1
+    start = initial_guess(problem)
+    std, fix_std = np.array(SENSORS.relative_std), np.array(KNOWN.gnss_std)
+    plugin, quiet, inner = PLAIN[method]
+
+    def cost(x: Any, fix: Any, seen: Any) -> Any:
+        """Of x and fix (3, n) and seen (3, K)."""
+        gap = x[:, 1:] - casadi.repmat(x[:, 0], 1, NEIGHBOURS)
+        flat = casadi.sqrt(gap[0, :] ** 2 + gap[1, :] ** 2)
+        across = gap[1, :] * casadi.cos(seen[1, :]) - gap[0, :] * casadi.sin(seen[1, :])
+        along = gap[0, :] * casadi.cos(seen[1, :]) + gap[1, :] * casadi.sin(seen[1, :])
+        rest = casadi.vertcat(
+            (casadi.sqrt(flat**2 + gap[2, :] ** 2) - seen[0, :]) / std[0],
+            casadi.atan2(across, along) / std[1],
+            (casadi.atan2(flat, gap[2, :]) - seen[2, :]) / std[2],
+        )
+        return 0.5 * (casadi.sumsqr((x - fix) / casadi.repmat(fix_std, 1, NEIGHBOURS + 1)) + casadi.sumsqr(rest))
+
+    x, fix, relative = (
+        casadi.SX.sym(name, 3, n) for name, n in (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS))
+    )
+    nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, relative), "f": cost(x, fix, relative)}
+    solver = casadi.nlpsol("solver", plugin, nlp, {**quiet, **({plugin: inner} if inner else {})})
+
+    def batch() -> Any:
+        numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
+        return np.stack(
+            [np.asarray(solver(x0=a.ravel(), p=p)["x"]).reshape(-1, 3) for a, p in zip(start, numbers, strict=True)]
+        )
+
+    def opti() -> Any:
+        found = []
+        for b in range(2):
+            model = casadi.Opti()
+            nodes = [model.variable(3) for _ in range(NEIGHBOURS + 1)]
+            total = sum(casadi.sumsqr((node - fix) / fix_std) for node, fix in zip(nodes, fixes.z[b], strict=True))
+            for node, (r, azimuth, inclination) in zip(nodes[1:], edges.z[b], strict=True):
+                gap = node - nodes[0]
+                flat = casadi.sqrt(gap[0] ** 2 + gap[1] ** 2)
+                turn = casadi.atan2(gap[1], gap[0]) - azimuth
+                turn = casadi.atan2(casadi.sin(turn), casadi.cos(turn))
+                total += ((casadi.norm_2(gap) - r) / std[0]) ** 2 + (turn / std[1]) ** 2
+                total += ((casadi.atan2(flat, gap[2]) - inclination) / std[2]) ** 2
+            model.minimize(0.5 * total)
+            for node, at in zip(nodes, start[b], strict=True):
+                model.set_initial(node, at)
+            model.solver(plugin, quiet, inner)
+            answer = model.solve()
+            found.append([answer.value(node) for node in nodes])
+        return np.stack(found)
+
+    job, options = f"casadi {method}, snapshot, exact", {} if method == "fatrop" else {"method": method}
+    return Job(
+        [
+            Row(job, "ours", runs, ours(problem, "casadi", runs, **options)),
+            Row(job, "hand-written", runs, batch),
+            Row(job, "Opti, rebuilt", 2, opti),
+        ],
+        as_good(problem),
+    )
+
+
+SIZE = 3 * (NEIGHBOURS + 1)
+
+
+def osqp_linear(problem: Problem) -> Job:
+    """One workspace; P and q are ready before the clock starts. `update` writes into the P of `setup`."""
+    runs = problem.batch or 1
+    rows = [problem.pick(b).whiten(np.zeros((NEIGHBOURS + 1, 3))) for b in range(runs)]
+    matrices = [csc_matrix(triu(J.T @ J, format="csc")) for _, J in rows]
+    gradients = [np.asarray(J.T @ r) for r, J in rows]
+    settings = {
+        "scaling": 0,
+        "rho": 1e-4,
+        "alpha": 1.0,
+        "eps_abs": 1e-9,
+        "eps_rel": 1e-9,
+        "max_iter": 200,
+        "check_termination": 1,
+        "adaptive_rho": 0,
+        "verbose": False,
+    }
+    nothing = csc_matrix((0, SIZE)), np.empty(0), np.empty(0)
+
+    def workspace(b: int) -> Any:
+        made = osqp.OSQP()
+        made.setup(matrices[b].copy(), gradients[b], *nothing, **settings)
+        return made
+
+    persistent = workspace(0)
+
+    def batch() -> Any:
+        found = []
+        for matrix, gradient in zip(matrices, gradients, strict=True):
+            persistent.update(Px=matrix.data, q=gradient)
+            found.append(persistent.solve(raise_error=False).x)
+        return np.stack(found).reshape(runs, -1, 3)
+
+    def bare() -> Any:
+        """By the extension module that osqp's Python class calls."""
+        found, core = [], persistent._solver
+        for matrix, gradient in zip(matrices, gradients, strict=True):
+            core.update_data_vec(gradient, None, None)
+            core.update_data_mat(matrix.data, None, None, None)
+            core.solve()
+            found.append(core.solution.x)
+        return np.stack(found).reshape(runs, -1, 3)
+
+    def setups() -> Any:
+        return np.stack([workspace(b).solve(raise_error=False).x for b in range(10)]).reshape(10, -1, 3)
+
+    job = "osqp, snapshot, converted"
+    return Job(
+        [
+            Row(job, "ours", runs, ours(problem, "osqp", runs)),
+            Row(job, "hand-written", runs, batch),
+            Row(job, "hand-written, without osqp's Python class", runs, bare),
+            Row(job, "setup at each solve", 10, setups),
+            Row(job, "ours, solve() one by one", 4, single(problem, "osqp", 4)),
+        ],
+        as_good(problem),
+    )

@@ -1,0 +1,299 @@
+"""Filters of an ego that fuse a pseudo-fix from each neighbour: MSMV-R, and (split) covariance intersection.
+
+In covariance intersection each source, the ego's own estimate and the pseudo-fixes of its neighbours, has a dependent
+and an independent covariance D and I. With s = w for the ego and 1 - w for all others its information is
+
+    L(s) = (D / s + I)^-1 = s K,  K = (D + s I)^-1,  L' = K D K,  L'' = -2 sym(K I L'),
+
+and w makes the trace of P = (F + sum of L)^-1 least, F the information that depends on nothing: the only minimum of a
+convex function, by Newton's method within brackets from the weight of the step before. LANES runs side by side.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Floats
+from ..compiling.compile import as_written, inner, inside
+from ..compiling.small import (
+    add,
+    add_diagonal,
+    apply,
+    from_upper,
+    inverse,
+    load,
+    minus_product,
+    negate,
+    scale,
+    square,
+    store,
+    subtract,
+    times,
+    transpose,
+    zeros,
+)
+from ..compiling.vectors import LANES, choose
+from .messages import (
+    HELD,
+    MOVED,
+    NEW,
+    NONE,
+    NOWHERE,
+    POSITION,
+    PROCESS,
+    RELATIVE,
+    ROW,
+    VARIANCE,
+    Assumptions,
+    Estimates,
+    Measurements,
+    Star,
+    gather,
+    largest,
+    new_estimates,
+    star_within,
+    write_ego,
+)
+from .relative import Numbers, completed, converted_cov, direction, vector
+
+ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
+"""Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
+LEAST = 1e-9
+"""Least weight of the ego's own estimate: at zero nothing might be left to invert."""
+
+
+@as_written
+def run_msmv(seen: Measurements, known: Assumptions) -> Estimates:
+    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
+
+    Args:
+        seen: `broadcast` holds every vehicle's own estimate.
+        known: `broadcast` its variance m^2.
+    """
+    runs, steps = seen.gnss.shape[:2]
+    out = new_estimates(seen)
+    most, x, cov = largest(seen.start), np.zeros((3, LANES)), np.zeros((9, LANES))
+    for first in range(0, runs, LANES):
+        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        for t in range(steps):
+            n = gather(star, seen, known, first, last, t, old)
+            fuse_pseudo_fixes(star, known, x, cov, n, old)
+            write_ego(out, star, x, cov, first, last, t, seen.start[t], n)
+            old = n
+    return out
+
+
+@inside
+def fuse_pseudo_fixes(star: Star, known: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
+    """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
+    fix = load(star.motion, POSITION, ROW)
+    if old == 0:
+        at, p = fix, zeros(fix[0], square(ROW))
+        flat = 0.0 * fix[0] + known.flat
+        p = add_diagonal(p, (flat, flat, flat))
+    else:
+        at = add(load(x, 0, ROW), load(star.motion, MOVED, ROW))
+        p = add_diagonal(load(cov, 0, square(ROW)), load(star.motion, PROCESS, ROW))
+    weight, variance = load(star.status, NEW, (0.0,))[0], load(star.motion, VARIANCE, ROW)
+    own = weight / variance[0], weight / variance[1], weight / variance[2]
+    information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
+    for k in range(1, n):
+        position, variance = pseudo_fix(star, known, k, at)
+        new = load(star.status, 5 * k + NEW, (0.0,))[0]
+        weight_k = scale(inverse(variance), new)
+        information, eta = add(information, weight_k), add(eta, apply(weight_k, subtract(position, at)))
+    p = inverse(information)
+    store(x, 0, add(at, apply(p, eta)))
+    store(cov, 0, p)
+
+
+@inside
+def pseudo_fix(star: Star, known: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
+    """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
+    theirs, relative = load(star.motion, 4 * k + POSITION, ROW), load(star.relative, k, RELATIVE)
+    seen = completed(relative, subtract(theirs, at))
+    one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
+    cov = from_upper((one, o, o, one, o, one))
+    if len(known.relative_std):
+        cov = from_upper(converted_cov(seen, (relative[5], relative[6], relative[7]), known.min_range))
+        cov = add_diagonal(cov, load(star.motion, 4 * k + VARIANCE, ROW))
+    return subtract(theirs, vector(seen)), cov
+
+
+class Fusion(NamedTuple):
+    """The estimate of the ego and what is fused with it at a step.
+
+    Attributes:
+        x: (3, LANES) m.
+        dependent: (9 most, LANES) m^2 of each source, the ego's first.
+        independent: (9 most, LANES) m^2.
+        gap: (3 most, LANES) m, from the ego to their pseudo-fixes.
+        used: (most, LANES) 1, or 0 for one without a message.
+        weight: (1, LANES) w.
+        cov: (9, LANES) m^2 of the fused estimate.
+        split: keep independent errors apart.
+    """
+
+    x: Floats
+    dependent: Floats
+    independent: Floats
+    gap: Floats
+    used: Floats
+    weight: Floats
+    cov: Floats
+    split: bool
+
+
+@as_written
+def run_intersection(seen: Measurements, known: Assumptions, split: bool) -> Estimates:
+    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
+
+    Args:
+        seen: `broadcast` holds every vehicle's own estimate.
+        known: `broadcast` its variance m^2.
+        split: keep independent errors apart.
+    """
+    runs, steps = seen.gnss.shape[:2]
+    out = new_estimates(seen)
+    most = largest(seen.start)
+    fusion = Fusion(
+        np.zeros((3, LANES)),
+        np.zeros((9 * most, LANES)),
+        np.zeros((9 * most, LANES)),
+        np.zeros((3 * most, LANES)),
+        np.ones((most, LANES)),
+        np.zeros((1, LANES)),
+        np.zeros((9, LANES)),
+        split,
+    )
+    for first in range(0, runs, LANES):
+        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        for t in range(steps):
+            n = gather(star, seen, known, first, last, t, old)
+            intersect(star, known, fusion, n, old)
+            write_ego(out, star, fusion.x, fusion.cov, first, last, t, seen.start[t], n)
+            old = n
+    return out
+
+
+@inner
+def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) -> None:
+    """Predict and fuse."""
+    fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
+    o = 0.0 * fix[0]
+    nothing = zeros(o, square(ROW))
+    if old == 0:
+        x, fixed, w = fix, nothing, o + 0.5
+        add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
+    else:
+        new = load(star.status, NEW, (0.0,))[0]
+        x, w = add(load(fusion.x, 0, ROW), load(star.motion, MOVED, ROW)), load(fusion.weight, 0, (0.0,))[0]
+        fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
+        independent = add_diagonal(load(fusion.independent, 0, square(ROW)), load(star.motion, PROCESS, ROW))
+        add_source(fusion, 0, load(fusion.dependent, 0, square(ROW)), independent)
+    add_neighbours(star, known, fusion, x, n)
+    w = best_weight(fusion, fixed, n, w)
+    total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
+    for k in range(n):
+        s = w if k == 0 else 1.0 - w
+        information, derivative, _ = source(fusion, k, s)
+        total, dependent = add(total, information), add(dependent, scale(derivative, s))
+        eta = add(eta, apply(information, load(fusion.gap, k, ROW)))
+    cov = inverse(total)
+    dependent = product(product(cov, dependent), cov)
+    store(fusion.x, 0, add(x, apply(cov, eta)))
+    store(fusion.cov, 0, cov)
+    store(fusion.dependent, 0, dependent)
+    store(fusion.independent, 0, subtract(cov, dependent))
+    store(fusion.weight, 0, (w,))
+
+
+@inner
+def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
+    """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
+    o = 0.0 * x[0]
+    one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
+    for k in range(1, n):
+        gap = subtract(load(star.motion, 4 * k + POSITION, ROW), x)
+        relative, variance = load(star.relative, k, RELATIVE), load(star.motion, 4 * k + VARIANCE, ROW)
+        noise = one
+        if len(known.relative_std):
+            std = (relative[5], relative[6], relative[7])
+            noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, known.min_range))
+        held = load(star.status, 5 * k + HELD, (0.0,))[0]
+        store(fusion.used, k, (choose(o + NOWHERE - variance[0], held, o),))
+        store(fusion.gap, k, subtract(gap, vector(completed(relative, gap))))
+        add_source(fusion, k, add_diagonal(zeros(o, square(ROW)), variance), noise)
+
+
+@inside
+def add_source(fusion: Fusion, k: int, dependent: Numbers, independent: Numbers) -> None:
+    """Set a source; plain covariance intersection takes all of its error as dependent."""
+    if not fusion.split:
+        dependent, independent = add(dependent, independent), scale(independent, 0.0)
+    store(fusion.dependent, k, dependent)
+    store(fusion.independent, k, independent)
+
+
+@inner
+def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]:
+    """L, L' and K I L' of a source at its s; 0 for one that is not used.
+
+    K I is (1 - K D) / s, which keeps its digits beside an I of 1e8 m^2; if not split it is 0.
+    """
+    d, i = load(fusion.dependent, k, square(ROW)), load(fusion.independent, k, square(ROW))
+    root = scale(inverse(add(d, scale(i, s))), load(fusion.used, k, (0.0,))[0])
+    share = product(root, d)
+    derivative = product(share, root)
+    bend = scale(derivative, 0.0)
+    if fusion.split:
+        bend = scale(subtract(derivative, product(share, derivative)), 1.0 / max(s, 0.0 * s + 1e-12))
+    return scale(root, s), derivative, bend
+
+
+@inner
+def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
+    """w of least trace in [LEAST, 1]."""
+    low, high = 0.0 * w + LEAST, 0.0 * w + 1.0
+    for round_ in range(ROUNDS):
+        first, second = derivatives(fusion, fixed, n, w)
+        low, high = choose(first, low, w), choose(-first, high, w)
+        newton = choose(second, w - first / second, w)
+        inside_low, inside_high = newton - low, high - newton
+        middle = 0.5 * (low + high)
+        below, above = (low, high) if round_ < BISECT else (middle, middle)
+        before, w = w, choose(inside_low, choose(inside_high, newton, above), below)
+        if abs(w - before) <= 0.0 * w + TOLERANCE:
+            break
+    return w
+
+
+@inner
+def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float, float]:
+    """First and second derivative of tr P by w."""
+    total, slope, bend = fixed, scale(fixed, 0.0), scale(fixed, 0.0)
+    for k in range(n):
+        information, derivative, curvature = source(fusion, k, w if k == 0 else 1.0 - w)
+        total, bend = add(total, information), add(bend, curvature)
+        slope = add(slope, derivative) if k == 0 else subtract(slope, derivative)
+    p = inverse(total)
+    twice = product(p, p)
+    bend = add(product(product(slope, p), slope), bend)
+    return -inner_product(twice, slope), 2.0 * inner_product(twice, transpose(bend))
+
+
+@inside
+def product(a: Numbers, b: Numbers) -> Numbers:
+    """A B."""
+    found: Numbers = negate(minus_product(a, b))
+    return found
+
+
+@inside
+def inner_product(a: Numbers, b: Numbers) -> float:
+    """The sum of a_i b_i."""
+    p = times(a, b)
+    total: float = p[0] + p[1] + p[2] + p[3] + p[4] + p[5] + p[6] + p[7] + p[8]
+    return total

@@ -1,1 +1,0 @@
-"""A graph solved by its robots, which exchange what they share."""

@@ -1,0 +1,271 @@
+"""osqp: sequential quadratic programming with one workspace per structure, whose values are updated at every step.
+
+Bounds on positions and displacements are rows l - h <= C dx <= u - h of each quadratic programme. The start is first
+moved onto them by the least step; from then on every step keeps them, so that the cost alone decides between steps.
+
+Settings matter: OSQP reports "solved" and can be a metre off when odometry weighs 5e5 times as much as GNSS. Scaling is
+off, the tolerance is tight, and every answer is checked against its own KKT conditions and repaired where it fails.
+Without constraints over-relaxation is off too (alpha = 1: an iteration is then a proximal step with the weight sigma,
+and 1.6 would make 40 of them out of one), and a repair is further iterations. With them rho adapts, and a repair solves
+exactly for the active set that the iterations have found (polishing).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from threading import get_ident
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Floats, Ints
+from ..algebra.sparse import Layout, Sparse, sparse
+from ..assess.active import constraint_rows
+from ..backend import Backend, Capabilities, Solver, SolverResult
+from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
+from ..model.factor import bounded
+from ..model.linear import Linear, local
+from ..model.problem import Problem
+
+SETTINGS = {
+    "scaling": 0,
+    "rho": 1e-4,
+    "alpha": 1.0,
+    "sigma": 1e-6,
+    "eps_abs": 1e-12,
+    "eps_rel": 1e-12,
+    "max_iter": 200,
+    "check_termination": 1,
+    "polishing": False,
+    "adaptive_rho": 0,
+    "warm_starting": True,
+    "verbose": False,
+}
+BOUNDED = {
+    "rho": 0.1,
+    "alpha": 1.6,
+    "eps_abs": 1e-9,
+    "eps_rel": 1e-9,
+    "max_iter": 4000,
+    "check_termination": 10,
+    "polish_refine_iter": 10,
+    "adaptive_rho": 1,
+}
+"""Settings that change under constraints."""
+NEGLIGIBLE = 1e-11
+"""m, an error of a coordinate that no tolerance asks to be smaller."""
+CLOSE = 1e-9
+"""m, by which a bound may be missed."""
+REPAIRS = 5
+"""Continuations of a quadratic programme before its answer is refused."""
+FAR = 1e-6
+"""Cost of a step of 1 m over that of a violation of 1 m, where none can be avoided."""
+
+
+def prepare(
+    structure: Problem,
+    max_iterations: int = MAX_ITERATIONS,
+    tolerance: float = TOLERANCE,
+    kkt_tolerance: float = 1e-9,
+) -> Solver:
+    """Solver of a structure. A linear problem is a single quadratic programme.
+
+    Args:
+        structure: a problem whose structure counts, and its constraints.
+        max_iterations: of quadratic programmes.
+        tolerance: m, largest move of a point in the last step.
+        kkt_tolerance: largest |P dx + q + C^T y| that is accepted, as a share of |q| or of the largest |P_ij dx_j|.
+
+    >>> from coopoc.optimize import solve
+    >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    >>> solve(problem.constrain("displacement", ("a", "b"), upper=[7, 9, 9]), "osqp").x.round(3)[:, 0]
+    array([1., 8.])
+    """
+    check_limits(max_iterations, tolerance)
+    limits, programmes = _limits(structure), dict[Layout, Programme]()
+
+    def solver(problem: Problem, x: Floats) -> SolverResult:
+        system = sparse(problem)
+        if system.layout not in programmes:
+            programmes[system.layout] = _programme(system, limits, kkt_tolerance)
+        programme = programmes[system.layout]
+        programme.counts.update(osqp_iterations=0, repairs=0)
+        if problem.constraints:
+            try:
+                x, feasible = _nearest(limits, x)
+            except np.linalg.LinAlgError:
+                return SolverResult(x, 0, extras=dict(programme.counts))
+            if not feasible:
+                return SolverResult(x, 0, True, dict(programme.counts))
+        step = partial(_step, system, limits, programme)
+        found = minimise(problem, step, x[None], max_iterations, tolerance)
+        extras = found.extras | dict(programme.counts)
+        return SolverResult(found.x[0], int(np.ravel(found.iterations)[0]), extras=extras)
+
+    return solver
+
+
+def _programme(system: Sparse, limits: _Limits, tolerance: float) -> Programme:
+    """The quadratic programme of a structure."""
+    from scipy.sparse import csc_matrix
+
+    entries = system.entries
+    if not len(limits.lower):
+        return unbounded(entries.indices.tobytes(), entries.indptr.tobytes(), tolerance, get_ident())
+    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    return Programme(pattern, csc_matrix(limits.matrix[:, _moving(system)]), tolerance)
+
+
+def _moving(system: Sparse) -> Ints:
+    return np.flatnonzero(system.entries.number.ravel() >= 0)
+
+
+def _step(system: Sparse, limits: _Limits, programme: Programme, linear: Linear, damping: Floats) -> Floats:
+    """dx (1, n, dof) of the quadratic programme around a point."""
+    dx, moving = np.zeros(damping.size), _moving(system)
+    _, q, values = system.quadratic(linear.x[0], "gauss-newton")
+    values = np.array(values)
+    values[system.entries.diagonal] += damping.ravel()[moving]
+    dx[moving] = programme.solve(values, np.array(q), *limits.around(linear.x[0]))
+    return dx.reshape(damping.shape)
+
+
+class Infeasible(np.linalg.LinAlgError):
+    """No step satisfies the bounds."""
+
+
+class Programme:
+    """min 1/2 dx^T P dx + q^T dx within lower <= C dx <= upper: one workspace, whose values are updated.
+
+    Args:
+        pattern: the upper triangle of P (CSC), any values.
+        rows: C.
+        tolerance: of the KKT conditions.
+    """
+
+    def __init__(self, pattern: Any, rows: Any, tolerance: float) -> None:
+        self._pattern, self._rows, self._tolerance = pattern, rows, tolerance
+        self._workspace: Any = None
+        self._polishing = False
+        self.counts = {"osqp_iterations": 0, "repairs": 0}
+
+    def solve(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> Floats:
+        """dx for the values of the upper triangle of P.
+
+        Raises:
+            Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
+        """
+        from scipy.sparse import csc_matrix
+
+        P = csc_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(len(q), len(q)))
+        self._update(P, q, lower, upper)
+        for attempt in range(REPAIRS + 1):
+            end = self._workspace.solve(raise_error=False)
+            self.counts["osqp_iterations"] += int(end.info.iter)
+            if end.info.status.startswith("primal infeasible"):
+                raise Infeasible
+            dx, y, value = np.array(end.x), np.array(end.y), self._rows @ end.x
+            active = bool(np.any((upper - value < y) | (value - lower < -y)))
+            if self._holds(P, q, lower, upper, dx, y) and self._polishing >= active:
+                return dx
+            self.counts["repairs"] += attempt < REPAIRS and self._polishing >= active
+            self._polish(active)
+        raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
+
+    def _update(self, P: Any, q: Floats, lower: Floats, upper: Floats) -> None:
+        import osqp
+
+        if self._workspace is None:
+            self._workspace = osqp.OSQP()
+            settings = {**SETTINGS, **(BOUNDED if len(lower) else {})}
+            self._workspace.setup(P, q, self._rows, lower, upper, **settings)
+            return
+        self._polish(False)
+        self._workspace.update(Px=P.data, q=q, **({"l": lower, "u": upper} if len(lower) else {}))
+        if not len(lower):  # the workspace is kept: earlier solves must not show
+            self._workspace.warm_start(x=np.zeros(len(q)))
+
+    def _polish(self, wanted: bool) -> None:
+        """Whether OSQP solves for its active set exactly; without one it would print a message."""
+        if wanted != self._polishing:
+            self._polishing = wanted
+            self._workspace.update_settings(polishing=wanted)
+
+    def _holds(self, P: Any, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
+        """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
+        own, value = P.diagonal(), self._rows @ dx
+        weak = self._tolerance * max(np.abs(q).max(), np.abs(own * dx).max())  # a share of what adds up
+        rest = P @ dx + P.T @ dx - own * dx + q + self._rows.T @ y
+        if not (np.abs(rest) <= weak + NEGLIGIBLE * own).all():
+            return False
+        kept = (value >= lower - CLOSE) & (value <= upper + CLOSE)
+        pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
+        return bool(np.all(kept & pushed))
+
+
+@lru_cache(maxsize=64)
+def unbounded(indices: bytes, indptr: bytes, tolerance: float, thread: int) -> Programme:
+    """The programme without bounds of a structure of P, its workspace set up once, its own for each thread."""
+    from scipy.sparse import csc_matrix
+
+    row, start = np.frombuffer(indices, np.int64), np.frombuffer(indptr, np.int64)
+    size = len(start) - 1
+    identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
+    found = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)), tolerance)
+    found.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Limits:
+    """The constraints as rows lower - h(x) <= C dx <= upper - h(x): h is linear, C the same everywhere."""
+
+    problem: Problem
+    matrix: Any
+    lower: Floats
+    upper: Floats
+
+    def around(self, x: Floats) -> tuple[Floats, Floats]:
+        """Bounds of C dx at x (n, ambient)."""
+        space, constraints = self.problem.space, self.problem.constraints
+        seen = [local(space, c.measurement, x[None], c.nodes)[0][0][bounded(c)] for c in constraints]
+        value = np.concatenate([np.empty(0), *seen])
+        return self.lower - value, self.upper - value
+
+
+def _limits(problem: Problem) -> _Limits:
+    from scipy.sparse import csc_matrix
+
+    if not problem.constraints:
+        return _Limits(problem, None, np.empty(0), np.empty(0))
+    rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
+    return _Limits(problem, csc_matrix(rows.matrix), rows.lower, rows.upper)
+
+
+def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:
+    """x moved by the least step that satisfies the constraints and True; if there is none, by a step that violates them
+    least, and False."""
+    from scipy.sparse import csc_matrix, diags, eye, hstack
+
+    lower, upper = limits.around(x)
+    if np.all(lower <= 0) and np.all(upper >= 0):
+        return x, True
+    space, (rows, size) = limits.problem.space, limits.matrix.shape
+    try:
+        programme = Programme(eye(size, format="csc"), limits.matrix, CLOSE)
+        return space.retract(x, programme.solve(np.ones(size), np.zeros(size), lower, upper).reshape(len(x), -1)), True
+    except Infeasible:
+        slack, weight = csc_matrix(hstack([limits.matrix, eye(rows)])), np.repeat([FAR, 1.0], [size, rows])
+        programme = Programme(diags(weight, format="csc"), slack, CLOSE)
+        step = programme.solve(weight, np.zeros(size + rows), lower, upper)[:size]
+        return space.retract(x, step.reshape(len(x), -1)), False
+
+
+BACKEND = Backend(
+    "osqp",
+    prepare,
+    "sequential quadratic programming, persistent workspace",
+    "osqp",
+    Capabilities(constraints="linear"),
+)

@@ -1,0 +1,303 @@
+"""Aggregation rules: mean, median, trimmed mean, Krum, FedAvgM and FedAdam."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coopoc.errors import InputError, shown
+from coopoc.plugins import find
+
+Combine = Callable[[Tensor, Tensor], Tensor]
+"""New weights (P,) from the clients' weights (C, P) and numbers of training pieces (C,)."""
+State = tuple[Tensor, ...]
+
+
+class Rule:
+    """theta, state <- rule(state, theta, weights, sizes).
+
+    A rule holds its parameters; what it carries from round to round is in its state. A stateless rule overrides
+    `combine`, one with a state `start` and `__call__`.
+    """
+
+    @property
+    def name(self) -> str:
+        """Name in messages."""
+        return repr(self)
+
+    @property
+    def least(self) -> int:
+        """Smallest number of clients that it can combine."""
+        return 1
+
+    def start(self, theta: Tensor) -> State:
+        """State before the first round, with weights theta (P,)."""
+        return ()
+
+    def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
+        """New weights (P,) from those of the clients (C, P) and their pieces (C,)."""
+        raise NotImplementedError(f"{type(self).__name__} defines neither combine nor __call__")
+
+    def __call__(self, state: State, theta: Tensor, weights: Tensor, sizes: Tensor) -> tuple[Tensor, State]:
+        """New weights (P,) and state; theta (P,) is what the clients received."""
+        return self.combine(weights, sizes), state
+
+
+def within(field: str, value: object, good: bool, allowed: str, hint: str = "The docstring cites its source.") -> None:
+    """InputError for a parameter outside its range."""
+    if not good:
+        raise InputError(field, value, f"must be {allowed}", hint)
+
+
+@dataclass(frozen=True)
+class Function(Rule):
+    """A plain function (weights, sizes) -> (P,) as a rule."""
+
+    function: Combine
+
+    @property
+    def name(self) -> str:
+        """Name of the function."""
+        return getattr(self.function, "__name__", repr(self.function))
+
+    def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
+        """The value of the function."""
+        return self.function(weights, sizes)
+
+
+def mean(weights: Tensor, sizes: Tensor) -> Tensor:
+    """FedAvg: sum_i a_i theta_i with a_i = n_i / sum n, of weights (C, P) and pieces (C,).
+
+    References:
+        McMahan et al., AISTATS 2017, algorithm 1; arXiv 2411.05847, equation 8.
+
+    >>> mean(torch.tensor([[1.0], [3.0]]), torch.tensor([3.0, 1.0])).tolist()
+    [1.5]
+    """
+    share = (sizes.double() / sizes.double().sum()).to(weights.dtype)
+    return (share[:, None] * weights).sum(0)
+
+
+def uniform(weights: Tensor, sizes: Tensor) -> Tensor:
+    """sum_i theta_i / C, whatever the sizes.
+
+    >>> uniform(torch.tensor([[1.0], [3.0]]), torch.tensor([3.0, 1.0])).tolist()
+    [2.0]
+    """
+    return mean(weights, torch.ones_like(sizes))
+
+
+def median(weights: Tensor, sizes: Tensor | None = None) -> Tensor:
+    """Median of each weight over the clients (C, P), the mean of the middle two where C is even; sizes are not read.
+
+    References:
+        Yin et al., ICML 2018, algorithm 1, option I.
+
+    >>> median(torch.tensor([[1.0], [2.0], [90.0]])).tolist()
+    [2.0]
+    """
+    ordered, count = weights.sort(0).values, len(weights)
+    return (ordered[(count - 1) // 2] + ordered[count // 2]) / 2
+
+
+@dataclass(frozen=True)
+class TrimmedMean(Rule):
+    """Mean of each weight over the clients without its int(share C) least and greatest values.
+
+    Args:
+        share: of the clients, left out at either end.
+
+    References:
+        Yin et al., ICML 2018, algorithm 1, option II.
+
+    >>> TrimmedMean(0.25).combine(torch.tensor([[1.0], [2.0], [4.0], [90.0]]), torch.ones(4)).tolist()
+    [3.0]
+    """
+
+    share: float = 0.25
+
+    def __post_init__(self) -> None:
+        within("share", self.share, 0 <= self.share < 0.5, "in [0, 0.5)")
+
+    def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
+        """Unweighted."""
+        cut = int(self.share * len(weights))
+        return weights.sort(0).values[cut : len(weights) - cut].mean(0)
+
+
+def krum_scores(weights: Tensor, byzantine: int) -> Tensor:
+    """(C,) sum of the squared distances of each client to its C - f - 2 nearest others, in float64.
+
+    Args:
+        weights: (C, P) weights.
+        byzantine: f, number of Byzantine clients that is tolerated.
+
+    Raises:
+        InputError: C <= 2 f + 2, for which there is no guarantee.
+
+    References:
+        Blanchard et al., Machine Learning with Adversaries, NeurIPS 2017, section 4.
+
+    >>> krum_scores(torch.tensor([[0.0], [1.0], [2.0], [3.0], [90.0]]), 1).tolist()
+    [5.0, 2.0, 2.0, 5.0, 15313.0]
+    """
+    count = len(weights)
+    if count <= 2 * byzantine + 2:
+        given = f"{count} with byzantine = {byzantine}"
+        allowed = f"Krum needs more than 2 f + 2 = {2 * byzantine + 2} clients"
+        raise InputError("clients", given, allowed, "Tolerate fewer Byzantine clients, or take the median.")
+    exact = weights.double()
+    square = torch.stack([(exact - one).square().sum(1) for one in exact])
+    nearest: Tensor = square.fill_diagonal_(torch.inf).sort(1).values[:, : count - byzantine - 2]
+    return nearest.sum(1)
+
+
+@dataclass(frozen=True)
+class Krum(Rule):
+    """Mean of the m clients with the lowest scores (`krum_scores`): Krum with m = 1, multi-Krum with more.
+
+    Args:
+        byzantine: f, number of Byzantine clients that is tolerated; needs C > 2 f + 2.
+        keep: m; None for C - f, as in the paper's experiments.
+
+    References:
+        Blanchard et al., NeurIPS 2017, sections 4 and 5.
+
+    >>> Krum(byzantine=2).least
+    7
+    """
+
+    byzantine: int = 1
+    keep: int | None = 1
+
+    def __post_init__(self) -> None:
+        whole = self.byzantine == int(self.byzantine) and self.byzantine >= 0
+        within("byzantine", self.byzantine, whole, "a whole number >= 0")
+        within("keep", self.keep, self.keep is None or self.keep >= 1, ">= 1 or None")
+
+    @property
+    def least(self) -> int:
+        """2 f + 3, or m if that is more."""
+        return max(2 * self.byzantine + 3, self.keep or 0)
+
+    def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
+        """Plain mean of the clients with the lowest scores; the first of equals."""
+        best = krum_scores(weights, self.byzantine).argsort(stable=True)[: self.keep or len(weights) - self.byzantine]
+        return weights[best.sort().values].mean(0)
+
+
+@dataclass(frozen=True)
+class FedAvgM(Rule):
+    """Momentum at the server: v <- momentum v + (mean_i theta_i - theta);  theta <- theta + rate v.
+
+    Momentum 0 and rate 1 are `mean`. Momentum makes a constant update 1 / (1 - momentum) times as long: 0.9 suits
+    hundreds of rounds, and with 20 rounds training had not converged.
+
+    Args:
+        rate: of the server.
+        momentum: share of the velocity that is carried over.
+
+    References:
+        Hsu, Qi, Brown, arXiv 1909.06335, section 4.3.
+
+    >>> rule, two = FedAvgM(), torch.tensor([[1.0], [3.0]])
+    >>> rule(rule.start(torch.zeros(1)), torch.zeros(1), two, torch.ones(2))[0].tolist()
+    [2.0]
+    """
+
+    rate: float = 1.0
+    momentum: float = 0.5
+
+    def __post_init__(self) -> None:
+        within("rate", self.rate, self.rate > 0, "> 0")
+        within("momentum", self.momentum, 0 <= self.momentum < 1, "in [0, 1)")
+
+    def start(self, theta: Tensor) -> State:
+        """v = 0."""
+        return (torch.zeros_like(theta),)
+
+    def __call__(self, state: State, theta: Tensor, weights: Tensor, sizes: Tensor) -> tuple[Tensor, State]:
+        """One step of the server's momentum."""
+        velocity = self.momentum * state[0] + (mean(weights, sizes) - theta)
+        return theta + self.rate * velocity, (velocity,)
+
+
+@dataclass(frozen=True)
+class FedAdam(Rule):
+    """Adam at the server with d = mean_i theta_i - theta as its gradient, and without bias correction:
+
+        m <- beta1 m + (1 - beta1) d;  v <- beta2 v + (1 - beta2) d^2;  theta <- theta + rate m / (sqrt(v) + tau),
+
+    where v starts at tau^2: a weight moves by about `rate` per round, by less where d is below tau. The published beta1
+    is 0.9; with 20 rounds 0.5 is better, see `FedAvgM`.
+
+    Args:
+        rate: of the server.
+        beta1: decay of the first moment.
+        beta2: decay of the second moment.
+        tau: added to the root of the second moment.
+
+    References:
+        Reddi et al., Adaptive Federated Optimization, ICLR 2021, algorithm 2.
+
+    >>> rule = FedAdam(rate=1.0, beta1=0.0, beta2=0.0, tau=0.5)
+    >>> rule(rule.start(torch.zeros(1)), torch.zeros(1), torch.ones(2, 1), torch.ones(2))[0].item()
+    0.6666666865348816
+    """
+
+    rate: float = 1e-2
+    beta1: float = 0.5
+    beta2: float = 0.99
+    tau: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("rate", "tau"):
+            within(name, getattr(self, name), getattr(self, name) > 0, "> 0")
+        for name in ("beta1", "beta2"):
+            within(name, getattr(self, name), 0 <= getattr(self, name) < 1, "in [0, 1)")
+
+    def start(self, theta: Tensor) -> State:
+        """m = 0, v = tau^2."""
+        return torch.zeros_like(theta), torch.full_like(theta, self.tau**2)
+
+    def __call__(self, state: State, theta: Tensor, weights: Tensor, sizes: Tensor) -> tuple[Tensor, State]:
+        """One step of the server's Adam."""
+        change = mean(weights, sizes) - theta
+        first = self.beta1 * state[0] + (1 - self.beta1) * change
+        second = self.beta2 * state[1] + (1 - self.beta2) * change.square()
+        return theta + self.rate * first / (second.sqrt() + self.tau), (first, second)
+
+
+RULES: Mapping[str, Rule] = {
+    "mean": Function(mean),
+    "uniform": Function(uniform),
+    "fedavgm": FedAvgM(),
+    "fedadam": FedAdam(),
+    "median": Function(median),
+    "trimmed_mean": TrimmedMean(),
+    "krum": Krum(),
+    "multi_krum": Krum(keep=None),
+}
+"""Bundled rules with their default parameters; others come from entry points in `coopoc.rules` or from files."""
+
+
+def rule(given: str | Rule | Combine) -> Rule:
+    """The rule of a name or of a path "mine.py:NAME"; a `Rule`, a class of rules or a plain function as a rule.
+
+    Raises:
+        InputError: an unknown name (lists the rules and the nearest one), or an object that is no rule.
+
+    >>> rule("krum").least
+    5
+    """
+    found = (RULES.get(given) or find("coopoc.rules", given)) if isinstance(given, str) else given
+    made = found() if isinstance(found, type) else found
+    if isinstance(made, Rule):
+        return made
+    if callable(made):
+        return Function(made)
+    hint = "Give a function of (weights, sizes), or a Rule."
+    raise InputError("aggregate", shown(given), f"is a {type(made).__name__}, no aggregation rule", hint)

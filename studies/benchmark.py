@@ -1,0 +1,239 @@
+"""coopoc benchmark: a score card of any method on CL-Bench's tasks, and the table of all cards."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from tqdm import tqdm
+from tyro.conf import Positional, arg
+
+from coopoc.errors import InputError
+from coopoc.evaluate.scores import scored
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.file_names import given_path
+from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
+from coopoc.methods.track import Method
+from coopoc.one_file import file_digest, in_file
+from coopoc.plugins import find, names, unknown
+from coopoc.study.numbers import three
+from coopoc.study.provenance import environment
+
+from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
+
+SMOOTHERS = frozenset({"batch-smoother"})
+"""Methods that see the whole drive, for which a filtering bound is none."""
+
+
+def benchmark(
+    methods: Annotated[Positional[tuple[str, ...]], arg(metavar="METHOD")] = (),
+    /,
+    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/benchmark"),
+    data: Annotated[Path | None, arg(metavar="FOLDER")] = None,
+    validation: bool = False,
+    tasks: Annotated[tuple[str, ...], arg(metavar="TASK")] = (),
+    table: bool = False,
+) -> int:
+    """Run CL-Bench on methods: fixed tasks, seeds, egos and scores; one JSON card per method, and their table.
+
+    Example: coopoc benchmark joint lkf-sa mine.py:Own
+
+    Example: coopoc benchmark pose-fleet gauss-newton --data ~/measured
+
+    Example: coopoc benchmark --table --out benchmarks/cards
+
+    Args:
+        methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ... and backends.
+        out: folder of the cards.
+        data: folder with MR.CLAM set 6 and PyFG files, for the tasks of real measurements (docs/benchmark.md).
+        validation: run the validation tasks, for choosing parameters; their cards cannot be submitted.
+        tasks: run only these tasks.
+        table: print the table of all cards in the folder, best first.
+    """
+    known = {task.name: task for task in (VALIDATION if validation else TASKS)}
+    for name in tasks:
+        if name not in known:
+            raise InputError("tasks", repr(name), f"must be of {', '.join(known)}", "Leave it out for all.")
+    if not methods and not table:
+        raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
+    for name in methods:
+        if simulated(name):
+            method(name)
+        elif data is None:
+            raise InputError("data", None, f"must name the folder of measurements for {name}", "Add --data FOLDER.")
+    failed = 0
+    for name in methods:
+        began = time.perf_counter()
+        made = card(name, [known[task] for task in tasks or known] if simulated(name) else [], data)
+        failed += sum("failed" in row for row in made["tasks"])
+        folder = out / "validation" if validation else out
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
+        file.write_text(json.dumps(made, indent=1) + "\n")
+        print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
+        print(page([made]))
+    if table:
+        cards = [json.loads(file.read_text()) for file in sorted(out.glob("*.json"))]
+        if not cards:
+            raise InputError("out", str(out), "holds no card", "Run coopoc benchmark METHOD first.")
+        print(page(cards))
+    return int(failed > 0)
+
+
+def method(name: str) -> Method:
+    """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME".
+
+    Raises:
+        InputError: an unknown name.
+    """
+    if in_file(name) or name in names("coopoc.methods"):
+        made: Method = find("coopoc.methods", name)("nominal")
+        return made
+    from coopoc.learned import CooperativeGain, load_method
+    from coopoc.learned.recipes import shipped_weights
+
+    if name not in shipped_weights() and not given_path(name).is_file():
+        raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
+    learned: Any = load_method(name)
+    return CooperativeGain(learned.model, name) if name == "cooperative" else learned
+
+
+def information(name: str, one: Method) -> str:
+    """Information set whose bound a method is held against."""
+    if name in SMOOTHERS:
+        return ""
+    if not one.cooperative:
+        return "solo"
+    return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
+
+
+def tried(name: str, task: Task) -> dict[str, Any]:
+    """A method's row for one task: error with its interval, bound, consistency, bytes and time; or why it failed."""
+    return _row(task.name, partial(_tried, name, task))
+
+
+def _tried(name: str, task: Task) -> dict[str, Any]:
+    one = method(name)
+    held = information(name, one)
+    seen, fleet = recording(task, held in ("", "fleet"))
+    one(seen.between(0, 3), [task.columns[0]])  # compiles
+    scores = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
+    level = mean_interval(scores["rt_le_m"].T)
+    row: dict[str, Any] = {"task": task.name}
+    row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    if held:
+        least = bound(task, held)
+        rms = float(np.sqrt(np.mean(scores["rt_le_m"] ** 2)))
+        row |= {"bound_m": round(least, 4), "information": held, "over_bound": round(rms / least, 3)}
+    if "nees_inside" in scores:
+        row["nees_inside"] = round(float(scores["nees_inside"].mean()), 3)
+    row["received_bytes_per_second"] = round(float(scores["bytes_per_second"].mean()))
+    row["microseconds_per_step"] = round(1e6 * float(scores["seconds"].mean()) / len(fleet.t), 2)
+    return row
+
+
+def measured(name: str, data: Path) -> list[dict[str, Any]]:
+    """Rows of the tasks of real measurements: graphs of a backend, logs of a pose filter or of "mine.py:NAME"."""
+    if name in names("coopoc.backends"):
+        files = tqdm(BEST, desc=name, unit="graph", delay=2.0)
+        return [_row(file, partial(graph_row, data, file, name)) for file in files]
+    if name in POSES or in_file(name):
+        made: Any = find("coopoc.methods", name)("nominal") if in_file(name) else name
+        return [_row(task.name, partial(pose_row, task, data, made)) for task in LOGGED]
+    return []
+
+
+def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    try:
+        return made()
+    except Exception as error:  # a failure is a row
+        return {"task": task, "failed": f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"}
+
+
+def simulated(name: str) -> bool:
+    """Whether the simulated tasks are for a name: those of backends and of pose filters are real ones."""
+    return name not in POSES and name not in names("coopoc.backends")
+
+
+def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str, Any]:
+    """The card of a method: what it is, with which versions, and a row for each task.
+
+    Args:
+        name: of a method, a pose filter or a backend, or "mine.py:NAME".
+        tasks: simulated ones.
+        data: folder of the real measurements; None leaves these tasks out.
+    """
+    digest = file_digest(name, "method") if in_file(name) else ""
+    rows = [tried(name, task) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)]
+    rows += [] if data is None else measured(name, data)
+    used = environment()
+    versions = {library: used[library] for library in ("coopoc", "numpy", "numba", "torch") if library in used}
+    return {"benchmark": VERSION, "method": name, "source": digest, "versions": versions, "tasks": rows}
+
+
+def page(cards: Iterable[Mapping[str, Any]]) -> str:
+    """Markdown tables of cards, of simulated tasks and of logs and graphs where there are any.
+
+    Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean first.
+    """
+    from tabulate import tabulate
+
+    given = list(cards)
+    tables = [rows for rows in (_simulated(given), _logs(given), _graphs(given)) if rows]
+    return "\n\n".join(tabulate(rows, headers="keys", tablefmt="github", disable_numparse=True) for rows in tables)
+
+
+def _logs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """RT-LE, heading error and NEES of pose filters, a row per task and method."""
+    rows = []
+    for one, row in _rows(cards, {task.name for task in LOGGED}):
+        shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
+        if "failed" not in row:
+            shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
+            shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
+            shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
+        rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))
+    return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
+
+
+def _graphs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Cost over the least known, status and time of backends, a row per backend."""
+    shown: dict[str, dict[str, Any]] = {}
+    for one, row in _rows(cards, set(BEST)):
+        cell = "failed" if "failed" in row else f"{row['over_best']:.4g} {row['status']}, {row['seconds']:.2g} s"
+        shown.setdefault(one, {"backend": one})[row["task"]] = cell
+    return list(shown.values())
+
+
+def _rows(cards: Sequence[Mapping[str, Any]], tasks: set[str]) -> list[tuple[str, Mapping[str, Any]]]:
+    return [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] in tasks]
+
+
+def _simulated(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    rows = []
+    for one in cards:
+        cells = {row["task"]: row for _, row in _rows([one], {task.name for task in TASKS})}
+        if not cells:
+            continue
+        errors = [row["rt_le_m"][0] for row in cells.values() if "rt_le_m" in row]
+        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(cells) else np.inf
+        paper = cells.get("paper", {})
+        shown = {"method": one["method"], "mean": three(mean) if np.isfinite(mean) else "-"}
+        shown |= {name: _cell(row) for name, row in cells.items()}
+        shown |= {"NEES inside": paper.get("nees_inside", ""), "B/s": paper.get("received_bytes_per_second", "")}
+        rows.append((mean, shown | {"us/step": paper.get("microseconds_per_step", "")}))
+    return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
+
+
+def _cell(row: Mapping[str, Any]) -> str:
+    if "failed" in row:
+        return "failed"
+    ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else ""
+    return f"{three(row['rt_le_m'][0])}{ratio}"

@@ -1,0 +1,254 @@
+"""CL-Bench: its tasks, fixed by version: simulated drives with what goes wrong, logs of real robots, and graphs."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, load_fleet, observe, read_graph, solve
+from coopoc.arrays import Floats
+from coopoc.errors import InputError
+from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, posterior_bound
+from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.metrics import errors, heading_error, pose_nees
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.world.spoofing import spoofed
+
+from . import pose_drives
+
+VERSION = "1"
+"""Another set of tasks, seeds, egos or scores is another version."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a method is tried on.
+
+    Args:
+        name: of the task.
+        question: that it asks.
+        data: bundled fleet.
+        sensors: the noise that acts and that methods may know.
+        v2x: neighbourhood and channel.
+        share: of the vehicles that broadcast false fixes; methods do not know of it.
+        seed: of all draws.
+        runs: noise draws.
+        egos: evenly spaced over the fleet.
+    """
+
+    name: str
+    question: str
+    data: str
+    sensors: Sensors
+    v2x: V2X
+    share: float = 0.0
+    seed: int = 2026
+    runs: int = 10
+    egos: int = 5
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Egos as columns of the fleet."""
+        count = len(load_fleet(self.data).ids)
+        return tuple(k * count // self.egos for k in range(self.egos))
+
+
+WHITE = Sensors.paper_scenario2()
+IDEAL = V2X(max_neighbours=6)
+TASKS = (
+    Task("alone", "No neighbour: the paper's scenario 1, with a bias.", "town10", Sensors.paper_scenario1(), V2X(0)),
+    Task("paper", "The paper's scenario 2.", "town10", WHITE, IDEAL),
+    Task("elsewhere", "The same in another town with sparser traffic.", "town04", WHITE, IDEAL),
+    Task(
+        "lasting",
+        "GNSS errors that persist and are partly common.",
+        "town10",
+        replace(WHITE, gnss_std=(1.5, 1.5, 1.5), gnss_drift_std=2.5, gnss_common_std=1.5),
+        IDEAL,
+    ),
+    Task(
+        "field", "Messages at a CAM's rate, late and lost.", "town10", WHITE, replace(V2X.cam(6), latency=0.1, loss=0.3)
+    ),
+    Task("spoofed", "A fifth of the vehicles broadcasts false fixes.", "town10", WHITE, IDEAL, 0.2),
+    Task(
+        "heading",
+        "A compass of 2 deg with a constant error of 3 deg.",
+        "town10",
+        replace(WHITE, heading_std=float(np.deg2rad(2)), heading_bias_std=float(np.deg2rad(3))),
+        IDEAL,
+    ),
+)
+"""The test: parameters of a method are never chosen on it."""
+VALIDATION = tuple(replace(task, data="town10-validation", seed=1) for task in TASKS)
+"""The same questions on another drive with other draws: parameters may be chosen here."""
+
+
+@lru_cache(maxsize=2)
+def recording(task: Task, everyone: bool) -> tuple[Recording, Fleet]:
+    """What a task's vehicles see, and the truth."""
+    fleet = load_fleet(task.data)
+    egos = None if everyone else list(task.columns)
+    seen = observe(fleet, task.sensors, task.v2x, runs=task.runs, seed=task.seed, observers=egos)
+    if task.share:
+        seen = spoofed(seen, task.share, seed=task.seed, honest=list(task.columns))
+    return seen, fleet
+
+
+@lru_cache(maxsize=64)
+def bound(task: Task, information: str) -> float:
+    """RT-LE m of the bound over an ideal channel without attack, root mean square over the egos: no method is below it.
+
+    Args:
+        task: its drive and noise; a bias is left out.
+        information: "solo", "star" or "fleet".
+    """
+    fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
+    v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
+    if information == "fleet":
+        whole = fleet_bound(fleet, sensors, v2x)
+        bounds: list[Floats] = [whole[:, ego] for ego in task.columns]
+    else:
+        bounds = [
+            posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0)) for ego in task.columns
+        ]
+    return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
+
+
+POSES: Mapping[str, Mapping[str, Any]] = {
+    "pose-solo": {"unit": "solo"},
+    "pose-fleet": {"unit": "fleet"},
+    "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
+    "pose-naive": {"unit": "fleet", "fusion": "naive"},
+}
+"""Pose filters by name: their options."""
+GATE = 5.0
+RANGE_STD = 0.3
+"""m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
+BEST: Mapping[str, float] = {
+    "mrclam5a.pyfg": 69.10353,
+    "mrclam6.pyfg": 3144.2650,
+    "plaza1.pyfg": 1332.7850,
+    "tiers.pyfg": 2050.1000,
+}
+"""Graph -> least cost that is known of its chordal objective."""
+
+
+@dataclass(frozen=True)
+class Logged:
+    """What pose filters are tried on.
+
+    Args:
+        name: of the task.
+        question: that it asks.
+        file: file or folder below the folder of data.
+        block_s: s of a block of time, over which errors are averaged.
+    """
+
+    name: str
+    question: str
+    file: str
+    block_s: float
+
+
+LOGGED = (
+    Logged("robots", "MR.CLAM 6: odometry, two landmarks, four neighbours, nothing else.", "MRCLAM_Dataset6", 30.0),
+    Logged("uwb", "Four robots that range one another and one anchor.", "tiers.pyfg", 10.0),
+)
+
+
+def located(folder: Path, name: str) -> Path:
+    """The file or folder of that name anywhere below a folder.
+
+    Raises:
+        InputError: there is none.
+    """
+    found = sorted(folder.rglob(name)) if folder.is_dir() else []
+    if not found:
+        hint = "docs/benchmark.md names the sources."
+        raise InputError("data", str(folder), f"must hold {name}, however deep", hint)
+    return found[0]
+
+
+@lru_cache(maxsize=2)
+def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
+    """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
+    if task.name == "robots":
+        until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
+        drive = pose_drives.drive(str(path), until, v2x, GATE)
+        assert drive.truth is not None
+        start = int(until / drive.truth.dt)
+        return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
+    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
+    if drive.truth is None or drive.truth.heading is None:
+        raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
+    noise = replace(drive.recording.sensors, range_std=RANGE_STD)
+    return drive.recording, drive.truth, 0, {"begin": drive.begin, "spread": drive.spread, "assumed": noise}
+
+
+def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
+    """RT-LE with its interval over robots and blocks of time, heading error, NEES, bytes and time.
+
+    Args:
+        task: that is run.
+        folder: of the data.
+        made: name in POSES, or a method of one's own; fields `begin`, `spread`, `assumed` are set if it has them.
+    """
+    path = located(folder, task.file)
+    recording, fleet, start, known = seen(task, path)
+    if isinstance(made, str):
+        made = PoseFilter(**POSES[made], lasting=task.name == "robots", gate=GATE, **known)
+    elif is_dataclass(made):
+        own = {field.name for field in fields(made)}
+        made = replace(made, **{name: value for name, value in known.items() if name in own})  # type: ignore[type-var]
+    who = [k for k in range(len(recording.ids)) if k not in recording.landmarks]
+    ids = [recording.ids[k] for k in who]
+    made(recording.between(0, 3), ids)  # compiles
+    began = time.perf_counter()
+    track = made(recording, ids)
+    seconds = time.perf_counter() - began
+    account = of_track(track, recording, made.message)
+    squares = np.square(_blocks(errors(track, fleet)[0], start, task.block_s / fleet.dt))
+    level = mean_interval(np.sqrt(squares))
+    row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
+    row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    if track.heading is not None:
+        turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
+        row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
+        row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
+    received = account.of("online", "on air", "per receiver") / account.seconds
+    row["received_bytes_per_second"] = round(float(received.mean()))
+    row["microseconds_per_step"] = round(1e6 * seconds / len(recording.t) / len(who), 2)
+    return row
+
+
+def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
+    """Cost over the least that is known, status and s of a solve, its search for a start included."""
+    path = located(folder, file)
+    problem = read_graph(path)
+    solution = solve(problem, backend, throw=False)
+    seconds = solution.build_seconds + solution.solve_seconds
+    row = {"task": path.name, "data": hashed(path), "status": solution.status.name, "cost": round(solution.cost, 4)}
+    return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
+
+
+def _blocks(error: Floats, start: int, length: float) -> Floats:
+    """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
+    size = max(int(length), 1)
+    parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
+    found = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
+    return np.asarray(found.T)
+
+
+def hashed(path: Path) -> str:
+    """First 12 hex digits of the SHA-256 of a file, or of the measurements of a folder."""
+    sha = hashlib.sha256()
+    for file in sorted(path.glob("*.dat")) if path.is_dir() else [path]:
+        sha.update(file.read_bytes())
+    return sha.hexdigest()[:12]

@@ -1,0 +1,137 @@
+"""Views of studies declared as data: tables and figures whose captions end with the conditions of the study."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from coopoc.study.numbers import Number, Where, present
+from coopoc.study.style import Panel, look
+from coopoc.study.tables import Entry, Table, crossed, pivot
+
+from . import scene
+
+if TYPE_CHECKING:
+    from coopoc.study.plot import Plot
+    from coopoc.study.results import Results
+
+TableView: TypeAlias = Callable[["Results"], Table | None]
+FigureView: TypeAlias = "Callable[[Results], Plot | None]"
+Rows: TypeAlias = Iterable[tuple[Sequence[Entry], Where]]
+HEAD = ("Method", "Noise model")
+
+
+def of(method: str, known: str, /, **at: Any) -> dict[str, Any]:
+    """A method under a noise model, as parameters of a cell or as a selection."""
+    return {**at, "method": method, "noise_model": known}
+
+
+def labelled(pairs: Iterable[tuple[str, str]], **at: Any) -> Rows:
+    """Rows of a table under HEAD: labels and selection of each method under its noise model."""
+    return [((look(method).label, known), of(method, known, **at)) for method, known in pairs]
+
+
+def table(
+    *texts: str,
+    value: str = "rt_le_m",
+    rows: str | Sequence[str] = "method",
+    columns: str | Sequence[str] = "max_neighbours",
+    where: Where | None = None,
+    **options: Any,
+) -> TableView:
+    """A metric with columns of the results down and across, as `pivot`; None where nothing was run.
+
+    Args:
+        texts: of the caption, which may name settings in braces.
+        value: the metric.
+        rows: columns of the results that label the rows.
+        columns: columns of the results whose values become columns.
+        where: the selection; values that were not run are left out.
+        options: of `pivot`.
+    """
+
+    def view(results: Results) -> Table | None:
+        kept = present(results, where or {}, value)
+        if kept is None:
+            return None
+        shown = {"decimals": scene.decimals(results.settings), **options}
+        return pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
+
+    return view
+
+
+def selections(
+    head: Sequence[str],
+    rows: Rows | Callable[[Results], Rows],
+    columns: Mapping[str, Number],
+    *texts: str,
+    at: Where | None = None,
+    **options: Any,
+) -> TableView:
+    """Selections down and numbers across, as `crossed`; None where nothing was run.
+
+    Args:
+        head: titles over the labels of a row.
+        rows: labels and selection of each, or a function of the results that gives them.
+        columns: title -> number.
+        texts: of the caption.
+        at: parameters that the caption names beside the settings.
+        options: of `Table`.
+    """
+
+    def view(results: Results) -> Table | None:
+        shown = rows(results) if callable(rows) else rows
+        place = {**results.settings, **(at or {})}
+        kept = {"decimals": scene.decimals(place), **options}
+        return crossed(results, head, shown, columns, scene.caption(results, *texts, **(at or {})), **kept)
+
+    return view
+
+
+def curves(
+    panels: Sequence[Panel], lines: Sequence[Where], *texts: str, at: Where | None = None, **options: Any
+) -> FigureView:
+    """A number over a parameter, as `coopoc.study.figures.curves`.
+
+    Args:
+        panels: of the figure.
+        lines: selection of each line.
+        texts: of the caption.
+        at: parameters that the caption names beside the settings.
+        options: of `coopoc.study.figures.curves`.
+    """
+
+    def view(results: Results) -> Plot | None:
+        from coopoc.study import figures
+
+        return figures.curves(results, panels, lines, scene.caption(results, *texts, **(at or {})), **options)
+
+    return view
+
+
+def multiples(
+    pairs: Iterable[tuple[str, str]],
+    cases: Mapping[str, Where],
+    number: Callable[[Results, Where], Sequence[float]],
+    *texts: str,
+    target: Mapping[str, float] | None = None,
+    at: Where | None = None,
+) -> FigureView:
+    """Multiples of a reference, a row per method and a panel per case, as `coopoc.study.figures.multiples`.
+
+    Args:
+        pairs: methods and noise models.
+        cases: title -> selection.
+        number: multiples of a selection; none where it was not run.
+        texts: of the caption.
+        target: title -> upper end of the band.
+        at: parameters that the caption names beside the settings.
+    """
+
+    def view(results: Results) -> Plot | None:
+        from coopoc.study import figures
+
+        rows = {p: {title: number(results, of(*p, **case)) for title, case in cases.items()} for p in pairs}
+        return figures.multiples(rows, scene.caption(results, *texts, **(at or {})), target)
+
+    return view

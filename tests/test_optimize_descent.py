@@ -1,0 +1,83 @@
+"""Levenberg-Marquardt: its damping, laws that its steps obey, and the bar of a solve that lasts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.optimize import Problem, solve, solve_batch
+from coopoc.optimize.descent import descend
+from coopoc.optimize.descent.descend import _damping
+
+
+def test_damping_follows_the_share_of_the_promise_that_came_true() -> None:
+    """Marquardt's rule (Marquardt 1963; Nocedal and Wright 2006, algorithm 4.1): less where the model was good, as it
+    was where it was fair, more where it was poor although the cost fell, ten times where it rose."""
+    mu = np.array([1e-2, 1e-2, 1e-2, 0.0, 1e-2, 0.0])
+    share = np.array([0.9, 0.5, 0.1, 0.1, -1.0, -1.0])
+    better = np.array([True, True, True, True, False, False])
+    assert _damping(mu, better, share) == pytest.approx([2e-3, 1e-2, 4e-2, 1e-2, 1e-1, 1e-3])
+
+
+def test_damping_grows_until_a_step_helps_however_much_that_takes() -> None:
+    """A range that is too short, seen nearly along the height that is known: J^T J has a 4,000th of the curvature
+    across it, so that no step helps below that damping. Closed form: straight above, and the range's share of the
+    height is its information's."""
+    z = np.array([9.0, 9.5])
+    problem = Problem("av", dimension=2, x0=[[0, 0], [0.05, 10]], fixed=(0,))
+    problem = problem.add("position", ["v"], np.full((2, 1, 2), [0.0, 10.0]), std=[1e3, 1e-3])
+    problem = problem.add("range", [("a", "v")], z[:, None, None], std=1.0)
+    found = solve_batch(problem, backend="gauss-newton").x[:, 1]
+    assert found == pytest.approx(np.column_stack([0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)]), abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_unit_of_the_noise_changes_no_step(seed: int) -> None:
+    """A law of damped least squares: all standard deviations times c divide every cost by c^2, and nothing else. One
+    step less is taken where it promises 1e-9 standard deviations."""
+    rng, names = np.random.default_rng(seed), list("abcde")
+    pairs = [(i, j) for i in range(5) for j in range(i)]
+    truth, start = rng.normal(0, 10, (2, 5, 3))
+    distance = np.linalg.norm([truth[i] - truth[j] for i, j in pairs], axis=1) + rng.normal(0, 0.5, (3, 10))
+
+    def solved(unit: float) -> tuple[list[int], list[float]]:
+        problem = Problem(names, x0=start).add("position", names, truth, std=2.0 * unit)
+        ends = [(names[i], names[j]) for i, j in pairs]
+        one = solve(problem.add("range", ends, distance[0], std=0.1 * unit))
+        many = solve_batch(problem.add("range", ends, distance[..., None], std=0.1 * unit))
+        cost = np.append(one.cost, many.cost) * unit**2
+        return [one.iterations, *many.iterations.tolist()], cost.tolist()
+
+    steps, cost = solved(1.0)
+    assert min(steps) > 8  # far from the minimum, so that the damping matters
+    for unit in (1e-4, 1e4):
+        again, same = solved(unit)
+        assert all(new in (old, old - 1) for new, old in zip(again, steps, strict=True))
+        assert same == pytest.approx(cost, rel=1e-9)
+
+
+def ranged() -> co.Problem:
+    anchors = {f"a{k}": np.array(at) for k, at in enumerate(([0.0, 0], [9, 0], [0, 9]))}
+    names = (*anchors, "x")
+    x0 = np.array([*anchors.values(), [5.0, 5.0]])
+    problem = co.Problem(names, x0=x0, dimension=2)
+    for name, at in anchors.items():
+        problem = problem.add("position", name, at, 1e-3).add(
+            "range", ("x", name), np.linalg.norm(at - [3.0, 4.0]), 0.1
+        )
+    return problem
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "osqp"])
+def test_a_bar_shows_steps_and_cost(
+    backend: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    co.solve(ranged(), backend)  # the first call on a machine compiles
+    capsys.readouterr()
+    quick = co.solve(ranged(), backend)
+    assert "solve" not in capsys.readouterr().err
+    monkeypatch.setattr(descend, "DELAY", -1.0)
+    shown = co.solve(ranged(), backend)
+    assert "cost" in capsys.readouterr().err
+    assert np.array_equal(shown.position, quick.position)

@@ -1,0 +1,294 @@
+"""Every filter of a star against its dense textbook oracle and filterpy: gaps, absences, losses, delays, any batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from oracles import covariance_intersection, drift, joint, lkf_sa, messages, msmv
+
+from coopoc import (
+    LKFSA,
+    MSMV,
+    V2X,
+    CovarianceIntersection,
+    Fleet,
+    JointFilter,
+    NoiseModel,
+    Recording,
+    Sensors,
+    observe,
+    stars,
+)
+from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.relative import angle
+from coopoc.methods.drift_filter import DriftFilter
+from coopoc.methods.kalman import solo_filter
+from coopoc.methods.noise_model import resolve
+from coopoc.methods.star import ESTIMATE_GROWTH
+from coopoc.methods.track import Method
+from coopoc.world.links import spherical, to_vector, vector_cov
+
+S2 = Sensors.paper_scenario2()
+DRIFTING = replace(S2, gnss_drift_std=1.0, gnss_common_std=0.7, gnss_drift_time=5.0)
+CHANNELS = {
+    "ideal": V2X(max_neighbours=4),
+    "all": V2X(max_neighbours=20),
+    "late": V2X(max_neighbours=7, loss=0.3, latency=0.2),
+    "silent": V2X(max_neighbours=3, loss=1.0),
+    "slow": V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3, max_age=0.6),
+    "capped": V2X(max_neighbours=5, bytes_per_second=1000.0),
+    "alone": V2X(max_neighbours=0),
+}
+
+
+def holed(recording: Recording) -> Recording:
+    """The recording without a third of the fixes; the first ones stay."""
+    gnss = recording.gnss.copy()
+    gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < 0.3
+    gone[:, 0] = False
+    gnss[gone] = np.nan
+    return replace(recording, gnss=gnss)
+
+
+def slow_fixes(recording: Recording, every: int = 10) -> Recording:
+    """Fixes at 1 Hz in data of 10 Hz."""
+    gnss = np.where((np.arange(len(recording.t)) % every == 0)[:, None, None], recording.gnss, np.nan)
+    return replace(recording, gnss=gnss)
+
+
+def partial(recording: Recording) -> Recording:
+    """Every third measurement a range only, others without inclination."""
+    relative = recording.relative.copy()
+    draw = np.random.default_rng(6).uniform(size=relative.shape[:2])
+    relative[draw < 0.3, 1:] = np.nan
+    relative[draw > 0.8, 2] = np.nan
+    return replace(recording, relative=relative)
+
+
+def gappy(fleet: Fleet) -> Fleet:
+    """Vehicles that appear and vanish."""
+    position, velocity = fleet.position.copy(), fleet.velocity.copy()
+    position[:20, 2:5], velocity[:20, 2:5] = np.nan, np.nan
+    position[40:, 5:7], velocity[40:, 5:7] = np.nan, np.nan
+    return replace(fleet, position=position, velocity=velocity)
+
+
+def known_of(method: Any, recording: Recording) -> NoiseModel:
+    return resolve(method.noise_model, recording)
+
+
+def by_joint(method: JointFilter, recording: Recording, stars: Any) -> Any:
+    known = known_of(method, recording)
+    return joint.follow(stars, known, method.exact and known.exact_relative)
+
+
+def by_drift(method: DriftFilter, recording: Recording, stars: Any) -> Any:
+    known, s = known_of(method, recording), recording.sensors
+    errors = s.gnss_drift_std**2, s.gnss_common_std**2, float(np.exp(-recording.dt / s.gnss_drift_time))
+    return drift.follow(stars, known, np.square(s.gnss_std) - known.gnss_variance, errors)
+
+
+def by_lkf(method: LKFSA, recording: Recording, stars: Any) -> Any:
+    x, variance, others = lkf_sa.follow(stars, known_of(method, recording))
+    return x, variance[..., None] * np.eye(3), others
+
+
+def by_msmv(method: MSMV, recording: Recording, stars: Any) -> Any:
+    return msmv.follow(stars, known_of(method, recording))
+
+
+def by_ci(method: CovarianceIntersection, recording: Recording, stars: Any) -> Any:
+    return covariance_intersection.follow(stars, known_of(method, recording), method.split)
+
+
+ORACLES: list[tuple[Any, Callable[..., Any]]] = [
+    (JointFilter(), by_joint),
+    (JointFilter(exact=False), by_joint),
+    (JointFilter("identity"), by_joint),
+    (DriftFilter(), by_drift),
+    (LKFSA(), by_lkf),
+    (LKFSA("nominal"), by_lkf),
+    (MSMV("nominal"), by_msmv),
+    (MSMV(), by_msmv),
+    (CovarianceIntersection(), by_ci),
+    (CovarianceIntersection(split=True), by_ci),
+]
+
+
+def label(pair: Any) -> str:
+    return (
+        "-".join(str(v) for v in vars(pair[0]).values() if isinstance(v, str | bool)) if isinstance(pair, tuple) else ""
+    )
+
+
+def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: Recording, near: float = 1e-7) -> None:
+    known, ego = known_of(method, recording), 0
+    track, sent = method(recording, [ego]), {}
+    if isinstance(method, MSMV | CovarianceIntersection):
+        own = solo_filter(recording, range(len(recording.ids)), known, FixNoise(known.gnss_variance))[:2]
+        sent = {"sent": own, "growth": ESTIMATE_GROWTH}
+    if isinstance(method, MSMV):
+        sent |= {"growth": (0.0, 1.0), "acceleration_std": 0.0}
+    steps = list(stars(recording, ego, known, method.message, **sent))
+    assert track.covariance is not None
+    assert track.neighbours is not None
+    for run in range(recording.runs):
+        x, cov, *others = oracle(method, recording, [messages.members(star, run) for star in steps])
+        np.testing.assert_allclose(track.x[run, :, 0], x, atol=near)
+        np.testing.assert_allclose(track.covariance[run, :, 0], cov, atol=near * np.abs(cov).max())
+        if others and len(track.neighbours[run]):
+            np.testing.assert_allclose(track.neighbours[run], np.concatenate(others[0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("pair", ORACLES, ids=label)
+def test_the_filter_is_its_oracle(crossing: Fleet, pair: Any, channel: str) -> None:
+    """Neighbours join and leave; messages are lost, late, slow and rejected; K = 0 and K > N."""
+    sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
+    assert_is_the_oracle(*pair, observe(crossing, sensors, CHANNELS[channel], runs=2, observers=[0]))
+
+
+@pytest.mark.parametrize("damage", [holed, slow_fixes, partial], ids=lambda f: f.__name__)
+@pytest.mark.parametrize("pair", ORACLES, ids=label)
+def test_it_is_with_missing_fixes_and_measurements(
+    crossing: Fleet, pair: Any, damage: Callable[..., Recording]
+) -> None:
+    sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
+    recording = observe(crossing, sensors, V2X(max_neighbours=4, loss=0.2), runs=2, observers=[0])
+    recording = damage(recording)
+    if damage is partial and isinstance(pair[0], MSMV | CovarianceIntersection | LKFSA):
+        assert np.isfinite(pair[0](recording, [0]).x).all()
+        return
+    assert_is_the_oracle(*pair, recording, 1e-6)
+
+
+@pytest.mark.parametrize("runs", [1, 3, 5])
+@pytest.mark.parametrize("pair", ORACLES, ids=label)
+def test_it_is_in_any_batch_and_with_absences(crossing: Fleet, pair: Any, runs: int) -> None:
+    sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
+    fleet = gappy(crossing).between(0, 45)
+    assert_is_the_oracle(*pair, observe(fleet, sensors, V2X(max_neighbours=5, loss=0.2), runs=runs, observers=[0]))
+
+
+NOISES = {
+    "fitted": (S2, lambda fleet: NoiseModel("fitted", S2, (0.3, 0.2, 0.01))),
+    "still": (S2, lambda fleet: NoiseModel("fitted", S2, (1e-4, 1e-4, 1e-4))),
+    "oracle": (S2, lambda fleet: NoiseModel.oracle(S2, fleet)),
+    "speed": (replace(S2, velocity_reading="speed", velocity_floor=0.5), lambda fleet: "nominal"),
+}
+
+
+@pytest.mark.parametrize("noise", NOISES)
+@pytest.mark.parametrize("pair", [ORACLES[0], ORACLES[5], ORACLES[6], ORACLES[8]], ids=label)
+def test_it_is_whatever_the_noise(crossing: Fleet, pair: Any, noise: str) -> None:
+    """Little, constant and true process noise, and noise that grows with the speed."""
+    sensors, known = NOISES[noise]
+    recording = observe(crossing, sensors, V2X(max_neighbours=4, loss=0.2, latency=0.1), runs=2, observers=[0])
+    method = replace(pair[0], noise_model=known(crossing))
+    assert_is_the_oracle(method, pair[1], recording, 1e-5 if noise == "still" else 1e-7)
+
+
+def test_a_state_without_process_noise_stays_finite(crossing: Fleet) -> None:
+    known = NoiseModel("fitted", S2, (1e-60, 1e-30, 1e-60))
+    still = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
+    recording = observe(still, S2, V2X(max_neighbours=4, loss=0.2), runs=2)
+    track = JointFilter(known)(recording, [1])
+    mean = recording.gnss[:, :, 1].mean(axis=1)
+    assert np.isfinite(track.x).all()
+    assert np.abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < np.abs(mean - still.position[-1, 1]).mean() + 0.5
+
+
+def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
+    """Independent check over the stacked star of a formation that never changes, from its first estimate on."""
+    fleet = formation.select(range(4)).between(0, 40)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = JointFilter(known, exact=False)(recording, [0])
+    n, order = 12, [0, *recording.links.neighbour[:3]]
+    peer = KalmanFilter(dim_x=n, dim_z=n + 9, dim_u=n)
+    vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
+    peer.B, peer.H = 0.1 * np.eye(n), np.vstack([np.eye(n), vectors])
+    peer.Q = np.kron(np.eye(4), np.diag(np.square(known.process_std)))
+    where = to_vector(recording.relative[0])
+    noise = np.zeros((n + 9, n + 9))
+    noise[:n, :n] = np.kron(np.eye(4), np.diag(known.gnss_variance))
+    for t in range(40):
+        z = np.concatenate([recording.gnss[0, t, order].ravel(), where[3 * t : 3 * t + 3].ravel()])
+        if t:
+            peer.predict(u=recording.velocity[0, t, order].ravel())
+            ahead = peer.x[3:].reshape(3, 3) - peer.x[:3]
+        else:
+            ahead = where[:3]
+        for k in range(3):
+            at = slice(n + 3 * k, n + 3 * k + 3)
+            noise[at, at] = known.relative_cov(np.array(spherical(*ahead[k])))
+        if t:
+            peer.update(z, R=noise)
+        else:  # filterpy's own update would lose seven digits to the flat prior
+            weight = peer.H.T @ np.linalg.inv(noise)
+            peer.P = np.linalg.inv(np.eye(n) / 1e6 + weight @ peer.H)
+            start = np.concatenate([z[:3], (z[:3] + ahead).ravel()])
+            peer.x = start + peer.P @ weight @ (z - peer.H @ start)
+        assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-9)
+        assert track.covariance is not None
+        assert track.covariance[0, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
+
+
+def test_the_angle_is_atan2() -> None:
+    for turn in np.concatenate([np.linspace(-3.14, 3.14, 301), [0.0, 1e-9, -1e-300, 0.2449, -0.245]]):
+        assert angle(3 * math.sin(turn), 3 * math.cos(turn)) == pytest.approx(turn, rel=1e-15, abs=0)
+
+
+def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
+    """Per axis, over the star of a formation that never changes, from its first estimate on."""
+    fleet = formation.select(range(4)).between(0, 40)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = LKFSA(known)(recording, [0])
+    assert track.covariance is not None
+    order, laplacian = [0, *recording.links.neighbour[:3]], np.diag([3.0, 1.0, 1.0, 1.0])
+    laplacian[0, 1:] = laplacian[1:, 0] = -1.0
+    seen = recording.relative[1].reshape(40, 3, 3)
+    ahead = to_vector(seen)
+    variance = np.trace(vector_cov(seen, S2.relative_std, S2.min_range), axis1=-2, axis2=-1).mean(axis=1) / 3
+    for c in range(3):
+        peer = KalmanFilter(dim_x=4, dim_z=8, dim_u=4)
+        peer.B, peer.H = 0.1 * np.eye(4), np.vstack([laplacian, np.eye(4)])
+        peer.Q = known.process_std[c] ** 2 * np.eye(4)
+        for t in range(40):
+            noise = np.diag([*(np.diag(laplacian) * variance[t]), *np.full(4, known.gnss_variance[c])])
+            z = np.array([-ahead[t, :, c].sum(), *ahead[t, :, c], *recording.gnss[1, t, order, c]])
+            if t:
+                peer.predict(u=recording.velocity[1, t, order, c])
+                peer.update(z, R=noise)
+            else:  # filterpy's own update would lose seven digits to the flat prior
+                weight = peer.H.T @ np.linalg.inv(noise)
+                peer.P = np.linalg.inv(np.eye(4) / 1e6 + weight @ peer.H)
+                first = z[4] + np.array([0.0, *z[1:4]])
+                peer.x = first + peer.P @ weight @ (z - peer.H @ first)
+            assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
+            assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
+
+
+def test_pseudo_fixes_are_fused_as_information(formation: Fleet) -> None:
+    """The first step in closed form: fix, and each neighbour's fix less the measurement, weighted by their
+    covariances."""
+    fleet = formation.select(range(4)).between(0, 2)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
+    track = MSMV("nominal")(recording, [0])
+    assert track.covariance is not None
+    at = recording.links.of(0)[:3]
+    fixes, seen = recording.gnss[1, 0], recording.relative[1, at]
+    own = np.diag(np.square(S2.gnss_std))
+    weight = np.linalg.inv([own, *(own + vector_cov(seen, S2.relative_std, S2.min_range))])
+    positions = np.stack([fixes[0], *(fixes[recording.links.neighbour[at]] - to_vector(seen))])
+    cov = np.linalg.inv(np.eye(3) / 1e6 + weight.sum(axis=0))
+    x = fixes[0] + cov @ np.einsum("kij,kj->i", weight, positions - fixes[0])
+    assert track.x[1, 0, 0] == pytest.approx(x, abs=1e-9)
+    assert track.covariance[1, 0, 0] == pytest.approx(cov, rel=1e-9, abs=1e-12)

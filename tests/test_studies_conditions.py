@@ -1,0 +1,238 @@
+"""Studies of conditions on few cells: channel, spoofing, GNSS errors, consistency, places, cooperative gain, bounds."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import crossing_fleet, formation_fleet
+
+import coopoc as co
+from coopoc import InputError, Sensors, run_study
+from coopoc.data.fleet_files import write_table
+from coopoc.evaluate.bounds import past_bound, posterior_bound
+from coopoc.learned.checkpoint import Checkpoint, save
+from coopoc.learned.nets.noise_net import NoiseNet
+from coopoc.learned.recipes import Setting, jobs_of
+from coopoc.studies import cooperative_gain, correlated_gnss, generalisation, latency_loss, robustness, scene
+from coopoc.studies.cooperative_gain import STUDY
+from coopoc.study import numbers
+from coopoc.study.publish import views as published
+
+FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
+
+
+def conditions(file: Path) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str], dict[str, Any]]]]:
+    """Every condition of a study with the marks of its methods and bounds."""
+    found: dict[str, dict[tuple[str, str], dict[str, Any]]] = defaultdict(dict)
+    for number in json.loads(file.read_text())["numbers"]:
+        where = dict(number["where"])
+        pair = (where.pop("method"), where.pop("noise_model", ""))
+        if number["metric"] == "rt_le_m":
+            found[json.dumps(where, sort_keys=True)][pair] = number
+    for where, marks in found.items():
+        yield json.loads(where), marks
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_no_mark_lies_below_its_bound(file: Path) -> None:
+    for where, marks in conditions(file):
+        bounds = {known: mark["value"] for (method, known), mark in marks.items() if method == "bound"}
+        for (method, known), mark in marks.items():
+            if method == "bound" or not bounds:
+                continue
+            own = max(bounds.values())
+            error = mark["run_std"] / mark["runs"] ** 0.5
+            assert mark["value"] + 3.0 * error > own, (where, method, known, mark["value"], own)
+
+
+def test_most_studies_show_a_bound() -> None:
+    shown = {file.stem for file in FILES for _, marks in conditions(file) if any(m == "bound" for m, _ in marks)}
+    assert {"budget", "cooperative_gain", "correlated_gnss", "neighbours", "learned_gains", "heading_error"} <= shown
+
+
+def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
+    wanted = {
+        "data": short_town,
+        "runs": 3,
+        "egos": "1",
+        "method": "kalman,joint",
+        "latency_s": "0.0,0.3",
+        "loss": "0.0,0.6",
+    }
+    results = run_study("latency_loss", tmp_path, settings=wanted, progress=False)
+    perfect, late, lossy = (
+        numbers.mean(results, {**latency_loss.PERFECT, "method": "joint", **change})
+        for change in ({}, {"latency_s": 0.3}, {"loss": 0.6})
+    )
+    assert perfect is not None
+    assert late is not None
+    assert lossy is not None
+    assert perfect < min(late, lossy)
+    table = (tmp_path / "latency_loss" / "tables" / "rt_le.md").read_text()
+    assert "lost in runs of 10" in table
+    assert "0.3 s" in table
+
+
+def test_who_trusts_everybody_is_led_astray_and_who_is_careful_is_not(tmp_path: Path, short_town: str) -> None:
+    wanted = {
+        "data": short_town,
+        "runs": 1,
+        "egos": "1",
+        "method": "kalman,joint,cooperative-map-gnc",
+        "max_neighbours": "0,4",
+        "spoofed_share": "0.0,0.4",
+    }
+    results = run_study("robustness", tmp_path, settings=wanted, progress=False)
+    alone, trusting, careful, unharmed = (
+        numbers.mean(results, robustness.at(method, 4, share))
+        for method, share in (("kalman", 0.4), ("joint", 0.4), *(("cooperative-map-gnc", s) for s in (0.4, 0.0)))
+    )
+    assert alone is not None
+    assert trusting is not None
+    assert trusting > 3 * alone
+    assert careful == pytest.approx(unharmed, rel=0.3)
+
+
+QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
+
+
+def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path, short_town: str) -> None:
+    wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
+    results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
+    value = {
+        name: [
+            numbers.rms(results, {**correlated_gnss.CASES[name], "method": "drift", "max_neighbours": k})
+            for k in (0, 6)
+        ]
+        for name in ("white", "own", "common")
+    }
+    own, common = value["own"], value["common"]
+    assert own[0] is not None
+    assert own[1] is not None
+    assert own[1] < 0.5 * own[0]
+    assert common[0] is not None
+    assert common[1] is not None
+    assert common[1] > 0.8 * common[0]
+    found = correlated_gnss.STUDY.found(results)
+    assert list(found) == ["white", "own", "common"]
+    assert all(text.startswith(f"{name}: ") for name, text in found.items())
+    folder = tmp_path / "correlated_gnss"
+    assert "Cramér-Rao bound" in (folder / "tables" / "rms.md").read_text()
+    assert (folder / "figures" / "rms.pdf").stat().st_size > 5_000
+
+
+def test_shares_keep_the_variance_of_a_fix() -> None:
+    noise = scene.lasting(Sensors.paper_scenario2(), 0.45, 0.45)
+    assert noise.fix_std == pytest.approx((3.5, 3.5, 3.5))
+    assert noise.gnss_drift_std == pytest.approx(3.5 * np.sqrt(0.45))
+    for own, common in ((0.6, 0.4), (-0.1, 0.0)):
+        with pytest.raises(InputError, match="own_share"):
+            scene.lasting(Sensors(), own, common)
+
+
+def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path, short_town: str) -> None:
+    wanted = {
+        "data": short_town,
+        "runs": 4,
+        "egos": "2",
+        "method": "kalman,joint,lkf-sa",
+        "noise_model": "nominal,identity",
+    }
+    results = run_study("consistency", tmp_path, settings=wanted, progress=False)
+    table = (tmp_path / "consistency" / "tables" / "nees.md").read_text()
+    good = numbers.mean(results, {"method": "joint", "noise_model": "nominal"}, "nees_inside")
+    bad = numbers.mean(results, {"method": "lkf-sa", "noise_model": "identity"}, "nees_inside")
+    assert good is not None
+    assert bad is not None
+    assert good > 0.9 > 0.1 > bad
+    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in table.splitlines()]
+    assert rows.index(["Joint filter", "nominal"]) < rows.index(["LKF-SA", "identity"])  # the most credible first
+
+
+@pytest.mark.slow
+def test_generalisation_is_relative_to_the_oracle_of_each_place(tmp_path: Path) -> None:
+    wanted = {"runs": 2, "egos": "2", "method": "kalman,kalman-adaptive", "data": "town10,town04", "scenario": "2"}
+    results = run_study("generalisation", tmp_path, settings=wanted, progress=False)
+    for fleet in ("town10", "town04"):
+        where = {**generalisation.at(fleet, "scenario 2"), "method": "kalman"}
+        oracle, fitted = (
+            generalisation.multiple(results, {**where, "noise_model": known}) for known in ("oracle", "fitted")
+        )
+        assert oracle == 1.0
+        assert fitted is not None
+        assert fitted > 1.05
+    assert "Adaptive KF" in (tmp_path / "generalisation" / "tables" / "multiples.md").read_text()
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A folder with a net that is taken for a trained one: training has its own tests."""
+    folder, clients = tmp_path_factory.mktemp("weights"), co.load_fleet("town10-clients")
+    (job,) = jobs_of("cooperative", Setting(), clients)
+    save(folder / f"{job.label}.safetensors", Checkpoint(NoiseNet(), {"key": job.key(clients)}))
+    return str(folder)
+
+
+@pytest.mark.slow
+def test_views_say_what_was_run(tmp_path: Path, weights: str) -> None:
+    """On eight vehicles of six seconds."""
+    write_table(crossing_fleet(), tmp_path / "crossing.csv")
+    study = STUDY.override(
+        {
+            "runs": 4,
+            "train_seeds": 1,
+            "weights": weights,
+            "data": str(tmp_path / "crossing.csv"),
+            "max_neighbours": "0,6",
+            "loss": "0.0,0.7",
+        }
+    )
+    results = run_study(study, out=tmp_path, progress=False)
+    assert results.failed == 0
+    at = {"receivers": "alike", "max_neighbours": 6, "method": "cooperative"}
+    heard = [results.interval("bytes_per_second", {**at, "loss": loss}).mean for loss in (0.0, 0.7)]
+    assert heard[1] == pytest.approx(0.3 * heard[0], rel=0.1)
+    clear = results.values("rt_le_m", {**at, "loss": 0.0}).mean()
+    assert clear < results.values("rt_le_m", {**at, "loss": 0.7}).mean()
+    shown = published(tmp_path / "cooperative_gain")
+    assert [view["name"] for view in shown["tables"]] == ["rt_le", "bytes", "nees", "nees_inside", "receivers"]
+    assert [view["name"] for view in shown["figures"]] == ["rt_le"]
+    assert list(shown["findings"]) == ["0 % loss", "70 % loss"]
+    assert all(said.startswith(f"{key}, K = 6: ") for key, said in shown["findings"].items())
+    assert f"the cooperative gain has {clear:.3f} m" in shown["findings"]["0 % loss"]
+
+
+def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes() -> None:
+    fleet, noise = formation_fleet(5, 40), co.Sensors.paper_scenario2()
+    for k in (0, 4):
+        np.testing.assert_allclose(
+            past_bound(fleet, noise, 0, co.V2X(k)), posterior_bound(fleet, noise, 0, co.V2X(k)), rtol=1e-9
+        )
+
+
+def test_bound_with_the_past_is_lower_where_they_do(crossing: co.Fleet) -> None:
+    noise, v2x = co.Sensors.paper_scenario2(), co.V2X(3)
+    past, star = (np.trace(b(crossing, noise, 1, v2x), axis1=1, axis2=2) for b in (past_bound, posterior_bound))
+    assert (past <= star * (1 + 1e-9)).all()
+    assert past[-1] < 0.98 * star[-1]
+
+
+@pytest.mark.parametrize("receivers", cooperative_gain.RECEIVERS)
+def test_receivers_differ_as_the_caption_says(receivers: str) -> None:
+    """Noise of every fix over 20 runs, and what nominal filters are told of all."""
+    p = {**STUDY.settings, "runs": 20, "egos": "1", "receivers": receivers, "max_neighbours": 0, "loss": 0.0}
+    fleet, seen = co.load_fleet("town10"), cooperative_gain.recording(p)
+    acting = np.sqrt(np.square(seen.gnss - fleet.position).mean(axis=(0, 3)))
+    poor = np.zeros((900, 60), dtype=bool)
+    poor[300 : 600 if receivers == "changing" else 300] = True
+    if receivers == "mixed":
+        poor[:, [c for c in range(60) if c % 5 < 2]] = True
+    assert acting[poor].mean() == pytest.approx(5.0, rel=0.01)
+    assert acting[~poor].mean() == pytest.approx(1.5, rel=0.01)
+    assert seen.sensors.gnss_std[0] == pytest.approx(np.sqrt(np.square(seen.gnss - fleet.position).mean()), rel=0.01)
