@@ -47,7 +47,7 @@ from .methods.track import Track as Track
 from .optimize.backend import Backend as Backend
 from .optimize.backend import backends as backends
 from .optimize.graphs import read_graph as read_graph
-from .optimize.model.constraint import Constraint as Constraint
+from .optimize.model.factor import Constraint as Constraint
 from .optimize.model.factor import Factor as Factor
 from .optimize.model.losses import Loss as Loss
 from .optimize.model.problem import Problem as Problem

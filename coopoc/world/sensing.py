@@ -22,10 +22,8 @@ from .v2x import V2X, lost
 Frame = Literal["world", "body"]
 PAIRS = 2_000_000
 """Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
-VECTOR = np.dtype((np.void, 24))
-"""Three numbers."""
 _alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()
-"""Draws of recordings that still exist, by all that they depend on: the next K or channel need not draw them again."""
+"""Draws of recordings that still exist, by all that they depend on: the next channel need not draw them again."""
 
 
 def observe(
@@ -84,7 +82,8 @@ def observe(
     if standing:
         gnss = gnss.copy()
         gnss[:, :, standing] = fleet.position[:, standing]
-    relative = _relative(links, (watching, tuple(standing)), v2x, *drawn)
+    who = (watching, tuple(standing), v2x.radius, v2x.max_neighbours)
+    relative = _once(("relative", *key, who), lambda: _relative_measurements(fleet, links, sensors, runs, seed))
     body = None
     if frame == "world":
         velocity = _once(("velocity", *key), lambda: _velocity(*drawn))
@@ -190,7 +189,7 @@ def _noisy(fleet: Fleet, sensor: str, runs: int, seed: int, mean: Floats, std: F
             stream(seed, sensor, r, name).standard_normal(out=normals)
         drawn *= scale
         drawn += centre
-        found[r].view(VECTOR)[..., 0] = drawn.view(VECTOR)[..., 0].T  # three numbers at a time
+        found[r] = drawn.swapaxes(0, 1)
     return found
 
 
@@ -219,35 +218,6 @@ def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
     order = np.argsort(key, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
     return [(fleet.ids[links.observer[g[0]]], fleet.ids[links.neighbour[g[0]]], g) for g in groups]
-
-
-def _relative(
-    links: Links,
-    who: tuple[Sequence[int], Sequence[int]],
-    v2x: V2X,
-    fleet: Fleet,
-    sensors: Sensors,
-    runs: int,
-    seed: int,
-) -> Floats:
-    """(R, L, 3) of observers and landmarks, from a recording of as many or more neighbours where one still exists."""
-    columns, landmarks = who
-    drawn, most = ("relative", fleet, repr(sensors), runs, seed, who, v2x.radius), v2x.max_neighbours
-
-    def draw() -> Floats:
-        for key, wider in list(_alive.items()):
-            if key[:-1] == drawn and key[-1] > most:
-                whole = find_links(fleet, columns, key[-1], v2x.radius, sensors.min_range, landmarks)
-                return wider.take(np.flatnonzero(np.isin(_code(fleet, whole), _code(fleet, links))), axis=1)
-        return _relative_measurements(fleet, links, sensors, runs, seed)
-
-    return _once((*drawn, most), draw)
-
-
-def _code(fleet: Fleet, links: Links) -> Ints:
-    """One number for each link."""
-    size = len(fleet.ids)
-    return np.asarray((links.step * size + links.observer) * size + links.neighbour)
 
 
 def _relative_measurements(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:

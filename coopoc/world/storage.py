@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
-import math
 import zipfile
 import zlib
 from dataclasses import asdict
@@ -90,21 +88,8 @@ def unpacked(path: Path) -> dict[str, AnyArray]:
     with zipfile.ZipFile(path) as packed:
         if sum(part.file_size for part in packed.infolist()) > LARGEST:
             raise InputError(path.name, "more than 4 GB unpacked", "must be smaller", "Save fewer runs.")
-        return {name.removesuffix(".npy"): _array(packed.read(name)) for name in packed.namelist()}
-
-
-def _array(stored: bytes) -> AnyArray:
-    """NumPy's own reader asks for as much memory as the header claims, whatever follows it."""
-    file = io.BytesIO(stored)
-    version = np.lib.format.read_magic(file)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"an array in version {version} of NumPy's format")
-    reads = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, by_columns, dtype = reads(file)
-    if dtype.hasobject:
-        raise ValueError("an array of Python objects")
-    found = np.frombuffer(stored, dtype, math.prod(shape), file.tell())
-    return found.reshape(shape, order="F" if by_columns else "C")
+    with np.load(path, allow_pickle=False) as stored:
+        return dict(stored)
 
 
 def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
