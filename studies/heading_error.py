@@ -189,21 +189,6 @@ def _compasses(results: Results, number: Number, text: str, decimals: int) -> Ta
     return crossed(results, ("K", "Method", "Noise model"), rows, columns, text, decimals=decimals)
 
 
-def _estimated(results: Results) -> Table | None:
-    """Heading errors without a compass, speeds and K down, times across, the bound beside each."""
-    rows = [
-        ((f"{speed:g}", k), of(pose(k), ALWAYS, compass=NONE, speed=speed, max_neighbours=k))
-        for speed in SPEEDS
-        for k in NEIGHBOURS
-    ]
-    columns: dict[str, Number] = {}
-    for after in AFTER:
-        columns |= across(heading, {f"{after:g} s": {"after_s": after}})
-        columns |= across(heading, {f"{after:g} s (bound)": of("bound", "bound", after_s=after)})
-    text = _note(results, "Rms heading error [°] without a compass, after a time.")
-    return crossed(results, ("Speed [m/s]", "K"), rows, columns, text, best=None, decimals=1)
-
-
 def _over_time(results: Results) -> Plot | None:
     """Heading error over time without a compass, K = 0 and 10, a line per speed; dotted the bound."""
     from matplotlib import colormaps
@@ -287,7 +272,6 @@ STUDY = Study(
         "nees": partial(
             _compasses, number=partial(mean, value="nees"), text="NEES of a pose (3 is consistent)", decimals=1
         ),
-        "found": _estimated,
     },
     figures={"heading": _over_time, "cost": _cost},
     findings=_findings,
