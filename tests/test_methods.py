@@ -9,11 +9,9 @@ import pytest
 from filterpy.kalman import KalmanFilter
 
 from coopoc import GNSS, LKFSA, MSMV, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
-from coopoc.evaluate.metrics import errors, nees, nees_inside, neighbour_rt_le, rt_le
+from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.methods.sliding_window import FixedLagSmoother
-from coopoc.methods.star import FORGOTTEN
-from coopoc.world.links import spherical, to_vector
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
@@ -83,56 +81,6 @@ def test_solo_filter_equals_filterpy(crossing: Fleet) -> None:
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-9)
         assert track.covariance is not None
         assert track.covariance[0, t, 0] == pytest.approx(peer.P, abs=1e-9)
-
-
-def test_linear_joint_filter_equals_filterpy(formation: Fleet) -> None:
-    """Independent check: filterpy's KalmanFilter over the stacked star of a formation that never changes."""
-    fleet = formation.select(range(4)).between(0, 40)
-    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
-    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-    track = JointFilter(known, exact=False)(recording, [0])
-    n, order = 4, [0, *recording.links.neighbour[:3]]
-    vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
-    peer = KalmanFilter(dim_x=3 * n, dim_z=3 * n + 9, dim_u=3 * n)
-    peer.B, peer.H = 0.1 * np.eye(3 * n), np.vstack([np.eye(3 * n), vectors])
-    peer.Q = np.kron(np.eye(n), np.diag(np.square(known.process_std)))
-    where = to_vector(recording.relative[0])
-    peer.x = np.concatenate([recording.gnss[0, 0, 0], (recording.gnss[0, 0, 0] + where[:3]).ravel()])
-    peer.P = FORGOTTEN * np.eye(3 * n)
-    for t in range(40):
-        if t:
-            peer.predict(u=recording.velocity[0, t, order].ravel())
-        noise = np.zeros((3 * n + 9, 3 * n + 9))
-        noise[: 3 * n, : 3 * n] = np.kron(np.eye(n), np.diag(known.gnss_variance))
-        for k in range(3):
-            at = slice(3 * n + 3 * k, 3 * n + 3 * k + 3)
-            expected = np.array(spherical(*(peer.x[3 * k + 3 : 3 * k + 6] - peer.x[:3])))
-            noise[at, at] = known.relative_cov(expected)
-        peer.update(np.concatenate([recording.gnss[0, t, order].ravel(), where[3 * t : 3 * t + 3].ravel()]), R=noise)
-        assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-6)
-
-
-def test_laplacian_form_equals_the_batch_least_squares(formation: Fleet) -> None:
-    """Independent check: numpy.linalg.lstsq on [L; I] at the first step, where the filter has no past."""
-    recording = observe(formation.between(0, 2), S2, V2X(max_neighbours=4), runs=1, observers=[0])
-    track = LKFSA("identity")(recording, [0])
-    order = [0, *recording.links.neighbour[:4]]
-    laplacian = np.diag([4.0, 1, 1, 1, 1])
-    laplacian[0, 1:] = laplacian[1:, 0] = -1
-    vector = to_vector(recording.relative[0, :4])
-    delta = np.vstack([-vector.sum(axis=0), vector])
-    z = np.vstack([delta, recording.gnss[0, 0, order]])
-    expected = np.linalg.lstsq(np.vstack([laplacian, np.eye(5)]), z, rcond=None)[0]
-    assert track.x[0, 0, 0] == pytest.approx(expected[0], abs=1e-4)
-    assert track.neighbours is not None
-    assert track.neighbours[0, :4] == pytest.approx(expected[1:], abs=1e-4)
-
-
-def test_neighbours_are_better_located_than_by_their_fix(formation: Fleet) -> None:
-    fleet = formation.between(0, 200)
-    recording = observe(fleet, S2, V2X(max_neighbours=6), runs=4, observers=[0])
-    for method in (JointFilter("nominal"), LKFSA("identity"), MSMV("nominal")):
-        assert (neighbour_rt_le(method(recording, [0]), recording, fleet) < 3.5 * np.sqrt(3)).all()
 
 
 def test_loss_and_delay_cost_accuracy_and_never_break(formation: Fleet) -> None:

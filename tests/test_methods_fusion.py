@@ -193,22 +193,6 @@ def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
     assert method(poisoned, [0]).x == pytest.approx(method(recording, [0]).x, abs=1e-7)
 
 
-@pytest.mark.parametrize("split", [False, True])
-def test_messages_help_as_they_come(split: bool, formation: Fleet) -> None:
-    fleet, score = formation.between(0, 200), []
-    method = CovarianceIntersection(split=split)
-    for channel in (
-        V2X(max_neighbours=10),
-        V2X(max_neighbours=10, rate=1.0, latency=0.3, loss=0.3),
-        V2X(max_neighbours=0),
-    ):
-        recording = observe(fleet, S2, channel, runs=20, observers=[0])
-        track = method(recording, [0])
-        score.append(rt_le(track, fleet).mean())
-        assert nees(track, fleet).mean() < 3.3
-    assert score[0] < score[1] < score[2]
-
-
 @pytest.mark.parametrize("method", [MDS(), QCQPRelaxation()])
 def test_snapshots_bring_the_last_fix_forward(method, crossing: Fleet) -> None:
     """Fixes once in five steps and a tenth of the ranges missing: the notes say so, and errors stay those of a fix."""

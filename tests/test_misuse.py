@@ -46,6 +46,40 @@ WRONG: tuple[Any, ...] = (
     np.full(3, np.nan),
 )
 """Values of the wrong kind, size or range; some are right for some fields."""
+RAGGED: tuple[Any, ...] = ([[1], [2, 3]], np.datetime64("2024-01-01"), np.array([1, 2], object), 1 + 2j, [10**400] * 4)
+"""Values that NumPy cannot turn into numbers, or whose comparisons are no truth values."""
+
+
+class Foreign:
+    """An object of a library of which nothing is known: it is no array, and has not even a text."""
+
+    def __array__(self, *_given: Any, **_options: Any) -> Any:
+        raise RuntimeError("no array")
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no text")
+
+
+HOSTILE: tuple[Any, ...] = (
+    np.array(3),
+    np.array("x"),
+    np.array(None),
+    pd.NA,
+    pd.NaT,
+    np.timedelta64(300, "ms"),
+    np.ma.masked_array([1.0, 2.0, 3.0], [True, False, False]),
+    [pd.NA],
+    pd.Series([1, pd.NA]),
+    Foreign(),
+    10**400,
+    "a" * 300,
+    "a\0b",
+    "\ud800",
+    b"ab",
+    {0, 1},
+)
+"""What pandas, masks, paths and libraries from elsewhere bring in."""
+ALL = (*WRONG, *RAGGED, *HOSTILE)
 FEW = (None, "x", -1, 0, 1.5, True, float("nan"), float("inf"), [], np.ones((2, 2)))
 METHODS: tuple[Any, ...] = (
     co.GNSS,
@@ -79,7 +113,7 @@ def ours(call: Callable[[], object], what: str) -> None:
         pytest.fail(f"{what}: {type(error).__name__}: {error}")
 
 
-def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = WRONG) -> None:
+def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL) -> None:
     """Each argument once with each wrong value, the others as given."""
     for name in given:
         for value in wrong:
@@ -141,12 +175,13 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
         "age": 0.0,
     }
     swept(co.RelativeMeasurement, relative)
+    swept(co.Message, {"name": "m", "numbers": 6})
+    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "velocity": None})
     for metric in (co.rt_le, co.max_error, co.nees):
         swept(metric, {"track": TRACK, "fleet": FLEET})
-    swept(co.posterior_bound, {"fleet": FLEET, "sensors": SENSORS, "ego": 0, "smoothing": False, "information": "star"})
+    swept(co.posterior_bound, {"fleet": FLEET, "sensors": SENSORS, "ego": 0, "smoothing": False})
     swept(co.fleet_bound, {"fleet": FLEET, "sensors": SENSORS, "v2x": CHANNEL})
-    posed = {"fleet": FLEET, "sensors": co.Sensors(heading_std=0.1), "ego": 0, "v2x": CHANNEL, "information": "star"}
-    swept(co.pose_bound, posed)
+    swept(co.pose_bound, {"fleet": FLEET, "sensors": co.Sensors(heading_std=0.1), "v2x": CHANNEL})
     swept(co.OwnMeasurement, {"velocity": [9.0, 0.0, 0.0], "yaw_rate": 0.1, "gnss": [0.0, 0.0, 0.0], "heading": 0.1})
     swept(co.LandmarkMeasurement, {"relative": [9.0, 0.1, 1.57], "place": [0.0, 0.0, 0.0]})
     swept(co.bound_rt_le, {"cov": np.eye(3)[None]})
@@ -169,6 +204,10 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
     swept(optimize.solve_distributed, {"problem": whole, "owner": "ab", "rounds": 1, "rho": 0.3, "loss": 0.0})
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
+    swept(optimize.loop_closures, {"problem": whole})
+    swept(co.Loss, {"name": "huber", "scale": 1.0})
+    swept(lambda problem: solution.plot(problem=problem), {"problem": whole}, HOSTILE)
+    swept(solution.__getitem__, {"point": "a"})
     swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))})
     swept(co.pose, {"position": np.zeros((4, 2)), "turn": 0.1})
     swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3})
@@ -181,18 +220,13 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 
 
-RAGGED: tuple[Any, ...] = ([[1], [2, 3]], np.datetime64("2024-01-01"), np.array([1, 2], object), 1 + 2j, [10**400] * 4)
-"""Values that NumPy cannot turn into numbers, or whose comparisons are no truth values."""
-
-
 def test_noise_bodies_and_starts_refuse_what_is_no_array_of_theirs() -> None:
-    wrong, body = (*WRONG, *RAGGED, RECORDING, TRACK), co.observe(FLEET, co.Sensors(), CHANNEL, frame="body")
+    wrong, body = (*ALL, RECORDING, TRACK), co.observe(FLEET, co.Sensors(), CHANNEL, frame="body")
     swept(co.NoiseModel.nominal, {"sensors": SENSORS}, wrong)
     swept(co.NoiseModel.oracle, {"sensors": SENSORS, "fleet": FLEET}, wrong)
     swept(co.NoiseModel.fitted, {"recording": RECORDING, "fleet": FLEET}, (*wrong, FLEET.between(0, 3)))
     swept(co.Body, {"yaw_rate": np.zeros((1, 2, 1)), "heading": np.zeros((1, 2, 1))}, wrong)
     swept(lambda begin: co.PoseFilter(begin=begin)(body, [0]), {"begin": None}, wrong)
-    swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0}, RAGGED)
     whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
     with pytest.raises(co.InputError, match="nodes = 10000 nodes: must name each of 2 nodes once"):
         optimize.joint_covariance(whole, co.solve(whole), "a" * 10_000)
@@ -200,7 +234,7 @@ def test_noise_bodies_and_starts_refuse_what_is_no_array_of_theirs() -> None:
 
 def test_training_refuses_arguments_of_the_wrong_kind() -> None:
     learned = pytest.importorskip("coopoc.learned", exc_type=ImportError)
-    wrong = (*WRONG, *RAGGED, RECORDING)
+    wrong = (*ALL, RECORDING)
     swept(learned.Privacy, {"clip": 1.0, "noise_multiplier": 1.0, "delta": 1e-5, "clients": None}, wrong)
     drive = co.load_fleet("town10").between(0, 24).select([0])
     given = {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}
@@ -232,77 +266,18 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
             co.run_study("backends", value, progress=False)  # type: ignore[arg-type]
 
 
-class Foreign:
-    """An object of a library of which nothing is known: it is no array, and has not even a text."""
-
-    def __array__(self, *_given: Any, **_options: Any) -> Any:
-        raise RuntimeError("no array")
-
-    def __repr__(self) -> str:
-        raise RuntimeError("no text")
-
-
-HOSTILE: tuple[Any, ...] = (
-    np.array(3),
-    np.array("x"),
-    np.array(None),
-    pd.NA,
-    pd.NaT,
-    np.timedelta64(300, "ms"),
-    np.ma.masked_array([1.0, 2.0, 3.0], [True, False, False]),
-    [pd.NA],
-    pd.Series([1, pd.NA]),
-    Foreign(),
-    10**400,
-    "a" * 300,
-    "a\0b",
-    "\ud800",
-    b"ab",
-    {0, 1},
-)
-"""What pandas, masks, paths and libraries from elsewhere bring in."""
-
-
-@pytest.mark.parametrize("noun", [SENSORS, CHANNEL, FLEET, RECORDING, TRACK], ids=lambda n: type(n).__name__)
-def test_no_noun_takes_values_from_elsewhere(noun: Any) -> None:
-    swept(type(noun), init(noun), HOSTILE)
-
-
-def test_functions_refuse_values_from_elsewhere() -> None:
-    swept(co.observe, {"fleet": FLEET, "sensors": SENSORS, "runs": 1, "seed": 0, "observers": [0]}, HOSTILE)
-    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "velocity": None}, HOSTILE)
-    swept(co.RelativeMeasurement, {"id": "b", "relative": [9.0, 0.1, 1.57], "gnss": None, "age": 0.0}, HOSTILE)
-    swept(co.Message, {"name": "m", "numbers": 6}, HOSTILE)
-    given: dict[str, Any] = {"gnss": [0.0, 0.0, 0.0], "velocity": [1.0, 0.0, 0.0], "dt": 0.1, "fix_age": 0.0}
-    for method in (co.Kalman("identity"), co.JointFilter("identity")):
-        swept(lambda method=method, **step: method.start().step(**step), given, HOSTILE)
-        swept(method, {"recording": RECORDING, "egos": [0]}, HOSTILE)
+def test_a_duration_and_a_mask_are_no_numbers() -> None:
     with pytest.raises(co.InputError, match=r"dt = np\.timedelta64"):  # 300 ms are no 300 s
         co.Kalman("identity").start().step([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], np.timedelta64(300, "ms"))  # type: ignore[arg-type]
     with pytest.raises(co.InputError, match="a = dtype object"):  # numbers behind a mask are none
         co.paired_difference(np.ma.masked_array([1.0, 2.0], [True, False]), np.ones(2))
+
+
+def test_trajectory_scores_refuse_arguments_of_the_wrong_kind() -> None:
     path = {"t": np.arange(30.0), "position": np.zeros((30, 3)), "rotation": None, "covariance": None}
     swept(lambda **one: scores({"a": Path_(**one)}, {"a": Path_(**path)}), path, HOSTILE)
     both = {"estimates": {"a": Path_(**path)}, "truths": {"a": Path_(**path)}, "aligned": "none", "unit": "steps"}
     swept(scores, {**both, "max_diff": 0.1, "offset": 0.0, "delta": 1.0, "blocks": 5}, HOSTILE)
-
-
-def test_solvers_refuse_values_from_elsewhere() -> None:
-    whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
-    solution = co.solve(whole)
-    marked = {"problem": whole, "candidates": [0], "groups": None, "threshold": 0.99}
-    swept(optimize.solve_gnc, marked, (*HOSTILE, [[1], [2, 3]], ["a", None]))
-    swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a"]}, HOSTILE)
-    swept(optimize.loop_closures, {"problem": whole}, HOSTILE)
-    swept(co.Problem, {"names": ("a",), "x0": np.zeros((1, 3)), "poses": (), "fixed": (), "dimension": 3}, HOSTILE)
-    swept(PROBLEM.add, {"kind": "range", "nodes": ("a", "b"), "z": 9.0, "std": 1.0, "loss": None}, HOSTILE)
-    swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0}, HOSTILE)
-    swept(co.Loss, {"name": "huber", "scale": 1.0}, HOSTILE)
-    swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))}, (*HOSTILE, 1e308))
-    swept(lambda problem: solution.plot(problem=problem), {"problem": whole}, HOSTILE)
-    swept(solution.__getitem__, {"point": "a"}, HOSTILE)
-    with pytest.raises(co.InputError, match="loss"):
-        PROBLEM.add("range", ("a", "b"), 9.0, std=1.0, loss=3)  # type: ignore[arg-type]
 
 
 def test_training_refuses_values_from_elsewhere() -> None:

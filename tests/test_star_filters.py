@@ -1,13 +1,15 @@
-"""Every filter of a star against its dense textbook oracle: gaps, absences, losses, delays, rates, any K, any batch."""
+"""Every filter of a star against its dense textbook oracle and filterpy: gaps, absences, losses, delays, any batch."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from oracles import covariance_intersection, drift, joint, lkf_sa, messages, msmv
 
 from coopoc import (
@@ -24,11 +26,13 @@ from coopoc import (
     stars,
 )
 from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.relative import angle
 from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
 from coopoc.methods.star import ESTIMATE_GROWTH
 from coopoc.methods.track import Method
+from coopoc.world.links import spherical, to_vector, vector_cov
 
 S2 = Sensors.paper_scenario2()
 DRIFTING = replace(S2, gnss_drift_std=1.0, gnss_common_std=0.7, gnss_drift_time=5.0)
@@ -198,3 +202,93 @@ def test_a_state_without_process_noise_stays_finite(crossing: Fleet) -> None:
     mean = recording.gnss[:, :, 1].mean(axis=1)
     assert np.isfinite(track.x).all()
     assert np.abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < np.abs(mean - still.position[-1, 1]).mean() + 0.5
+
+
+def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
+    """Independent check over the stacked star of a formation that never changes, from its first estimate on."""
+    fleet = formation.select(range(4)).between(0, 40)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = JointFilter(known, exact=False)(recording, [0])
+    n, order = 12, [0, *recording.links.neighbour[:3]]
+    peer = KalmanFilter(dim_x=n, dim_z=n + 9, dim_u=n)
+    vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))
+    peer.B, peer.H = 0.1 * np.eye(n), np.vstack([np.eye(n), vectors])
+    peer.Q = np.kron(np.eye(4), np.diag(np.square(known.process_std)))
+    where = to_vector(recording.relative[0])
+    noise = np.zeros((n + 9, n + 9))
+    noise[:n, :n] = np.kron(np.eye(4), np.diag(known.gnss_variance))
+    for t in range(40):
+        z = np.concatenate([recording.gnss[0, t, order].ravel(), where[3 * t : 3 * t + 3].ravel()])
+        if t:
+            peer.predict(u=recording.velocity[0, t, order].ravel())
+            ahead = peer.x[3:].reshape(3, 3) - peer.x[:3]
+        else:
+            ahead = where[:3]
+        for k in range(3):
+            at = slice(n + 3 * k, n + 3 * k + 3)
+            noise[at, at] = known.relative_cov(np.array(spherical(*ahead[k])))
+        if t:
+            peer.update(z, R=noise)
+        else:  # filterpy's own update would lose seven digits to the flat prior
+            weight = peer.H.T @ np.linalg.inv(noise)
+            peer.P = np.linalg.inv(np.eye(n) / 1e6 + weight @ peer.H)
+            start = np.concatenate([z[:3], (z[:3] + ahead).ravel()])
+            peer.x = start + peer.P @ weight @ (z - peer.H @ start)
+        assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-9)
+        assert track.covariance is not None
+        assert track.covariance[0, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
+
+
+def test_the_angle_is_atan2() -> None:
+    for turn in np.concatenate([np.linspace(-3.14, 3.14, 301), [0.0, 1e-9, -1e-300, 0.2449, -0.245]]):
+        assert angle(3 * math.sin(turn), 3 * math.cos(turn)) == pytest.approx(turn, rel=1e-15, abs=0)
+
+
+def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
+    """Per axis, over the star of a formation that never changes, from its first estimate on."""
+    fleet = formation.select(range(4)).between(0, 40)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
+    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    track = LKFSA(known)(recording, [0])
+    assert track.covariance is not None
+    order, laplacian = [0, *recording.links.neighbour[:3]], np.diag([3.0, 1.0, 1.0, 1.0])
+    laplacian[0, 1:] = laplacian[1:, 0] = -1.0
+    seen = recording.relative[1].reshape(40, 3, 3)
+    ahead = to_vector(seen)
+    variance = np.trace(vector_cov(seen, S2.relative_std, S2.min_range), axis1=-2, axis2=-1).mean(axis=1) / 3
+    for c in range(3):
+        peer = KalmanFilter(dim_x=4, dim_z=8, dim_u=4)
+        peer.B, peer.H = 0.1 * np.eye(4), np.vstack([laplacian, np.eye(4)])
+        peer.Q = known.process_std[c] ** 2 * np.eye(4)
+        for t in range(40):
+            noise = np.diag([*(np.diag(laplacian) * variance[t]), *np.full(4, known.gnss_variance[c])])
+            z = np.array([-ahead[t, :, c].sum(), *ahead[t, :, c], *recording.gnss[1, t, order, c]])
+            if t:
+                peer.predict(u=recording.velocity[1, t, order, c])
+                peer.update(z, R=noise)
+            else:  # filterpy's own update would lose seven digits to the flat prior
+                weight = peer.H.T @ np.linalg.inv(noise)
+                peer.P = np.linalg.inv(np.eye(4) / 1e6 + weight @ peer.H)
+                first = z[4] + np.array([0.0, *z[1:4]])
+                peer.x = first + peer.P @ weight @ (z - peer.H @ first)
+            assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
+            assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
+
+
+def test_pseudo_fixes_are_fused_as_information(formation: Fleet) -> None:
+    """The first step in closed form: fix, and each neighbour's fix less the measurement, weighted by their
+    covariances."""
+    fleet = formation.select(range(4)).between(0, 2)
+    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
+    track = MSMV("nominal")(recording, [0])
+    assert track.covariance is not None
+    at = recording.links.of(0)[:3]
+    fixes, seen = recording.gnss[1, 0], recording.relative[1, at]
+    own = np.diag(np.square(S2.gnss_std))
+    weight = np.linalg.inv([own, *(own + vector_cov(seen, S2.relative_std, S2.min_range))])
+    positions = np.stack([fixes[0], *(fixes[recording.links.neighbour[at]] - to_vector(seen))])
+    cov = np.linalg.inv(np.eye(3) / 1e6 + weight.sum(axis=0))
+    x = fixes[0] + cov @ np.einsum("kij,kj->i", weight, positions - fixes[0])
+    assert track.x[1, 0, 0] == pytest.approx(x, abs=1e-9)
+    assert track.covariance[1, 0, 0] == pytest.approx(cov, rel=1e-9, abs=1e-12)

@@ -1,0 +1,197 @@
+"""Poor measurements: fixes that are missing or late, ranges without directions, headings that are wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+
+from coopoc import (
+    LKFSA,
+    MSMV,
+    V2X,
+    CentralFilter,
+    CovarianceIntersection,
+    FixedLagSmoother,
+    Fleet,
+    InputError,
+    JointFilter,
+    Kalman,
+    Method,
+    MovingHorizon,
+    Recording,
+    Sensors,
+    nees,
+    observe,
+    rt_le,
+    run_study,
+)
+from coopoc.learned import CooperativeGain, GainNet, LearnedGain, NoiseNet, RecursiveFilter, RecursiveGain
+from coopoc.learned.nets.cooperative import NetNoise
+from coopoc.methods.drift_filter import DriftFilter
+from coopoc.methods.noise_model import NoiseModel
+from coopoc.studies.views import of
+from coopoc.study import numbers
+from coopoc.world.links import wrap
+
+SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RecursiveFilter(RecursiveGain()), NoiseNet().method("noise"))
+STARS = (
+    JointFilter(),
+    JointFilter(exact=False),
+    LKFSA("nominal"),
+    DriftFilter(),
+    CooperativeGain(NoiseNet()),
+    MSMV("nominal"),
+    CovarianceIntersection(split=True),
+)
+
+
+def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> Recording:
+    """The recording without a share of the fixes; the first ones stay."""
+    gnss = recording.gnss.copy()
+    gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < share
+    gone[:, 0] = False
+    gnss[:, :, vehicles][gone[:, :, vehicles]] = np.nan
+    return replace(recording, gnss=gnss)
+
+
+def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None:
+    seen = holed(observe(crossing, Sensors(), V2X(0), runs=1), 0.4)
+    track = Kalman()(seen, [1])
+    q = np.broadcast_to(NoiseModel.nominal(seen.sensors).process_variance(seen), seen.gnss.shape)[0, :, 1]
+    kf = KalmanFilter(dim_x=3, dim_z=3)
+    kf.x, kf.P, kf.H, kf.R, kf.F, kf.B = (
+        seen.gnss[0, 0, 1][:, None],
+        2.25 * np.eye(3),
+        np.eye(3),
+        2.25 * np.eye(3),
+        np.eye(3),
+        0.1 * np.eye(3),
+    )
+    for t in range(1, len(crossing.t)):
+        kf.predict(u=seen.velocity[0, t, 1][:, None], Q=np.diag(q[t]))
+        if np.isfinite(seen.gnss[0, t, 1]).all():
+            kf.update(seen.gnss[0, t, 1][:, None])
+        np.testing.assert_allclose(track.x[0, t, 0], kf.x[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")
+def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  # type: ignore[no-untyped-def]
+    whole = observe(crossing, Sensors(gnss_std=(4, 4, 4)), V2X(4, 80.0), runs=6)
+    some, few = (float(rt_le(method(holed(whole, share), [0, 3]), crossing).mean()) for share in (0.0, 0.7))
+    assert np.isfinite(few)
+    assert few < 4 * np.sqrt(3)
+    assert method.name in ("fedkalmannet", "lkf-sa") or few > some
+
+
+def test_a_missing_fix_is_one_of_boundless_variance(crossing: Fleet) -> None:
+    """And not one at the origin: the joint filter that assumes 10^12 m^2 of those fixes gives the same answer."""
+    whole = observe(crossing, Sensors(), V2X(4, 80.0), runs=2)
+    some, known = holed(whole, 0.5), NoiseModel.nominal(whole.sensors)
+    r = np.where(np.isnan(some.gnss), 1e12, 1.5**2)
+    process = np.broadcast_to(known.process_variance(whole), whole.gnss.shape)
+    given = NetNoise("net", whole.sensors, fix=r, process=process)
+    np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(given)(whole, [0]).x, atol=1e-5)
+
+
+def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:
+    seen = observe(crossing, Sensors(), V2X(0), runs=1)
+    gnss = seen.gnss.copy()
+    gnss[:, 0] = np.nan
+    with pytest.raises(InputError, match="no fix at step 0"):
+        Kalman()(replace(seen, gnss=gnss), [0])
+
+
+RUNS = 10
+
+
+def ranged() -> tuple[Fleet, Recording]:
+    """Three cars that range each other at every step; those beside the ego have their first fix a step later."""
+    t = 0.5 * np.arange(200)
+    ego = np.stack([8 * t, 3 * np.sin(0.05 * t), 0 * t], axis=-1)
+    around = np.stack([25 * np.cos(0.03 * t), 4 + 20 * np.sin(0.03 * t), 0 * t], axis=-1)
+    behind = np.stack([8 * t - 15, 0 * t - 12, 0 * t], axis=-1)
+    x = np.stack([ego, ego + around, behind], axis=1)
+    velocity = np.diff(x, axis=0, prepend=x[:1]) / 0.5
+    velocity[0] = velocity[1]
+    fleet = Fleet(("ego", "around", "behind"), t, x, velocity)
+    noise = Sensors(gnss_std=(2.0, 2.0, 0.01), velocity_std_ratio=0.02, velocity_floor=0.05, range_std=0.5)
+    seen = observe(fleet, noise, V2X(max_neighbours=2, radius=200), runs=RUNS)
+    relative, gnss = seen.relative.copy(), seen.gnss.copy()
+    relative[..., 1:], gnss[:, 0, 1:] = np.nan, np.nan
+    return fleet, replace(seen, relative=relative, gnss=gnss)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        JointFilter(),
+        JointFilter(exact=False),
+        DriftFilter(),
+        FixedLagSmoother(lag=5),
+        MovingHorizon(horizon=5),
+    ],
+    ids=lambda method: f"{method.name}-{getattr(method, 'exact', '')}",
+)
+def test_a_range_to_a_neighbour_whose_first_fix_comes_late_does_no_harm(method: Method) -> None:
+    """Against the Kalman filter alone, and the whole-fleet filter, which has the same measurements."""
+    fleet, seen = ranged()
+    alone, central = (rt_le(m(seen, ["ego"]), fleet).mean() for m in (Kalman(), CentralFilter()))
+    track = method(seen, ["ego"])
+    assert rt_le(track, fleet).mean() < 0.5 * (alone + central)
+    assert track.covariance is not None
+    band = nees(track, fleet)[:, 10:].mean()
+    assert 2.0 < band < 4.5
+
+
+NOISE = Sensors(heading_std=0.05)
+BIAS = Sensors(heading_bias_std=0.05)
+
+
+def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing: Fleet) -> None:
+    """Against the same draws without it: azimuths of one observer and step move by one number, nothing else moves."""
+    v2x, plain = V2X(4, 80.0), observe(crossing, Sensors(), V2X(4, 80.0), runs=30)
+    for sensors, per_step in ((NOISE, True), (BIAS, False)):
+        seen = observe(crossing, sensors, v2x, runs=30)
+        np.testing.assert_array_equal(seen.gnss, plain.gnss)
+        np.testing.assert_array_equal(seen.relative[..., [0, 2]], plain.relative[..., [0, 2]])
+        turned, mine = wrap(seen.relative[..., 1] - plain.relative[..., 1]), plain.links.of(2)
+        steps = plain.links.step[mine]
+        for t in np.unique(steps):
+            assert np.ptp(turned[:, mine[steps == t]], axis=1) == pytest.approx(np.zeros(30), abs=1e-9)
+        assert (np.ptp(turned[:, mine], axis=1) > 1e-3).all() == per_step
+        assert turned.std() == pytest.approx(0.05, rel=0.2)
+
+
+def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
+    both = replace(NOISE, heading_bias_std=0.12, azimuth_std=0.0)
+    known = NoiseModel.nominal(replace(both, azimuth_std=1e-12))
+    assert known.sensors is not None
+    assert known.sensors.azimuth_std == pytest.approx(0.13)
+    assert NoiseModel.nominal(Sensors()).sensors == Sensors()
+
+
+@pytest.mark.slow
+def test_the_study_shows_what_a_heading_costs(tmp_path: Path) -> None:
+    wanted = {"runs": 4, "speed": "0.0,10.0", "after_s": "3.0,30.0", "max_neighbours": "0,2", "compass": "exact,3,none"}
+    results = run_study("heading_error", tmp_path, settings=wanted, progress=False)
+    pose, first, joint = ("pose-fleet", "nominal"), ("pose-fleet", "first compass"), ("joint", "nominal")
+    at = {"speed": 10.0, "after_s": 30.0, "max_neighbours": 2}
+    exact, estimated, noise, once, turned = (
+        numbers.mean(results, of(*line, **at, compass=compass)) or np.nan
+        for line, compass in ((pose, "exact"), (pose, "none"), (pose, "3"), (first, "3"), (joint, "3"))
+    )
+    assert exact < estimated < noise < turned
+    assert once < noise
+    for k, method, least, most in ((0, "pose-solo", 60.0, 180.0), (2, "pose-fleet", 0.3, 4.0), (2, "bound", 0.3, 4.0)):
+        still = numbers.rms(
+            results,
+            {"method": method, "max_neighbours": k, "compass": "none", "speed": 0.0, "after_s": 3.0},
+            "heading_deg",
+        )
+        assert still is not None
+        assert least < still < most
+    assert "Position filter" in (tmp_path / "heading_error" / "tables" / "compass.md").read_text()
