@@ -21,7 +21,7 @@ PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c 
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
 PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile
-QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_small formats formats_errors data_readers data_log \
+QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_vectors formats formats_errors data_readers data_log \
 	optimize_problem optimize_agreement statistics study_tables study_grid layering)
 
 LOWER := build/lower

@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from backends_gtsam import fixed_lag, gtsam_exact, gtsam_linear, pose_lag
+from backends_gtsam import gtsam_exact, gtsam_linear, pose_lag
 from backends_programmes import PLAIN, casadi_exact, osqp_linear
 from backends_star import Job, one_by_one, star
 from tabulate import tabulate
@@ -23,17 +23,16 @@ from timing import timed
 
 from coopoc.optimize.starts.initial import converted
 
-ROUNDS, RUNS, STEPS = 7, 200, 60
+ROUNDS, RUNS = 7, 200
 
 
-def jobs(runs: int = RUNS, steps: int = STEPS) -> list[Job]:
+def jobs(runs: int = RUNS) -> list[Job]:
     """All of them; a call of each has run once."""
     exact = star(runs)
     linear = converted(exact)
     return [
         gtsam_linear(linear),
         gtsam_exact(exact),
-        fixed_lag(linear, steps),
         pose_lag(),
         *(casadi_exact(exact, method) for method in PLAIN),
         osqp_linear(linear),

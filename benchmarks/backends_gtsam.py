@@ -14,8 +14,7 @@ from classical import KNOWN, NEIGHBOURS, SENSORS
 
 import coopoc as co
 from coopoc.methods.poses.pose_factors import PoseRun, pose_subgraph
-from coopoc.optimize import Problem, solve
-from coopoc.optimize.incremental import FixedLag
+from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import spherical, wrap
 
@@ -77,66 +76,6 @@ def custom_factors(fix: Any, vector: Any, root: Any) -> Any:
     params.setRelativeErrorTol(1e-12)
     found = gtsam.LevenbergMarquardtOptimizer(graph, at, params).optimize()
     return np.stack([found.atPoint3(k) for k in range(len(fix))])
-
-
-def fixed_lag(problem: Problem, count: int) -> Job:
-    """The star that drives on for `count` steps, realisation by realisation one step later; a lag of ten steps."""
-    fixes, edges = problem.factors
-    n, lag, moved = NEIGHBOURS + 1, 1.05, np.tile([1.0, 0.0, 0.0], (NEIGHBOURS + 1, 1))
-    odometry = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.process_std))
-    prior = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
-    z, roots = fixes.z[:count] + np.arange(count)[:, None, None] * moved, edges.root
-
-    def piece(names: list[str], first: int, steps: int) -> Problem:
-        """The steps from `first` on, and the odometry from the nodes before them where the names have those."""
-        found, each = Problem(names), np.arange(n)
-        before = len(names) - n * steps
-        for k in range(steps):
-            at = before + n * k + each
-            found = found.add("position", at.tolist(), z[first + k], std=KNOWN.gnss_std)
-            if before or k:
-                found = found.add("displacement", np.stack([at - n, at], 1).tolist(), moved, std=KNOWN.process_std)
-            star = np.stack([np.full(NEIGHBOURS, at[0]), at[1:]], 1).tolist()
-            found = found.add("displacement", star, edges.z[first + k], sqrt_information=roots[first + k])
-        return found
-
-    def called(t: int) -> list[str]:
-        return [f"{i}@{t}" for i in range(n)]
-
-    pieces = [piece([*(called(t - 1) if t else []), *called(t)], t, 1) for t in range(count)]
-    whole = {t: piece([name for s in range(t + 1) for name in called(s)], 0, t + 1) for t in (20, count - 1)}
-    best = {t: solve(problem).x[-n] for t, problem in whole.items()}
-
-    def mine() -> Any:
-        smoother = FixedLag(lag, threshold=np.inf)  # what is linear is never linearised again
-        return np.stack(
-            [smoother.update(part, dict.fromkeys(called(t), 0.1 * t), [f"0@{t}"]).x for t, part in enumerate(pieces)]
-        )
-
-    def hand() -> Any:
-        params = gtsam.ISAM2Params()
-        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-        smoother, found = gtsam.IncrementalFixedLagSmoother(lag, params), []
-        for t in range(count):
-            graph, fresh, key = gtsam.NonlinearFactorGraph(), gtsam.Values(), n * t
-            for k in range(n):
-                graph.add(gtsam.PriorFactorPoint3(key + k, z[t, k], prior))
-                fresh.insert(key + k, z[t, k])
-                if t:
-                    graph.add(gtsam.BetweenFactorPoint3(key - n + k, key + k, moved[k], odometry))
-            for k in range(NEIGHBOURS):
-                model = gtsam.noiseModel.Gaussian.SqrtInformation(roots[t, k], False)
-                graph.add(gtsam.BetweenFactorPoint3(key, key + k + 1, edges.z[t, k], model))
-            smoother.update(graph, fresh, dict.fromkeys(range(key, key + n), 0.1 * t))
-            found.append(smoother.calculateEstimate().atPoint3(key))
-            smoother.marginalCovariance(key)
-        return np.stack(found)[:, None]
-
-    def right(x: Any) -> bool:
-        return all(float(np.abs(x[t, 0] - wanted).max()) < 1e-3 for t, wanted in best.items())
-
-    job = "gtsam, fixed lag, converted"
-    return Job([Row(job, "ours", count, mine), Row(job, "hand-written", count, hand)], right)
 
 
 def seen(x: Any, z: Any, std: Any) -> tuple[Any, Any]:

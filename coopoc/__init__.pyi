@@ -4,7 +4,6 @@ from .errors import InputError as InputError
 from .errors import MissingLibraryError as MissingLibraryError
 from .evaluate.bounds import bound_rt_le as bound_rt_le
 from .evaluate.bounds import fleet_bound as fleet_bound
-from .evaluate.bounds import fleet_pose_bound as fleet_pose_bound
 from .evaluate.bounds import pose_bound as pose_bound
 from .evaluate.bounds import posterior_bound as posterior_bound
 from .evaluate.ledger import Ledger as Ledger
@@ -47,7 +46,7 @@ from .methods.track import Track as Track
 from .optimize.backend import Backend as Backend
 from .optimize.backend import backends as backends
 from .optimize.graphs import read_graph as read_graph
-from .optimize.model.constraint import Constraint as Constraint
+from .optimize.model.factor import Constraint as Constraint
 from .optimize.model.factor import Factor as Factor
 from .optimize.model.losses import Loss as Loss
 from .optimize.model.problem import Problem as Problem

@@ -19,7 +19,6 @@ import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.picture import draw
 from coopoc.data.log.read import read_log
-from coopoc.optimize import Problem, solve
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
 from coopoc.study.report import report
@@ -62,12 +61,11 @@ def text_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", NAMES)
 def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
-    """Of recordings, tracks, solutions, logs and studies; the name is in the legend, whatever it holds."""
+    """Of recordings, tracks, logs and studies; the name is in the legend, whatever it holds."""
     name, t = NAMES[kind], np.arange(40) / 10
     position = np.stack([np.column_stack([8 * t, y + 0 * t, 0 * t]) for y in (0.0, 9.0)], axis=1)
     fleet = co.Fleet((name, "b"), t, position, np.gradient(position, 0.1, axis=0))
     rec = co.observe(fleet, co.Sensors(), co.V2X(max_neighbours=1))
-    solution = solve(Problem((name, "b")).add("position", [name, "b"], [[0, 0, 0], [9, 1, 0]], std=2.0))
     studied = Figure()
     axes = studied.subplots()
     legend(axes, [{"method": name}, {"method": "kalman"}])
@@ -79,7 +77,7 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
     with (tmp_path / "log.csv").open("w", newline="") as file:
         csv.writer(file).writerows([("t", "vehicle", "kind", "value"), *rows])
     log = read_log(tmp_path / "log.csv")
-    figures = [co.Kalman()(rec, [0]).plot(fleet=fleet).figure, rec.plot().figure, solution.plot().figure, studied]
+    figures = [co.Kalman()(rec, [0]).plot(fleet=fleet).figure, rec.plot().figure, studied]
     texts = [*map(words, figures), draw(check(log), tmp_path / "log.svg").read_text()]
     shown = re.sub(r"[\s_]+", "", "".join(c for c in name if c.isalnum() or c in " _="))[:6]
     for text in texts:

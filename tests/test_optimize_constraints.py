@@ -355,20 +355,6 @@ def test_the_far_side_of_a_range_is_a_maximum(backend: str, options: dict[str, s
     assert aside.x[:, 0] == pytest.approx([0.01 * gap, 9.0 - 9.0 * gap], abs=1e-6)
 
 
-@pytest.mark.parametrize(("backend", "options"), LINEAR)
-def test_constraints_that_say_the_same_twice(dense: Recording, backend: str, options: dict[str, str]) -> None:
-    problem = Problem.from_snapshot(dense, 10, 0)
-    free = solve(problem).x
-    there, gap = free[0] + [1.0, 0, 0], np.array([*(free[2, :2] - free[1, :2] + 0.5), INF])
-    once = problem.constrain("position", 0, there, there).constrain("displacement", (1, 2), gap * [1, 1, -1], gap)
-    twice = once.constrain("position", 0, there, INF).constrain("displacement", (2, 1), -gap, gap * [-1, -1, 1])
-    first, again = solved(once, backend, options), solved(twice, backend, options)
-    assert again.x == pytest.approx(first.x, abs=1e-6)
-    assert again.covariance == pytest.approx(first.covariance, abs=1e-9)
-    assert again.x[0] == pytest.approx(there, abs=1e-9)
-    assert again.covariance[0] == pytest.approx(0.0, abs=1e-12)
-
-
 def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
     """min 1/2 x^2 + q x in [-1, 1]: by hand."""
     from scipy.sparse import eye

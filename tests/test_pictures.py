@@ -61,16 +61,6 @@ def test_a_track_shows_paths_and_truth(seen: tuple[co.Fleet, co.Recording]) -> N
     assert len(co.GNSS()(recording, [24]).plot().patches) in (0, 60)
 
 
-def test_a_solution_shows_nodes_factors_and_headings(seen: tuple[co.Fleet, co.Recording]) -> None:
-    problem = co.Problem.from_snapshot(seen[1], step=10, ego=24)
-    solution = co.solve(problem)
-    ax = solution.plot(problem=problem)
-    np.testing.assert_array_equal(ax.lines[0].get_xydata(), solution.position[:, :2])
-    assert [text.get_text() for text in ax.texts] == list(solution.names)
-    with pytest.raises(co.InputError, match="must be the one that was solved"):
-        solution.plot(problem=co.Problem(("a", "b")).add("position", ["a", "b"], np.zeros((2, 3)), std=1.0))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

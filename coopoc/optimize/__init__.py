@@ -8,8 +8,7 @@ from .distributed import Distributed, solve_distributed
 from .graphs import loop_closures
 from .joint import joint_covariance
 from .model import kinds as _kinds  # noqa: F401  (registers the kinds that we know)
-from .model.constraint import Constraint
-from .model.factor import Factor
+from .model.factor import Constraint, Factor
 from .model.losses import Loss
 from .model.measurements import MEASUREMENTS, Measurement, measurement
 from .model.problem import Problem

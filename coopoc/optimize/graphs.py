@@ -19,10 +19,18 @@ from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import STARTS, contenders, incremental_start, separated
+from .starts.linear import position_variance, rotation_variance
 from .starts.race import race
 from .starts.walk import parts
 
 Objective = Literal["chordal", "geodesic"]
+KINDS = {
+    "relative_pose": "relative_pose",
+    "pose_prior": "pose",
+    "relative_point": "relative_position",
+    "point_prior": "position",
+}
+"""Of measurements, by the name of a graph's edges."""
 Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
 
 
@@ -131,30 +139,28 @@ def _refuse_exact(graph: Graph, objective: Objective) -> None:
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
-    space, found = Space(graph.dimension, has_rotation=True), []
-    for kind, edges in (("relative_pose", graph.relative_pose), ("pose", graph.pose_prior)):
+    d, found = graph.dimension, list[Factor]()
+    for name, kind in KINDS.items():
+        edges: Any = getattr(graph, name)
         if not len(edges):
             continue
-        z = space.join(edges.position, edges.rotation)
+        turns = kind in ("relative_pose", "pose")
+        z = Space(d, has_rotation=True).join(edges.position, edges.rotation) if turns else edges.position
         if objective == "geodesic":
             found.append(Factor(kind, edges.nodes, z, cov=edges.covariance))
-        else:
-            found.append(Factor(f"{kind}_chordal", edges.nodes, z, std=_chordal_std(edges.covariance, graph.dimension)))
-    for kind, points in (("relative_position", graph.relative_point), ("position", graph.point_prior)):
-        if not len(points):
             continue
-        if objective == "geodesic":
-            found.append(Factor(kind, points.nodes, points.position, cov=points.covariance))
-        else:
-            std = np.sqrt(_mean_variance(points.covariance))[:, None].repeat(graph.dimension, axis=1)
-            found.append(Factor(kind, points.nodes, points.position, std=std))
-    ranges, std = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
+        std = np.sqrt(position_variance(edges.covariance, d))[:, None].repeat(d, axis=1)
+        if turns:
+            own = np.sqrt(rotation_variance(edges.covariance, d))[:, None].repeat(d * d, axis=1)
+            kind, std = f"{kind}_chordal", np.concatenate([std, own], axis=1)
+        found.append(Factor(kind, edges.nodes, z, std=std))
+    ranges, sigma = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
     apart = ranges.distance > 0
     if apart.any():
-        found.append(Factor("range", ranges.nodes[apart], ranges.distance[apart, None], std=std[apart]))
+        found.append(Factor("range", ranges.nodes[apart], ranges.distance[apart, None], std=sigma[apart]))
     if not apart.all():  # (|v| - 0)^2 = |v|^2, which has a derivative at v = 0, too
-        zero = np.zeros((int((~apart).sum()), graph.dimension))
-        found.append(Factor("displacement", ranges.nodes[~apart], zero, std=std[~apart] + zero))
+        zero = np.zeros((int((~apart).sum()), d))
+        found.append(Factor("displacement", ranges.nodes[~apart], zero, std=sigma[~apart] + zero))
     return tuple(found)
 
 
@@ -168,15 +174,3 @@ def _fixed(graph: Graph) -> tuple[int, ...]:
     free = np.flatnonzero(graph.is_pose & ~np.isin(part, part[np.concatenate(held)]))
     first = free[np.unique(part[free], return_index=True)[1]]
     return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())
-
-
-def _mean_variance(covariance: Floats) -> Floats:
-    return np.asarray(np.einsum("mii->m", covariance) / covariance.shape[-1])
-
-
-def _chordal_std(covariance: Floats, d: int) -> Floats:
-    """(M, d + d^2) of a relative pose with covariance (M, D, D): position entries, then rotation entries."""
-    position = np.sqrt(_mean_variance(covariance[:, :d, :d]))
-    turn = np.einsum("mii->m", covariance[:, d:, d:])
-    rotation = np.sqrt(turn if d == 2 else 2.0 * turn / 3.0)
-    return np.concatenate([position[:, None].repeat(d, 1), rotation[:, None].repeat(d * d, 1)], axis=1)

@@ -21,7 +21,7 @@ from .descent.trust_region import arrive
 from .model.factor import Factor
 from .model.problem import Problem
 from .model.space import Space
-from .starts.initial import initial_guess, somewhere
+from .starts.initial import initial_guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,18 +83,12 @@ class FixedLag:
         params.relinearizeSkip = 1
         params.enableRelinearization = bool(np.isfinite(threshold))
         self.lag, self.passes = lag, passes
-        self._smoother: Any = gtsam.IncrementalFixedLagSmoother(lag, params)
-        self._keys: dict[str, int] = {}
-        self._turns: dict[str, bool] = {}
-        self._stamps: dict[str, float] = {}
-        self._newest = -np.inf
-        self._dimension: int | None = None
-        self._count = count()
-
-    @property
-    def stamps(self) -> dict[str, float]:
+        self.stamps: dict[str, float] = {}
         """Moment of each node of the window, s."""
-        return dict(self._stamps)
+        self._smoother: Any = gtsam.IncrementalFixedLagSmoother(lag, params)
+        self._nodes: dict[str, tuple[int, bool]] = {}
+        self._dimension = 3
+        self._count = count()
 
     def update(self, piece: Problem, stamps: Mapping[str, float], wanted: Sequence[str] | None = None) -> Estimates:
         """The nodes `wanted` after a piece was added.
@@ -113,118 +107,86 @@ class FixedLag:
         instance("piece", piece, Problem)
         given = named("stamps", stamps, 'Give a moment of each new node, as {"v0@0": 0.0}.')
         stamps = {name: number("stamps", at, -np.inf, np.inf, allowed="seconds") for name, at in given.items()}
-        before = self._stamps
         posed = which_turn(piece)
-        fresh = self._check(piece, stamps, before, posed)
-        forms_ = forms(piece)
-        rest = [f for f, form in enumerate(forms_) if isinstance(form, str)]
-        x = self._geometry(piece, rest)
+        self._check(piece, stamps, posed)
+        parts = forms(piece)
+        rest = [f for f, form in enumerate(parts) if isinstance(form, str)]
+        x, new = self._geometry(piece, rest), [k for k, name in enumerate(piece.names) if name not in self.stamps]
         self._dimension = piece.dimension
-        for i in fresh:
-            self._keys[piece.names[i]] = next(self._count)
-            self._turns[piece.names[i]] = posed[i]
-        keys = [self._keys[name] for name in piece.names]
-        graph = graph_of(piece, forms_, keys)
+        for k in new:
+            self._nodes[piece.names[k]] = next(self._count), posed[k]
+        keys = [self._nodes[name][0] for name in piece.names]
+        graph = graph_of(piece, parts, keys)
         for factor in linearised(piece, rest, x, keys) if rest else ():
             graph.add(factor)
-        entering = values(piece.space, [posed[i] for i in fresh], x[fresh], [keys[i] for i in fresh])
-        self._advance(graph, entering, {self._keys[name]: at for name, at in stamps.items()})
-        self._age(stamps)
-        return self.estimate(wanted)
-
-    def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
-        """The nodes `wanted` of the window, by name; default those that have the newest stamp."""
-        stamps = self._stamps
-        if wanted is None:
-            wanted = [name for name, at in stamps.items() if at == self._newest]
-        names = tuple(listed("wanted", wanted, "Give a list of names."))
-        for name in names:
-            if not isinstance(name, str) or name not in stamps:
-                hint = suggestion(name, stamps, "See stamps.")
-                raise InputError("wanted", repr(name), f"must be in the window of {len(stamps)}", hint)
-        return self._read(names, Space(self._dimension or 3, any(self._turns[name] for name in names)))
-
-    def _age(self, moments: dict[str, float]) -> None:
-        """The new moments, without what the smoother has marginalised, by its own rule: asking it takes longer."""
-        moved = not self._stamps.keys().isdisjoint(moments)
-        self._stamps |= moments
-        latest = max((self._stamps if moved else moments).values(), default=-np.inf)
-        self._newest = latest if moved else max(self._newest, latest)
-        last = self._newest - self.lag
-        for name in [name for name, at in self._stamps.items() if at < last]:
-            del self._stamps[name], self._keys[name], self._turns[name]
-
-    def _read(self, names: tuple[str, ...], space: Space) -> Estimates:
-        keys, posed = [self._keys[name] for name in names], [self._turns[name] for name in names]
-        x = estimate(space, posed, self._smoother.calculateEstimate(keys), keys)
-        cov = [self._smoother.marginalCovariance(key) for key in keys]
-        if not space.has_rotation:
-            return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
-        turn, whole = tangent(space, posed, x), np.zeros((len(x), space.dof, space.dof))
-        for kind in {*posed}:  # theirs have one size each
-            rows = [k for k, turns in enumerate(posed) if turns == kind]
-            T, own = (np.array([each[k] for k in rows]) for each in (turn, cov))
-            whole[rows] = T @ own @ T.swapaxes(1, 2)
-        return Estimates(names, x, whole)
-
-    def _check(
-        self, piece: Problem, stamps: Mapping[str, float], before: Mapping[str, float], posed: Sequence[bool]
-    ) -> list[int]:
-        """Indices of the new nodes; InputError as `update`."""
-        for field, given in (("batch", piece.batch), ("fixed", piece.fixed), ("constraints", piece.constraints)):
-            if given:
-                hint = "Pick one realisation; hold a node with a position or pose factor of small std."
-                raise InputError("piece", f"with {field} {given}", f"must have no {field}", hint)
-        if self._dimension not in (None, piece.dimension):
-            hint = "Use one smoother per dimension."
-            raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", hint)
-        own, newest = {*piece.names}, max([self._newest, *stamps.values()])
-        for name, at in stamps.items():
-            if not (name in own or name in before) or not newest - self.lag <= at < np.inf:
-                hint = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
-                raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", hint)
-        fresh = []
-        for i, (name, turns) in enumerate(zip(piece.names, posed, strict=True)):
-            if name not in before:
-                fresh.append(i)
-                if name not in stamps:
-                    hint = "Give a new node its moment; a node that has left the window cannot be measured any more."
-                    raise InputError("stamps", f"none of {name!r}", "must have every new node", hint)
-            elif self._turns[name] != turns:
-                raise InputError("piece", repr(name), "must stay the point or pose that it was", "Name it in poses.")
-        return fresh
-
-    def _geometry(self, piece: Problem, rest: Sequence[int]) -> Floats:
-        """(n, ambient) where the piece is linearised: its most probable nodes given the marginals of the window.
-
-        Of converted measurements that is their linear solution; of others, the `rest`, one Gauss-Newton step from x0.
-        Where all is linear any will do.
-        """
-        x0 = None if piece.x0 is None else np.array(piece.x0)
-        if x0 is not None and not rest:
-            return x0
-        if piece.linear:
-            return np.asarray(somewhere(piece)[0])
-        prior = piece
-        old = np.array([i for i, name in enumerate(piece.names) if name in self._stamps], dtype=np.int64)
-        if len(old):
-            was = self._read(tuple(piece.names[i] for i in old), piece.space)
-            if x0 is not None:
-                x0[old] = was.x
-            prior = replace(piece, x0=x0, factors=(*piece.factors, *priors(piece, old, was)))
-        x = initial_guess(prior)
-        if x0 is None and all(piece.factors[f].kind == "spherical" and piece.factors[f].loss is None for f in rest):
-            return np.asarray(x[0])
-        return arrive(sparse(prior), x[0], 1, TOLERANCE).x
-
-    def _advance(self, graph: Any, entering: Any, moments: dict[int, float]) -> None:
+        entering = values(piece.space, [posed[k] for k in new], x[new], [keys[k] for k in new])
         try:
-            self._smoother.update(graph, entering, moments)
+            self._smoother.update(graph, entering, {self._nodes[name][0]: at for name, at in stamps.items()})
             for _ in range(self.passes - 1):
                 self._smoother.update()
         except RuntimeError as singular:
             hint = "Add a position factor, or more measurements. The smoother cannot be used any more."
             raise InputError("piece", str(singular)[:60], "must leave no node free", hint) from singular
+        self.stamps |= stamps
+        last = max(self.stamps.values()) - self.lag
+        for name in [name for name, at in self.stamps.items() if at < last]:
+            del self.stamps[name], self._nodes[name]
+        return self.estimate(wanted)
+
+    def estimate(self, wanted: Sequence[str] | None = None) -> Estimates:
+        """The nodes `wanted` of the window, by name; default those that have the newest stamp."""
+        if wanted is None:
+            newest = max(self.stamps.values())
+            wanted = [name for name, at in self.stamps.items() if at == newest]
+        names = tuple(listed("wanted", wanted, "Give a list of names."))
+        for name in names:
+            if not isinstance(name, str) or name not in self.stamps:
+                hint = suggestion(name, self.stamps, "See stamps.")
+                raise InputError("wanted", repr(name), f"must be in the window of {len(self.stamps)}", hint)
+        return self._read(names, Space(self._dimension, any(self._nodes[name][1] for name in names)))
+
+    def _read(self, names: tuple[str, ...], space: Space) -> Estimates:
+        keys, posed = zip(*(self._nodes[name] for name in names), strict=True) if names else ((), ())
+        x = estimate(space, posed, self._smoother.calculateEstimate(list(keys)), keys)
+        turn = tangent(space, posed, x)
+        cov = [T @ self._smoother.marginalCovariance(key) @ T.T for T, key in zip(turn, keys, strict=True)]
+        return Estimates(names, x, np.array(cov).reshape(len(x), space.dof, space.dof))
+
+    def _check(self, piece: Problem, stamps: Mapping[str, float], posed: Sequence[bool]) -> None:
+        """InputError as `update`."""
+        for field, given in (("batch", piece.batch), ("fixed", piece.fixed), ("constraints", piece.constraints)):
+            if given:
+                hint = "Pick one realisation; hold a node with a position or pose factor of small std."
+                raise InputError("piece", f"with {field} {given}", f"must have no {field}", hint)
+        if self.stamps and self._dimension != piece.dimension:
+            hint = "Use one smoother per dimension."
+            raise InputError("piece", f"of dimension {piece.dimension}", "must have that of the others", hint)
+        inside, newest = {*piece.names, *self.stamps}, max([*self.stamps.values(), *stamps.values()], default=0.0)
+        for name, at in stamps.items():
+            if name not in inside or not newest - self.lag <= at < np.inf:
+                hint = "Stamp the nodes of the piece, in seconds, none earlier than the newest minus the lag."
+                raise InputError("stamps", f"{name!r}: {at}", "must be moments of nodes within the lag", hint)
+        for name, turns in zip(piece.names, posed, strict=True):
+            if name not in self.stamps and name not in stamps:
+                hint = "Give a new node its moment; a node that has left the window cannot be measured any more."
+                raise InputError("stamps", f"none of {name!r}", "must have every new node", hint)
+            if name in self.stamps and self._nodes[name][1] != turns:
+                raise InputError("piece", repr(name), "must stay the point or pose that it was", "Name it in poses.")
+
+    def _geometry(self, piece: Problem, rest: Sequence[int]) -> Floats:
+        """(n, ambient) where the piece is linearised: its most probable nodes given the marginals of the window, by one
+        Gauss-Newton step; where GTSAM has every factor its own start will do."""
+        x0 = None if piece.x0 is None else np.array(piece.x0)
+        if x0 is not None and not rest:
+            return x0
+        old = np.array([i for i, name in enumerate(piece.names) if name in self.stamps], dtype=np.int64)
+        if len(old):
+            was = self._read(tuple(piece.names[i] for i in old), piece.space)
+            if x0 is not None:
+                x0[old] = was.x
+            piece = replace(piece, x0=x0, factors=(*piece.factors, *priors(piece, old, was)))
+        x = initial_guess(piece)[0]
+        return arrive(sparse(piece), x, 1, TOLERANCE).x if rest else x
 
 
 def priors(piece: Problem, old: Ints, was: Estimates) -> list[Factor]:

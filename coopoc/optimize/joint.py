@@ -10,8 +10,7 @@ import numpy as np
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
 from .algebra.sparse import sparse
-from .model.nodes import several
-from .model.problem import Problem
+from .model.problem import Problem, several
 
 if TYPE_CHECKING:
     from .solution import Solution

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.constraint import bounded, values
+from ..model.factor import bounded, values
 from ..model.linear import chain, local
 from ..model.problem import Problem
 
@@ -166,18 +166,12 @@ def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:
 
 def _directions(size: int, blocks: list[tuple[Ints, Floats]]) -> Any:
     """(size, k) sparse: the blocks' directions on their columns, and each coordinate that is in no block."""
-    from scipy.sparse import csc_array
+    from scipy.sparse import block_diag, eye_array
 
-    kept: Ints = np.setdiff1d(np.arange(size), np.concatenate([np.empty(0, np.int64), *(c for c, _ in blocks)]))
-    rows, cols, top = [kept], [np.arange(len(kept))], len(kept)
-    data: list[Floats] = [np.ones(len(kept))]
-    for columns, block in blocks:
-        rows.append(np.repeat(columns, block.shape[1]))
-        cols.append(top + np.tile(np.arange(block.shape[1]), len(columns)))
-        data.append(block.ravel())
-        top += block.shape[1]
-    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(cols)))
-    return csc_array(entries, shape=(size, top))
+    own = np.concatenate([np.empty(0, np.int64), *(columns for columns, _ in blocks)])
+    rest = np.setdiff1d(np.arange(size), own)
+    whole = block_diag([*(block for _, block in blocks), eye_array(len(rest))], format="csr")
+    return whole[np.argsort(np.concatenate([own, rest]))].tocsc()
 
 
 def _words(problem: Problem, rows: Rows, worst: int) -> str:

@@ -22,7 +22,7 @@ from ...errors import InputError
 from ...plugins import one_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
-from ..model.constraint import steerable
+from ..model.factor import steerable
 from ..model.problem import Problem
 from ..model.symbolic import Structure, expressions, parameters, structure_of
 

@@ -24,7 +24,7 @@ from ..algebra.sparse import Layout, Sparse, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
-from ..model.constraint import bounded
+from ..model.factor import bounded
 from ..model.linear import Linear, local
 from ..model.problem import Problem
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +15,6 @@ from ...errors import InputError
 from ..backend import SolverResult
 from ..model.linear import Linear
 from ..model.problem import Problem
-from .progress import progress
 
 Step = Callable[[Linear, Floats], Floats]
 """(linearisation, damping (B, n, dof)) -> dx (B, n, dof): (J^T J + diag(damping)) dx = -J^T r, else LinAlgError."""
@@ -170,3 +172,34 @@ def diagonal(problem: Problem, linear: Linear) -> Floats:
         for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
             np.add.at(total.swapaxes(0, 1), column, np.square(jacobian).sum(axis=-2).swapaxes(0, 1))
     return total
+
+
+DELAY = 2.0
+"""s before the bar is shown: most solves are over by then, and a bar takes longer to make than a small one."""
+
+
+@contextmanager
+def progress(name: str) -> Iterator[Callable[[float], None]]:
+    """A function that counts a step and takes its cost.
+
+    >>> with progress("solve") as step:
+    ...     step(1.5)
+    """
+    began, count, bars = perf_counter(), 0, list[Any]()
+
+    def step(cost: float) -> None:
+        nonlocal count
+        count += 1
+        if not bars and perf_counter() - began > DELAY:
+            from tqdm import tqdm
+
+            bars.append(tqdm(desc=name, unit=" steps", initial=count - 1))
+        for bar in bars:
+            bar.set_postfix_str(f"cost {cost:.6g}", refresh=False)
+            bar.update()
+
+    try:
+        yield step
+    finally:
+        for bar in bars:
+            bar.close()

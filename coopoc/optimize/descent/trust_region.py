@@ -9,8 +9,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Sparse
 from ..algebra.tape import Model
-from .descend import GIVE_UP, HIDDEN, LEAST_DAMPING
-from .progress import progress
+from .descend import GIVE_UP, HIDDEN, LEAST_DAMPING, progress
 
 OFF = 0.2
 """A share of the promised decrease this far from 1 casts doubt on J^T J."""

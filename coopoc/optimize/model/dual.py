@@ -105,10 +105,9 @@ def where(condition: Any, a: Any, b: Any) -> Dual:
     """`a` where the condition holds, else `b`; both are computed, so both must be finite."""
     first, second = (v if isinstance(v, Dual) else Dual(np.asarray(v, dtype=np.float64), np.zeros(1)) for v in (a, b))
     value = np.where(condition, first.value, second.value)
-    jacobians = (
-        s.derivative.reshape(
-            len(s.derivative), *(1,) * (np.ndim(value) - s.derivative.ndim + 1), *s.derivative.shape[1:]
-        )
+    rank = np.ndim(value)
+    sides = (
+        s.derivative.reshape(len(s.derivative), *(1,) * (rank + 1 - s.derivative.ndim), *s.derivative.shape[1:])
         for s in (first, second)
     )
-    return Dual(value, np.where(condition, *jacobians))
+    return Dual(value, np.where(condition, *sides))

@@ -71,10 +71,8 @@ def check_nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
 def check_constants(known: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
     """(M, c) finite numbers, as many as the kind has."""
     if constants is None and known.constants == 0:
-        return _no_constants(count)
+        return frozen(np.empty((count, 0)))
     given = numbers(f"constants of {known.name}", [] if constants is None else constants)
-    if known.constants == given.size == 0:
-        return _no_constants(count)
     fits = (
         given.ndim in (1, 2)
         and given.shape[-1] == known.constants
@@ -86,11 +84,6 @@ def check_constants(known: Measurement, constants: npt.ArrayLike | None, count: 
             "constants", given.tolist(), f"must be {known.constants} finite numbers for {known.name}", hint
         )
     return frozen(np.broadcast_to(given, (count, known.constants)))
-
-
-@lru_cache(maxsize=16)
-def _no_constants(count: int) -> Floats:
-    return frozen(np.empty((count, 0)))
 
 
 def check_values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
@@ -135,20 +128,6 @@ def _check_rotations(known: Measurement, rotation: Floats) -> None:
 
 def check_std(known: Measurement, std: npt.ArrayLike | float, shape: tuple[int, ...]) -> Floats:
     """std as (M or 1, size) or (B, M or 1, size): > 0, angles at most pi."""
-    if isinstance(std, float):
-        return _one_std(known, std, shape[-1])
-    if isinstance(std, tuple) and all(isinstance(one, float) for one in std):
-        return _one_std(known, std, shape[-1])
-    return _checked_std(known, std, shape)
-
-
-@lru_cache(maxsize=256)
-def _one_std(known: Measurement, std: float | tuple[float, ...], size: int) -> Floats:
-    """Of all components, or one each: measurements that are added one by one share the array."""
-    return _checked_std(known, std, (1, size))
-
-
-def _checked_std(known: Measurement, std: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
     array, size = numbers(f"std of {known.name}", std), shape[-1]
     wide = np.broadcast_to(array, (size,)) if array.ndim < 2 and array.size in (1, size) else array
     wide = wide[None] if wide.ndim == 1 else wide

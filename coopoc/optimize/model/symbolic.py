@@ -9,8 +9,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from .constraint import steerable
-from .factor import Factor
+from .factor import Factor, steerable
 from .kinds import converted_rows, is_converted
 from .losses import LOSSES, Loss
 from .measurements import Measurement

@@ -43,7 +43,7 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     at = np.arange(size).reshape(n, d + 1)
     A, goal, weight = _rows(graph, at)
     turns, places = at[graph.is_pose, :d].ravel(), at[:, d]
-    kappa = np.median(1.0 / _turn_variance(graph.relative_pose.covariance, d)) if len(graph.relative_pose) else 1.0
+    kappa = np.median(1.0 / rotation_variance(graph.relative_pose.covariance, d)) if len(graph.relative_pose) else 1.0
     proximal = np.append(weight, np.full(len(turns), PROXIMAL * kappa))
     whole = np.concatenate([np.swapaxes(rotation, 1, 2), position[:, None]], axis=1).reshape(size, d)
     solve = _least_squares(vstack([A, eye_array(size, format="csr")[turns]], format="csr"), proximal, d + 1)
@@ -97,20 +97,20 @@ def _rows(graph: Graph, at: Ints) -> tuple[Any, Floats, Floats]:
             i, j = pairs.nodes.T
             columns = np.concatenate([at[j, k : k + 1], at[i, :d]], axis=1)
             values = np.concatenate([np.ones((len(i), 1)), -pairs.rotation[:, :, k]], axis=1)
-            add(columns, values, np.zeros((len(i), d)), _turn_variance(pairs.covariance, d))
+            add(columns, values, np.zeros((len(i), d)), rotation_variance(pairs.covariance, d))
         if len(priors):
             columns = at[priors.nodes[:, 0], k : k + 1]
-            add(columns, np.ones(columns.shape), priors.rotation[:, :, k], _turn_variance(priors.covariance, d))
+            add(columns, np.ones(columns.shape), priors.rotation[:, :, k], rotation_variance(priors.covariance, d))
     for edges in (pairs, graph.relative_point):
         if len(edges):
             i, j = edges.nodes.T
             columns = np.concatenate([at[j, d:], at[i, d:], at[i, :d]], axis=1)
             values = np.concatenate([np.tile([1.0, -1.0], (len(i), 1)), -edges.position], axis=1)
-            add(columns, values, np.zeros((len(i), d)), _variance(edges.covariance, d))
+            add(columns, values, np.zeros((len(i), d)), position_variance(edges.covariance, d))
     for fixes in (priors, graph.point_prior):
         if len(fixes):
             columns = at[fixes.nodes[:, 0], d:]
-            add(columns, np.ones(columns.shape), fixes.position, _variance(fixes.covariance, d))
+            add(columns, np.ones(columns.shape), fixes.position, position_variance(fixes.covariance, d))
     return (
         vstack(matrices, format="csr"),
         np.concatenate([np.empty((0, d)), *goals]),
@@ -138,12 +138,12 @@ def _least_squares(A: Any, weight: Floats, width: int) -> Callable[[Floats, Floa
     return solve
 
 
-def _variance(covariance: Floats, d: int) -> Floats:
+def position_variance(covariance: Floats, d: int) -> Floats:
     """(M,) mean variance of the position."""
     return np.asarray(np.einsum("mii->m", covariance[:, :d, :d]) / d)
 
 
-def _turn_variance(covariance: Floats, d: int) -> Floats:
+def rotation_variance(covariance: Floats, d: int) -> Floats:
     """(M,) of an entry of the rotation, as the chordal objective has it."""
     turn = np.einsum("mii->m", covariance[:, d:, d:])
     return np.asarray(turn if d == 2 else 2.0 * turn / 3.0)

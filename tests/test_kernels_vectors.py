@@ -1,0 +1,125 @@
+"""Vectors of runs and small matrices: a run is to the bit what it is alone; blocks of any size against NumPy."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, Sensors, observe
+from coopoc.arrays import Floats
+from coopoc.kernels.compiling.compile import as_written
+from coopoc.kernels.compiling.small import store
+from coopoc.kernels.compiling.vectors import LANES
+from coopoc.kernels.stars.elimination import eliminate, predict, substitute
+
+BLOCKS = 4
+
+
+@as_written
+def solved(a: Floats, eta: Floats, memory: Floats, block: Any, row: Any) -> None:
+    pivot = eliminate(a, a, eta, BLOCKS, BLOCKS, memory, block, row)
+    substitute(a, eta, BLOCKS, BLOCKS, block, row)
+    store(memory, 0, pivot)
+
+
+@as_written
+def predicted(a: Floats, process: Floats, memory: Floats, block: Any, row: Any) -> None:
+    predict(a, BLOCKS, BLOCKS, process, memory, block, row)
+
+
+def blockwise(matrix: Floats, d: int) -> Floats:
+    return matrix.reshape(BLOCKS, d, BLOCKS, d).swapaxes(1, 2).reshape(-1)
+
+
+def drawn(d: int) -> tuple[Floats, Floats, Floats]:
+    rng = np.random.default_rng(d)
+    root = rng.normal(size=(BLOCKS * d, BLOCKS * d))
+    return root @ root.T + np.eye(BLOCKS * d), rng.normal(size=BLOCKS * d), rng.uniform(0.1, 1.0, BLOCKS * d)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize("d", [1, 2, 3, 4, pytest.param(6, marks=pytest.mark.slow)])
+def test_blocks_of_any_size(d: int, batched: bool) -> None:
+    a, eta, process = drawn(d)
+    shape = (lambda v: np.repeat(v[:, None], LANES, axis=1)) if batched else np.copy
+    block, row, memory = (0.0,) * d**2, (0.0,) * d, shape(np.zeros(2 * BLOCKS * d**2))
+    mine, right = shape(blockwise(a, d)), shape(eta)
+    solved(mine, right, memory, block, row)
+    lanes = [(..., k) for k in range(LANES)] if batched else [...]
+    for lane in lanes:
+        assert right[lane] == pytest.approx(np.linalg.solve(a, eta), rel=1e-10)
+        last = -memory[lane][: d * d].reshape(d, d)
+        assert last == pytest.approx(np.linalg.inv(a)[-d:, -d:], rel=1e-10)
+
+    mine = shape(blockwise(a, d))
+    predicted(mine, shape(1.0 / process), memory, block, row)
+    expected = np.linalg.inv(np.linalg.inv(a) + np.diag(process)).reshape(BLOCKS, d, BLOCKS, d).swapaxes(1, 2)
+    for lane in lanes:
+        found = mine[lane].reshape(BLOCKS, BLOCKS, d, d)
+        for i in range(BLOCKS):
+            for j in range(i, BLOCKS):
+                upper = np.triu_indices(d) if i == j else np.indices((d, d)).reshape(2, -1)
+                assert found[i, j][tuple(upper)] == pytest.approx(expected[i, j][tuple(upper)], rel=1e-9, abs=1e-12)
+
+
+def test_plain_njit_gives_the_same_without_the_private_hooks(tmp_path: Path) -> None:
+    env = {**os.environ, "COOPOC_PLAIN_NJIT": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "any_size and 2"]
+    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    assert done.returncode == 0, done.stdout
+
+
+S2 = Sensors.paper_scenario2()
+CHANNELS = [V2X(max_neighbours=4), V2X(max_neighbours=7, loss=0.3, latency=0.2), V2X(max_neighbours=3, loss=1.0)]
+
+
+def some(recording: Recording, runs: list[int]) -> Recording:
+    """Some of the runs."""
+    axes = ("gnss", "velocity", "relative", "arrival")
+    return replace(recording, **{name: getattr(recording, name)[runs] for name in axes})
+
+
+@pytest.mark.parametrize("channel", CHANNELS, ids=str)
+@pytest.mark.parametrize("method", [JointFilter(), JointFilter(exact=False), JointFilter("identity")], ids=str)
+def test_a_run_is_to_the_bit_what_it_is_alone(crossing: Fleet, channel: V2X, method: JointFilter) -> None:
+    """Neighbours join and leave, and each run loses other messages. A run that is left over is repeated."""
+    recording = observe(crossing, S2, channel, runs=6)
+    whole = method(recording, [0, 3])
+    for runs in ([0], [5], [3, 1], [4, 2, 0], [5, 4, 3, 2, 1]):
+        part = method(some(recording, runs), [0, 3])
+        np.testing.assert_array_equal(part.x, whole.x[runs])
+        np.testing.assert_array_equal(part.covariance, whole.covariance[runs])
+        np.testing.assert_array_equal(part.neighbours, whole.neighbours[runs])
+
+
+def test_the_same_with_process_noise_of_every_size(crossing: Fleet) -> None:
+    recording = observe(crossing, S2, V2X(max_neighbours=4, loss=0.2), runs=3)
+    for std in ((0.3, 0.2, 0.01), (1e-60, 1e-30, 1e-60)):
+        method = JointFilter(NoiseModel("fitted", S2, std))
+        whole, alone = method(recording, [1]), method(some(recording, [1]), [1])
+        np.testing.assert_array_equal(alone.x[0], whole.x[1])
+        np.testing.assert_array_equal(alone.covariance[0], whole.covariance[1])
+
+
+def test_angles_side_by_side_are_those_of_atan2() -> None:
+    """Where all are small, where some are, and where one is missing."""
+    import numba
+
+    from coopoc.kernels.compiling.vectors import pack, put, take
+    from coopoc.kernels.stars.relative import angle
+
+    @numba.njit
+    def call(sine, cosine, out):  # type: ignore[no-untyped-def]
+        put(out, 0, angle(take(sine, 0), pack(cosine[0], cosine[1], cosine[2], cosine[3])))
+
+    for turns in ([0.01, -0.2, 0.1, 0.0], [0.01, 3.0, -1.0, 0.2], [0.1, np.nan, 0.1, -2.0]):
+        out = np.empty(4)
+        call(np.sin(turns), np.cos(turns), out)
+        np.testing.assert_allclose(out, turns, rtol=1e-15)
