@@ -15,7 +15,7 @@ from latex import compiled
 
 from coopoc.errors import InputError
 from coopoc.evaluate.statistics import Interval
-from coopoc.study.results import Results
+from coopoc.study.results import Results, parsed
 from coopoc.study.tables import FORMATS, Table, pivot
 
 
@@ -111,9 +111,9 @@ def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str,
 
 def test_selection_from_text(rows: list[dict[str, Any]]) -> None:
     found = results(pd.DataFrame(rows))
-    assert found.parsed(["k=0,4", "method=gnss"]) == {"k": [0, 4], "method": ["gnss"]}
+    assert parsed([found.frame], ["k=0,4", "method=gnss"]) == {"k": (0, 4), "method": ("gnss",)}
     with pytest.raises(InputError, match="k = 'x': must be a whole number"):
-        found.parsed(["k=x"])
+        parsed([found.frame], ["k=x"])
 
 
 def test_parquet_holds_every_digit(rows: list[dict[str, Any]], tmp_path: Any) -> None:
