@@ -316,7 +316,7 @@ def pieces(problem: Problem, steps: int) -> list[tuple[Problem, dict[str, float]
             rows = np.flatnonzero(moment[factor.nodes].max(axis=1) == k)
             if len(rows):
                 std = factor.std if len(factor.std) == 1 else factor.std[rows]
-                factors.append(replace(factor, nodes=factor.nodes[rows], z=factor.z[rows], std=std, constants=None))
+                factors.append(replace(factor, nodes=factor.nodes[rows], z=factor.z[rows], std=std))
         touched = np.unique(np.concatenate([[k, steps + k, n], *(f.nodes.ravel() for f in factors)]))
         place = {int(i): p for p, i in enumerate(touched)}
         factors = [replace(f, nodes=np.vectorize(place.get)(f.nodes)) for f in factors]

@@ -94,7 +94,6 @@ class Backend:
         purpose: one line for lists.
         library: that it imports, None if it needs none but those of coopoc.
         capabilities: which problems it can solve.
-        fallback: (problem, options) -> options with which to try again where an answer fails the checks, or None.
     """
 
     name: str
@@ -102,7 +101,6 @@ class Backend:
     purpose: str = ""
     library: str | None = None
     capabilities: Capabilities = Capabilities()
-    fallback: Callable[[Problem, Options], Options | None] = lambda problem, options: None
 
     @property
     def installed(self) -> bool:
