@@ -176,15 +176,13 @@ def report(
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     title: Annotated[str, arg(metavar="TEXT")] = "",
 ) -> None:
-    """Write a self-contained HTML page, or a PDF, on one or several studies.
+    """Write a self-contained HTML page on one or several studies.
 
     Example: coopoc report runs/neighbours runs/error_cdf --out report.html
 
-    Example: coopoc report runs/neighbours --out report.pdf
-
     Args:
         folders: folders of the studies, in the order of the page.
-        out: file to write; .pdf needs Chromium. Default: report.html in the first folder.
+        out: file to write. Default: report.html in the first folder.
         title: title of the page.
     """
     from .study.report import report as write_report

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import ast
 import difflib
+import importlib.util
 import os
 import sys
 from collections.abc import Iterable, Mapping
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
-from .entry_names import names_in
 from .errors import InputError, shown
 from .one_file import from_file, in_file
 
@@ -28,6 +30,7 @@ GROUPS = {
     "coopoc.commands": "command",
 }
 """Group -> what one of its names is called."""
+MAPPINGS = ("dict", "MappingProxyType")
 
 
 def points(group: str) -> Mapping[str, metadata.EntryPoint]:
@@ -72,6 +75,41 @@ def names(group: str) -> tuple[str, ...]:
         written = names_in(point.value)
         found += (_members(point) if written is None else written) or [name]
     return tuple(sorted(found))
+
+
+@cache
+def names_in(value: str) -> tuple[str, ...] | None:
+    """Keys of the mapping that an entry point names, read from its source, so that a list of names imports no library.
+
+    Args:
+        value: "package.module:NAME".
+
+    Returns:
+        No name for a definition or for what a call returns; None if only an import can show it.
+
+    >>> names_in("coopoc.world.v2x:CHANNELS")
+    ('ideal', 'cam', 'bsm', 'cpm')
+    >>> names_in("coopoc.plugins:find")
+    ()
+    """
+    module, _, name = value.partition(":")
+    try:
+        spec = importlib.util.find_spec(module)
+        body = ast.parse(Path(str(spec and spec.origin)).read_text(encoding="utf-8")).body
+    except (ImportError, OSError, SyntaxError, ValueError):
+        return None
+    for statement in body:
+        if isinstance(statement, ast.FunctionDef | ast.ClassDef) and statement.name == name:
+            return ()
+        targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
+        if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+            written = getattr(statement, "value", None)
+            if isinstance(written, ast.Dict):
+                keys = [key.value for key in written.keys if isinstance(key, ast.Constant)]
+                return tuple(map(str, keys)) if len(keys) == len(written.keys) else None
+            named = isinstance(written, ast.Call) and getattr(written.func, "id", "") not in MAPPINGS
+            return () if named else None
+    return None
 
 
 def find(group: str, name: str) -> Any:

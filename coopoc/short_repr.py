@@ -27,18 +27,18 @@ def short_repr(self: Any) -> str:
 def _part(name: str, value: Any) -> str:
     if value is None or (isinstance(value, Mapping | Sequence) and not value):
         return ""
-    if (shape := getattr(value, "shape", None)) is not None and shape != ():
+    shape = getattr(value, "shape", ())
+    if shape != ():
         return f"{name} {tuple(shape)}"
     if isinstance(value, Enum):
         return f"{name}={value.name}"
-    text = _text(value.item() if shape == () else value)
-    if len(text) <= LONG and "\n" not in text and (not isinstance(value, Mapping) or len(value) <= FEW):
+    if isinstance(value, Mapping) and len(value) > FEW:
+        return f"{name}={{{', '.join(map(repr, list(value)[:FEW]))}, ...}}"
+    text = _text(value.item() if hasattr(value, "item") else value)
+    if len(text) <= LONG and "\n" not in text:
         return f"{name}={text}"
     if isinstance(value, str):
         return f"{name}={value[:LONG].splitlines()[0]!r}..."
-    if isinstance(value, Mapping):
-        keys = ", ".join(map(repr, list(value)[:FEW]))
-        return f"{name}={{{keys}{', ...' if len(value) > FEW else ''}}}"
     kind = type(value[0] if isinstance(value, Sequence) else value).__name__
     return f"{name}={len(value)} x {kind}" if isinstance(value, Sequence) else f"{name}={kind}(...)"
 

@@ -28,11 +28,9 @@ TABLES = (".csv", ".parquet", ".xlsx")
 COLUMNS, CELLS, UNPACKED = 5000, 20_000_000, 2**30
 """Most columns of a table, most cells of a spreadsheet, and most bytes of one when it is unpacked."""
 USUAL = {
-    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "car_id", "agent_id"),
-    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "peer", "anchor", "receiver", "landmark"),
-    "t": ("time", "timestamp", "stamp", "time_s", "seconds", "sec", "datetime", "utc", "rostime"),
-    "value": ("measurement", "val", "data"),
-    "arrival": ("received", "arrival_time", "t_arrival", "rx_time"),
+    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id"),
+    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
+    "t": ("time", "timestamp", "stamp", "seconds", "datetime", "utc"),
 }
 """Headers that others give to the columns."""
 

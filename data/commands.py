@@ -12,7 +12,7 @@ from coopoc.errors import InputError
 from coopoc.one_file import in_file
 from coopoc.plugins import names, unknown
 
-from .fleet_store import described, facts
+from .fleet_store import facts, in_words
 from .registry import DATASETS, convert, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
@@ -36,7 +36,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
         name: a bundled fleet, or a path as in --data.
     """
     if name in DATASETS:
-        print(DATASETS[name].card().render())
+        _print(name, DATASETS[name].card().fields())
         return
     if not Path(split(name)[0]).exists() and not in_file(name) and name not in names("coopoc.datasets"):
         raise unknown("fleet", name, DATASETS, "Or give the path of a file.")
@@ -49,7 +49,11 @@ def show(name: tyro.conf.Positional[str]) -> None:
     present = fleet.present.mean(axis=0)
     first = {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"}
     there = {"there": f"{present.min():.0%} to {present.max():.0%} of the time"}
-    print(described(fleet.name, first, facts(fleet), there))
+    _print(fleet.name, first | in_words(facts(fleet)) | there)
+
+
+def _print(name: str, fields: dict[str, str]) -> None:
+    print("\n".join([name, *(f"  {key:<13}{value}" for key, value in fields.items())]))
 
 
 def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> None:
@@ -99,7 +103,7 @@ def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fle
     from .generate import make as generate
 
     card = generate(recipe, maps, out, seed)
-    print(card.render())
+    _print(card.name, card.fields())
     print(f"written to {out}. Use it: --data {out / f'{card.name}.npz'}", file=sys.stderr)
 
 

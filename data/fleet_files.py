@@ -21,10 +21,6 @@ from .assemble import assemble
 from .cells import named_columns, numeric, read_frame, seconds, words
 
 NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
-LAYOUT = ("id", "x", "y", "z", "yaw", *VELOCITY)
-"""Columns of CARLA's tables of 14 columns, or 15 with an index; accelerations and angular velocities follow."""
-AGREED = 0.3
-"""|dx/dt - v| / |v| below which an interval is believed: those in use differ by factors of 1.5 and more."""
 
 
 def read_table(
@@ -32,8 +28,8 @@ def read_table(
 ) -> Fleet:
     """Fleet of a CSV, Parquet or Excel file; without vx, vy, vz the velocity is the backward difference.
 
-    A table of CARLA (with yaw and velocities, or 14 columns as LAYOUT, such as the paper's data set, IEEE DataPort
-    10.21227/511y-4s83) needs `handedness`, and without a column t `dt`: rows of each id are then equally spaced.
+    A table of CARLA, with yaw and velocities, needs `handedness`, and without a column t `dt`: rows of each id are then
+    equally spaced.
 
     Args:
         path: s, m, m/s in a local east-north-up frame; a missing row means absent.
@@ -47,15 +43,12 @@ def read_table(
     """
     names = dict(columns or {})
     frame = read_frame(path, names.get("id", "id"))
-    if len(frame.columns) in (14, 15) and not {*NEEDED[2:], *names} & set(frame.columns):
-        frame = frame.rename(columns=dict(zip(frame.columns[-14:], LAYOUT, strict=False)))
     stamped = "t" in {*names, *frame.columns} or "yaw" not in frame.columns
     needed = NEEDED if stamped else tuple(name for name in NEEDED if name != "t")
     given = bool({*VELOCITY} & {*names, *frame.columns})
     frame = named_columns(frame, names, (*NEEDED, *VELOCITY), (*needed, *(VELOCITY if given else ())), path.name)
-    carla = given and "yaw" in frame.columns
     source = f"table {path.name}" + ("" if given else ", velocity by backward difference")
-    if carla or handedness:
+    if handedness or "yaw" in frame.columns:
         one_of("handedness", handedness or "unknown", ("left", "right"))
         source += f", {handedness}-handed"
     if stamped:
@@ -70,19 +63,7 @@ def read_table(
         numbers[:, 1::3] *= -1
     labels: dict[str, Any] = {"file": path.name, "name": path.stem, "source": source}
     velocity = numbers[:, 3:] if given else None
-    fleet = assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
-    if carla and not (apart := _disagreement(fleet)) < AGREED:
-        found = f"dt {fleet.dt:g} s leaves {apart:.0%} of |v|"
-        allowed = "must agree with positions and velocities"
-        raise InputError(f"{path.name}: dt", found, allowed, "Pass another dt=, or check the units of t.")
-    return fleet
-
-
-def _disagreement(fleet: Fleet) -> float:
-    """rms |dx/dt - v| / rms |v|, v being the mean over the step; 0 if nothing moves."""
-    middle = (fleet.velocity[1:] + fleet.velocity[:-1]) / 2
-    apart, size = (np.sqrt(np.nanmean(v**2)) for v in (np.diff(fleet.position, axis=0) / fleet.dt - middle, middle))
-    return float(apart / size) if size > 0 or apart > 0 else 0.0
+    return assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
 
 
 def write_table(fleet: Fleet, path: Path) -> None:

@@ -135,33 +135,23 @@ class Card:
         """One line for Fleet.source."""
         return f"simulated with SUMO {self.sumo} on CARLA's {self.map}, seed {self.recipe['seed']}, smoothed"
 
-    def row(self) -> dict[str, Any]:
-        """The card in a list of fleets."""
-        own = {key: getattr(self, key) for key in ("name", "map", "vehicles", "steps")}
-        own |= {"dt_s": self.dt, "mean_speed_m_s": self.speed["mean"], "mean_neighbours": self.neighbours["mean"]}
-        return own | {"licence": self.map_licence, "sha256": self.sha256}
-
-    def render(self) -> str:
-        """The card as a text to read."""
+    def fields(self) -> dict[str, str]:
+        """The card in words, field by field."""
         made = {"map": f"{self.map}, {self.map_licence}", "made by": f"{self.command} (SUMO {self.sumo})"}
-        moves = {"acceleration": f"at most {self.acceleration:g} m/s^2"}
-        return described(self.name, made, asdict(self), moves)
+        return made | in_words(asdict(self)) | {"acceleration": f"at most {self.acceleration:g} m/s^2"}
 
 
-def described(name: str, first: dict[str, str], facts: dict[str, Any], last: dict[str, str]) -> str:
-    """Facts of a card, or `facts` of a fleet, as lines to read between other lines."""
+def in_words(facts: dict[str, Any]) -> dict[str, str]:
+    """Size and statistics of a fleet as texts."""
     speed = "{min:g}..{max:g} m/s, mean {mean:g}, 5..95 %: {p05:g}..{p95:g}, standing {standing:.0%}"
     near = "mean {mean:g} within {radius:g} m (cap {cap:g}), some in {any:.0%} of the steps"
-    lines = {
-        **first,
+    return {
         "sha256": facts["sha256"],
         "size": "{vehicles} vehicles x {steps} steps of {dt:g} s".format(**facts),
         "speed": speed.format(**facts["speed"]),
         "neighbours": near.format(**facts["neighbours"]),
         "height": "{:g}..{:g} m".format(*facts["height"]),
-        **last,
     }
-    return "\n".join([name, *(f"  {key:<13}{value}" for key, value in lines.items())])
 
 
 def facts(fleet: Fleet) -> dict[str, Any]:

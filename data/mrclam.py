@@ -199,7 +199,7 @@ def recording(log: MrclamLog, v2x: V2X, *, runs: int = 1, seed: int = 0) -> Reco
         min_range=0.0,
     )
     fixes = observe(log.fleet, acting, V2X(max_neighbours=0), runs=runs, seed=seed, assumed=known).gnss
-    index, lost_in_gaps, repeated = kept(log, v2x)
+    index = kept(log, v2x)
     links = Links(log.step[index], log.observer[index], log.subject[index])
     azimuth = log.bearing[index] + log.observer_heading[index]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
@@ -224,13 +224,13 @@ def recording(log: MrclamLog, v2x: V2X, *, runs: int = 1, seed: int = 0) -> Reco
             "world azimuth and direction of travel use Vicon's heading, which is truth",
             "inclination was not measured: pi/2 by the constraint z = 0",
             "assumed standard deviations were measured against Vicon",
-            f"{repeated} repeated measurements within a step and {lost_in_gaps} in gaps of Vicon are left out",
+            "repeated measurements within a step, and those in gaps of Vicon, are left out",
         ),
     )
 
 
-def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> tuple[Ints, int, int]:
-    """Measurements that become links, by step, observer and range; numbers left out in gaps and as repetitions.
+def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> Ints:
+    """Measurements that become links, by step, observer and range.
 
     Args:
         log: of read_mrclam.
@@ -244,8 +244,7 @@ def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> tuple[Ints, int, int]:
     unique = index[nearest(late, log.step[index], log.observer[index], log.subject[index])]
     near = unique[log.range[unique] <= v2x.radius]
     near = near[np.lexsort((log.range[near], log.observer[near], log.step[near]))]
-    chosen = near[first_of_each(v2x.max_neighbours, log.step[near], log.observer[near])]
-    return chosen, int((inside & ~visible).sum()), len(index) - len(unique)
+    return near[first_of_each(v2x.max_neighbours, log.step[near], log.observer[near])]
 
 
 def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:

@@ -64,7 +64,7 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
     """
     robots, marks = log.fleet.ids, surveyed(log)
     forward = known.speed * _delayed(log, log.speed, known.lag)
-    index, _, _ = kept(log, v2x, gaps=True)
+    index = kept(log, v2x, gaps=True)
     others = [getattr(log, name)[index] for name in ("step", "observer", "subject", "range", "bearing")]
     t, observer, mark, reach, bearing = log.sightings.T
     step, late = steps_of(t, log.fleet.dt, len(log.fleet.t))

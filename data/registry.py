@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
@@ -22,7 +20,6 @@ from coopoc.world.storage import is_recording, read_recording
 from coopoc.world.v2x import V2X
 
 from . import fleet_store
-from .assemble import assemble
 from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table, write_tum
 from .fleet_store import Card
 from .graphs import read_graph_log
@@ -120,7 +117,9 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     name, options, part = _split(name_or_path, {"format": format, **options})
     chosen = options.pop("format", None)
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
-        made: Fleet = parted(_resampled(_made(find("coopoc.datasets", name), name), **options), **part)
+        if options:
+            raise InputError("options", sorted(options), f"{name} is bundled and takes none", "Leave them out.")
+        made: Fleet = parted(_made(find("coopoc.datasets", name), name), **part)
         return made
     path = Path(name)
     if not path.exists():
@@ -208,12 +207,13 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
 
 
 def list_datasets() -> list[dict[str, Any]]:
-    """One row per bundled fleet: name, vehicles, steps, dt_s, mean speed, neighbours, licence, sha256.
+    """One row per bundled fleet: name, map, its licence, vehicles, steps, dt s, sha256.
 
     >>> [row["name"] for row in list_datasets()][:2]
     ['town04', 'town10']
     """
-    return [dataset.card().row() for dataset in DATASETS.values()]
+    columns = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
+    return [{name: getattr(dataset.card(), name) for name in columns} for dataset in DATASETS.values()]
 
 
 def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:
@@ -274,18 +274,3 @@ def _made(found: Any, name: str) -> Fleet:
     if not isinstance(fleet, Fleet):
         raise InputError("data", repr(name), f"gives a {type(fleet).__name__}, no Fleet", "Return coopoc.Fleet(...).")
     return fleet
-
-
-def _resampled(fleet: Fleet, dt: float | None = None, **others: Any) -> Fleet:
-    if others:
-        raise InputError("options", sorted(others), f"{fleet.name} is bundled and takes dt only", "Leave them out.")
-    if dt is None:
-        return fleet
-    step, column = np.nonzero(fleet.present)
-    labels: dict[str, Any] = {
-        "name": fleet.name,
-        "source": f"{fleet.source}, resampled at {dt:g} s",
-        "licence": fleet.licence,
-    }
-    ids = [fleet.ids[c] for c in column]
-    return assemble(ids, fleet.t[step], fleet.position[step, column], dt=dt, file=fleet.name, **labels)

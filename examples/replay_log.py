@@ -66,8 +66,8 @@ def kitti(odometry: Path, times: Path, truth: Path) -> Log:
 def bundled(vehicle: str = "town10-24") -> Log:
     """A simulated drive with the velocity noise of the paper's training, in place of a log."""
     fleet = co.load_fleet("town10").select([vehicle])
-    seen = co.observe(fleet, co.Sensors.paper_training(), co.V2X(max_neighbours=0))
-    return Log(fleet.t, np.cumsum(seen.dt * seen.velocity[0, :, 0], axis=0), fleet.position[:, 0])
+    recording = co.observe(fleet, co.Sensors.paper_training(), co.V2X(max_neighbours=0))
+    return Log(fleet.t, np.cumsum(recording.dt * recording.velocity[0, :, 0], axis=0), fleet.position[:, 0])
 
 
 def ticks(log: Log, *, jitter: bool, drop: bool, late: bool) -> list[Tick]:
@@ -88,7 +88,7 @@ def ticks(log: Log, *, jitter: bool, drop: bool, late: bool) -> list[Tick]:
     return found
 
 
-def known(assumed: co.Sensors) -> co.NoiseModel:
+def noise_model(assumed: co.Sensors) -> co.NoiseModel:
     """That velocity noise, and the GNSS noise as it is."""
     return co.NoiseModel.nominal(replace(assumed, gnss_std=(GNSS_STD,) * 3))
 
@@ -107,8 +107,8 @@ def replay(filter: Any, drive: Iterable[Tick]) -> tuple[float, float]:
 AXIS, SPEED = (replace(ASSUMED, velocity_reading=reading) for reading in ("axis", "speed"))
 """Velocity noise of 10 %, of each axis as in the training, or of the speed on every axis: odometry that also turns."""
 FILTERS: dict[str, Callable[[], Any]] = {
-    "Kalman, GNSS known, 10 % of axis": lambda: co.Kalman(known(AXIS)).start(),
-    "Kalman, GNSS known, 10 % of speed": lambda: co.Kalman(known(SPEED)).start(),
+    "Kalman, GNSS known, 10 % of axis": lambda: co.Kalman(noise_model(AXIS)).start(),
+    "Kalman, GNSS known, 10 % of speed": lambda: co.Kalman(noise_model(SPEED)).start(),
     "adaptive, 10 % of axis": lambda: co.AdaptiveKalman(AXIS).start(),
     "adaptive, 10 % of speed": lambda: co.AdaptiveKalman(SPEED).start(),
     "OKF": lambda: load_method("okf").start(),

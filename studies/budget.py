@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from coopoc.evaluate.ledger import Kind, Ledger, Way, break_even
+from coopoc.evaluate.ledger import Kind, Ledger, break_even
 from coopoc.evaluate.scores import BYTES
 from coopoc.study.numbers import Number, Where, across, difference, interval, listed, mean, present, ratio, rms
 from coopoc.study.style import look
@@ -48,12 +48,6 @@ WORDS = {"ideal": "ideal, 10 Hz", "cam": "CAM, 2.2 Hz", "bsm": "BSM, 10 Hz", "cp
 PAYLOAD = "payload_bytes_per_second"
 LIMITS = (0.0, 300.0, 1000.0, 5000.0)
 """B/s, under which the best method is named."""
-COUNTS: tuple[tuple[Kind, Way], ...] = (
-    ("payload", "per receiver"),
-    ("payload", "broadcast"),
-    ("on air", "per receiver"),
-    ("on air", "broadcast"),
-)
 
 
 def over(channel: str, k: int, **limits: Any) -> dict[str, Any]:
@@ -191,28 +185,6 @@ def even(results: Results) -> Table | None:
     return selections(head, rows, {"Payload [B/s]": _rate, **once}, text)(results)
 
 
-def ledger(results: Results) -> Table | None:
-    """The same for the joint filter as payload and on air, sent once and per receiver."""
-    trainings, (method, known), body = _trainings(results), SCHEDULED[0], list[tuple[Any, ...]]()
-    for channel, make in CHANNELS.items() if trainings else ():
-        account = _account(results, of(method, known, **over(channel, MOST)))
-        for kind, way in COUNTS if account is not None else ():
-            if account is not None and (kind == "payload" or make(MOST).overhead):
-                times = (duration(break_even(total, account, kind, way)) for total in trainings.values())
-                body.append((WORDS[channel], f"{kind}, {way}", round(account.rate(kind, way)), *times))
-    for kind, way in COUNTS[:2] if body else ():
-        once = (f"{total.per_vehicle('training', kind, way) / 1e3:,.0f} kB" for total in trainings.values())
-        body.append(("a training, once", f"{kind}, {way}", None, *once))
-    text = (
-        f"The ledger per vehicle: {look(method).label.lower()}, {known}, K = {MOST}, and the driving time after which "
-        "it has moved as many bytes as a training. Broadcast: what is sent, each message once, a server's included; "
-        "per receiver: a copy for each that receives it. Nothing is added to the payload of a training, which goes by "
-        "another network."
-    )
-    header = ("Channel", "Counted", "Online [B/s]", *trainings)
-    return Table(header, tuple(body), scene.caption(results, text)) if body else None
-
-
 def duration(seconds: float) -> str:
     """Seconds in a unit that suits them.
 
@@ -261,7 +233,6 @@ STUDY = lineup.study(
             decimals=3,
         ),
         "break_even": even,
-        "ledger": ledger,
     },
     figures={"pareto": _figure},
     findings=_findings,

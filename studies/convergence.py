@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
-from coopoc.study.numbers import listed, present
+from coopoc.evaluate.statistics import Interval
+from coopoc.study.numbers import Where, listed, present, seed_means
 from coopoc.study.study import Params, Row
+from coopoc.study.style import Panel
 
 from . import lineup, scene, weights
 from .views import table
@@ -71,18 +73,23 @@ def _curve(results: Results, method: str) -> list[float]:
     return [results.interval("rt_le_m", method=method, round=number).mean for number in rounds]
 
 
+def _seeds(results: Results, where: Where) -> Interval | None:
+    """Mean over training seeds, with the lowest and the highest of them."""
+    each = seed_means(results, where)
+    return Interval(sum(each) / len(each), min(each), max(each), len(each)) if each else None
+
+
 def _figure(results: Results) -> Plot | None:
     from coopoc.study import figures
 
-    where = present(results, BOTH)
-    if where is None:
-        return None
-    ends = [curve[-1] for name in weights.INDIVIDUAL if (curve := _curve(results, name))]
+    rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else [0]
+    panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round")
     text = (
         "RT-LE after every round with the weights that validated best so far (mean over training seeds, band from the "
-        "lowest to the highest); dashed: the individual nets at their end."
+        "lowest to the highest); horizontal: the individual nets at their end."
     )
-    return figures.convergence(results, where=where, levels=ends, caption=scene.caption(results, text))
+    lines, ends = ([{"method": name} for name in names] for names in (BOTH["method"], weights.INDIVIDUAL))
+    return figures.curves(results, [panel], lines, scene.caption(results, text), _seeds, ends, width=6.4)
 
 
 def _findings(results: Results) -> dict[str, str]:

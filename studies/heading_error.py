@@ -11,7 +11,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import fleet_pose_bound
+from coopoc.evaluate.bounds import pose_bound
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.poses.pose_filter import PoseFilter
@@ -93,7 +93,7 @@ def cell(p: Params) -> list[Row]:
     fleet, noise, v2x = convoy(float(p["speed"]), float(p["after_s"])), sensors(p), channel(p)
     last = slice(-round(float(p["score_s"]) / DT), None)
     if p["method"] == "bound":
-        cov = fleet_pose_bound(fleet, noise, v2x)[last]
+        cov = pose_bound(fleet, noise, v2x)[last]
         square = np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)
         return [{"run": 0, "ego": "all", "rt_le_m": _root(square), "heading_deg": np.rad2deg(_root(cov[..., 3, 3]))}]
     runs = int(p["runs"])
@@ -189,21 +189,6 @@ def _compasses(results: Results, number: Number, text: str, decimals: int) -> Ta
     return crossed(results, ("K", "Method", "Noise model"), rows, columns, text, decimals=decimals)
 
 
-def _estimated(results: Results) -> Table | None:
-    """Heading errors without a compass, speeds and K down, times across, the bound beside each."""
-    rows = [
-        ((f"{speed:g}", k), of(pose(k), ALWAYS, compass=NONE, speed=speed, max_neighbours=k))
-        for speed in SPEEDS
-        for k in NEIGHBOURS
-    ]
-    columns: dict[str, Number] = {}
-    for after in AFTER:
-        columns |= across(heading, {f"{after:g} s": {"after_s": after}})
-        columns |= across(heading, {f"{after:g} s (bound)": of("bound", "bound", after_s=after)})
-    text = _note(results, "Rms heading error [°] without a compass, after a time.")
-    return crossed(results, ("Speed [m/s]", "K"), rows, columns, text, best=None, decimals=1)
-
-
 def _over_time(results: Results) -> Plot | None:
     """Heading error over time without a compass, K = 0 and 10, a line per speed; dotted the bound."""
     from matplotlib import colormaps
@@ -287,7 +272,6 @@ STUDY = Study(
         "nees": partial(
             _compasses, number=partial(mean, value="nees"), text="NEES of a pose (3 is consistent)", decimals=1
         ),
-        "found": _estimated,
     },
     figures={"heading": _over_time, "cost": _cost},
     findings=_findings,

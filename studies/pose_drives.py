@@ -18,7 +18,7 @@ from coopoc.data.mrclam_poses import Calibration, calibrate, pose_recording, sur
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
 from coopoc.errors import InputError
-from coopoc.methods.poses.pose_filter import SPREAD
+from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.methods.poses.pose_start import pose_start
 from coopoc.study.study import Params
 from coopoc.world.fleet import Fleet

@@ -15,7 +15,7 @@ import pytest
 import coopoc as co
 from coopoc.data.log.check import check as check_poses
 from coopoc.data.registry import load_log
-from coopoc.evaluate.innovations import innovation_columns, normalised_innovations
+from coopoc.evaluate.metrics import innovation_columns, normalised_innovations
 from coopoc.study.run import find_study
 
 T = np.round(np.arange(0, 40, 0.1), 1)
@@ -203,7 +203,7 @@ def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
     frame.to_csv(tmp_path / "log.csv", index=False)
     command = [sys.executable, "-m", "coopoc.cli", "data", "check", "log.csv?frame=body"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert "400 yaw rates" in done.stdout
+    assert "400 samples of odometry" in done.stdout
     assert "no filter follows it" in done.stdout
 
 

@@ -45,23 +45,11 @@ def results() -> Results:
     return Results("demo", "?", axes, {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
 
 
-@pytest.fixture(scope="module")
-def rounds() -> Results:
-    rows = [
-        {"method": m, "train_seed": s, "round": k, "ego": "a", "run": r, "rt_le_m": 1 + s / 10 + 3 * np.exp(-k / 3)}
-        for m in ("fedkalmannet", "centralised")
-        for s in range(3)
-        for k in range(6)
-        for r in range(2)
-    ]
-    return Results("demo", "?", ("method", "train_seed", "round"), {}, pd.DataFrame(rows), pd.DataFrame(), 0, {})
-
-
 GNSS = {"method": "gnss", "noise_model": "identity", "max_neighbours": 0}
 LINES = [{"method": "joint"}, {"method": "bound"}]
 
 
-def all_plots(results: Results, rounds: Results) -> dict[str, Callable[[], Plot]]:
+def all_plots(results: Results) -> dict[str, Callable[[], Plot]]:
     return {
         "sweep": lambda: figures.sweep(results, "max_neighbours", log=True),
         "facets": lambda: figures.sweep(results, "max_neighbours", facet="noise_model"),
@@ -69,13 +57,12 @@ def all_plots(results: Results, rounds: Results) -> dict[str, Callable[[], Plot]
         "curves": lambda: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
         "multiples": lambda: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
         "cdf": lambda: figures.cdf(results, where={"max_neighbours": 2}),
-        "convergence": lambda: figures.convergence(rounds, levels=(1.4, 1.41)),
     }
 
 
-@pytest.mark.parametrize("name", ["sweep", "facets", "pareto", "cdf", "convergence", "curves", "multiples"])
-def test_the_same_numbers_give_the_same_bytes(results: Results, rounds: Results, tmp_path: Path, name: str) -> None:
-    make = all_plots(results, rounds)[name]
+@pytest.mark.parametrize("name", ["sweep", "facets", "pareto", "cdf", "curves", "multiples"])
+def test_the_same_numbers_give_the_same_bytes(results: Results, tmp_path: Path, name: str) -> None:
+    make = all_plots(results)[name]
     assert make().save(tmp_path / "a") == make().save(tmp_path / "b") != ""
     for suffix in ("pdf", "png", "svg"):
         first, second = ((tmp_path / f"{n}.{suffix}").read_bytes() for n in "ab")
@@ -136,13 +123,6 @@ def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
     assert share[0] > 0
     assert share[-1] == 1.0
     assert np.all(np.diff(share) > 0)
-
-
-def test_convergence_bands_reach_from_seed_to_seed(rounds: Results) -> None:
-    axes = figures.convergence(rounds).figure.axes[0]
-    band = axes.collections[0].get_paths()[0].vertices[:, 1]
-    assert band.max() == pytest.approx(4.2)
-    assert axes.lines[0].get_ydata()[0] == pytest.approx(4.1)
 
 
 @pytest.mark.parametrize("suffix", ["svg", "png"])

@@ -1,17 +1,18 @@
-"""Figures of a study: a metric over an axis, its distribution, its convergence, its bytes, and methods over a case."""
+"""Figures of a study: a metric over an axis, its distribution, its bytes, and methods over a case."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FixedLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
+from ..errors import InputError
 from ..escapes import picture
 from ..evaluate.statistics import Interval
-from .numbers import Number, Where, mean, ran
+from .numbers import Number, Where, interval, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
 from .style import NEUTRAL, SYMBOLS, Panel, label, look, title, words
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
     from .results import Results
 
-__all__ = ["Plot", "cdf", "convergence", "curves", "multiples", "pareto", "sweep"]
+__all__ = ["Plot", "cdf", "curves", "multiples", "pareto", "sweep"]
 
 
 def sweep(
@@ -48,24 +49,22 @@ def sweep(
     Raises:
         InputError: as `Results.summary`.
     """
+    rows, base = results.select(where), dict(where or {})
     by = [name for name in _line_names(results, x, facet) if name != facet]
-    summary = results.summary([*by, *([facet] if facet else []), x], y, where)
-    panels = list(summary.groupby(facet)) if facet else [("", summary)]
-    drawn: list[dict[str, Any]] = []
-    size = {"width": 6.4 if len(panels) == 1 else 2.2 + 2.6 * len(panels)}
-    with canvas(1, len(panels), squeeze=False, sharex=True, sharey=True, **size) as (figure, ((*grid,),)):
-        for axes, (value, part) in zip(grid, panels, strict=True):
-            for names, group in _groups(part, by):
-                rows = group.set_index(x)[["mean", "low", "high", "n"]].sort_index().T.to_dict("list")
-                drawn += [names] if _draw(axes, names, {k: Interval(*row) for k, row in rows.items()}) else []
-            axes.set(xlabel=words(x), title=title(facet, value) if facet else "")
-        ticks = sorted(summary[x].unique())
-        if len(ticks) <= 12:
-            grid[0].set_xticks(ticks)
-        _vertical(grid[0], words(y), log)
-        legend(grid[-1], drawn)
+    faces = rows[facet].unique() if facet else [""]
+    at = {value: {x: value} for value in sorted(rows[x].unique())}
+    panels = [
+        Panel(at, {**base, **({facet: face} if facet else {})}, title(facet, face) if facet else "", words(x))
+        for face in faces
+    ]
+    lines = [names for names, _ in _groups(rows, by)]
     text = f"{words(y)} against {words(x)}{_selected(where)}. Bands: 95 % intervals over egos, then runs."
-    return Plot(figure, caption or text)
+    number = partial(interval, value=y)
+    width = 6.4 if len(panels) == 1 else None
+    plot = curves(results, panels, lines, caption or text, number, ylabel=words(y), log=log, width=width)
+    if plot is None:
+        raise InputError(y, "no value", "must have been computed for a cell", "See the failed cells.")
+    return plot
 
 
 def cdf(results: Results, value: str = "error_quantiles_m", where: Where | None = None, caption: str = "") -> Plot:
@@ -97,48 +96,6 @@ def cdf(results: Results, value: str = "error_quantiles_m", where: Where | None 
         axes.set_xlim(left=0.1)
         legend(axes, drawn, {method: f" (max {' / '.join(each)} m)" for method, each in maxima.items()})
     text = f"Cumulative distribution of the error{_selected(where)}. Markers: mean of the per-run maxima."
-    return Plot(figure, caption or text)
-
-
-def convergence(
-    results: Results,
-    x: str = "round",
-    y: str = "rt_le_m",
-    where: Where | None = None,
-    levels: Sequence[float] = (),
-    caption: str = "",
-) -> Plot:
-    """Plot a metric after every round: mean over training seeds, band from the lowest to the highest seed.
-
-    Args:
-        results: of the study.
-        x: column of rounds.
-        y: metric.
-        where: column -> value or values.
-        levels: constant values across, such as the error of each individual net.
-        caption: under the figure.
-
-    Raises:
-        InputError: as `Results.summary`; no column "train_seed".
-    """
-    by = _line_names(results)
-    drawn = []
-    with canvas() as (figure, axes):
-        for names, group in _groups(results.summary([*by, "train_seed", x], y, where), by):
-            table = group.pivot(index=x, columns="train_seed", values="mean").sort_index()
-            ends = zip(table.index, table.mean(axis=1), table.min(axis=1), table.max(axis=1), strict=True)
-            style = {"markevery": max(1, len(table) // 10)}
-            _draw(axes, names, {k: Interval(middle, low, high, 0) for k, middle, low, high in ends}, style)
-            drawn.append(names)
-        for level in levels:
-            axes.axhline(level, color=look("individual").color, linewidth=0.9, linestyle=(0, (6, 2)))
-        axes.set(xlabel=words(x), ylabel=words(y))
-        axes.set_xlim(left=0)
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        low, high = axes.get_ylim()
-        axes.set_ylim(low, high + 0.25 * (high - low))  # room for the legend above the curves
-        legend(axes, drawn, inside=True)
-    text = f"{words(y)} after every round{_selected(where)}: mean over training seeds; bands: lowest to highest."
     return Plot(figure, caption or text)
 
 
@@ -257,10 +214,6 @@ def curves(
     return Plot(figure, caption)
 
 
-NEAR, BOTH, FAR = (0.9, 1.0, 1.1, 1.2, 1.3, 1.5, 1.7, 2.0), (0.8, 1.0, 1.25, 1.6, 2.0), (0.5, 1.0, 2.0, 5.0, 10.0)
-"""Ticks of an axis from about 1 to 2, of one that begins well below 1, and of a longer one."""
-
-
 def multiples(
     rows: Mapping[tuple[str, str], Mapping[str, Sequence[float]]],
     caption: str,
@@ -290,11 +243,8 @@ def multiples(
                 values = each.get(case, ())
                 style = {**strokes({"method": method}), "linestyle": "none", "markersize": 4, "alpha": 0.8}
                 panel.plot(values, np.full(len(values), row), **style)
-            panel.set(title=case, xscale="log", xlabel="× reference")
-            low, high = panel.get_xlim()
-            panel.xaxis.set_major_locator(FixedLocator(FAR if high > 2.1 else BOTH if low < 0.85 else NEAR))
-            panel.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-            panel.xaxis.set_minor_formatter(NullFormatter())
+            panel.set(title=case, xlabel="× reference")
+            plain_log(panel.xaxis)
         labels = [look(m).label + ("" if known in ("trained", "none") else f", {known}") for m, known in rows]
         axes[0].set(yticks=range(len(rows)), yticklabels=labels, ylim=(len(rows) - 0.4, -0.6))
     return Plot(figure, caption)

@@ -88,16 +88,13 @@ def strokes(names: Mapping[str, Any]) -> dict[str, Any]:
     return {"color": shown.color, "marker": shown.marker or None, "linestyle": dashes, "markeredgewidth": 0.8}
 
 
-def legend(
-    axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None, inside: bool = False
-) -> None:
-    """Draw the legend: one entry per method and per bound, and one per line style where noise models differ.
+def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, str] | None = None) -> None:
+    """Draw the legend at the right: one entry per method and bound, and one per line style where noise models differ.
 
     Args:
         axes: panel.
         lines: names (method, noise_model) of the lines in it.
         words: method -> text after its label.
-        inside: in the panel; else at its right.
     """
     if not any(lines):
         return
@@ -116,8 +113,7 @@ def legend(
     if len(styles) > 1:
         grey = {dashes: picture(" / ".join(models)) for dashes, models in styles.items()}
         handles += [Line2D([], [], color="#555555", linestyle=dashes, label=text) for dashes, text in grey.items()]
-    place: dict[str, Any] = {} if inside else {"bbox_to_anchor": (1.02, 1.0), "borderaxespad": 0}
-    axes.legend(handles=handles, loc="upper right" if inside else "upper left", handlelength=2.6, **place)
+    axes.legend(handles=handles, loc="upper left", handlelength=2.6, bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
 
 
 def plain_log(axis: Axis) -> None:

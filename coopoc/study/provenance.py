@@ -13,6 +13,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -35,8 +36,9 @@ def environment() -> dict[str, str]:
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
     }
-    installed = {each.metadata["Name"].lower() for each in metadata.distributions() if each.metadata["Name"]}
-    versions |= {name: metadata.version(name) for name in _LIBRARIES if name in installed}
+    for name in _LIBRARIES:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
     return {name: value for name, value in versions.items() if value}
 
 

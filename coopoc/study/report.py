@@ -1,12 +1,9 @@
-"""report: one self-contained page, HTML or PDF, from folders of studies; it needs neither network nor what ran."""
+"""report: one self-contained page from folders of studies; it needs neither network nor what ran."""
 
 from __future__ import annotations
 
 import base64
 import re
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,14 +12,14 @@ import jinja2
 from markupsafe import Markup, escape
 
 from ..arrays import listed
-from ..errors import InputError, MissingLibraryError
+from ..errors import InputError
 from ..escapes import uncontrolled
 from ..file_names import given_path, inside
 from . import store
 from .manifest import environments
 from .publish import views
 from .results import Results
-from .style import look, title, words
+from .style import TERMS, look, title, words
 from .tables import Table
 
 OWN = Path(__file__).parent
@@ -38,30 +35,6 @@ NOISE_MODELS = ("identity", "fitted", "nominal", "oracle")
 """Ends of the names of views that differ in nothing else: the page shows one of them at a time."""
 
 
-TERMS = {
-    "RT-LE": "root of the time-averaged squared localization error, in metres, per run and ego",
-    "NEES": "normalised estimation error squared: 3 on average for a consistent filter of a position",
-    "NIS": "normalised innovation squared per dimension: 1 on average for a consistent filter",
-    "egos": "the vehicles whose positions a method estimates",
-    "ego": "the vehicle whose position a method estimates",
-    "GNSS": "satellite navigation: fixes of each vehicle's position",
-    "V2X": "messages between vehicles, and between vehicles and road-side units",
-    "OKF": "a Kalman filter whose noise parameters are trained on the error (Greenberg et al. 2023)",
-    "KF": "Kalman filter",
-    "LKF-SA": "the paper's cooperative Kalman filter, which exchanges measurements in real time",
-    "MSMV": "the paper's cooperative baseline that weighs neighbours by their variances; a reconstruction",
-    "FedKalmanNet": "a KalmanNet trained by federated averaging over vehicles (arXiv 2411.05847)",
-    "KalmanNet": "a Kalman filter whose gain is a trained net (Revach et al. 2022)",
-    "GNC": "graduated non-convexity: a robust loss approached from a convex one",
-    "CI": "covariance intersection: fusion that is consistent whatever the correlation",
-    "Cramér-Rao bound": "no unbiased filter with the same information has a smaller mean squared error",
-    "identity": "noise model: unit covariances, as the paper's baselines have",
-    "fitted": "noise model: covariances estimated on the training recordings",
-    "nominal": "noise model: the standard deviations that act",
-    "consistent": "errors as large as the filter's covariance claims",
-    "over-confident": "errors larger than the filter's covariance claims",
-}
-"""Term -> meaning, which the page shows where a reader points at it."""
 _TERM = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(TERMS, key=len, reverse=True)))})(?![\w-])")
 
 
@@ -77,7 +50,7 @@ def report(
 
     Args:
         folders: of finished studies, in the order of the page.
-        out: the file; a name in .pdf is printed by Chromium.
+        out: the file.
         title: of the page.
         lead: sentences under the title, before the first study.
         answers: question -> answer, shown after the lead; default each study's question with its first finding.
@@ -85,7 +58,6 @@ def report(
 
     Raises:
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
-        MissingLibraryError: a PDF without Chromium.
     """
     out = given_path(out)
     if out.is_dir():
@@ -106,7 +78,7 @@ def report(
         css=Markup((OWN / "report.css").read_text()),
         script=Markup((OWN / "report.js").read_text()),
     )
-    store.write(out, printed(page) if out.suffix.lower() == ".pdf" else page)
+    store.write(out, page)
     return out
 
 
@@ -209,41 +181,3 @@ def explained(text: object) -> Markup:
         return f'<abbr title="{escape(TERMS[term])}">{term}</abbr>'
 
     return Markup(_TERM.sub(one, str(escape(uncontrolled(str(text))))))
-
-
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-"""Names of the program in Linux distributions, in the order in which they are tried."""
-
-
-def printed(page: str) -> bytes:
-    """A page as a PDF, printed by Chromium, which draws it as a reader's browser does.
-
-    Raises:
-        MissingLibraryError: no Chromium. InputError: it could not print the page, with its last words.
-    """
-    program = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if program is None:
-        raise MissingLibraryError("chromium", "a PDF of the report", "chromium", "apt-get install")
-    with tempfile.TemporaryDirectory(prefix="coopoc-", ignore_cleanup_errors=True) as name:
-        folder = Path(name)
-        (folder / "page.html").write_text(page)
-        out = folder / "page.pdf"
-        # --no-sandbox: as root, as in a container, Chromium refuses to start without it, and the page is our own;
-        # a profile of its own: a browser that is already open would take the page and print nothing
-        flags = [
-            "--headless",
-            "--disable-gpu",
-            "--no-pdf-header-footer",
-            "--no-first-run",
-            "--disable-extensions",
-            "--no-sandbox",
-        ]
-        places = [f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={out}", (folder / "page.html").as_uri()]
-        try:
-            done = subprocess.run([program, *flags, *places], capture_output=True, text=True, timeout=180)
-            ended = done.stderr.strip().splitlines()[-1:] or [f"exit status {done.returncode}"]
-        except subprocess.TimeoutExpired:
-            ended = ["not done after 180 s"]
-        if not out.is_file():
-            raise InputError("PDF", program, f"could not print the page: {ended[0]}", "Write report.html and print it.")
-        return out.read_bytes()

@@ -13,7 +13,6 @@ import pyarrow as pa
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..escapes import spreadsheet
 from ..evaluate.statistics import Interval, mean_interval
 from ..file_names import given_path
 from ..plugins import unknown
@@ -147,14 +146,6 @@ class Results:
     def to_parquet(self, path: str | Path) -> None:
         """Write all rows as Parquet."""
         store.write(given_path(path), lambda file: self.frame.to_parquet(file, index=False))
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write all rows as CSV with full precision; columns of lists are left to Parquet, no text is a formula."""
-        flat = [c for c in self.frame if not self.frame[c].map(lambda v: isinstance(v, list | np.ndarray)).any()]
-        texts = [str(c) for c in flat if not pd.api.types.is_numeric_dtype(self.frame[c])]
-        safe = self.frame[flat].copy()
-        safe[texts] = safe[texts].map(lambda v: spreadsheet(v) if isinstance(v, str) else v)
-        store.write(given_path(path), safe.to_csv(index=False))
 
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
         check_metric(frame, value)

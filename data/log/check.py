@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc.arrays import Bools, Floats, robust_std
 from coopoc.errors import InputError
-from coopoc.evaluate.innovations import fix_innovations, normalised_innovations
+from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_start import pose_start
@@ -35,7 +35,6 @@ COARSE = 0.5
 """rad: no sensor's angles scatter as much about positions that are better known."""
 MISTAKEN = (
     (0.0, 3e-3, "Is t in ms, or finer? Divide it: stamps are in s."),
-    (5e-3, 2e-2, "Is speed in cm/s? Speeds are in m/s."),
     (0.2, 0.4, "Is speed in km/h? Name it speed_kmh. Or in feet a second? Speeds are in m/s."),
     (0.42, 0.55, "Is speed in miles an hour, or in knots? Speeds are in m/s."),
     (3.0, 3.6, "Are positions in feet, or ranges? They are in m."),

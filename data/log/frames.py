@@ -25,8 +25,6 @@ PLANE_STD = 0.01
 """m, how well z = 0 is known where no height was logged; rad, the inclination that goes with it."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
-VARIED = 1.5
-"""Ratio of large to small standard deviations (98 and 2 %) beyond which one for all is worth a word."""
 
 
 def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
@@ -154,13 +152,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -
     def of(*names: str, default: float, unit: str) -> float:
         parts = [given[name] for name in names if name in given]
         if parts:
-            every = np.concatenate(parts)
-            level = float(np.sqrt(np.mean(every**2)))
-            low, high = np.percentile(every, [2, 98])
-            if high > VARIED * low:
-                what = f"{low:.3g} to {high:.3g} {unit}"
-                summary.assume(f"one standard deviation of {names[0]} for all, {level:.3g} {unit}; the log has {what}")
-            return level
+            return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
         if used & set(names):
             summary.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
         return default

@@ -172,7 +172,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     good = np.flatnonzero(both & np.isfinite(value))
     good = good[np.argsort(np.abs(lag[good]), kind="stable")]
     seen = Measured(value[good], component[good], step[good], lag[good], observer[good], partner[good])
-    brought = (_brought_in_body if body else _brought)(seen, list(members.values()), steps.dt)
+    brought = _to_step(seen, list(members.values()), steps)
     brought = np.where(seen.component == 1, wrap(brought), brought)
     keys = np.column_stack([seen.step, seen.observer, seen.partner, seen.component])
     first = np.unique(keys, axis=0, return_index=True)[1]
@@ -209,53 +209,46 @@ def _messages(rows: Rows, ids: Sequence[str], there: Bools, steps: Steps) -> tup
     return keys.reshape(-1, 3), np.where(first == never, -1, first), broadcasts
 
 
-def _brought(rows: Measured, members: Sequence[Member], dt: float) -> Floats:
-    """Values (M,) at their steps: z + f(g) - f(g + lag du), with the vector g from the observer to the partner at the
-    step, from the last fixes and the odometry since, the difference du of their velocities, and f the range, azimuth or
-    inclination of a vector."""
-    velocity = np.stack([one.velocity for one in members], axis=1)
-    fixes = np.stack([one.gnss for one in members], axis=1)
-    path = np.cumsum(np.nan_to_num(velocity) * dt, axis=0)
-    every = np.arange(len(path))[:, None]
-    last = np.maximum.accumulate(np.where(np.isfinite(fixes[..., 0]), every, -1), axis=0)
-    place = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
-    gap = place[rows.step, rows.partner] - place[rows.step, rows.observer]
-    moved = rows.lag[:, None] * (_during(velocity, rows, rows.partner) - _during(velocity, rows, rows.observer))
-    return rows.value + _change(rows, gap + moved, gap)
+def _to_step(seen: Measured, members: Sequence[Member], steps: Steps) -> Floats:
+    """Values (M,) at their steps: z + f(now) - f(then), f being the range, azimuth or inclination of a vector.
 
-
-def _brought_in_body(rows: Measured, members: Sequence[Member], dt: float) -> Floats:
-    """Values (M,) at their steps in body frames: a bearing grows by lag w, with the observer's yaw rate w. What stands,
-    and was measured by range and bearing at one time, moves by lag v, with the observer's velocity v; how a vehicle
-    moves in the observer's frame is not known."""
-    stands = np.array([one.stands for one in members])[rows.partner]
-    _, same = np.unique(
-        np.column_stack([rows.step, rows.lag, rows.observer, rows.partner]), axis=0, return_inverse=True
+    In the world `now` is the vector g from the observer to the partner at the step, from the last fixes and the
+    odometry since, and `then` is g + lag du, with the difference du of their velocities. In body frames a bearing grows
+    by lag w, with the observer's yaw rate w; what stands, and was measured by range and bearing at one time, moves by
+    lag v, with the observer's velocity v; how a vehicle moves in the observer's frame is not known. Nothing is moved
+    where the vectors or the range are not far longer than what lies between.
+    """
+    velocity, fixes, rate = (
+        np.stack([getattr(one, name) for one in members], axis=1) for name in ("velocity", "gnss", "yaw_rate")
     )
-    polar = np.tile([np.nan, np.nan, np.pi / 2], (len(same), 1))
-    polar[same.reshape(-1), rows.component] = rows.value
-    gap = to_vector(polar)[same.reshape(-1)]
-    gap[~stands] = np.nan
-    velocity, rate = (np.stack([getattr(one, name) for one in members], axis=1) for name in ("velocity", "yaw_rate"))
-    turned = np.where(rows.component == 1, rows.lag * _during(rate[..., None], rows, rows.observer)[:, 0], 0.0)
-    return rows.value + turned + _change(rows, gap, gap + rows.lag[:, None] * _during(velocity, rows, rows.observer))
+    lag = seen.lag[:, None]
+    after = np.minimum(seen.step + (seen.lag > 0), len(velocity) - 1)
 
+    def during(of_step: Floats, column: Ints) -> Floats:
+        """(M, ...) means over the step in which each time lies; of the one before where the member is absent then."""
+        absent = np.isnan(velocity[after, column, 0])
+        return np.asarray(of_step[np.where(absent, seen.step, after), column])
 
-def _change(rows: Measured, then: Floats, now: Floats) -> Floats:
-    """(M,) f(now) - f(then), zero where that is unknown, and where the vectors (M, 3) m or the range are not far longer
-    than what lies between."""
+    moved, value = lag * during(velocity, seen.observer), seen.value
+    if steps.body:
+        keys = np.column_stack([seen.step, seen.lag, seen.observer, seen.partner])
+        same = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+        polar = np.tile([np.nan, np.nan, np.pi / 2], (len(same), 1))
+        polar[same, seen.component] = seen.value
+        then = to_vector(polar)[same]
+        then[~np.array([one.stands for one in members])[seen.partner]] = np.nan
+        now = then + moved
+        value = value + np.where(seen.component == 1, seen.lag * during(rate, seen.observer), 0.0)
+    else:
+        path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
+        known = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
+        last = np.maximum.accumulate(known, axis=0)
+        place = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
+        now = place[seen.step, seen.partner] - place[seen.step, seen.observer]
+        then = now + lag * during(velocity, seen.partner) - moved
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
-    distance = np.where(rows.component == 0, rows.value, np.inf)
+    distance = np.where(seen.component == 0, seen.value, np.inf)
     far = np.minimum(np.linalg.norm(now, axis=1), distance) > NEAR * np.linalg.norm(now - then, axis=1)
-    found: Floats = np.where(far, change[np.arange(len(change)), rows.component], 0.0)
-    return found
-
-
-def _during(of_step: Floats, rows: Measured, column: Ints) -> Floats:
-    """(M, C) means over the step in which each time lies, of means (T, N, C) over the step that ends at each instant;
-    of the step before where the member is absent then."""
-    after = np.minimum(rows.step + (rows.lag > 0), len(of_step) - 1)
-    absent = np.isnan(of_step[after, column, 0])
-    found: Floats = of_step[np.where(absent, rows.step, after), column]
+    found: Floats = value + np.where(far, change[np.arange(len(change)), seen.component], 0.0)
     return found

@@ -151,14 +151,14 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
         forward, rate = step_means(speed, steps.grid), step_means(turn, steps.grid)[:, 0]
-        velocity = forward * [1.0, 0.0, 0.0]
+        velocity: Floats = forward * [1.0, 0.0, 0.0]
         along, _ = _heading(measured, turn, ((derived, "fixes"),), steps)
-        carried = still if along is None else np.nan_to_num(forward * _ahead(along(steps.grid)))
-        text = f"{len(speed.t)} speeds, {len(turn.t)} yaw rates, {len(measured.t)} headings"
+        carried: Floats = still if along is None else np.nan_to_num(forward * _ahead(along(steps.grid)))
     else:
-        moved, heading, text, course = _in_world(name, rows, turn, measured, derived, steps)
+        moved, heading, course = _in_world(name, rows, turn, measured, derived, steps)
         signals, rate = [moved], none
-        velocity = carried = step_means(moved, steps.grid)
+        velocity = step_means(moved, steps.grid)
+        carried = velocity
     there = np.ones(size, dtype=bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
@@ -169,7 +169,7 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~known).sum()))
         there &= known
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time"
-    text = f"{int(np.isfinite(gnss[:, 0]).sum())} fixes, {text}, {span}"
+    text = f"{len(fixes.t)} fixes, {len(signals[0].t)} samples of odometry, {len(measured.t)} headings, {span}"
     absent = np.where(there, 0.0, np.nan)
     compass = _compass_on_steps(measured, rate, steps) + absent if steps.body else none
     return Member(gnss, velocity + absent[:, None], heading, text, course, False, rate + absent, compass)
@@ -177,16 +177,15 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
 
 def _in_world(
     name: str, rows: Rows, turn: Signal, measured: Signal, derived: Signal | None, steps: Steps
-) -> tuple[Signal, HeadingAt | None, str, str]:
-    """Velocity at its own times, heading, where both come from in words, and the course that the heading is."""
+) -> tuple[Signal, HeadingAt | None, str]:
+    """Velocity at its own times, heading, and whose course the heading is."""
     summary, rate = steps.summary, turn if len(turn.t) > 1 else None
     world, _ = samples(rows, ("vx", "vy", "vz"), summary, 2)
     speed, first = samples(rows, ("speed",), summary, 1)
     heading, course = _heading(measured, rate, ((world, "odometry"), (derived, "fixes")), steps)
-    source = f", heading from the course of the {course}" if course else ", heading measured" if heading else ""
     if len(world.t):
         summary.refuse_rows("speeds where a world velocity is given", rows, first)
-        return Signal(world.t, np.nan_to_num(world.value)), heading, f"{len(world.t)} velocities{source}", course
+        return Signal(world.t, np.nan_to_num(world.value)), heading, course
     if len(speed.t):
         if heading is None:
             allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
@@ -197,13 +196,12 @@ def _in_world(
         summary.refuse_rows("speeds without a heading", rows, first[~known])
         if course:
             summary.assume(COURSE.format("{}", course), name)
-        velocity = Signal(speed.t[known], speed.value[known] * _ahead(turned[known]))
-        return velocity, heading, f"{len(velocity.t)} speeds{source}", course
+        return Signal(speed.t[known], speed.value[known] * _ahead(turned[known])), heading, course
     if derived is None:
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
     summary.assume(DERIVED, name)
-    return derived, heading, f"velocity derived from them{source}", course
+    return derived, heading, course
 
 
 def _heading(

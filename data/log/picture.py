@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.escapes import picture
-from coopoc.evaluate.innovations import dimensions
+from coopoc.evaluate.metrics import dimensions
 from coopoc.pictures import COLORS, INK
 
 from .check import Check
@@ -84,7 +84,8 @@ def innovations(axes: Axes, found: Check, drives: list[tuple[int, str, str]]) ->
         each = size * found.normalised[np.isfinite(found.normalised[:, k]), k]
         if len(each) > 1:
             label = f"{name}: mean {each.mean():.3g}"
-            axes.hist(each.clip(0, 14), line[::5], density=True, histtype="step", color=color, label=label)
+            bars: dict[str, Any] = {"bins": 35, "range": (0, 14), "density": True, "histtype": "step"}
+            axes.hist(each.clip(0, 14), color=color, label=label, **bars)
     if not axes.get_legend_handles_labels()[1]:
         axes.text(7, 0.2, "no vehicle has a fix after its first", ha="center")
     axes.plot(line, chi2(size).pdf(line), label=f"$\\chi^2_{size}$: mean {size}", **DASHED)

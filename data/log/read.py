@@ -143,19 +143,20 @@ def read_log(
     one_of("frame", frame, get_args(Frame))
     instance("any_scale", any_scale, bool, "Give True or False.")
     texts("ignore", ignore)
-    for field, value in (("dt", dt), ("max_gap", max_gap)):
+    ahead = named("clock", clock or {}, "Give clock={name: s}.")
+    for field, value in {"dt": dt, "max_gap": max_gap, **{f"clock of {one}": s for one, s in ahead.items()}}.items():
         if value is not None:
-            number(field, value, 1e-12, allowed="> 0 s", hint="Give seconds.")
-    for field, mapping in (("columns", columns), ("kinds", kinds), ("clock", clock)):
-        named(field, mapping or {}, f"Give {field}={{name: ...}}.")
-    for one, ahead in (clock or {}).items():
-        number(f"clock[{one!r}]", ahead, -np.inf, allowed="finite s", hint="Give the seconds that it is ahead.")
+            number(field, value, -np.inf if field.startswith("clock") else 1e-12, allowed="> 0 s", hint="Give seconds.")
     if origin is not None:
         checked("origin", origin, "(3,)", (3,))
-    options: dict[str, Any] = {"columns": columns or {}, "kinds": kinds or {}, "ignore": ignore}
+    options: dict[str, Any] = {
+        "columns": named("columns", columns or {}, "Give columns={name: header}."),
+        "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
+        "ignore": ignore,
+    }
     rows, actual = _rows(path, truth, summary, options)
     check_time(rows.t, path.name)
-    rows = on_one_clock(rows, clock or {}, path.name)
+    rows = on_one_clock(rows, ahead, path.name)
     origin = origin_of(rows, origin)
     rows = local(rows, origin)
     if not any_scale:

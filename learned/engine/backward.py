@@ -8,7 +8,18 @@ from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import compiled, part, storage
 from coopoc.learned.engine import layers as on
 from coopoc.learned.engine.forward import Drives, State, follow, missing, new_state
-from coopoc.learned.engine.layers import CELLS, LANES, PAD, SHORTEST, Net, Plan, backward_layer, columns_of, unpack
+from coopoc.learned.engine.layers import (
+    CELLS,
+    LANES,
+    PAD,
+    SHORTEST,
+    Index,
+    Net,
+    Plan,
+    backward_layer,
+    columns_of,
+    unpack,
+)
 from coopoc.learned.engine.optimiser import Found, Moments, Update, advance_row
 
 
@@ -58,7 +69,7 @@ def descend(
 
 
 @part
-def score(x: Floats, truth: Floats, r: int, lane: int) -> float:
+def score(x: Floats, truth: Floats, r: Index, lane: Index) -> float:
     """Squared error m^2 of a drive, sum over components, mean over the steps with a truth, over the number of drives; x
     becomes its gradient in x, 0 where the truth is not known (NaN)."""
     known, squares, zero = 0, 0.0, x.dtype.type(0.0)
@@ -70,7 +81,7 @@ def score(x: Floats, truth: Floats, r: int, lane: int) -> float:
         for i in range(3):
             error = zero if np.isnan(truth[t, r, lane, i]) else x[t, r, lane, i] - truth[t, r, lane, i]
             x[t, r, lane, i] = scale * error
-            squares += error * error
+            squares += float(error * error)
     return share * squares
 
 
@@ -89,7 +100,7 @@ def collect(net: Net, tape: Floats, gradient: Floats, total: Floats) -> None:
 
 
 @part
-def copy(source: Floats, first: int, target: Floats) -> None:
+def copy(source: Floats, first: Index, target: Floats) -> None:
     """Columns (T, n) of an array from `first` on."""
     for t in range(len(target)):
         row, into = source[t, first : first + target.shape[1]], target[t]
@@ -111,7 +122,7 @@ def back(
     gradient: Floats,
     gnss: Floats,
     adjoints: Floats,
-    rows: tuple[int, int, int],
+    rows: tuple[Index, Index, Index],
     adjoint: State,
 ) -> None:
     """The gradient of the tape, zero before, from that of the estimates (T, S, B, 3); `rows` as in `forward.follow`.
@@ -142,7 +153,7 @@ def back(
 
 
 @part
-def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: int) -> None:
+def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
     """`forward.move` backwards: the gradient of gain, innovation and new states of a lane."""
     columns = net.columns
     gain, residual = columns[on.GAIN], columns[on.RESIDUAL]
@@ -157,7 +168,7 @@ def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: in
 
 
 @part
-def think_back(net: Net, tape: Floats, gradient: Floats, row: int, lanes: int) -> None:
+def think_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
     """`forward.think` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
     prior, copy = net.columns[on.PRIOR], net.columns[on.PRIOR_COPY]
     backward_layer(net, on.L_POSTERIOR, tape, gradient, row, lanes)
@@ -177,7 +188,9 @@ def think_back(net: Net, tape: Floats, gradient: Floats, row: int, lanes: int) -
 
 
 @part
-def gru_back(net: Net, layer: int, field: int, to: int, tape: Floats, gradient: Floats, row: int, lanes: int) -> None:
+def gru_back(
+    net: Net, layer: Index, field: Index, to: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index
+) -> None:
     """`forward.gru` backwards."""
     old, x, h = net.columns[field], net.columns[field + 1], net.columns[field + 2]
     gates, new, one = net.columns[field + 3], net.columns[to], tape.dtype.type(1.0)
@@ -198,7 +211,7 @@ def gru_back(net: Net, layer: int, field: int, to: int, tape: Floats, gradient: 
 
 
 @part
-def look_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: int) -> None:
+def look_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
     """`forward.look` backwards, and `adjoint` of the state of a lane before the step."""
     real, at, columns = tape.dtype.type, net.columns[on.CHANGES], net.columns
     residual, lengths = columns[on.RESIDUAL], columns[on.LENGTHS]

@@ -9,7 +9,19 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import compiled, part, storage
 from coopoc.learned.engine import layers as on
-from coopoc.learned.engine.layers import CELLS, LANES, PAD, SHORTEST, Net, Plan, forward_layer, sigmoid, tanh, unpack
+from coopoc.learned.engine.layers import (
+    CELLS,
+    LANES,
+    PAD,
+    SHORTEST,
+    Index,
+    Net,
+    Plan,
+    forward_layer,
+    sigmoid,
+    tanh,
+    unpack,
+)
 
 
 class Drives(NamedTuple):
@@ -53,7 +65,7 @@ def forward(theta: Floats, plan: Plan, drives: Drives, x: Floats, span: tuple[in
 
 @part
 def follow(
-    net: Net, tape: Floats, drives: Drives, x: Floats, rows: tuple[int, int, int], state: State, keep: int
+    net: Net, tape: Floats, drives: Drives, x: Floats, rows: tuple[Index, Index, Index], state: State, keep: int
 ) -> None:
     """Estimates x[:, s, first : first + lanes] m of `rows` = s, first, lanes; keep: 1 keeps all steps on the tape, so
     many rows each, 0 the last."""
@@ -70,7 +82,7 @@ def follow(
 
 
 @part
-def start(state: State, x0: Floats, rows: tuple[int, int, int]) -> None:
+def start(state: State, x0: Floats, rows: tuple[Index, Index, Index]) -> None:
     """The state before the first step: GRU states I, 0, I, all positions x0 m."""
     s, first, lanes = rows
     for lane in range(lanes):
@@ -83,14 +95,16 @@ def start(state: State, x0: Floats, rows: tuple[int, int, int]) -> None:
 
 
 @part
-def missing(gnss: Floats, at: tuple[int, int, int]) -> bool:
+def missing(gnss: Floats, at: tuple[Index, Index, Index]) -> bool:
     """Whether there is no fix at a step of a model's drive."""
     t, s, b = at
     return bool(np.isnan(gnss[t, s, b, 0]) and np.isnan(gnss[t, s, b, 1]) and np.isnan(gnss[t, s, b, 2]))
 
 
 @part
-def look(drives: Drives, state: State, net: Net, tape: Floats, row: int, t: int, rows: tuple[int, int, int]) -> None:
+def look(
+    drives: Drives, state: State, net: Net, tape: Floats, row: Index, t: Index, rows: tuple[Index, Index, Index]
+) -> None:
     """Directions of the four changes, their lengths, and the innovation; a missing fix repeats the last."""
     real, at = tape.dtype.type, net.columns[on.CHANGES]
     residual, lengths = net.columns[on.RESIDUAL], net.columns[on.LENGTHS]
@@ -114,7 +128,7 @@ def look(drives: Drives, state: State, net: Net, tape: Floats, row: int, t: int,
 
 
 @part
-def think(net: Net, state: State, tape: Floats, row: int, lanes: int) -> None:
+def think(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> None:
     """The net itself, from the changes to the gain and the posterior."""
     forward_layer(net, on.L_UPDATE, tape, row, lanes)
     gru(net, on.L_PROCESS_X, on.PROCESS_OLD, on.PROCESS, state.process, tape, row, lanes)
@@ -134,7 +148,7 @@ def think(net: Net, state: State, tape: Floats, row: int, lanes: int) -> None:
 
 
 @part
-def gru(net: Net, layer: int, field: int, to: int, state: Floats, tape: Floats, row: int, lanes: int) -> None:
+def gru(net: Net, layer: Index, field: Index, to: Index, state: Floats, tape: Floats, row: Index, lanes: Index) -> None:
     """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h' = n + z (h - n), biases in W and U.
 
     The fields of a GRU follow each other: old state, W x, U h, gates. Gates are computed over PAD columns, of which
@@ -165,7 +179,7 @@ def gru(net: Net, layer: int, field: int, to: int, state: Floats, tape: Floats, 
 
 
 @part
-def move(drives: Drives, state: State, net: Net, tape: Floats, lane: int, at: tuple[int, int, int]) -> None:
+def move(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: tuple[Index, Index, Index]) -> None:
     """x <- x_prior + K (z - x_prior) and the new states of a lane; without a fix x <- x_prior and nothing else."""
     t, s, b = at
     gone, gain, residual = missing(drives.gnss, at), net.columns[on.GAIN], net.columns[on.RESIDUAL]

@@ -26,6 +26,8 @@ LANES = 4
 """Drives that one tape holds."""
 PAD = 16
 """Columns of a gate of a GRU: more than the nine that count, because loops of such a length vectorise."""
+Index: TypeAlias = int | np.integer[Any]
+"""A number of a layer, field, row or column: Python's, or NumPy's from a table of them."""
 Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 """Names and shapes of a net's parameters, in the order of theta."""
 
@@ -162,14 +164,14 @@ def unpack(theta: Floats, net: Net) -> None:
 
 
 @part
-def columns_of(net: Net, name: int) -> tuple[int, ...]:
+def columns_of(net: Net, name: Index) -> tuple[Any, ...]:
     """A row of `Net.layers`."""
     row = net.layers[name]
     return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]
 
 
 @part
-def forward_layer(net: Net, name: int, tape: Floats, row: int, lanes: int) -> None:
+def forward_layer(net: Net, name: Index, tape: Floats, row: Index, lanes: Index) -> None:
     """y = W x + b of a layer at so many rows of the tape."""
     weight, bias, outputs, inputs, tall, source, to, relu = columns_of(net, name)
     start, matrix = net.weights[bias : bias + outputs], net.weights[weight : weight + outputs * inputs]
@@ -190,7 +192,7 @@ def forward_layer(net: Net, name: int, tape: Floats, row: int, lanes: int) -> No
 
 
 @part
-def backward_layer(net: Net, name: int, tape: Floats, gradient: Floats, row: int, lanes: int) -> None:
+def backward_layer(net: Net, name: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
     """Add W^T dy to dx of a layer at so many rows; where its ReLU is shut dy becomes zero."""
     weight, _, outputs, inputs, tall, source, to, relu = columns_of(net, name)
     matrix, zero = net.weights[weight : weight + outputs * inputs], tape.dtype.type(0.0)
@@ -206,7 +208,7 @@ def backward_layer(net: Net, name: int, tape: Floats, gradient: Floats, row: int
 
 
 @summing
-def add_rows(target: Floats, to: int, given: Floats, source: int, matrix: Floats, row: int, lanes: int) -> None:
+def add_rows(target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, row: Index, lanes: Index) -> None:
     """y (n,) += x (m,) M (m, n) in rows of two arrays; four rows of M at a time, which all lanes share."""
     m, n = matrix.shape
     whole = m - m % 4
@@ -224,7 +226,7 @@ def add_rows(target: Floats, to: int, given: Floats, source: int, matrix: Floats
 
 
 @summing
-def add_dots(target: Floats, to: int, given: Floats, source: int, matrix: Floats, row: int, lanes: int) -> None:
+def add_dots(target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, row: Index, lanes: Index) -> None:
     """y (m,) += M (m, n) x (n,), as `add_rows`; three rows of M at a time, since m is always a multiple of three."""
     m, n = matrix.shape
     for p in range(0, m, 3):

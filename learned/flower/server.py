@@ -145,7 +145,8 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object]) -> A
     class Screened(base):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **options)
-            self.row, self.usual, self.names = Row(0, theta, {}, {}, {}, {}), None, dict[int, str]()
+            self.row, self.names = Row(0, theta, {}, {}, {}, {}), dict[int, str]()
+            self.usual: float | None = None
             keep(self.row)
 
         def aggregate_train(self, server_round: int, replies: Iterable[Message]) -> tuple[Any, Any]:
@@ -162,8 +163,8 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object]) -> A
 
         def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> Any:
             answers, rejected = read(replies, self.names, "validation-loss")
-            losses, pieces = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
-            pieces = {name: int(count) for name, count in pieces.items()}
+            losses, counts = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
+            pieces = {name: int(count) for name, count in counts.items()}
             row = self.row._replace(validation_loss=losses, pieces=pieces, rejected=self.row.rejected | rejected)
             keep(row)
             return super().aggregate_evaluate(server_round, list(answers.values()))

@@ -72,29 +72,23 @@ def _factor(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floa
     return factor.whiten(gap), chain(space, known, x, factor.nodes, seen, jacobian)
 
 
-def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], which: int) -> Any:
+def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], index: int) -> Any:
     """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
     from scipy.sparse import csr_array
 
-    data, row, col = entries(linear, factors, shape[1])
-    total = sum(len(factor.nodes) * factor.size for factor in factors)
-    return csr_array((data[which if len(data) > 1 else 0], (row, col)), shape=(total, shape[1] * shape[0]))
-
-
-def entries(linear: Linear, factors: Sequence[Factor], dof: int) -> tuple[Floats, Ints, Ints]:
-    """Values (B, E), rows and columns (E,) of the Jacobian."""
-    batch, top = len(linear.x), 0
-    data: list[Floats] = [np.empty((batch, 0))]
-    rows, cols = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    (n, dof), top = shape, 0
+    data, rows, columns = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
         count, size = residual.shape[1:]
-        row = top + np.arange(count * size).reshape(count, size, 1) + np.zeros(dof, np.int64)
-        for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
-            data.append(np.broadcast_to(jacobian, (*residual.shape, dof)).reshape(batch, -1))
-            rows.append(row.ravel())
-            cols.append((dof * column[:, None, None] + np.arange(dof) + np.zeros((size, 1), np.int64)).ravel())
+        row = top + np.arange(count * size).reshape(count, size, 1)
+        for nodes, jacobian in zip(factor.nodes.T, jacobians, strict=True):
+            own = jacobian[index if len(jacobian) > 1 else 0]
+            column = dof * nodes[:, None, None] + np.arange(dof)
+            for into, part in ((data, own), (rows, row), (columns, column)):
+                into.append(np.broadcast_to(part, (count, size, dof)).ravel())
         top += count * size
-    return np.concatenate(data, axis=1), np.concatenate(rows), np.concatenate(cols)
+    place = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((np.concatenate(data), place), shape=(top, n * dof))
 
 
 def local(space: Space, known: Measurement, x: Floats, nodes: Ints) -> tuple[Floats, Floats | None]:

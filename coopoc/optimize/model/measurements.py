@@ -73,8 +73,9 @@ class Measurement:
 
     def predict(self, vector: Floats, constants: Sequence[float] = ()) -> Floats:
         """(..., size) h of vectors (..., d), for kinds that see no rotation."""
-        nothing = np.zeros(self.size(vector.shape[-1]))
-        return np.stack(np.broadcast_arrays(*self.residual([*np.moveaxis(vector, -1, 0)], nothing, constants, np)), -1)
+        shape = vector.shape[:-1]
+        nothing = np.zeros((*shape, self.size(vector.shape[-1])))
+        return self.difference(vector, None, nothing, np.broadcast_to(constants, (*shape, len(constants))))
 
     def residual(self, local: Sequence[Any], z: Iterable[Any], constants: Iterable[Any], m: Any) -> list[Any]:
         """h(x) - z in any namespace; angles are not wrapped.
@@ -116,13 +117,7 @@ class Measurement:
 
     def difference(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> Floats:
         """(..., size) residuals h(x) - z, angles in [-pi, pi); arguments as `differentiate`."""
-        if self.linear:
-            return local - z
-        numbers = columns(local)
-        if rotation is not None:
-            numbers += columns(rotation.reshape(*rotation.shape[:-2], -1))
-        parts = self.residual(numbers, columns(z), columns(given), np)
-        return self.wrapped(np.stack(np.broadcast_arrays(*parts), axis=-1))
+        return self.differentiate(local, rotation, z, given)[0]
 
     def wrapped(self, gap: Floats) -> Floats:
         """`gap` (..., size) with its angles in [-pi, pi), in place."""
