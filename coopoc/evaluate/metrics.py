@@ -9,7 +9,7 @@ from scipy import stats
 
 from ..arrays import Bools, Floats, checked, instance, number, refuse
 from ..errors import InputError
-from ..kernels.scores import distances, normalised, root_mean_squares
+from ..kernels.scores import normalised
 from ..methods.track import Track
 from ..plugins import find
 from ..world.body_frames import true_heading, turned
@@ -45,7 +45,7 @@ def distance(x: Floats, truth: Floats) -> Floats:
     if x.shape[1:] != truth.shape:
         allowed = f"must have shape (T, E, 3) = {x.shape[1:]}"
         raise InputError("truth", f"shape {truth.shape}", allowed, "Give the truth of the same egos and steps.")
-    return distances(np.ascontiguousarray(x), np.ascontiguousarray(truth))
+    return np.asarray(np.sqrt(np.square(x - truth).sum(axis=-1)))
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
@@ -81,7 +81,12 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     mine = [recording.links.of(ego) for ego in track.egos]
     links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
-    return root_mean_squares(np.ascontiguousarray(track.neighbours), truth, ends)
+    square, mean = np.square(track.neighbours - truth).sum(axis=-1), np.full((len(track.x), len(mine)), np.nan)
+    known = np.isfinite(square)
+    for e, span in enumerate(map(slice, ends[:-1], ends[1:])):
+        count = known[:, span].sum(axis=1)
+        np.divide(np.where(known, square, 0.0)[:, span].sum(axis=1), count, out=mean[:, e], where=count > 0)
+    return np.asarray(np.sqrt(mean))
 
 
 def nees(track: Track, fleet: Fleet) -> Floats:
