@@ -92,6 +92,32 @@ def names_in(value: str) -> tuple[str, ...] | None:
     >>> names_in("coopoc.plugins:find")
     ()
     """
+    statement = _definition(value)
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        return ()
+    written = getattr(statement, "value", None)
+    if isinstance(written, ast.Dict):
+        keys = [key.value for key in written.keys if isinstance(key, ast.Constant)]
+        return tuple(map(str, keys)) if len(keys) == len(written.keys) else None
+    named = isinstance(written, ast.Call) and getattr(written.func, "id", "") not in MAPPINGS
+    return () if named else None
+
+
+def summary_in(value: str) -> str | None:
+    """First line of the docstring of the function that an entry point names, or keys of its mapping, from its source.
+
+    >>> summary_in("coopoc.plugins:summary_in")[:27]
+    'First line of the docstring'
+    """
+    statement = _definition(value)
+    if isinstance(statement, ast.FunctionDef):
+        return (ast.get_docstring(statement) or "").partition("\n")[0]
+    keys = names_in(value)
+    return " | ".join(keys) if keys else None
+
+
+def _definition(value: str) -> ast.stmt | None:
+    """The statement that defines what "package.module:NAME" names; None if only an import can show it."""
     module, _, name = value.partition(":")
     try:
         spec = importlib.util.find_spec(module)
@@ -100,15 +126,10 @@ def names_in(value: str) -> tuple[str, ...] | None:
         return None
     for statement in body:
         if isinstance(statement, ast.FunctionDef | ast.ClassDef) and statement.name == name:
-            return ()
+            return statement
         targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
         if any(isinstance(target, ast.Name) and target.id == name for target in targets):
-            written = getattr(statement, "value", None)
-            if isinstance(written, ast.Dict):
-                keys = [key.value for key in written.keys if isinstance(key, ast.Constant)]
-                return tuple(map(str, keys)) if len(keys) == len(written.keys) else None
-            named = isinstance(written, ast.Call) and getattr(written.func, "id", "") not in MAPPINGS
-            return () if named else None
+            return statement
     return None
 
 
