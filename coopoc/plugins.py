@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import difflib
-import importlib.util
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -119,9 +118,13 @@ def summary_in(value: str) -> str | None:
 def _definition(value: str) -> ast.stmt | None:
     """The statement that defines what "package.module:NAME" names; None if only an import can show it."""
     module, _, name = value.partition(":")
+    parts, path, origin = module.split("."), None, ""
     try:
-        spec = importlib.util.find_spec(module)
-        body = ast.parse(Path(str(spec and spec.origin)).read_text(encoding="utf-8")).body
+        for k in range(len(parts)):  # importlib.util.find_spec would import the packages above
+            finders = (f.find_spec(".".join(parts[: k + 1]), path) for f in sys.meta_path if hasattr(f, "find_spec"))
+            spec = next((spec for spec in finders if spec), None)
+            path, origin = (spec.submodule_search_locations, str(spec.origin)) if spec else ([], "")
+        body = ast.parse(Path(origin).read_text(encoding="utf-8")).body
     except (ImportError, OSError, SyntaxError, ValueError):
         return None
     for statement in body:
