@@ -92,7 +92,8 @@ def local(rows: Rows, origin: Origin | None) -> Rows:
     parts, heights = [rows.take(~geodetic)], rows.of("height").any()
     for name in dict.fromkeys(rows.vehicle[geodetic].tolist()):
         mine = rows.take(geodetic & (rows.vehicle == name))
-        fixes, first = samples(mine, DEGREES, Summary(), 3 if heights else 2)
+        fixes = samples(mine, DEGREES, Summary(), 3 if heights else 2)
+        first = fixes.row
         at = fixes.value if heights else np.column_stack([fixes.value[:, :2], np.full(len(fixes.t), origin[2])])
         enu, base = to_enu(at, origin), mine.take(first)
         for axis, (to, what) in enumerate(ENU[: 3 if heights else 2]):

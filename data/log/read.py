@@ -253,7 +253,7 @@ def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str)
 def _check_scale(rows: Rows, name: str) -> None:
     parts, t, position = [], np.empty(0), np.empty((0, 3))
     for one in dict.fromkeys(rows.vehicle[rows.of("x")].tolist()):
-        fixes, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Summary(), 2)
+        fixes = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Summary(), 2)
         parts.append(len(t) + np.arange(len(fixes.t)))
         t, position = np.append(t, fixes.t), np.append(position, np.nan_to_num(fixes.value), axis=0)
     if len(t):
@@ -305,7 +305,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
     for column, one in enumerate(recording.ids):
         mine = rows.take(rows.vehicle == one)
         for out, kinds in ((position, axes), (heading, ("heading",))):
-            true, _ = samples(mine, kinds, Summary(), len(kinds))
+            true = samples(mine, kinds, Summary(), len(kinds))
             value = np.zeros((len(true.t), out.shape[2]))
             value[:, : len(kinds)] = true.value if kinds is axes else np.unwrap(true.value, axis=0)
             if len(true.t) > 1:
