@@ -30,10 +30,12 @@ FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ENOUGH = 20
 """Measurements from which a statistic is worth a word."""
+COARSE = 0.5
+"""rad: no sensor's angles scatter as much about positions that are better known."""
 HINTS = {
     "range": "Are ranges or positions in feet? They are in m.",
-    "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), whose "
-    "heading they count from, and that no axis is mirrored.",
+    "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "
+    "whose heading they count from, and that no axis is mirrored.",
     "inclination": "Inclinations count from +z, elevations from the horizon.",
 }
 """What to look for where measurements of a kind miss the positions."""
@@ -323,7 +325,14 @@ def _of_measurements(c: Check) -> list[str]:
             continue
         word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
-        if std > WIDE * should or abs(median) > 3 * should:
+        position = float(np.sqrt(max(should**2 - row["stated_std"] ** 2, 0.0)))
+        wrong = std > WIDE * should or abs(median) > 3 * should or (name == "azimuth" and std > COARSE > 3 * position)
+        if name == "range":
+            measured = c.world.relative[0, :, 0]
+            true = measured - c.relative[:, 0]
+            ratio = (measured / true)[true > FAR * position]
+            wrong |= len(ratio) >= ENOUGH and not 0.8 <= float(np.median(ratio)) <= 1.25
+        if wrong:
             sentences.append(f"{word}s miss the positions by {stated}. {HINTS[name]}")
         elif std < NARROW * should and row["stated_std"] > 2 * std:
             sentences.append(f"{word}s are better than stated: {stated}.")

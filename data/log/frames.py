@@ -54,8 +54,8 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
 
 
 def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
-    """Rows in SI units, with x, y, z in place of latitude, longitude, height; and the origin of that frame: the one that
-    is given, or the first complete fix in degrees (its height 0 where there is none in the log), None where positions
+    """Rows in SI units, with x, y, z in place of latitude, longitude, height; and the origin of that frame: the given
+    one, or the first complete fix in degrees (its height 0 where there is none in the log), None where positions
     were local.
 
     Raises:
