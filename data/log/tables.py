@@ -139,7 +139,7 @@ def _rows(frame: pd.DataFrame, file: str, value: str, std: str) -> Rows:
     values = np.full(len(frame), np.nan)
     if not message.all():
         values[~message] = numeric(frame[~message], value, file)
-    rows = {
+    rows: dict[str, Any] = {
         "t": seconds(frame, "t", file) if "t" in frame.columns else np.nan,
         "vehicle": words(frame, "vehicle", file),
         "partner": "",
