@@ -94,7 +94,7 @@ def _repeated(found: Batch, problem: Problem, backend: Backend, options: Options
 
 def _checked(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
     """Cost, covariance and largest move of a Gauss-Newton step of each realisation; NaN where one is unobservable."""
-    singles = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+    singles = problem.realisations
     each = [assess(single, at) for single, at in zip(singles, x, strict=True)]
     cov = np.stack([one.covariance for one in each])
     return np.array([one.cost for one in each]), cov, np.array([one.remaining for one in each])

@@ -18,13 +18,15 @@ from ..model.symbolic import Kind, cost_of
 if TYPE_CHECKING:
     from ...kernels.graphs.graph_tape import Tape
 
-Model = Literal["cost", "gauss-newton", "newton", "converted"]
-"""What a tape gives: the cost alone, with J^T J, with the exact Hessian; or J^T J of the converted measurement."""
+Model = Literal["cost", "gauss-newton", "newton", "converted", "jacobian"]
+"""What a tape gives: the cost alone, with J^T J, with the exact Hessian; J^T J of the converted measurement; or the
+whitened residuals and their Jacobian."""
 
 
 class Written(NamedTuple):
     """A tape and what its outputs are: the cost, then entries (row, column) of the gradient (column -1) and of the
-    upper triangle of the curvature, by the dof of the first node and then of the second.
+    upper triangle of the curvature, by the dof of the first node and then of the second; or entries of the residual
+    (column -1) and of its Jacobian.
 
     Attributes:
         tape: for the kernel.
@@ -50,7 +52,11 @@ def write(kind: Kind, model: Model) -> Written:
     cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
     zero = ca.SX.zeros(steps.size1())
     outputs, entries = [cost], [(-1, -1)]
-    if model != "cost":
+    if model == "jacobian":
+        whole = ca.horzcat(white, ca.jacobian(white, steps))
+        entries = [(i, j - 1) for i in range(whole.size1()) for j in range(whole.size2())]
+        outputs = [whole[i, j + 1] for i, j in entries]
+    elif model != "cost":
         slope = ca.gradient(cost, steps)
         if model == "newton":
             curvature = ca.hessian(cost, steps)[0]

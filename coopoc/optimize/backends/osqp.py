@@ -24,8 +24,8 @@ from ..algebra.sparse import Layout, Sparse, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
-from ..model.factor import bounded
-from ..model.linear import Linear, local
+from ..model.factor import as_factor, bounded
+from ..model.linear import Linear, linearise
 from ..model.problem import Problem
 
 SETTINGS = {
@@ -156,9 +156,8 @@ class Programme:
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
         """
-        from scipy.sparse import csc_matrix
-
-        P = csc_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(len(q), len(q)))
+        P = self._pattern
+        P.data = values
         self._update(P, q, lower, upper)
         for attempt in range(REPAIRS + 1):
             end = self._workspace.solve(raise_error=False)
@@ -229,8 +228,9 @@ class _Limits:
     def around(self, x: Floats) -> tuple[Floats, Floats]:
         """Bounds of C dx at x (n, ambient)."""
         space, constraints = self.problem.space, self.problem.constraints
-        seen = [local(space, c.measurement, x[None], c.nodes)[0][0][bounded(c)] for c in constraints]
-        value = np.concatenate([np.empty(0), *seen])
+        linear = linearise(space, [as_factor(c) for c in constraints], None, x[None])
+        parts = [h[0, bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
+        value = np.concatenate([np.empty(0), *parts])
         return self.lower - value, self.upper - value
 
 

@@ -164,7 +164,7 @@ def of_recorded(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
 def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
     """A factor of nodes (M, arity), z (M, k) and std (M or 1, size) that come from checked arrays."""
     made = object.__new__(Factor)
-    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=check_constants(lookup(kind), None, len(nodes)))
+    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=np.empty((len(nodes), 0)))
     made.__dict__.update(std=std, sqrt_information=None, loss=None)
     return made
 
@@ -264,13 +264,11 @@ class Constraint:
         return f"Constraint({self.lower.min()} <= {self.kind} <= {self.upper.max()} x {len(self.nodes)})"
 
 
-def values(
-    known: Measurement, constraint: Constraint, vector: Floats, rotation: Floats | None
-) -> tuple[Floats, Floats]:
-    """h (B, M, size) and its derivative by what is seen, of a constraint; angles are not wrapped."""
-    nothing: npt.NDArray[np.float64] = np.zeros((len(constraint.nodes), constraint.lower.shape[-1]))
-    assert constraint.constants is not None
-    return known.differentiate(vector, rotation, nothing, constraint.constants)
+def as_factor(constraint: Constraint) -> Factor:
+    """The factor whose residual is h of a constraint, angles in [-pi, pi]."""
+    shape = constraint.lower.shape
+    factor = of_checked(constraint.kind, constraint.nodes, np.zeros(shape), np.ones((1, shape[1])))
+    return unchecked(factor, constants=constraint.constants)
 
 
 def bounded(constraint: Constraint) -> Bools:

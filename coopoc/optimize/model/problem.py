@@ -248,6 +248,11 @@ class Problem:
         x0 = self.x0 if self._start_batch is None or self.x0 is None else self.x0[which]
         return self.replace_unchecked(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
 
+    @cached_property
+    def realisations(self) -> tuple[Problem, ...]:
+        """A single problem for each of the B realisations, itself if it is one."""
+        return (self,) if self.batch is None else tuple(self.pick(b) for b in range(self.batch))
+
     def replace_unchecked(self, **changes: Any) -> Problem:
         """The problem with changes that come from checked parts and need not be checked again."""
         changed = object.__new__(Problem)

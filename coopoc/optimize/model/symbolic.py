@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,8 +13,10 @@ from .factor import Factor, steerable
 from .kinds import converted_rows, is_converted
 from .losses import LOSSES, Loss
 from .measurements import Measurement
-from .problem import Problem
 from .space import Space
+
+if TYPE_CHECKING:
+    from .problem import Problem
 
 Columns = list[Any]
 """One CasADi column (M, 1) per number: a formula runs once for all M measurements, as it does on NumPy's arrays."""

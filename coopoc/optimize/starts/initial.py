@@ -43,7 +43,7 @@ def initial_guess(problem: Problem) -> Floats:
         x, touched = _solution(sparse(problem), "converted")
         return x if touched else _apart(problem, x)
     if not is_star(problem):
-        return np.concatenate([initial_guess(problem.pick(b)) for b in range(batch)])
+        return np.concatenate([initial_guess(single) for single in problem.realisations])
     x, linear = np.zeros((batch, len(problem.names), problem.dimension)), converted(problem)
     return _apart(problem, star_at(linear, linear.linearise(x)).solve(RIDGE)[0])
 
