@@ -29,7 +29,7 @@ from tabulate import tabulate
 from unseen_graphs import FAMILIES
 
 from coopoc.errors import InputError
-from coopoc.evaluate.alignment import absolute_error
+from coopoc.evaluate.trajectory_scores import absolute_error
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve

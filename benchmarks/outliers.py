@@ -18,7 +18,7 @@ import numpy as np
 from tabulate import tabulate
 from unseen_graphs import joined, manhattan, world
 
-from coopoc.evaluate.alignment import absolute_error
+from coopoc.evaluate.trajectory_scores import absolute_error
 from coopoc.formats.graph import Graph
 from coopoc.optimize import solve_gnc
 from coopoc.optimize.graphs import from_graph, loop_closures

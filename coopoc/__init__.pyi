@@ -4,7 +4,6 @@ from .errors import InputError as InputError
 from .errors import MissingLibraryError as MissingLibraryError
 from .evaluate.bounds import bound_rt_le as bound_rt_le
 from .evaluate.bounds import fleet_bound as fleet_bound
-from .evaluate.bounds import fleet_pose_bound as fleet_pose_bound
 from .evaluate.bounds import pose_bound as pose_bound
 from .evaluate.bounds import posterior_bound as posterior_bound
 from .evaluate.ledger import Ledger as Ledger

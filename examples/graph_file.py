@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from coopoc.evaluate.alignment import absolute_error, align
+from coopoc.evaluate.trajectory_scores import absolute_error, align
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve

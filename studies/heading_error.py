@@ -11,7 +11,7 @@ import numpy as np
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import fleet_pose_bound
+from coopoc.evaluate.bounds import pose_bound
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.poses.pose_filter import PoseFilter
@@ -93,7 +93,7 @@ def cell(p: Params) -> list[Row]:
     fleet, noise, v2x = convoy(float(p["speed"]), float(p["after_s"])), sensors(p), channel(p)
     last = slice(-round(float(p["score_s"]) / DT), None)
     if p["method"] == "bound":
-        cov = fleet_pose_bound(fleet, noise, v2x)[last]
+        cov = pose_bound(fleet, noise, v2x)[last]
         square = np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)
         return [{"run": 0, "ego": "all", "rt_le_m": _root(square), "heading_deg": np.rad2deg(_root(cov[..., 3, 3]))}]
     runs = int(p["runs"])

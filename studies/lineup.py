@@ -12,8 +12,8 @@ import numpy as np
 from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
-from coopoc.evaluate.innovations import innovation_columns
 from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.metrics import innovation_columns
 from coopoc.evaluate.scores import BYTES, rows_of, scored
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.kalman import Kalman

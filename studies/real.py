@@ -13,9 +13,8 @@ import numpy as np
 from coopoc.arrays import Floats
 from coopoc.data.source import split
 from coopoc.errors import InputError
-from coopoc.evaluate.innovations import fix_innovations
 from coopoc.evaluate.ledger import of_track
-from coopoc.evaluate.metrics import errors, heading_error, pose_nees
+from coopoc.evaluate.metrics import errors, fix_innovations, heading_error, pose_nees
 from coopoc.learned.pose_noise import PoseTask, fit_pose_noise
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.track import Track

@@ -122,11 +122,10 @@ def sigmas(*std: float) -> Any:
     return gtsam.noiseModel.Diagonal.Sigmas(np.array(std))
 
 
-def pose_marginals(fleet: co.Fleet, steps: int, everyone: bool, sensors: co.Sensors) -> Any:
+def pose_marginals(fleet: co.Fleet, steps: int, sensors: co.Sensors) -> Any:
     """Fixes, compasses, odometry, bearings and ranges in the plane at the truth, as GTSAM's own factors."""
     marks = [k for k, name in enumerate(fleet.ids) if name[0] == "m"]
-    watching = range(len(fleet.ids)) if everyone else [0]
-    links = find_links(fleet, watching, NEAR.max_neighbours, NEAR.radius, sensors.min_range, marks)
+    links = find_links(fleet, range(len(fleet.ids)), NEAR.max_neighbours, NEAR.radius, sensors.min_range, marks)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     heading, (u, _) = true_heading(fleet), body_motion(fleet)
     middle, dt, before = midway(heading), fleet.dt, {}
@@ -135,8 +134,9 @@ def pose_marginals(fleet: co.Fleet, steps: int, everyone: bool, sensors: co.Sens
         graph.add(gtsam.NonlinearEqualityPoint2(gtsam.symbol("m", m), fleet.position[0, m, :2]))
     for t in range(steps):
         mine = np.flatnonzero(links.step == t)
-        who = set(range(len(fleet.ids))) if everyone else {0, *links.neighbour[mine].tolist()}
-        now = {k: gtsam.Pose2(*fleet.position[t, k, :2], heading[t, k]) for k in who - set(marks)}
+        now = {
+            k: gtsam.Pose2(*fleet.position[t, k, :2], heading[t, k]) for k in range(len(fleet.ids)) if k not in marks
+        }
         for k, pose in now.items():
             key = gtsam.symbol(chr(97 + k), t)
             values.insert(key, pose)
@@ -168,18 +168,15 @@ def pose_marginals(fleet: co.Fleet, steps: int, everyone: bool, sensors: co.Sens
 
 
 @pytest.mark.parametrize("compass", [True, False])
-@pytest.mark.parametrize(("everyone", "masts"), [(False, 1), (True, 0)], ids=["star and landmark", "fleet"])
-def test_pose_bounds_equal_gtsam_marginals(everyone: bool, masts: int, compass: bool) -> None:
+@pytest.mark.parametrize("masts", [0, 1])
+def test_pose_bounds_equal_gtsam_marginals(masts: int, compass: bool) -> None:
     """A graph up to step t gives the filtering bound at t; GTSAM's covariance is of a step in the body."""
     fleet, sensors = convoy(4, 16, masts), replace(NOISE, compass=compass)
     flat = co.Fleet(fleet.ids, fleet.t, fleet.position * [1, 1, 0], fleet.velocity)
     marks = [name for name in fleet.ids if name[0] == "m"]
-    if everyone:
-        found = co.fleet_pose_bound(flat, sensors, NEAR, landmarks=marks)[:, 0]
-    else:
-        found = co.pose_bound(flat, sensors, 0, NEAR, landmarks=marks)
+    found = co.pose_bound(flat, sensors, NEAR, landmarks=marks)[:, 0]
     for t in (0, 5, 15):
-        marginal = pose_marginals(flat, t + 1, everyone, sensors).marginalCovariance(gtsam.symbol("a", t))
+        marginal = pose_marginals(flat, t + 1, sensors).marginalCovariance(gtsam.symbol("a", t))
         world = np.eye(3)
         h = true_heading(flat)[t, 0]
         world[:2, :2] = [[np.cos(h), -np.sin(h)], [np.sin(h), np.cos(h)]]
@@ -193,8 +190,8 @@ def test_a_compass_and_a_gyro_alone_are_a_scalar_filter() -> None:
     sensors = co.Sensors(heading_std=0.1, yaw_rate_std=0.02)
     q, r = (0.1 * 0.02) ** 2, 0.1**2
     level = -q / 2 + np.sqrt(q * q / 4 + q * r)
-    assert co.pose_bound(fleet, sensors, 0)[-1, 3, 3] == pytest.approx(level, rel=1e-6)
-    biased = co.pose_bound(fleet, replace(sensors, heading_bias_std=0.05), 0)
+    assert co.pose_bound(fleet, sensors)[-1, 0, 3, 3] == pytest.approx(level, rel=1e-6)
+    biased = co.pose_bound(fleet, replace(sensors, heading_bias_std=0.05))[:, 0]
     assert biased.shape == (2000, 5, 5)
     assert biased[-1, 3, 3] == pytest.approx(level + 0.05**2, rel=0.02)
 
@@ -219,7 +216,7 @@ def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method: co.Po
     marks = [name for name in fleet.ids if name[0] == "m"]
     seen = co.observe(fleet, sensors, v2x, runs=120, seed=3, frame="body", landmarks=marks)
     track = method(seen, [0])
-    bound = co.fleet_pose_bound(fleet, sensors, v2x, landmarks=marks)[:, 0]
+    bound = co.pose_bound(fleet, sensors, v2x, landmarks=marks)[:, 0]
     position = np.square(track.x - fleet.position[:, :1]).sum(axis=-1)[:, 10:, 0].mean(axis=1)
     heading = np.square(co.heading_error(track, fleet))[:, 10:, 0].mean(axis=1)
     for square, least in (
@@ -238,11 +235,10 @@ def test_more_knowledge_lowers_the_bound_of_poses() -> None:
     worse = replace(NOISE, yaw_rate_bias_std=0.02, speed_scale_std=0.02)
 
     def heading(sensors: co.Sensors, k: int, **more: Any) -> float:
-        return float(co.pose_bound(fleet, sensors, 0, co.V2X(k, 60.0), **more)[20:, 3, 3].mean())
+        return float(co.pose_bound(fleet, sensors, co.V2X(k, 60.0), **more)[20:, 0, 3, 3].mean())
 
-    alone, star = heading(plain, 0), heading(plain, 2)
-    whole = float(co.fleet_pose_bound(fleet, plain, co.V2X(2, 60.0))[20:, 0, 3, 3].mean())
-    assert whole < star < alone
+    alone = heading(plain, 0)
+    assert heading(plain, 2) < alone
     assert heading(plain, 0, landmarks=["m0"]) < alone
     assert heading(NOISE, 0) < heading(worse, 0)
     assert heading(NOISE, 0) < alone
@@ -251,12 +247,10 @@ def test_more_knowledge_lowers_the_bound_of_poses() -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda f: co.pose_bound(f, replace(NOISE, heading_std=0.0), 0), "heading_std"),
-        (lambda f: co.pose_bound(f, replace(NOISE, gnss_drift_std=1.0), 0), "gnss_drift_std"),
-        (lambda f: co.pose_bound(f, replace(NOISE, range_std=0.0), 0, landmarks=["m0"]), "relative_std"),
-        (lambda f: co.fleet_pose_bound(f, NOISE, landmarks=["m9"]), "landmarks"),
-        (lambda f: co.pose_bound(f, NOISE, "b"), "vehicle"),
-        (lambda f: co.pose_bound(f, NOISE, "m0", landmarks=["m0"]), "is a landmark"),
+        (lambda f: co.pose_bound(f, replace(NOISE, heading_std=0.0)), "heading_std"),
+        (lambda f: co.pose_bound(f, replace(NOISE, gnss_drift_std=1.0)), "gnss_drift_std"),
+        (lambda f: co.pose_bound(f, replace(NOISE, range_std=0.0), landmarks=["m0"]), "relative_std"),
+        (lambda f: co.pose_bound(f, NOISE, landmarks=["m9"]), "landmarks"),
     ],
 )
 def test_mistakes_are_named(make: Any, words: str) -> None:

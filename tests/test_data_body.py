@@ -15,7 +15,7 @@ import pytest
 import coopoc as co
 from coopoc.data.log.check import check as check_poses
 from coopoc.data.registry import load_log
-from coopoc.evaluate.innovations import innovation_columns, normalised_innovations
+from coopoc.evaluate.metrics import innovation_columns, normalised_innovations
 from coopoc.study.run import find_study
 
 T = np.round(np.arange(0, 40, 0.1), 1)

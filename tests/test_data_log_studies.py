@@ -18,7 +18,7 @@ from coopoc.data.log import picture as log_picture
 from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet
-from coopoc.evaluate.innovations import fix_innovations, innovation_columns, normalised_innovations
+from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.world.storage import digest, read_recording, save_recording
 
 FEW = {"method": "gnss,kalman,joint,bound", "max_neighbours": "0,2"}

@@ -181,8 +181,7 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
         swept(metric, {"track": TRACK, "fleet": FLEET})
     swept(co.posterior_bound, {"fleet": FLEET, "sensors": SENSORS, "ego": 0, "smoothing": False})
     swept(co.fleet_bound, {"fleet": FLEET, "sensors": SENSORS, "v2x": CHANNEL})
-    posed = {"fleet": FLEET, "sensors": co.Sensors(heading_std=0.1), "ego": 0, "v2x": CHANNEL}
-    swept(co.pose_bound, posed)
+    swept(co.pose_bound, {"fleet": FLEET, "sensors": co.Sensors(heading_std=0.1), "v2x": CHANNEL})
     swept(co.OwnMeasurement, {"velocity": [9.0, 0.0, 0.0], "yaw_rate": 0.1, "gnss": [0.0, 0.0, 0.0], "heading": 0.1})
     swept(co.LandmarkMeasurement, {"relative": [9.0, 0.1, 1.57], "place": [0.0, 0.0, 0.0]})
     swept(co.bound_rt_le, {"cov": np.eye(3)[None]})
@@ -207,7 +206,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(optimize.loop_closures, {"problem": whole})
     swept(co.Loss, {"name": "huber", "scale": 1.0})
-    swept(lambda problem: solution.plot(problem=problem), {"problem": whole}, HOSTILE)
     swept(solution.__getitem__, {"point": "a"})
     swept(co.pose, {"position": np.zeros((4, 3)), "turn": np.zeros((4, 3))})
     swept(co.pose, {"position": np.zeros((4, 2)), "turn": 0.1})
@@ -236,7 +234,6 @@ def test_noise_bodies_and_starts_refuse_what_is_no_array_of_theirs() -> None:
 def test_training_refuses_arguments_of_the_wrong_kind() -> None:
     learned = pytest.importorskip("coopoc.learned", exc_type=ImportError)
     wrong = (*ALL, RECORDING)
-    swept(learned.Privacy, {"clip": 1.0, "noise_multiplier": 1.0, "delta": 1e-5, "clients": None}, wrong)
     drive = co.load_fleet("town10").between(0, 24).select([0])
     given = {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}
     swept(lambda fleet, **options: learned.clients(fleet, **options), given, wrong)

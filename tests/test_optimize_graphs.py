@@ -289,7 +289,6 @@ def test_gtsams_elimination_takes_over_where_its_optimizer_does_not_arrive() -> 
     small = replace(edges, position=1e6 * edges.position, covariance=edges.covariance * scale[:, None] * scale)
     problem = from_graph(replace(graph, position=1e6 * graph.position, relative_pose=small), "geodesic", "odometry")
     found = solve(problem, "gtsam")
-    assert found.extras["failed_first"] == "lm: MAX_ITERATIONS"
     assert found.cost == pytest.approx(solve(from_graph(graph, "geodesic")).cost, rel=1e-9)
 
 

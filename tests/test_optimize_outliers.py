@@ -12,7 +12,7 @@ import pytest
 
 import coopoc as co
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.evaluate.alignment import absolute_error
+from coopoc.evaluate.trajectory_scores import absolute_error
 from coopoc.formats import write_graph
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges
 from coopoc.formats.values import to_orientation

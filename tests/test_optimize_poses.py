@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 import coopoc as co
-from coopoc.evaluate.alignment import absolute_error
+from coopoc.evaluate.trajectory_scores import absolute_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve

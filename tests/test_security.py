@@ -386,8 +386,7 @@ def test_no_device_and_no_folder_is_replaced_by_a_file(folder: Path, tmp_path: P
     os.mkfifo(out) if kind == "pipe" else out.mkdir()
     before = os.stat(out).st_mode
     weights = learned.Checkpoint(learned.NoiseParameters(), {})
-    results = Results.load(folder)
-    for write in (lambda: report([folder], out), lambda: results.to_csv(out), lambda: learned.save(out, weights)):
+    for write in (lambda: report([folder], out), lambda: learned.save(out, weights)):
         with pytest.raises(InputError, match=r"is a folder|must be a file, and is a device or a pipe"):
             write()
     assert os.stat(out).st_mode == before

@@ -26,6 +26,10 @@ UNKNOWN_HEADING = 3.0 / np.pi**2
 """1/rad^2 of a heading of which nothing is known: uniform over a turn."""
 
 
+NO_ERROR = 1e-18
+"""m^2, variance of an error of the fixes that there is not."""
+
+
 def posterior_bound(
     fleet: Fleet, sensors: Sensors, ego: int | str, v2x: V2X | None = None, *, smoothing: bool = False
 ) -> Floats:
@@ -52,10 +56,13 @@ def posterior_bound(
     >>> float(posterior_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0)[1, 0, 0])  # standing still: 4 / 2
     2.0
     """
-    v2x, column = checked_noise(fleet, sensors, v2x), _present(fleet, ego)
+    v2x, column = checked_noise(fleet, sensors, v2x), fleet.index(ego)
+    if not fleet.present[:, column].all():
+        raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
     instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range)
-    return _bound(fleet, sensors, links, _star(fleet, links, column), smoothing)[:, column]
+    steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
+    return _bound(fleet, sensors, links, [np.append(column, near) for near in steps], smoothing)[:, column]
 
 
 def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
@@ -96,14 +103,9 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
 
 
 def pose_bound(
-    fleet: Fleet,
-    sensors: Sensors,
-    ego: int | str,
-    v2x: V2X | None = None,
-    *,
-    landmarks: Sequence[int | str] = (),
+    fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landmarks: Sequence[int | str] = ()
 ) -> Floats:
-    """Bound covariance of the ego's (x, y, z, heading, ...) at every step, filtering, (T, d, d) m and rad.
+    """Bound covariances of (x, y, z, heading, ...) of all vehicles from all that any measures, filtering.
 
     J_t = (F_t J_{t-1}^-1 F_t^T + G_t Q_t G_t^T)^-1 + H_t^T R^-1 H_t (Tichavsky, Muravchik, Nehorai 1998) with the
     derivatives of `PoseFilter`'s motion and measurements at the truth. An error that lasts and acts is one number more,
@@ -113,38 +115,17 @@ def pose_bound(
     Args:
         fleet: truth.
         sensors: the noise that acts.
-        ego: column or id.
-        v2x: K and radius, not loss; None or K = 0: a vehicle alone with its landmarks.
+        v2x: K and radius, not loss; None or K = 0: each vehicle alone with its landmarks.
         landmarks: columns or ids of vehicles that stand at known positions.
 
+    Returns:
+        (T, N, d, d) m and rad, NaN where absent and for landmarks.
+
     Raises:
-        InputError: an acting std of zero, for which the bound is zero; drifting fixes; an ego that is unknown,
-            absent or a landmark.
-
-    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-    >>> bound = pose_bound(fleet, Sensors(heading_std=0.2), 0)  # at first little is known but one compass
-    >>> bool(abs(bound[0, 3, 3] - 1 / (1 / 0.2**2 + 3 / np.pi**2)) < 1e-12)
-    True
-    """
-    column = _present(instance("fleet", fleet, Fleet), ego)
-    marks = columns("landmarks", landmarks, fleet.ids)
-    if column in marks:
-        raise InputError("ego", fleet.ids[column], "is a landmark", "Its position is known.")
-    v2x = checked_noise(fleet, sensors, v2x, bool(marks))
-    links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range, marks)
-    stages = pose_stages(fleet, sensors, links, _star(fleet, links, column, marks))
-    return _marginals(fleet, stages, covariances(stages, smoothing=False))[:, column]
-
-
-def fleet_pose_bound(
-    fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landmarks: Sequence[int | str] = ()
-) -> Floats:
-    """Bound covariances (T, N, d, d) of all vehicles from all that any measures; NaN where absent and for landmarks.
-
-    Args and errors: as in `pose_bound`.
+        InputError: an acting std of zero, for which the bound is zero; drifting fixes.
 
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
-    >>> alone, together = (fleet_pose_bound(fleet, Sensors(compass=False), V2X(k))[0, 0, 3, 3] for k in (0, 1))
+    >>> alone, together = (pose_bound(fleet, Sensors(compass=False), V2X(k))[0, 0, 3, 3] for k in (0, 1))
     >>> bool(together < 0.1 * alone)  # a bearing of a neighbour with a fix gives a heading
     True
     """
@@ -173,39 +154,22 @@ def checked_noise(fleet: Fleet, sensors: Sensors, v2x: V2X | None, landmarks: bo
     return v2x
 
 
-def _present(fleet: Fleet, ego: int | str) -> int:
-    """Column of an ego; InputError where it is absent."""
-    column = fleet.index(ego)
-    if not fleet.present[:, column].all():
-        raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
-    return column
-
-
-def _star(fleet: Fleet, links: Links, ego: int, landmarks: Sequence[int] = ()) -> list[Ints]:
-    """The ego and its neighbours of each step."""
-    vehicle = ~np.isin(links.neighbour, landmarks)
-    step, neighbour = links.step[vehicle], links.neighbour[vehicle]
-    return [np.append(ego, near) for near in np.split(neighbour, np.searchsorted(step, np.arange(1, len(fleet.t))))]
-
-
 def _bound(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool) -> Floats:
     """Bound covariances (T, N, 3, 3) m^2 of positions, NaN for those that are no members."""
-    if drifting(sensors) and smoothing:
+    if smoothing:
         require_white(sensors, "the smoothing bound")
-    if not drifting(sensors):
-        stages = position_stages(fleet, sensors, links, members)
-        return _marginals(fleet, stages, covariances(stages, smoothing))
-    stages = position_stages(fleet, sensors, links, members, fixes=False)
-    return _marginals(fleet, stages, drifting_covariances(stages, sensors, fleet.dt))
+    stages = position_stages(fleet, sensors, links, members)
+    return _marginals(fleet, stages, covariances(stages, smoothing))[..., :3, :3]
 
 
 def _marginals(fleet: Fleet, stages: list[Stage], found: Iterator[tuple[int, Floats]]) -> Floats:
     """(T, N, d, d) of each member from the covariances of all at each step."""
-    d = len(stages[0].prior)
+    d, vehicles = stages[0].motion.shape[-1], len(fleet.ids)
     out = np.full((*fleet.position.shape[:2], d, d), np.nan)
     for t, cov in found:
-        n = len(stages[t].members)
-        out[t, stages[t].members] = cov.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
+        n, members = len(stages[t].members), stages[t].members
+        blocks = cov.reshape(n, d, n, d)[np.arange(n), :, np.arange(n)]
+        out[t, members[members < vehicles]] = blocks[members < vehicles]
     return out
 
 
@@ -218,7 +182,7 @@ class Stage:
         previous: (n,) their places one step before, -1 for a new member.
         motion: (n, d, d) derivatives F of a member's state by the one before.
         process: (n, d, d) covariance Q of the motion.
-        prior: (d,) information of what is known of a new member's numbers.
+        prior: (n, d) information of what is known of a new member's numbers.
         gained: (dn, dn) information of the step's measurements.
     """
 
@@ -230,17 +194,31 @@ class Stage:
     gained: Floats
 
 
-def position_stages(
-    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], *, fixes: bool = True
-) -> list[Stage]:
-    """Every step of the positions of vehicles (columns) that are members of it, with fixes or without."""
-    stages: list[Stage] = []
-    alone = np.diag(1.0 / np.square(sensors.gnss_std)) * fixes
-    for now, previous, edges in steps_of(fleet, links, members):
-        t, n = len(stages), len(now)
-        process = (fleet.dt * sensors.velocity_std(fleet.velocity[t, now]))[:, :, None] ** 2 * np.eye(3)
-        gained = edge_information(edges, (n, 3), sensors.relative_std) + diagonal(np.tile(alone, (n, 1, 1)))
-        stages.append(Stage(now, previous, np.tile(np.eye(3), (n, 1, 1)), process, np.zeros(3), gained))
+def position_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints]) -> list[Stage]:
+    """Every step of the positions of vehicles (columns) that are members of it.
+
+    Where fixes have time-correlated errors, z = x + own + common + white noise, three more numbers of a member are its
+    own error, and one more member, in the column behind all, has the common error as its first three numbers. Errors
+    are Gauss-Markov, e_t = keep e_{t-1} + w.
+    """
+    drifts, white, stages = drifting(sensors), 1.0 / np.square(sensors.gnss_std), list[Stage]()
+    own, common = (max(std**2, NO_ERROR) for std in (sensors.gnss_drift_std, sensors.gnss_common_std))
+    keep, d = float(np.exp(-fleet.dt / sensors.gnss_drift_time)), 6 if drifts else 3
+    behind = [len(fleet.ids)] if drifts else []
+    for now, previous, edges in steps_of(fleet, links, [np.append(row, behind).astype(np.int64) for row in members]):
+        t, n, m = len(stages), len(now), len(now) - len(behind)
+        motion, process, prior = np.ones((n, d)), np.zeros((n, d)), np.zeros((n, d))
+        process[:m, :3] = (fleet.dt * sensors.velocity_std(fleet.velocity[t, now[:m]])) ** 2
+        rows = np.zeros((m, 3, n, d))
+        rows[np.arange(m), :, np.arange(m), :3] = np.eye(3)
+        if drifts:
+            motion[:m, 3:], process[:m, 3:], prior[:m] = keep, own * (1 - keep**2), [1 / FORGOTTEN] * 3 + [1 / own] * 3
+            motion[m, :3], process[m, :3], prior[m] = keep, common * (1 - keep**2), [1 / common] * 3 + [1.0] * 3
+            rows[np.arange(m), :, np.arange(m), 3:] = rows[:, :, m, :3] = np.eye(3)
+        fixes = rows.reshape(3 * m, n * d)
+        gained = edge_information(edges, (n, d), sensors.relative_std) + (fixes.T * np.tile(white, m)) @ fixes
+        unit = np.eye(d)
+        stages.append(Stage(now, previous, motion[..., None] * unit, process[..., None] * unit, prior, gained))
     return stages
 
 
@@ -258,11 +236,11 @@ def pose_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints
     own, d = _own(sensors, lasting), 4 + len(lasting)
     prior = np.concatenate([[0, 0, 0, UNKNOWN_HEADING], 1.0 / np.square([acting[kind] for kind in lasting])])
     motion, process = _motion(fleet, sensors, lasting)
-    stages: list[Stage] = []
+    stages = list[Stage]()
     for now, previous, edges in steps_of(fleet, links, members):
         t, n = len(stages), len(now)
-        gained = edge_information(edges, (n, d), sensors.relative_std) + diagonal(np.tile(own, (n, 1, 1)))
-        stages.append(Stage(now, previous, motion[t, now], process[t, now], prior, gained))
+        gained = edge_information(edges, (n, d), sensors.relative_std, posed=True) + diagonal(np.tile(own, (n, 1, 1)))
+        stages.append(Stage(now, previous, motion[t, now], process[t, now], np.tile(prior, (n, 1)), gained))
     return stages
 
 
@@ -308,9 +286,9 @@ Edges = tuple[Floats, Ints, Ints]
 
 def steps_of(fleet: Fleet, links: Links, members: list[Ints]) -> Iterator[tuple[Ints, Ints, Edges]]:
     """Members of each step, their places one step before (-1 for new ones), and its true vectors."""
-    start, before = np.searchsorted(links.step, np.arange(len(fleet.t) + 1)), np.full(len(fleet.ids), -1)
+    start, before = np.searchsorted(links.step, np.arange(len(fleet.t) + 1)), np.full(len(fleet.ids) + 1, -1)
     for t, now in enumerate(members):
-        place = np.full(len(fleet.ids), -1)
+        place = np.full(len(before), -1)
         place[now] = np.arange(len(now))
         observer, neighbour = (side[start[t] : start[t + 1]] for side in (links.observer, links.neighbour))
         vector = fleet.position[t, neighbour] - fleet.position[t, observer]
@@ -318,8 +296,8 @@ def steps_of(fleet: Fleet, links: Links, members: list[Ints]) -> Iterator[tuple[
         before = place
 
 
-def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats) -> Floats:
-    """Information (dn, dn) of relative measurements about n members of d numbers, the fourth, if any, the heading.
+def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats, *, posed: bool = False) -> Floats:
+    """Information (dn, dn) of relative measurements about n members of d numbers.
 
     A measured vector v moves by dp_j - dp_i, and with the observer's heading by -dth (-v_y, v_x, 0).
 
@@ -327,11 +305,12 @@ def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats) -> Float
         edges: of the step.
         sizes: n and d.
         std: (3,) m, rad, rad.
+        posed: whether the fourth number is the heading.
     """
     (vector, observer, neighbour), (n, d) = edges, sizes
     own, other = np.zeros((2, len(vector), 3, d))
     own[..., :3] = -np.eye(3)
-    if d > 3:
+    if posed:
         own[:, 0, 3], own[:, 1, 3] = vector[:, 1], -vector[:, 0]
     other[..., :3] = np.eye(3) * (neighbour >= 0)[:, None, None]
     weight = np.linalg.inv(vector_cov(np.stack(spherical(*vector.T), axis=-1), std))
@@ -365,10 +344,6 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
             bar.update()
 
 
-NO_ERROR = 1e-18
-"""m^2, variance of an error of the fixes that there is not."""
-
-
 def drifting(sensors: Sensors) -> bool:
     """Whether fixes have time-correlated errors."""
     return sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0
@@ -382,43 +357,10 @@ def require_white(sensors: Sensors, what: str) -> None:
         raise InputError("gnss_drift_std, gnss_common_std", given, f"must be 0 for {what}", hint)
 
 
-def drifting_covariances(stages: list[Stage], sensors: Sensors, dt: float) -> Iterator[tuple[int, Floats]]:
-    """Filtering bound (3n, 3n) where fixes have time-correlated errors: z = x + own + common + white noise.
-
-    The state holds position and own error of each member and the common error; an error is Gauss-Markov,
-    e_t = keep e_{t-1} + w.
-
-    Args:
-        stages: without the fixes, which do not see positions alone.
-        sensors: of the fixes.
-        dt: s.
-    """
-    own, common = (max(std**2, NO_ERROR) for std in (sensors.gnss_drift_std, sensors.gnss_common_std))
-    keep, unit = float(np.exp(-dt / sensors.gnss_drift_time)), np.eye(3)
-    cov: Floats = common * unit
-    for t, stage in enumerate(tqdm(stages, desc="bound", unit="step", delay=2.0)):
-        n = len(stage.members)
-        motion, noise = np.zeros((6 * n + 3, len(cov))), np.zeros(6 * n + 3)
-        motion[-3:, -3:], noise[-3:] = (keep * unit, common * (1 - keep**2)) if t else (unit, 0.0)
-        for k, before in enumerate(stage.previous):
-            position, error = slice(6 * k, 6 * k + 3), slice(6 * k + 3, 6 * k + 6)
-            noise[position], noise[error] = FORGOTTEN, own
-            if before >= 0:
-                motion[position, 6 * before : 6 * before + 3] = unit
-                motion[error, 6 * before + 3 : 6 * before + 6] = keep * unit
-                noise[position], noise[error] = np.diag(stage.process[k]), own * (1 - keep**2)
-        fixes = np.hstack([np.kron(np.eye(n), np.hstack([unit, unit])), np.tile(unit, (n, 1))])
-        weight, positions = np.tile(1.0 / np.square(sensors.gnss_std), n), _numbers(2 * np.arange(n), 3)
-        information = np.linalg.inv(motion @ cov @ motion.T + np.diag(noise)) + (fixes.T * weight) @ fixes
-        information[np.ix_(positions, positions)] += stage.gained
-        cov = np.linalg.inv(information)
-        yield t, cov[np.ix_(positions, positions)]
-
-
 def _onward(cov: Floats, stage: Stage) -> Floats:
     """Information about the members of a step from the covariance one step before, (F P F^T + Q)^-1."""
-    n, d = stage.motion.shape[:2]
-    stays, out = np.flatnonzero(stage.previous >= 0), np.diag(np.tile(stage.prior, n))
+    d = stage.motion.shape[-1]
+    stays, out = np.flatnonzero(stage.previous >= 0), np.diag(stage.prior.ravel())
     if len(stays):
         here, there = _numbers(stays, d), _numbers(stage.previous[stays], d)
         motion = diagonal(stage.motion[stays])
@@ -429,13 +371,13 @@ def _onward(cov: Floats, stage: Stage) -> Floats:
 
 def _backward(future: Floats, stage: Stage, n: int) -> Floats:
     """Information of a step and its future about the n members one step before, whose motion is the inverse one."""
-    d, back = len(stage.prior), np.linalg.inv(stage.motion)
+    d, back = stage.motion.shape[-1], np.linalg.inv(stage.motion)
     stays, previous = np.flatnonzero(stage.previous >= 0), np.full(n, -1)
     previous[stage.previous[stays]] = stays
     motion, process = np.zeros((2, n, d, d))
     motion[stage.previous[stays]] = back[stays]
     process[stage.previous[stays]] = (back @ stage.process @ back.swapaxes(1, 2))[stays]
-    reverse = replace(stage, previous=previous, motion=motion, process=process, prior=np.zeros(d))
+    reverse = replace(stage, previous=previous, motion=motion, process=process, prior=np.zeros((n, d)))
     return _onward(np.linalg.inv(future + stage.gained), reverse)
 
 

@@ -66,9 +66,10 @@ class Ledger:
 
     def of(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> Floats:
         """(R, V) bytes."""
-        array = self.sent if _place(Way, "way", way) == 0 else self.received
-        found: Floats = array[_place(Purpose, "purpose", purpose), _place(Kind, "kind", kind)]
-        return found
+        for name, value, allowed in (("way", way, Way), ("purpose", purpose, Purpose), ("kind", kind, Kind)):
+            one_of(name, value, get_args(allowed))
+        array = self.sent if way == "broadcast" else self.received
+        return np.asarray(array[get_args(Purpose).index(purpose), get_args(Kind).index(kind)])
 
     def per_vehicle(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> float:
         """Bytes of all, servers included, for each vehicle: the mean over runs."""
@@ -194,9 +195,3 @@ def of_drive(
     for k, on_air in enumerate((sent, received)):
         moved[k, 1] = payload(on_air, message, overhead), on_air
     return Ledger(tuple(names), np.broadcast_to(np.asarray(seconds, float), len(names)), moved[0], moved[1])
-
-
-def _place(allowed: object, name: str, value: str) -> int:
-    known = get_args(allowed)
-    one_of(name, value, known)
-    return known.index(value)

@@ -1,4 +1,4 @@
-"""Errors of a Track against its Fleet: RT-LE, maximum, heading, NEES with its band; metrics by name."""
+"""Errors of a Track against its Fleet: RT-LE, maximum, heading, NEES; metrics by name; innovations without a truth."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from scipy import stats
 
-from ..arrays import Floats, checked, instance, number, refuse
+from ..arrays import Bools, Floats, checked, instance, number, refuse
 from ..errors import InputError
-from ..kernels.scores import distances, normalised, root_mean_squares
+from ..kernels.scores import normalised
 from ..methods.track import Track
 from ..plugins import find
-from ..world.body_frames import true_heading
+from ..world.body_frames import true_heading, turned
 from ..world.fleet import Fleet
 from ..world.links import wrap
 from ..world.recording import Recording
@@ -45,7 +45,7 @@ def distance(x: Floats, truth: Floats) -> Floats:
     if x.shape[1:] != truth.shape:
         allowed = f"must have shape (T, E, 3) = {x.shape[1:]}"
         raise InputError("truth", f"shape {truth.shape}", allowed, "Give the truth of the same egos and steps.")
-    return distances(np.ascontiguousarray(x), np.ascontiguousarray(truth))
+    return np.asarray(np.sqrt(np.square(x - truth).sum(axis=-1)))
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
@@ -58,13 +58,9 @@ def rt_le(track: Track, fleet: Fleet) -> Floats:
     >>> rt_le(GNSS()(observe(fleet, Sensors(), runs=5)), fleet).shape
     (5, 1)
     """
-    squares = errors(track, fleet) ** 2
-    known = fleet.present[:, list(track.egos)]
-    if known.all():
-        return np.asarray(np.sqrt(np.mean(squares, axis=1)))
-    total = np.sum(squares, axis=1, where=known)
-    mean = np.divide(total, known.sum(axis=0), out=np.full(total.shape, np.nan), where=known.any(axis=0))
-    return np.asarray(np.sqrt(mean))
+    squares, present = errors(track, fleet) ** 2, fleet.present[:, list(track.egos)]
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.sum(squares, axis=1, where=present) / present.sum(axis=0)))
 
 
 def max_error(track: Track, fleet: Fleet) -> Floats:
@@ -85,7 +81,12 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     mine = [recording.links.of(ego) for ego in track.egos]
     links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
-    return root_mean_squares(np.ascontiguousarray(track.neighbours), truth, ends)
+    square, mean = np.square(track.neighbours - truth).sum(axis=-1), np.full((len(track.x), len(mine)), np.nan)
+    known = np.isfinite(square)
+    for e, span in enumerate(map(slice, ends[:-1], ends[1:])):
+        count = known[:, span].sum(axis=1)
+        np.divide(np.where(known, square, 0.0)[:, span].sum(axis=1), count, out=mean[:, e], where=count > 0)
+    return np.asarray(np.sqrt(mean))
 
 
 def nees(track: Track, fleet: Fleet) -> Floats:
@@ -187,15 +188,10 @@ def pose_covariance(track: Track) -> Floats:
     return cov
 
 
-def mean_nees(track: Track, fleet: Fleet) -> Floats:
-    """Mean over time of the normalised estimation error squared, (R, E); 3 for a consistent filter."""
-    return np.asarray(np.nanmean(nees(track, fleet), axis=1))
-
-
 METRICS: Mapping[str, Callable[[Track, Fleet], Floats]] = {
     "rt_le_m": rt_le,
     "max_error_m": max_error,
-    "nees": mean_nees,
+    "nees": lambda track, fleet: np.asarray(np.nanmean(nees(track, fleet), axis=1)),
 }
 """Column of a table -> function of a Track and its Fleet; a unit that is not SI stands in the name."""
 
@@ -217,3 +213,89 @@ def measure(name: str, track: Track, fleet: Fleet) -> Floats:
     (5, 1)
     """
     return checked(name, find("coopoc.metrics", name)(track, fleet), "(R, E)", (len(track.x), len(track.egos)))
+
+
+def fix_innovations(track: Track, recording: Recording) -> Floats:
+    """Fix less prediction, z_t - (x_{t-1} + dt u_t), (R, T, E, 3) m; NaN without a fix, and at the first step.
+
+    In body frames u_t is turned by the heading in the middle of the step, h_{t-1} + dt w_t / 2.
+
+    Args:
+        track: of the recording.
+        recording: whose fixes and velocities were used.
+
+    >>> from coopoc import GNSS, Fleet, Sensors, observe
+    >>> seen = observe(Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3))), Sensors(), runs=5)
+    >>> fix_innovations(GNSS()(seen), seen).shape
+    (5, 2, 1, 3)
+    """
+    egos = list(track.egos)
+    found = np.full(track.x.shape, np.nan)
+    moved = recording.dt * turned(recording.velocity[:, 1:, egos], _halfway(track, recording))
+    found[:, 1:] = recording.gnss[:, 1:, egos] - (track.x[:, :-1] + moved)
+    return found
+
+
+def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
+    """d^T S^-1 d / n of the innovations d, (R, T, E): 1 on average if the assumed noise is right and white.
+
+    S = P_{t-1} + dt^2 diag(sigma_u^2) + diag(sigma_fix^2), with the standard deviations that the recording states and
+    its `dimensions` n. In body frames sigma_u is turned as u is, and the heading of the track adds its part of S.
+
+    Returns:
+        None for a method without a covariance.
+
+    References:
+        Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.
+    """
+    if track.covariance is None:
+        return None
+    egos, noise = list(track.egos), recording.sensors
+    innovation = fix_innovations(track, recording)
+    u, angle = recording.velocity[:, 1:, egos], _halfway(track, recording)
+    axes = turned(np.eye(3), angle[..., None])  # rows: the axes of sigma_u
+    moving = recording.dt * np.nan_to_num(noise.assumed_velocity_std(u))[..., None] * axes
+    covariance = track.covariance[:, :-1] + np.einsum("...ki,...kj->...ij", moving, moving)
+    covariance[..., range(3), range(3)] += np.square(noise.fix_std)
+    if track.heading_covariance is not None:
+        shared, variance = track.heading_covariance[:, :-1, :, :3], track.heading_covariance[:, :-1, :, 3, None, None]
+        aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])
+        cross = shared[..., :, None] * aside[..., None, :]
+        covariance += cross + np.swapaxes(cross, -1, -2) + variance * aside[..., :, None] * aside[..., None, :]
+    there: Bools = np.asarray(np.isfinite(innovation[:, 1:]).all(axis=-1))
+    found = np.full(innovation.shape[:3], np.nan)
+    d = np.where(there[..., None], innovation[:, 1:], 0.0)
+    square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
+    found[:, 1:] = np.where(there, square / dimensions(recording), np.nan)
+    return found
+
+
+def _halfway(track: Track, recording: Recording) -> Floats:
+    """(R, T-1, E) rad from the frame of odometry to the world in the middle of each step; 0 in the world frame."""
+    if recording.body is None or track.heading is None:
+        return np.zeros(track.x[:, 1:, :, 0].shape)
+    return track.heading[:, :-1] + 0.5 * recording.dt * recording.body.yaw_rate[:, 1:, list(track.egos)]
+
+
+def dimensions(recording: Recording) -> int:
+    """Degrees of freedom of a fix: 3, or 2 where every fix has the same height, which was not measured then.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> dimensions(observe(Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3))), Sensors()))
+    3
+    """
+    height = recording.gnss[..., 2]
+    return 3 if np.nanmax(height) > np.nanmin(height) else 2
+
+
+def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
+    """Columns (R, E): `innovation_m`, the root mean square of the fixes' innovations, m; `fixes`, their number; `nis`,
+    the mean of the normalised ones, 1 if consistent, of a method with a covariance. NaN where there is no second fix.
+    """
+    square = (fix_innovations(track, recording) ** 2).sum(axis=-1)
+    count, normalised_square = np.isfinite(square).sum(axis=1), normalised_innovations(track, recording)
+    with np.errstate(invalid="ignore"):
+        found = {"innovation_m": np.sqrt(np.nansum(square, axis=1) / count), "fixes": count.astype(float)}
+        if normalised_square is not None:
+            found["nis"] = np.nansum(normalised_square, axis=1) / count
+    return found

@@ -25,8 +25,6 @@ BYTES: Mapping[str, tuple[Kind, Way]] = {
 SLAB = 2**25
 """Bytes of a Track, about: runs are scored while the cache still holds them, and memory does not grow with the number
 of runs."""
-LANES = 4
-"""Runs that kernels follow beside each other."""
 
 
 def rows_of(columns: Mapping[str, AnyArray], who: Sequence[str], **more: Any) -> list[dict[str, Any]]:
@@ -106,8 +104,7 @@ def scored(
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
     """The recording in parts of some runs each, as many as the cache holds."""
-    per_run = 8 * (12 * len(recording.t) * egos + 3 * len(recording.links))
-    runs = max(1, SLAB // (LANES * per_run)) * LANES
+    runs = max(1, SLAB // (4 * 8 * (12 * len(recording.t) * egos + 3 * len(recording.links)))) * 4
     for first in range(0, recording.runs, runs):
         yield recording.of_runs(slice(first, first + runs)) if runs < recording.runs else recording
 

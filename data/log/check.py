@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc.arrays import Bools, Floats, robust_std
 from coopoc.errors import InputError
-from coopoc.evaluate.innovations import fix_innovations, normalised_innovations
+from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_start import pose_start

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.escapes import picture
-from coopoc.evaluate.innovations import dimensions
+from coopoc.evaluate.metrics import dimensions
 from coopoc.pictures import COLORS, INK
 
 from .check import Check

@@ -66,7 +66,7 @@ log.recording.plot(step=300).figure
 # innovation (NIS) near 1 means that the assumed noise agrees with the acting noise.
 
 # %%
-from coopoc.evaluate.innovations import innovation_columns
+from coopoc.evaluate.metrics import innovation_columns
 
 for method in (co.Kalman("nominal"), co.JointFilter("nominal")):
     track = method(log.recording, ["red", "blue"])

@@ -70,7 +70,7 @@ def check_nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
 
 def check_constants(known: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
     """(M, c) finite numbers, as many as the kind has."""
-    if known.constants == 0 and (constants is None or not np.size(constants)):
+    if known.constants == 0 and (constants is None or np.size(constants) == 0):
         return frozen(np.empty((count, 0)))
     given = numbers(f"constants of {known.name}", [] if constants is None else constants)
     fits = (
