@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..algebra.sparse import Sparse
-from ..algebra.tape import Model
+from ..model.tape import Model
 from .descend import GIVE_UP, HIDDEN, LEAST_DAMPING, progress
 
 OFF = 0.2

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..algebra.tape import write
 from .factor import Factor
 from .space import Space
 from .symbolic import Kind, numbers_of
+from .tape import write
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from .factor import Factor, steerable
+from .factor import Factor
 from .kinds import converted_rows, is_converted
 from .losses import LOSSES, Loss
 from .measurements import Measurement
 from .space import Space
-
-if TYPE_CHECKING:
-    from .problem import Problem
 
 Columns = list[Any]
 """One CasADi column (M, 1) per number: a formula runs once for all M measurements, as it does on NumPy's arrays."""
@@ -87,18 +84,6 @@ class Structure(NamedTuple):
         return ~np.frombuffer(self.still, bool).reshape(shape) if self.still else np.ones(shape, dtype=bool)
 
 
-def structure_of(problem: Problem) -> Structure:
-    """The structure of a problem."""
-    space, movable = problem.space, problem.movable
-    factors = (Term(Kind(f.measurement, space, f.std is None, f.loss), f.nodes.tobytes()) for f in problem.factors)
-    constraints = (
-        Term(Kind(c.measurement, space), c.nodes.tobytes(), steerable(c, movable).tobytes())
-        for c in problem.constraints
-    )
-    still = b"" if movable is None else (~movable).tobytes()
-    return Structure(len(problem.names), space, still, tuple(factors), tuple(constraints))
-
-
 def numbers_of(factor: Factor) -> Floats:
     """(P, M) or (B, P, M): z, constants and weights of the measurements of a factor."""
     weight, batch = factor.sqrt_information, () if factor.batch is None else (factor.batch,)
@@ -115,15 +100,9 @@ def numbers_of(factor: Factor) -> Floats:
     return out
 
 
-def parameters(problem: Problem, x: Floats) -> Floats:
-    """(B, .) parameters of `expressions`: the centres x (B, n, ambient), then `numbers_of` factors, and constants."""
-    parts = [x.swapaxes(1, 2), *map(numbers_of, problem.factors)]
-    parts += [c.constants.T for c in problem.constraints if c.constants is not None]
-    return np.concatenate([np.broadcast_to(p, (len(x), *p.shape[-2:])).reshape(len(x), -1) for p in parts], axis=1)
-
-
 def expressions(structure: Structure) -> dict[str, Any]:
-    """CasADi's x (the free steps), p (see `parameters`), f (cost) and g (what the constraints bound).
+    """CasADi's x (the free steps), p (centres, numbers of factors, constants of constraints), f (cost) and g (what
+    the constraints bound).
 
     A step (dp, w) moves a node from the centre to (p + dp, R C(w)), C the Cayley map in space, which like Exp starts
     as I + [w]x but is rational, and the angle itself in the plane.

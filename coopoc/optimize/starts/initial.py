@@ -8,11 +8,11 @@ from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import Sparse, sparse
 from ..algebra.star import is_star, star_at
-from ..algebra.tape import Model
 from ..model.factor import Factor, unchecked
 from ..model.kinds import converted_rows, is_converted
 from ..model.measurements import columns
 from ..model.problem import Problem
+from ..model.tape import Model
 
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...arrays import Ints
 from ...errors import InputError
-from ..model.symbolic import Kind, cost_of
+from .symbolic import Kind, cost_of
 
 if TYPE_CHECKING:
     from ...kernels.graphs.graph_tape import Tape
