@@ -173,7 +173,8 @@ def programme(structure: Structure, max_iterations: int) -> Any:
 
     found, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**found, "p": ca.vertcat(found["p"], scale), "f": scale * found["f"]}
-    return ca.nlpsol("solver", "ipopt", nlp, {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}})
+    ipopt: dict[str, Any] = {**IPOPT, "max_iter": max_iterations}
+    return ca.nlpsol("solver", "ipopt", nlp, {**QUIET, "ipopt": ipopt})
 
 
 BACKEND = Backend(
