@@ -61,10 +61,10 @@ class Entries:
         key, offset = self.block
         return upper, lower, offset[np.searchsorted(key, upper * len(self.number) + lower)]
 
-    def places(self, pair: tuple[Ints, Ints, Ints], one: Ints, other: Ints) -> Ints:
-        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where one is -1."""
+    def places(self, pair: tuple[Ints, Ints, Ints], unknown: Ints, another: Ints) -> Ints:
+        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where unknown is -1."""
         upper, lower, offset = pair
-        low, high = np.minimum(one, other), np.maximum(one, other)
+        low, high = np.minimum(unknown, another), np.maximum(unknown, another)
         within = high - self.first[upper]
         at = self.start[upper] + within * self.height[upper] + within * (within + 1) // 2
         return np.where(low < 0, -1, at + offset + low - self.first[lower])

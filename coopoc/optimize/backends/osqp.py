@@ -95,9 +95,9 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
         step = partial(_step, system, limits, programme)
-        found = minimise(problem, step, x[None], max_iterations, tolerance)
-        extras = found.extras | dict(programme.counts)
-        return SolverResult(found.x[0], int(np.ravel(found.iterations)[0]), extras=extras)
+        result = minimise(problem, step, x[None], max_iterations, tolerance)
+        extras = result.extras | dict(programme.counts)
+        return SolverResult(result.x[0], int(np.ravel(result.iterations)[0]), extras=extras)
 
     return solver
 
@@ -206,9 +206,9 @@ def unbounded(indices: bytes, indptr: bytes, thread: int) -> Programme:
     row, start = np.frombuffer(indices, np.int64), np.frombuffer(indptr, np.int64)
     size = len(start) - 1
     identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
-    found = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)))
-    found.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
-    return found
+    programme = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)))
+    programme.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
+    return programme
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,7 +36,7 @@ class Measurement:
             namespace with sqrt, atan2 and where.
         linear: the formula is the world vector itself.
         plane: components that a problem of dimension 2 keeps (z = 0 there); None if it has none of them.
-        constants: how many known numbers each measurement carries, such as the time between two positions.
+        constants: how many numbers each measurement carries, such as the time between two positions.
         compares_poses: z is a pose (Space.ambient numbers), and the formula also gets it: (x, y, z, R, pose z, m).
     """
 
@@ -89,8 +89,8 @@ class Measurement:
         arguments = embed(local, dimension)
         if self.compares_poses:
             return [self.formula(*arguments, embed([*z], dimension), m)[k] for k in kept]
-        found = self.formula(*arguments, *constants, m)
-        return [found[k] - number for k, number in zip(kept, z, strict=True)]
+        predicted = self.formula(*arguments, *constants, m)
+        return [predicted[k] - number for k, number in zip(kept, z, strict=True)]
 
     def difference(self, local: Floats, rotation: Floats | None, z: Floats, constants: Floats) -> Floats:
         """(..., size) residuals h(x) - z, angles in [-pi, pi).
@@ -155,7 +155,7 @@ def measurement(
     if isinstance(arity, bool) or not isinstance(arity, int) or arity not in (1, 2):
         raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
     given = components if isinstance(components, tuple | list) else ()
-    if not given or not all(isinstance(one, str) and one in get_args(Component) for one in given):
+    if not given or not all(isinstance(component, str) and component in get_args(Component) for component in given):
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
     one_of("frame", frame, get_args(Frame))
@@ -188,10 +188,10 @@ def lookup(kind: str) -> Measurement:
         return MEASUREMENTS[kind]
     if not in_file(kind) and kind not in names("coopoc.measurements"):
         raise unknown("kind", kind, sorted({*MEASUREMENTS, *names("coopoc.measurements")}))
-    found = find("coopoc.measurements", kind)
-    for known in MEASUREMENTS.values():
-        if known.formula is found:
-            return known
+    formula = find("coopoc.measurements", kind)
+    for registered in MEASUREMENTS.values():
+        if registered.formula is formula:
+            return registered
     raise InputError("kind", repr(kind), "is no measurement", "Decorate the formula: @measurement(name, arity, ...).")
 
 

@@ -73,8 +73,8 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.substitute(ca.vertcat(*outputs), steps, zero)
     here = ca.cse(here)
     kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
-    found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
-    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found), kind.measurement.name)
+    together = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], together), kind.measurement.name)
     return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
 
 
@@ -82,15 +82,16 @@ def _tape(function: Any, name: str) -> Tape:
     """The operations of a CasADi function of one vector."""
     from ...kernels.graphs.graph_tape import Operation, Tape
 
-    known, constant, read_in, write_out = _known(), int(Operation.CONST), int(Operation.INPUT), int(Operation.OUTPUT)
+    operations, constant = _operations(), int(Operation.CONST)
+    read_in, write_out = int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
     code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
     for k in range(count):
-        found = function.instruction_id(k)
-        if found not in known:
-            allowed = f"must not use CasADi's operation {found}"
+        instruction = function.instruction_id(k)
+        if instruction not in operations:
+            allowed = f"must not use CasADi's operation {instruction}"
             raise InputError("kind", repr(name), allowed, "Use +, -, *, /, ** and the functions of m.")
-        code[k] = operation = known[found]
+        code[k] = operation = operations[instruction]
         read, written = function.instruction_input(k), function.instruction_output(k)
         if operation == constant:
             place[k, 0], value[k] = written[0], function.instruction_constant(k)
@@ -104,11 +105,12 @@ def _tape(function: Any, name: str) -> Tape:
 
 
 @lru_cache(maxsize=1)
-def _known() -> dict[int, int]:
+def _operations() -> dict[int, int]:
     """CasADi's number of an operation -> ours."""
     import casadi as ca
 
     from ...kernels.graphs.graph_tape import Operation
 
-    known = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
-    return known | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}  # of one slot, which is read twice
+    operations = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
+    # the two of one slot, which is read twice
+    return operations | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}
