@@ -26,7 +26,7 @@ NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
 def read_table(
     path: Path, *, columns: Mapping[str, str] | None = None, handedness: str | None = None, **options: Any
 ) -> Fleet:
-    """Fleet of a CSV, Parquet or Excel file; without vx, vy, vz the velocity is the backward difference.
+    """Fleet of a CSV or Parquet file; without vx, vy, vz the velocity is the backward difference.
 
     A table of CARLA, with yaw and velocities, needs `handedness`, and without a column t `dt`: rows of each id are then
     equally spaced.

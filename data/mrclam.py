@@ -1,4 +1,4 @@
-"""UTIAS MR.CLAM: real robots with wheel odometry, range and bearing, and Vicon truth -> Recording in the world."""
+"""Reader of UTIAS MR.CLAM: wheel odometry, range and bearing of real robots, and Vicon's truth."""
 
 from __future__ import annotations
 
@@ -8,33 +8,23 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats, Ints, robust_std
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.formats.values import LARGEST, read_table, read_words
 from coopoc.short_repr import short_repr
-from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links, wrap
-from coopoc.world.recording import Recording
-from coopoc.world.sensing import observe, schedule
-from coopoc.world.sensors import Sensors
+from coopoc.world.links import wrap
 from coopoc.world.v2x import V2X
 
 from .assemble import backward_difference, check_size, check_time, interpolate
-from .planar import PLANE_STD, first_of_each, nearest, steps_of
+from .planar import first_of_each, nearest, steps_of
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""
 SUBJECTS = 5
 """Subjects 1 to 5 are robots, those beyond are landmarks."""
 TURN = 2 * np.pi + 1e-6
-GNSS_STD = 0.3
-"""m, simulated on x and y."""
-ODOMETRY_STD = 0.015
-"""m/s per axis, of the odometry velocity against Vicon: 0.014-0.018 over the five robots of set 6."""
-STATED_STD, LEAST_STD = (0.095, 0.007), 1e-4
-"""m, rad, of a folder without measurements between robots; and the least that is believed."""
 PAPER = "Leung et al., The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8) 2011"
 
 
@@ -55,7 +45,6 @@ class MrclamLog:
         bearing: (M,) rad in the observer's body frame.
         true_range: (M,) m, from Vicon at `time`; NaN in gaps.
         true_bearing: (M,) rad, from Vicon at `time`; NaN in gaps.
-        observer_heading: (M,) rad, Vicon at `time`.
         landmarks: (L, 3) subject, x m, y m of the landmarks.
         sightings: (S, 5) time s on the fleet's clock, observer (column), landmark (row of `landmarks`, -1 if it has no
             position), range m, bearing rad, of every measurement of a landmark.
@@ -75,7 +64,6 @@ class MrclamLog:
     bearing: Floats
     true_range: Floats
     true_bearing: Floats
-    observer_heading: Floats
     landmarks: Floats
     sightings: Floats
     unknown: int
@@ -124,9 +112,9 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     table = _measurements(folder, numbers)
     table[:, 0] -= start
     subject = table[:, 2]
-    place = {number: k for k, number in enumerate(numbers)}
+    robot_column = {number: k for k, number in enumerate(numbers)}
     others = table[np.isin(subject, numbers)]
-    observer, other = others[:, 1].astype(np.int64), np.array([place[n] for n in others[:, 2]], dtype=np.int64)
+    observer, other = others[:, 1].astype(np.int64), np.array([robot_column[n] for n in others[:, 2]], dtype=np.int64)
     sightings = table[subject > SUBJECTS]
     row = {number: k for k, number in enumerate(marks[:, 0].tolist())}
     sightings[:, 2] = [row.get(number, -1) for number in sightings[:, 2].tolist()]
@@ -158,7 +146,6 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         bearing=others[:, 4],
         true_range=np.hypot(dx, dy),
         true_bearing=wrap(np.arctan2(dy, dx) - here[:, 2]),
-        observer_heading=here[:, 2],
         landmarks=marks,
         sightings=sightings,
         unknown=int((subject == 0).sum()),
@@ -166,82 +153,15 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     )
 
 
-def innovations(log: MrclamLog) -> tuple[Floats, Floats]:
-    """Measured minus true range m and bearing rad, where Vicon saw both robots."""
-    seen = np.isfinite(log.true_range)
-    return (log.range - log.true_range)[seen], wrap(log.bearing - log.true_bearing)[seen]
-
-
-def recording(log: MrclamLog, v2x: V2X, *, runs: int = 1, seed: int = 0) -> Recording:
-    """Recording of the real drive: runs differ only in the simulated GNSS, everything else was measured.
-
-    velocity = v (cos th, sin th, 0) with wheel speed v and Vicon's heading th in the middle of the step (after a gap of
-    Vicon: at its end); relative = (measured range, measured bearing + Vicon's heading, pi/2). Of several measurements
-    of one robot in a step the one nearest to the step's instant is kept; at most K <= 4 neighbours, nearest first by
-    measured range.
-
-    Args:
-        log: of read_mrclam.
-        v2x: K, radius and channel.
-        runs: R.
-        seed: of GNSS and channel.
-    """
-    acting = Sensors(gnss_std=(GNSS_STD, GNSS_STD, 0.0), velocity_std_ratio=0.0)
-    both = zip(innovations(log), STATED_STD, strict=True)
-    stds = [max(robust_std(r), LEAST_STD) if len(r) else std for r, std in both]
-    known = Sensors(
-        gnss_std=(GNSS_STD, GNSS_STD, PLANE_STD),
-        velocity_std_ratio=0.0,
-        velocity_floor=ODOMETRY_STD,
-        range_std=stds[0],
-        azimuth_std=stds[1],
-        inclination_std=PLANE_STD,
-        min_range=0.0,
-    )
-    fixes = observe(log.fleet, acting, V2X(max_neighbours=0), runs=runs, seed=seed, assumed=known).gnss
-    index = kept(log, v2x)
-    links = Links(log.step[index], log.observer[index], log.subject[index])
-    azimuth = log.bearing[index] + log.observer_heading[index]
-    azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
-    relative = np.column_stack([log.range[index], azimuth, np.full(len(index), np.pi / 2)])
-    broadcasts, arrival = schedule(log.fleet, links, v2x, runs, seed)
-    velocity = turned(log.speed[..., None] * [1.0, 0.0, 0.0], midway(log.heading))
-    return Recording(
-        ids=log.fleet.ids,
-        t=log.fleet.t,
-        gnss=fixes,
-        velocity=np.broadcast_to(np.where(log.fleet.present[..., None], velocity, np.nan), fixes.shape),
-        links=links,
-        relative=np.broadcast_to(relative, (runs, *relative.shape)),
-        broadcasts=broadcasts,
-        arrival=arrival,
-        sensors=known,
-        v2x=v2x,
-        observers=tuple(range(len(log.fleet.ids))),
-        notes=(
-            f"GNSS is simulated, {GNSS_STD:g} m on x and y: there is none indoors; z = 0 is taken as known",
-            "range, bearing and wheel odometry are real",
-            "world azimuth and direction of travel use Vicon's heading, which is truth",
-            "inclination was not measured: pi/2 by the constraint z = 0",
-            "assumed standard deviations were measured against Vicon",
-            "repeated measurements within a step, and those in gaps of Vicon, are left out",
-        ),
-    )
-
-
-def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> Ints:
-    """Measurements that become links, by step, observer and range.
+def kept(log: MrclamLog, v2x: V2X) -> Ints:
+    """Indices of the measurements that become links, by step, observer and range.
 
     Args:
         log: of read_mrclam.
         v2x: K and radius.
-        gaps: whether those in gaps of Vicon stay.
     """
-    present, inside = log.fleet.present, log.step >= 0
-    visible = present[log.step, log.observer] & present[log.step, log.subject] & np.isfinite(log.observer_heading)
-    index = np.flatnonzero(inside & (visible | gaps))
-    late = np.abs(log.time - log.fleet.t[log.step])[index]
-    unique = index[nearest(late, log.step[index], log.observer[index], log.subject[index])]
+    late = np.abs(log.time - log.fleet.t[log.step])
+    unique = nearest(late, log.step, log.observer, log.subject)
     near = unique[log.range[unique] <= v2x.radius]
     near = near[np.lexsort((log.range[near], log.observer[near], log.step[near]))]
     return near[first_of_each(v2x.max_neighbours, log.step[near], log.observer[near])]
@@ -250,8 +170,8 @@ def kept(log: MrclamLog, v2x: V2X, gaps: bool = False) -> Ints:
 def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
     """(T, C) mean over the step that ends at each instant: difference of the trapezoidal integral."""
     integral = np.vstack([0 * values[:1], np.cumsum(np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2, axis=0)])
-    at = np.column_stack([np.interp(grid, t, column) for column in integral.T])
-    mean = np.diff(at, axis=0) / np.diff(grid)[:, None]
+    on_grid = np.column_stack([np.interp(grid, t, column) for column in integral.T])
+    mean = np.diff(on_grid, axis=0) / np.diff(grid)[:, None]
     return np.vstack([mean[:1], mean])
 
 

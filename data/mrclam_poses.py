@@ -32,7 +32,7 @@ ROBUST = 5.0
 
 
 class Calibration(NamedTuple):
-    """What is known of a log's sensors.
+    """Noise, delay and scales of a log's sensors.
 
     Attributes:
         sensors: standard deviations of white noise that leads as far astray as the real errors do.
@@ -47,7 +47,7 @@ class Calibration(NamedTuple):
     turn: Floats
 
 
-def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
+def pose_recording(log: MrclamLog, v2x: V2X, calibration: Calibration) -> Recording:
     """Recording of the robots' own measurements, one run: odometry, range and bearing of robots and landmarks.
 
     There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of
@@ -57,26 +57,27 @@ def pose_recording(log: MrclamLog, v2x: V2X, known: Calibration) -> Recording:
     Args:
         log: of read_mrclam.
         v2x: K, radius and channel.
-        known: of its sensors: odometry is scaled and delayed by it, since it is a record of commands.
+        calibration: of its sensors: odometry is scaled and delayed by it, since it is a record of commands.
 
     Raises:
         InputError: a folder without positions of landmarks.
     """
     robots, marks = log.fleet.ids, surveyed(log)
-    forward = known.speed * _delayed(log, log.speed, known.lag)
-    index = kept(log, v2x, gaps=True)
+    forward = calibration.speed * _delayed(log, log.speed, calibration.lag)
+    index = kept(log, v2x)
     others = [getattr(log, name)[index] for name in ("step", "observer", "subject", "range", "bearing")]
     t, observer, mark, reach, bearing = log.sightings.T
     step, late = steps_of(t, log.fleet.dt, len(log.fleet.t))
-    seen = np.column_stack([step, observer, len(robots) + mark, reach, bearing])[nearest(late, step, observer, mark)]
+    sightings = np.column_stack([step, observer, len(robots) + mark, reach, bearing])
+    sightings = sightings[nearest(late, step, observer, mark)]
     return planar_recording(
         (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
         log.fleet.t,
         forward[..., None] * [1.0, 0.0],
-        known.turn * _delayed(log, log.turn_rate, known.lag),
+        calibration.turn * _delayed(log, log.turn_rate, calibration.lag),
         marks[:, 1:],
-        np.vstack([np.column_stack(others), seen]),
-        known.sensors,
+        np.vstack([np.column_stack(others), sightings]),
+        calibration.sensors,
         v2x,
         "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
     )
@@ -140,15 +141,15 @@ def _delayed(log: MrclamLog, values: Floats, lag: float) -> Floats:
 
 
 def _slope(true: Floats, logged: Floats) -> Floats:
-    known = np.isfinite(true)
-    return np.asarray((np.where(known, true, 0) * logged).sum(axis=0) / (known * logged**2).sum(axis=0))
+    """(N,) least-squares factor of the logged values (T, N) on the true ones, NaN where these are unknown."""
+    return np.asarray(np.nansum(true * logged, axis=0) / (np.isfinite(true) * logged**2).sum(axis=0))
 
 
 def _in_blocks(error: Floats, regressor: Floats, steps: int) -> float:
     """Rms over robots and blocks of steps of the factor of a regressor (T, N) that explains errors (T, N) best."""
     starts = range(0, len(error) - steps + 1, steps)
-    found = [_slope(error[first : first + steps], regressor[first : first + steps]) for first in starts]
-    return float(np.sqrt(np.nanmean(np.square(found))))
+    factors = [_slope(error[first : first + steps], regressor[first : first + steps]) for first in starts]
+    return float(np.sqrt(np.nanmean(np.square(factors))))
 
 
 def summed(error: Floats, window: int) -> float:
@@ -173,15 +174,15 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     for column in range(len(log.fleet.ids)):  # poses by Vicon, NaN in gaps
         path = np.column_stack([log.fleet.position[:, column, :2], log.heading[:, column]])
         inside = (marks[:, 1] == column) & (marks[:, 0] >= 0) & (marks[:, 0] <= end)
-        known = np.isfinite(path[:, 0])
-        own[inside] = interpolate(log.fleet.t[known], path[known], marks[inside, 0], 2 * log.fleet.dt)
+        present = log.fleet.present[:, column]
+        own[inside] = interpolate(log.fleet.t[present], path[present], marks[inside, 0], 2 * log.fleet.dt)
     dx, dy = (log.landmarks[marks[:, 2].astype(np.int64), 1:] - own[:, :2]).T
     t, observer = np.append(log.time, marks[:, 0]), np.append(log.observer, marks[:, 1])
     reach = np.append(log.range - log.true_range, marks[:, 3] - np.hypot(dx, dy))
     angle = wrap(np.append(log.bearing - log.true_bearing, marks[:, 4] - (np.arctan2(dy, dx) - own[:, 2])))
-    known = np.isfinite(reach) & (t >= 0) & (t < until)
-    if known.sum() < FEWEST:
-        given, allowed = f"{known.sum()} measurements in {until:g} s", f"must be {FEWEST} or more"
+    used = np.isfinite(reach) & (t >= 0) & (t < until)
+    if used.sum() < FEWEST:
+        given, allowed = f"{used.sum()} measurements in {until:g} s", f"must be {FEWEST} or more"
         raise InputError("calibrate_s", given, allowed, "Take longer.")
-    ranges, bearings = (grouped(error[known], observer[known], t[known]) for error in (reach, angle))
+    ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, angle))
     return ranges, bearings

@@ -343,21 +343,6 @@ def test_an_endless_lag_is_the_whole_problem() -> None:
     assert every.covariance == pytest.approx(whole.covariance, rel=0.05, abs=1e-3)  # their chord's J^T J, not ours
 
 
-def test_a_short_lag_keeps_landmarks_and_comes_near_the_whole() -> None:
-    problem = plane(odometry=(0.1, 0.05, 0.02))  # not GTSAM's: linearised once, when it comes
-    problem = problem.add("position", 16, problem.x0[16, :2], std=3.0)
-    whole, smoother, blind = solve(problem), FixedLag(2.5), FixedLag(2.5)
-    for piece, stamps in pieces(problem, 8):
-        old = np.isin(piece.names, list(blind.stamps))
-        elsewhere = np.where(old[:, None], pose([99.0, -99.0], 1.0), piece.x0)
-        newest = smoother.update(piece, stamps, tuple(stamps))
-        same = blind.update(replace(piece, x0=elsewhere), stamps, tuple(stamps))
-        assert same.x == pytest.approx(newest.x, abs=1e-12)
-    assert set(smoother.stamps) == {"5", "6", "7", "13", "14", "15", "16"}
-    gap = np.abs(newest.x[:, :2] - whole.position[[7, 15, 16]]).max(axis=1)
-    assert (gap < 0.25 * np.sqrt(whole.covariance[[7, 15, 16], 0, 0])).all()
-
-
 def test_points_and_poses_in_space_are_linearised_in_gtsams_directions() -> None:
     """Without noise all is exact: a body-frame vector to a point, which GTSAM lacks, and its covariances."""
     rng = np.random.default_rng(12)

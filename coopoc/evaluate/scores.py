@@ -13,7 +13,7 @@ from ..methods.track import Method, Track
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from .ledger import Kind, Way, of_track
-from .metrics import distance, errors, measure, nees, neighbour_rt_le, rt_le, share_of_average
+from .metrics import errors, measure, nees, neighbour_rt_le, rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
@@ -113,7 +113,7 @@ def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, q
     """Columns that need no average over runs."""
     error, mine = errors(track, drive), list(track.egos)
     level = np.sqrt((error**2).mean(axis=1))
-    fixes = np.sqrt((distance(recording.gnss.take(mine, axis=2), drive.position[:, mine]) ** 2).mean(axis=1))
+    fixes = np.sqrt((np.square(recording.gnss.take(mine, axis=2) - drive.position[:, mine]).sum(axis=-1)).mean(axis=1))
     account = of_track(track, recording, method.message)
     found = {
         "rt_le_m": level,

@@ -437,7 +437,8 @@ def _stamps(stamps: tuple[Floats, Floats], met: int, max_diff: float) -> str:
     count = min(map(len, stamps))
     if 2 * met >= count:
         return ""
-    ratio = float(np.ptp(stamps[0]) / max(np.ptp(stamps[1]), 1e-12))
+    long, true = (float(t[-1] - t[0]) for t in stamps)
+    ratio = long / max(true, 1e-12)
     looks = "another clock (offset), or rates that do not meet (max_diff)?"
     for factor, unit in UNITS.items():
         if 0.5 < ratio / factor < 2:

@@ -68,7 +68,7 @@ def inverted(matrix: Floats) -> Floats:
     with np.errstate(all="ignore"):
         if matrix.shape[-1] == 3:
             entries = matrix.reshape(*matrix.shape[:-2], 9)
-            a, b, c, d = (entries[..., chosen] for chosen in COFACTORS)
+            a, b, c, d = (entries.take(chosen, axis=-1) for chosen in COFACTORS)
             adjugate = a * b - c * d
             determinant = (entries[..., :3] * adjugate[..., ::3]).sum(axis=-1, keepdims=True)
             return np.asarray(adjugate / determinant).reshape(matrix.shape)

@@ -173,8 +173,8 @@ def programme(structure: Structure, max_iterations: int) -> Any:
 
     found, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**found, "p": ca.vertcat(found["p"], scale), "f": scale * found["f"]}
-    ipopt: dict[str, Any] = {**IPOPT, "max_iter": max_iterations}
-    return ca.nlpsol("solver", "ipopt", nlp, {**QUIET, "ipopt": ipopt})
+    options: dict[str, Any] = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
+    return ca.nlpsol("solver", "ipopt", nlp, options)
 
 
 BACKEND = Backend(
