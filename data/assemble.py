@@ -16,8 +16,6 @@ SLOWEST, FASTEST = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
 LATEST = 1e11
 """s since 1970, the year 5138."""
-LONGEST_ID = 200
-"""Characters."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 
@@ -65,7 +63,7 @@ def assemble(
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
     if not len(t):
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
-    ids, column = _ids(vehicle, file)
+    ids, column = _ids(vehicle)
     numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
     stamps = np.round(np.asarray(t, dtype=float), 6)
     by_vehicle = np.split(np.argsort(column, kind="stable"), np.cumsum(np.bincount(column))[:-1])
@@ -238,14 +236,10 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
         )
 
 
-def _ids(vehicle: Sequence[str], file: str) -> tuple[tuple[str, ...], Ints]:
+def _ids(vehicle: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
     """Names in the order of their first row, and the (L,) column of each row."""
     column_of: dict[str, int] = {}
     column = np.array([column_of.setdefault(str(name), len(column_of)) for name in vehicle], dtype=np.int64)
-    for name, k in column_of.items():
-        if len(name) > LONGEST_ID:
-            where, allowed = f"{file}: row {np.argmax(column == k) + 1}", f"must have at most {LONGEST_ID} characters"
-            raise InputError(f"{where}, column id", f"{name[:40]}...", allowed, "Check the column.")
     return tuple(column_of), column
 
 

@@ -136,7 +136,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     name, options, part = _split(name_or_path, options)
     kind = _real(Path(name))
     if kind == "mrclam":
-        hint = "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam_poses."
+        hint = "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam."
         raise InputError("data", name, "is a folder of MR.CLAM, whose noise has to be calibrated first", hint)
     log: Log = _read(LOGS.get(kind, read_log), Path(name), options)
     return log.part(**part)

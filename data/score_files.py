@@ -33,8 +33,8 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 def read_paths(name: str) -> dict[str, Path]:
     """Trajectories of a file, by vehicle: TUM and KITTI hold one, named after the file, a table several.
 
-    A table has columns t, x, y, z (m; without z in the plane), and, if known, id, qx, qy, qz, qw, and cxx, cxy, cxz, cyy,
-    cyz, czz (m^2). KITTI files have no stamps: poses are numbered, or `?times=FILE` gives them.
+    A table has columns t, x, y, z (m; without z in the plane), and may have id, qx, qy, qz, qw, and cxx, cxy, cxz,
+    cyy, cyz, czz (m^2). KITTI files have no stamps: poses are numbered, or `?times=FILE` gives them.
 
     Raises:
         InputError: a file with a fault, named with its line or row.
@@ -143,11 +143,19 @@ def table(rows: list[Score], delta: float, unit: Unit) -> str:
     """The scores as a Markdown table."""
     from tabulate import tabulate
 
-    header = "vehicle,poses,without truth,RT-LE [m],APE [m],largest [m]".split(",")
+    header = [
+        "vehicle",
+        "poses",
+        "without truth",
+        "RT-LE [m]",
+        "APE [m]",
+        "largest [m]",
+        f"RPE, {delta:g} {unit} [m]",
+        "NEES",
+    ]
     shown = [
         [row.vehicle, row.poses, row.missed, row.rt_le_m, row.ape_m, f"{row.ape_max_m:.3g}"]
         + ["" if value is None else f"{value:.3g}" for value in (row.rpe_m, row.nees)]
         for row in rows
     ]
-    header += [f"RPE, {delta:g} {unit} [m]", "NEES"]
     return str(tabulate(shown, headers=header, tablefmt="github", disable_numparse=True))

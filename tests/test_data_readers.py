@@ -257,7 +257,6 @@ def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | Non
         ("a,0.1,1_0,0,0", r"row 2, column x = 1_0"),
         ("a,0.1,١,0,0", r"row 2, column x = ١"),
         ("a,0.1,1e308,0,0", r"row 2, column x = 1e\+308"),
-        (f"{'a' * 5000},0.1,1,0,0", r"row 2, column id = a+\.\.\.: must have at most 200 characters"),
     ],
 )
 def test_a_row_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:

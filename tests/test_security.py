@@ -16,9 +16,7 @@ import numpy as np
 import pytest
 from latex import compiled
 
-from coopoc import Fleet
 from coopoc.cli import main
-from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.merge import merge
