@@ -11,7 +11,6 @@ from filterpy.kalman import KalmanFilter
 from coopoc import GNSS, LKFSA, MSMV, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.covariance_intersection import CovarianceIntersection
-from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.methods.mds import MDS
 
 S2 = Sensors.paper_scenario2()
@@ -148,8 +147,6 @@ def test_a_bad_noise_model_is_named(crossing: Fleet) -> None:
         Kalman("nominl")(recording)
     with pytest.raises(InputError, match="process_std"):
         NoiseModel("mine", S2, process_std=(0.1, 0.1, 0.0))
-    with pytest.raises(InputError, match=r"carry = 'beliefs': must be one of .* Did you mean belief\?"):
-        GaussianBeliefPropagation(carry="beliefs")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="x0"):
         Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 

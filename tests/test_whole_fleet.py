@@ -223,7 +223,6 @@ def test_bad_settings_and_egos_are_named(crossing: Fleet) -> None:
     for method, bad in (
         (GaussianBeliefPropagation, {"rounds": 0}),
         (GaussianBeliefPropagation, {"damping": 1.0}),
-        (GaussianBeliefPropagation, {"carry": "all"}),
         (ConsensusADMM, {"rho": 0.0}),
         (ConsensusADMM, {"rounds": 1.5}),
         (BatchSmoother, {"exact_steps": -1}),

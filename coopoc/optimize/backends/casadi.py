@@ -25,7 +25,7 @@ ROUNDS = 10
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
 QUIET: dict[str, Any] = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
-IPOPT = {
+IPOPT: dict[str, Any] = {
     "print_level": 0,
     "sb": "yes",
     "nlp_scaling_method": "none",
@@ -169,7 +169,8 @@ def programme(structure: Structure, max_iterations: int) -> Any:
 
     found, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**found, "p": ca.vertcat(found["p"], scale), "f": scale * found["f"]}
-    return ca.nlpsol("solver", "ipopt", nlp, {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}})
+    options: dict[str, Any] = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
+    return ca.nlpsol("solver", "ipopt", nlp, options)
 
 
 BACKEND = Backend(
