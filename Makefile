@@ -79,7 +79,7 @@ $(READY): pyproject.toml constraints.txt
 
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
-	$(PIP) --no-build-isolation --editable '.[dev,sumo,excel,nmea,ros,flower,export,cluster]'
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,nmea,ros,flower,export,cluster]'
 	@touch $@
 
 $(VENV)/.ready-fuzz: $(VENV)/.ready-dev

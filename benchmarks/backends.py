@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from backends_gtsam import gtsam_exact, gtsam_linear, pose_lag
-from backends_programmes import PLAIN, casadi_exact, osqp_linear
+from backends_programmes import casadi_exact, osqp_linear
 from backends_star import Job, one_by_one, star
 from tabulate import tabulate
 from timing import timed
@@ -34,7 +34,7 @@ def jobs(runs: int = RUNS) -> list[Job]:
         gtsam_linear(linear),
         gtsam_exact(exact),
         pose_lag(),
-        *(casadi_exact(exact, method) for method in PLAIN),
+        casadi_exact(exact),
         osqp_linear(linear),
         one_by_one(linear, "converted"),
         one_by_one(exact, "exact"),

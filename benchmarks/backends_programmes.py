@@ -14,19 +14,16 @@ from scipy.sparse import csc_matrix, triu
 from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
 
-PLAIN: dict[str, tuple[str, dict[str, Any], dict[str, Any]]] = {
-    "fatrop": ("fatrop", {"print_time": False}, {"print_level": 0}),
-    "ipopt": ("ipopt", {"print_time": False}, {"print_level": 0, "sb": "yes"}),
-}
-"""By our method: CasADi's plugin, its options, those of the solver behind it."""
+PLAIN = {"print_time": False}, {"print_level": 0, "sb": "yes"}
+"""Options of CasADi's plugin, and of IPOPT behind it."""
 
 
-def casadi_exact(problem: Problem, method: str) -> Job:
-    """One programme whose measurements are parameters, by the same solver; fatrop is what `solve` takes by itself."""
+def casadi_exact(problem: Problem) -> Job:
+    """One programme whose measurements are parameters, by the same solver."""
     (fixes, edges), runs = problem.factors, problem.batch or 1
     start = initial_guess(problem)
     std, fix_std = np.array(SENSORS.relative_std), np.array(KNOWN.gnss_std)
-    plugin, quiet, inner = PLAIN[method]
+    quiet, inner = PLAIN
 
     def cost(x: Any, fix: Any, seen: Any) -> Any:
         """Of x and fix (3, n) and seen (3, K)."""
@@ -45,7 +42,7 @@ def casadi_exact(problem: Problem, method: str) -> Job:
         casadi.SX.sym(name, 3, n) for name, n in (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS))
     )
     nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, relative), "f": cost(x, fix, relative)}
-    solver = casadi.nlpsol("solver", plugin, nlp, {**quiet, **({plugin: inner} if inner else {})})
+    solver = casadi.nlpsol("solver", "ipopt", nlp, {**quiet, "ipopt": inner})
 
     def batch() -> Any:
         numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
@@ -69,15 +66,15 @@ def casadi_exact(problem: Problem, method: str) -> Job:
             model.minimize(0.5 * total)
             for node, at in zip(nodes, start[b], strict=True):
                 model.set_initial(node, at)
-            model.solver(plugin, quiet, inner)
+            model.solver("ipopt", quiet, inner)
             answer = model.solve()
             found.append([answer.value(node) for node in nodes])
         return np.stack(found)
 
-    job, options = f"casadi {method}, snapshot, exact", {} if method == "fatrop" else {"method": method}
+    job = "casadi ipopt, snapshot, exact"
     return Job(
         [
-            Row(job, "ours", runs, ours(problem, "casadi", runs, **options)),
+            Row(job, "ours", runs, ours(problem, "casadi", runs)),
             Row(job, "hand-written", runs, batch),
             Row(job, "Opti, rebuilt", 2, opti),
         ],

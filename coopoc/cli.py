@@ -160,14 +160,15 @@ def table(
         where: use only the results with these values.
     """
     from .study.publish import tables
-    from .study.results import Results
+    from .study.results import Results, parsed
     from .study.tables import pivot
 
     if rows is None:
         print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
         return
     results = Results.load(folder)
-    print(pivot(results, rows, columns, value, results.parsed(where)).render(format).rstrip("\n"))
+    chosen = {name: list(values) for name, values in parsed([results.frame], where).items()}
+    print(pivot(results, rows, columns, value, chosen).render(format).rstrip("\n"))
 
 
 def report(

@@ -28,7 +28,7 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
 
 
 def load_recording(path: str | Path, **options: Any) -> Recording:
-    """Recording of one's own measurements: tables (CSV, Parquet, Excel), NMEA, ROS bags, an MR.CLAM folder.
+    """Recording of one's own measurements: tables (CSV, Parquet), NMEA, ROS bags, PyFG.
 
     docs/your_data.md describes the tables. `read_log` gives the truth and the summary, too.
 

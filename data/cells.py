@@ -1,4 +1,4 @@
-"""Reading a table once: CSV, Parquet or Excel as a frame of named columns, whose numbers, times and names are checked.
+"""Reading a table once: CSV or Parquet as a frame of named columns, whose numbers, times and names are checked.
 
 Every table is read here; fleets (`fleet_files`), logs (`log.tables`) and trajectories (`score_files`) are its uses. The
 index of a frame is the row in the file, from 1, so that an error names it whatever part of the frame is at hand.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import re
-import zipfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -17,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError, MissingLibraryError
+from coopoc.errors import InputError
 from coopoc.formats.values import LARGEST
 from coopoc.plugins import suggestion, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLES = (".csv", ".parquet", ".xlsx")
-COLUMNS, CELLS, UNPACKED = 5000, 20_000_000, 2**30
-"""Most columns of a table, most cells of a spreadsheet, and most bytes of one when it is unpacked."""
+TABLES = (".csv", ".parquet")
+COLUMNS = 5000
+"""Most columns of a table."""
 USUAL = {
     "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id"),
     "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
@@ -36,7 +35,7 @@ USUAL = {
 
 
 def read_frame(path: Path, *text: str) -> pd.DataFrame:
-    """Table of a .parquet, .xlsx or (any other ending) CSV file.
+    """Table of a .parquet or (any other ending) CSV file.
 
     Args:
         path: of the file; CSV between commas, or between semicolons or tabs with decimal commas.
@@ -44,19 +43,15 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
 
     Raises:
         InputError: a damaged file, one column, no header, two columns of one name, or a row longer than the header.
-        MissingLibraryError: openpyxl is not installed.
     """
     import pandas as pd
 
-    suffix = path.suffix.lower()
     try:
-        if suffix == ".parquet":
-            frame = pd.read_parquet(path).reset_index(drop=True)
-        else:
-            frame = _read_xlsx(path) if suffix == ".xlsx" else _read_csv(path, text)
-    except (InputError, MissingLibraryError):
+        parquet = path.suffix.lower() == ".parquet"
+        frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
+    except InputError:
         raise
-    except Exception as error:  # of pandas, Arrow, zlib, expat, openpyxl: a damaged file meets them all
+    except Exception as error:  # of pandas and Arrow: a damaged file meets them all
         raise _no_table(path, next(iter(str(error).splitlines()), type(error).__name__)[:200]) from None
     frame.columns = pd.Index([str(name).strip() for name in frame.columns])
     _check_header(path, list(frame.columns))
@@ -69,12 +64,10 @@ def headers(path: Path) -> list[str]:
     try:
         if path.suffix.lower() == ".csv":
             return [name.strip() for name in _first_lines(path)[1]]
-        if path.suffix.lower() == ".parquet":
-            from pyarrow.parquet import read_schema
+        from pyarrow.parquet import read_schema
 
-            return [str(name) for name in read_schema(path).names]
-        return list(read_frame(path).columns)
-    except Exception:  # of Arrow, csv, openpyxl
+        return [str(name) for name in read_schema(path).names]
+    except Exception:  # of Arrow and csv
         return []
 
 
@@ -98,8 +91,8 @@ def optional(frame: pd.DataFrame, column: str, file: str) -> Floats:
     """A column of numbers in which cells may be empty; NaN where they are, or where there is no such column."""
     out = np.full(len(frame), np.nan)
     if column in frame.columns:
-        there = filled(frame[column])
-        out[there] = numeric(frame[there], column, file)
+        given = filled(frame[column])
+        out[given] = numeric(frame[given], column, file)
     return out
 
 
@@ -149,29 +142,29 @@ def filled(cells: pd.Series[Any]) -> Bools:
 
 
 def named_columns(
-    frame: pd.DataFrame, columns: Mapping[str, str], known: Sequence[str], needed: Sequence[str], file: str
+    frame: pd.DataFrame, columns: Mapping[str, str], allowed: Sequence[str], needed: Sequence[str], file: str
 ) -> pd.DataFrame:
     """The frame with our names of its columns.
 
     Args:
         frame: of `read_frame`.
         columns: our name -> header in the file, where they differ.
-        known: our names.
+        allowed: our names.
         needed: those that must be there.
         file: named in errors.
 
     Raises:
-        InputError: a key of `columns` that is not known, a header that stands for two names, or a missing column.
+        InputError: a key of `columns` that is not allowed, a header that stands for two names, or a missing column.
     """
     for key in columns:
-        if key not in known:
-            raise unknown(f"{file}: key of columns", key, known, 'Give columns={"t": "name in the file"}.')
+        if key not in allowed:
+            raise unknown(f"{file}: key of columns", key, allowed, 'Give columns={"t": "name in the file"}.')
     given = [str(header) for header in frame.columns]
     frame = frame.rename(columns={header: key for key, header in columns.items()})
     for key in columns:
         if (frame.columns == key).sum() > 1:
-            allowed = f"is not the only column {key} then: the file has one of that name"
-            raise InputError(f"{file}: columns[{key!r}]", repr(columns[key]), allowed, "Rename or remove one of them.")
+            twice = f"is not the only column {key} then: the file has one of that name"
+            raise InputError(f"{file}: columns[{key!r}]", repr(columns[key]), twice, "Rename or remove one of them.")
     for key in needed:
         if columns.get(key, key) not in given:
             raise missing_column(file, columns.get(key, key), given, f"columns {', '.join(needed)} are needed", key)
@@ -202,10 +195,7 @@ def _read_csv(path: Path, text: Sequence[str]) -> pd.DataFrame:
     if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
         form["float_precision"] = "round_trip"  # the default became exact in 3.1
     try:
-        found: pd.DataFrame = pd.read_csv(
-            path, header=0, index_col=False, skipinitialspace=True, encoding="utf-8-sig", **form
-        )
-        return found
+        return pd.read_csv(path, header=0, index_col=False, skipinitialspace=True, encoding="utf-8-sig", **form)
     except pd.errors.ParserError as error:
         wide = re.search(r"fields in line (\d+), saw (\d+)", str(error))
         raise _too_wide(path, int(wide[1]) - 1, int(wide[2]), len(header)) if wide else error from None
@@ -219,35 +209,6 @@ def _first_lines(path: Path) -> tuple[str, list[str], list[str]]:
         file.seek(0)
         rows = csv.reader(file, skipinitialspace=True, delimiter=separator)
         return separator, next(rows, []), next(filter(None, rows), [])
-
-
-def _read_xlsx(path: Path) -> pd.DataFrame:
-    """First sheet of a spreadsheet, unless it grows beyond CELLS: what it claims to be its size may be anything."""
-    import pandas as pd
-
-    try:
-        from openpyxl import load_workbook
-    except ImportError:
-        raise MissingLibraryError("openpyxl", "reading a spreadsheet", "'coopoc[excel]'") from None
-    with zipfile.ZipFile(path) as packed:
-        if sum(part.file_size for part in packed.infolist()) > UNPACKED:
-            raise _no_table(path, f"more than {UNPACKED >> 20} MB unpacked")
-    book = load_workbook(path, read_only=True, data_only=True)
-    sheet = book.worksheets[0]
-    sheet.reset_dimensions()
-    rows, size = [], 0
-    for row in sheet.iter_rows(values_only=True):
-        size += len(row) + 1
-        if size > CELLS:
-            raise _no_table(path, f"more than {CELLS:,} cells")
-        if any(cell is not None for cell in row):
-            rows.append(row)
-    book.close()
-    if not rows:
-        raise InputError(path.name, "0 rows", "must have a header and rows", "Export it again.")
-    width = max(map(len, rows))
-    header, *body = [[*row, *[None] * (width - len(row))] for row in rows]
-    return pd.DataFrame(body, columns=[f"column {k}" if name is None else name for k, name in enumerate(header)])
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
@@ -278,7 +239,7 @@ def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
 
 
 def _no_table(path: Path, given: str) -> InputError:
-    allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet or Excel"
+    allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet"
     return InputError(path.name, given, allowed, "Export it again as CSV, without empty rows and columns.")
 
 

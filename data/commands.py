@@ -13,7 +13,7 @@ from coopoc.one_file import in_file
 from coopoc.plugins import names, unknown
 
 from .fleet_store import facts, in_words
-from .registry import DATASETS, convert, kind_of, list_datasets, load_fleet, load_log
+from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
 
@@ -36,11 +36,11 @@ def show(name: tyro.conf.Positional[str]) -> None:
         name: a bundled fleet, or a path as in --data.
     """
     if name in DATASETS:
-        _print(name, DATASETS[name].card().fields())
+        _print(name, in_words(card(name)))
         return
     if not Path(split(name)[0]).exists() and not in_file(name) and name not in names("coopoc.datasets"):
         raise unknown("fleet", name, DATASETS, "Or give the path of a file.")
-    if kind_of(name) in ("log", "pyfg", "recording"):
+    if kind_of(name) in LOGS:
         log = load_log(name)
         print(log.summary)
         if log.truth is None:
@@ -62,7 +62,7 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     Example: coopoc data check "mylog?dt=0.1&columns=t:timestamp,vehicle:car"
 
     Args:
-        path: a file or a folder: tables, NMEA, a ROS bag, PyFG, MR.CLAM, and options; see docs/your_data.md.
+        path: a file or a folder: tables, NMEA, a ROS bag, PyFG, and options; see docs/your_data.md.
         picture: its file; default: the log's name with -check.png, in the working folder.
     """
     from tabulate import tabulate
@@ -73,48 +73,47 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     log = load_log(path)
     print(log.summary)
     try:
-        found = checked(log)
+        result = checked(log)
     except InputError as error:
         print(f"\ncheck: no filter follows it, no picture is drawn: {error}")
         return
-    against = f"a filter of each vehicle alone{', ' * bool(found.span)}{found.span}"
-    for title, rows in (("Fixes", found.vehicles), ("Relative measurements", found.measurements)):
+    against = f"a filter of each vehicle alone{', ' * bool(result.span)}{result.span}"
+    for title, rows in (("Fixes", result.vehicles), ("Relative measurements", result.measurements)):
         if rows:
             print(f"\n{title}: innovations against {against}")
             print(tabulate(rows, headers="keys", tablefmt="github", floatfmt=".3g"))
     print()
-    for warning in found.warnings or ("nothing looks wrong",):
+    for warning in result.warnings or ("nothing looks wrong",):
         print(f"check: {warning}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
-    print(f"picture: {draw(found, out)}", file=sys.stderr)
+    print(f"picture: {draw(result, out)}", file=sys.stderr)
 
 
-def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fleets"), seed: int | None = None) -> None:
-    """Make a fleet with SUMO from an OpenDRIVE map: the same seed gives the same bytes.
+def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fleets")) -> None:
+    """Make a bundled fleet again with SUMO from an OpenDRIVE map: the same bytes.
 
     Example: coopoc data make town10 --maps carla_maps
 
     Args:
-        recipe: name of a bundled fleet, or FILE.py:NAME of a Recipe of your own.
+        recipe: name of a bundled fleet.
         maps: folder with the .xodr files of CARLA.
         out: folder for the fleet and its card.
-        seed: seed instead of the recipe's.
     """
     from .generate import make as generate
 
-    card = generate(recipe, maps, out, seed)
-    _print(card.name, card.fields())
-    print(f"written to {out}. Use it: --data {out / f'{card.name}.npz'}", file=sys.stderr)
+    made = generate(recipe, maps, out)
+    _print(made["name"], in_words(made))
+    print(f"written to {out}. Use it: --data {out / (made['name'] + '.npz')}", file=sys.stderr)
 
 
 def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:
-    """Convert a drive to CSV, Parquet or a folder of TUM files.
+    """Convert a drive to CSV or Parquet.
 
     Example: coopoc data convert "fcd.xml?dt=0.1" drive.csv
 
     Args:
         source: name or path of the drive, and options.
-        out: file in .csv or .parquet, or a folder for TUM files.
+        out: file in .csv or .parquet.
     """
     print(f"{convert(source, out)!r} written to {out}", file=sys.stderr)
 

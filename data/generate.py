@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import subprocess
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from coopoc.errors import InputError, MissingLibraryError
-from coopoc.one_file import from_file, in_file
-from coopoc.plugins import suggestion, unknown
+from coopoc.plugins import unknown
 from coopoc.world.fleet import Fleet
 
 from . import fleet_store
@@ -28,6 +30,13 @@ DRIVER = 'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="
 """Krauss' model: m/s^2, s and m as in dense city traffic; dawdling changes once a second, not at every 0.1 s."""
 JUMP = 8.0
 """m/s^2, less than the grip of a dry road."""
+DT, WARMUP = 0.1, 60.0
+"""s: the sampling interval, and what is driven before the first step that is kept."""
+CUTOFF = 0.5
+"""Hz, half-power frequency of the smoother."""
+TURN_ACCELERATION = 3.0
+"""m/s^2, lateral, that limits the speed in turns of junctions."""
+MAP_LICENCE = "MIT (CARLA project)"
 
 
 @dataclass(frozen=True)
@@ -41,18 +50,11 @@ class Recipe:
         steps: steps that are kept, one number for all or one per vehicle (absent, NaN, afterwards).
         seed: of routes, top speeds and SUMO.
         top_speed: (low, high) m/s, each vehicle's own top speed is uniform between them.
-        warmup: seconds that are driven before the first kept step.
         platoon: vehicles that share one random route and start on the same edge.
         start: SUMO's departPos: "random_free" spreads a platoon over its first edge, "last" queues it.
         lights: True: netconvert guesses junctions with traffic lights, actuated; False: junctions of equal rank.
-        turn_acceleration: m/s^2 of lateral acceleration that limits the speed in turns of junctions.
         tours: routes that are repeated instead of random ones, for the first vehicles: edge ids with spaces between.
         dawdle: Krauss' sigma in 0..1, how irregularly a driver keeps the speed.
-        dt: sampling interval, s.
-        cutoff: Hz, half-power frequency of the smoother.
-
-    Raises:
-        InputError: a number that no drive can have.
 
     >>> Recipe("tiny", "Town10HD.xodr", vehicles=2, steps=20, seed=1).lengths
     (20, 20)
@@ -64,25 +66,11 @@ class Recipe:
     steps: int | tuple[int, ...]
     seed: int
     top_speed: tuple[float, float] = (8.0, 11.0)
-    warmup: float = 60.0
     platoon: int = 1
     start: str = "random_free"
     lights: bool = True
-    turn_acceleration: float = 3.0
     tours: tuple[str, ...] = ()
     dawdle: float = 0.5
-    dt: float = 0.1
-    cutoff: float = 0.5
-
-    def __post_init__(self) -> None:
-        for field in ("vehicles", "platoon", "turn_acceleration", "dt", "cutoff"):
-            if not getattr(self, field) > 0:
-                raise InputError(field, getattr(self, field), "must be > 0", f"Give the recipe a positive {field}.")
-        if not 0 < self.top_speed[0] <= self.top_speed[1]:
-            raise InputError("top_speed", self.top_speed, "must be 0 < low <= high m/s", "Order the two speeds.")
-        if len(self.lengths) != self.vehicles or min(self.lengths) < 2:
-            allowed = f"must be one number >= 2, or {self.vehicles} of them"
-            raise InputError("steps", self.steps, allowed, "One entry per vehicle.")
 
     @property
     def lengths(self) -> tuple[int, ...]:
@@ -92,7 +80,7 @@ class Recipe:
     @property
     def duration(self) -> float:
         """s, with the warm-up."""
-        return self.warmup + max(self.lengths) * self.dt
+        return WARMUP + max(self.lengths) * DT
 
 
 TOWN10, TOWN04 = "Town10HD.xodr", "Town04.xodr"
@@ -110,31 +98,33 @@ RECIPES: dict[str, Recipe] = {
 """Of the bundled fleets."""
 
 
-def make(
-    recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path, seed: int | None = None
-) -> fleet_store.Card:
-    """Drive a recipe in SUMO and write <name>.npz and <name>.json; the same seed gives the same bytes.
+def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -> dict[str, Any]:
+    """Drive a recipe in SUMO and write <name>.npz and its card <name>.json; the same recipe gives the same bytes.
 
     Args:
-        recipe: a Recipe, the name of one in RECIPES, or "mine.py:NAME".
+        recipe: a Recipe, or the name of one in RECIPES.
         map_folder: holds the OpenDRIVE file that the recipe names (CARLA's maps: MIT licence, not part of the package).
         out_folder: is created if needed; files of the same name are replaced.
-        seed: instead of the recipe's.
+
+    Returns:
+        The card.
 
     Raises:
         InputError: an unknown recipe, a missing map; a vehicle that could not drive or that jumps: take another seed.
         MissingLibraryError: eclipse-sumo is not installed.
     """
-    chosen = _recipe(recipe)
-    chosen = chosen if seed is None else replace(chosen, seed=seed)
-    fleet, out = simulate(chosen, Path(map_folder)), Path(out_folder)
-    out.mkdir(parents=True, exist_ok=True)
-    fleet_store.save(fleet, out / f"{chosen.name}.npz")
     command = "coopoc.data.generate.make(Recipe(**card['recipe']), MAPS, OUT), in Python"
     if not isinstance(recipe, Recipe):
-        command = f"coopoc data make {recipe} --maps {map_folder} --seed {chosen.seed}"
-    card = fleet_store.card_of(fleet, chosen.name, chosen.map, asdict(chosen), list(chosen.lengths), command)
-    (out / f"{chosen.name}.json").write_text(card.to_json())
+        if recipe not in RECIPES:
+            raise unknown("recipe", recipe, RECIPES, "Or build a Recipe of your own, in Python.")
+        command, recipe = f"coopoc data make {recipe} --maps {map_folder}", RECIPES[recipe]
+    fleet, out = simulate(recipe, Path(map_folder)), Path(out_folder)
+    out.mkdir(parents=True, exist_ok=True)
+    fleet_store.save(fleet, out / f"{recipe.name}.npz")
+    origin = {"name": recipe.name, "map": recipe.map, "map_licence": MAP_LICENCE, "command": command}
+    settings = {"sumo": version("eclipse-sumo"), "recipe": asdict(recipe)}
+    card = {**origin, **settings, **fleet_store.facts(fleet)}
+    (out / f"{recipe.name}.json").write_text(json.dumps(card, indent=1) + "\n")
     return card
 
 
@@ -150,18 +140,16 @@ def simulate(recipe: Recipe, map_folder: Path) -> Fleet:
     position = raw.select(ids).position[:steps]
     if len(ids) < recipe.vehicles or len(position) < steps or np.isnan(position).any():
         allowed = f"must drive {recipe.vehicles} vehicles through all steps"
-        hint = f"{len(ids)} departed; try another --seed, fewer vehicles, smaller platoons or more warm-up."
+        hint = f"{len(ids)} departed; try another seed, fewer vehicles or smaller platoons."
         raise InputError("recipe", f"{recipe.name}, seed {recipe.seed}", allowed, hint)
-    position = smooth(position, recipe.dt, recipe.cutoff)
+    position = smooth(position, DT, CUTOFF)
     for column, last in enumerate(recipe.lengths):
         position[last:, column] = np.nan
-    t = np.arange(steps) * recipe.dt
+    t = np.arange(steps) * DT
     fleet = fleet_store.quantise(Fleet(tuple(ids), t, position, position, name=recipe.name))
-    acceleration = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2) / fleet.dt
-    if np.nanmax(acceleration) > JUMP:
-        step, worst = np.unravel_index(np.nanargmax(acceleration), acceleration.shape)
-        given = f"{acceleration[step, worst]:.1f} m/s^2 of {fleet.ids[worst]} at step {step}"
-        raise InputError("acceleration", given, f"must stay below {JUMP} m/s^2", "Try another --seed or lower cutoff.")
+    acceleration = fleet_store.facts(fleet)["acceleration"]
+    if acceleration > JUMP:
+        raise InputError("acceleration", f"{acceleration} m/s^2", f"must stay below {JUMP} m/s^2", "Try another seed.")
     return fleet
 
 
@@ -171,19 +159,6 @@ def program(name: str) -> Path:
     if spec is None or spec.origin is None:
         raise MissingLibraryError("eclipse-sumo", "making a fleet", "'coopoc[sumo]'")
     return Path(spec.origin).parent / "bin" / name
-
-
-def _recipe(recipe: str | Recipe) -> Recipe:
-    if isinstance(recipe, Recipe):
-        return recipe
-    if in_file(recipe):
-        found = from_file(recipe, "recipe")
-        if not isinstance(found, Recipe):
-            raise InputError("recipe", repr(recipe), f"is a {type(found).__name__}, no Recipe", "Name a Recipe.")
-        return found
-    if recipe not in RECIPES:
-        raise unknown("recipe", recipe, RECIPES, "Or build a Recipe of your own.")
-    return RECIPES[recipe]
 
 
 def _build_network(map_file: Path, recipe: Recipe, out: Path) -> None:
@@ -200,7 +175,7 @@ def _build_network(map_file: Path, recipe: Recipe, out: Path) -> None:
         "offset.disable-normalization": "true",
         "opendrive.curve-resolution": 0.5,
         "junctions.internal-link-detail": 20,
-        "junctions.limit-turn-speed": recipe.turn_acceleration,
+        "junctions.limit-turn-speed": TURN_ACCELERATION,
         "tls.discard-loaded": "true",
         "tls.guess": str(recipe.lights).lower(),
         "tls.default-type": "actuated",
@@ -236,9 +211,6 @@ def _write_routes(recipe: Recipe, streets: Streets, length: dict[str, float], ou
     for vehicle in range(recipe.vehicles):
         if vehicle < len(recipe.tours):
             route = recipe.tours[vehicle].split()
-            if wrong := [edge for edge in route if edge not in length]:
-                hint = suggestion(wrong[0], length, "Take ids from the file netconvert writes.")
-                raise InputError("tours", wrong, "must be edges of the network", hint)
             route *= int(np.ceil(distance / sum(length[edge] for edge in route)))
         elif (vehicle - len(recipe.tours)) % recipe.platoon == 0:
             route = _walk(streets, length, distance, rng)
@@ -269,12 +241,12 @@ def _drive(recipe: Recipe, network: Path, routes: Path, out: Path) -> None:
         "net-file": network,
         "route-files": routes,
         "end": f"{recipe.duration:.3f}",
-        "step-length": recipe.dt,
+        "step-length": DT,
         "seed": recipe.seed,
         "precision": 6,
         "fcd-output": out,
         "fcd-output.attributes": "x,y,z,angle,slope,speed",
-        "device.fcd.begin": recipe.warmup,
+        "device.fcd.begin": WARMUP,
         "lanechange.duration": 3,
         "time-to-teleport": -1,
         "ignore-junction-blocker": 5,

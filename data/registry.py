@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,85 +14,70 @@ from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names, suggestion, unknown
 from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
 from coopoc.world.storage import is_recording, read_recording
-from coopoc.world.v2x import V2X
 
 from . import fleet_store
-from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table, write_tum
-from .fleet_store import Card
+from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
 from .graphs import read_graph_log
-from .log.links import under
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
-from .mrclam import read_mrclam, recording
+from .mrclam import MAX_GAP, read_mrclam
 from .source import parted, split
 
+FLEETS = Path(__file__).parent / "fleets"
 
-@dataclass(frozen=True)
-class Dataset:
-    """A bundled fleet: its file and its card.
 
-    >>> DATASETS["town10"].load()
+def card(name: str) -> dict[str, Any]:
+    """The card of a bundled fleet: provenance and statistics.
+
+    >>> card("town10")["neighbours"]["mean"] > 5
+    True
+    """
+    return fleet_store.card_of(FLEETS / f"{name}.npz")
+
+
+def bundled(name: str) -> Fleet:
+    """A bundled fleet, with name, source and licence of its card.
+
+    >>> bundled("town10")
     Fleet(town10: 60 vehicles x 900 steps, dt 0.1 s)
     """
-
-    path: Path
-
-    def card(self) -> Card:
-        """Provenance and statistics."""
-        return Card(**json.loads(self.path.with_suffix(".json").read_text()))
-
-    def load(self) -> Fleet:
-        """The fleet, with name, source and licence of its card."""
-        card = self.card()
-        fleet = fleet_store.load(self.path)
-        return replace(fleet, name=card.name, source=card.source, licence=card.map_licence)
+    made = card(name)
+    source = "simulated with SUMO {sumo} on CARLA's {map}, seed {recipe[seed]}, smoothed".format(**made)
+    fleet = fleet_store.load(FLEETS / f"{name}.npz")
+    return replace(fleet, name=made["name"], source=source, licence=made["map_licence"])
 
 
-FLEETS = Path(__file__).parent / "fleets"
-DATASETS: Mapping[str, Dataset] = {
-    name: Dataset(FLEETS / f"{name}.npz") for name in ("town04", "town10", "town10-clients", "town10-validation")
+DATASETS: Mapping[str, Callable[[], Fleet]] = {
+    "town04": partial(bundled, "town04"),
+    "town10": partial(bundled, "town10"),
+    "town10-clients": partial(bundled, "town10-clients"),
+    "town10-validation": partial(bundled, "town10-validation"),
 }
 """Bundled fleets; the names are written out so that a list of them imports nothing."""
 
 
-def _mrclam_log(path: Path, *, dt: float = 0.1, max_gap: float = 0.5) -> Log:
-    log = read_mrclam(path, dt=dt, max_gap=max_gap)
-    seen = recording(log, V2X(max_neighbours=max(len(log.fleet.ids) - 1, 0), radius=float("inf")))
-    counts = {
-        "landmarks (coopoc run real takes them)": len(log.sightings),
-        "robots without odometry, measurements or truth": log.absent,
-        "barcodes in no list": log.unknown,
-    }
-    refused = {f"measurements of {what}": (number, "") for what, number in counts.items() if number}
-    vehicles = dict.fromkeys(log.fleet.ids, "wheel odometry, range and bearing, Vicon")
-    read = {"measurements between robots": len(log.range)}
-    notes = {note: list[str]() for note in seen.notes}
-    summary = Summary(path.name, steps_in_words(seen), vehicles, read, refused, {}, notes)
-    return Log(seen, log.fleet, summary, False)
+def _mrclam_fleet(path: Path, *, dt: float = 0.1, max_gap: float = MAX_GAP) -> Fleet:
+    return read_mrclam(path, dt=dt, max_gap=max_gap).fleet
 
 
 def _stored_log(path: Path) -> Log:
-    seen, truth = read_recording(path)
-    vehicles, grid = dict.fromkeys(seen.ids, "recorded"), f"{steps_in_words(seen)}, {seen.runs} runs"
-    return Log(seen, truth, Summary(path.name, grid, vehicles, {"links": len(seen.links)}), True)
+    recording, truth = read_recording(path)
+    vehicles, grid = dict.fromkeys(recording.ids, "recorded"), f"{steps_in_words(recording)}, {recording.runs} runs"
+    return Log(recording, truth, Summary(path.name, grid, vehicles, {"links": len(recording.links)}), True)
 
 
-LOGS: Mapping[str, Callable[..., Log]] = {
-    "mrclam": _mrclam_log,
-    "pyfg": read_graph_log,
-    "recording": _stored_log,
-    "log": read_log,
-}
+LOGS: Mapping[str, Callable[..., Log]] = {"pyfg": read_graph_log, "recording": _stored_log, "log": read_log}
 """Formats of real measurements -> reader; one of several files or endings belongs to `log.read.READERS`."""
 DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "table": read_table,
     "tum": read_tum,
     "fcd": read_fcd,
     "fleet": lambda path: fleet_store.load(path, path.stem),
+    "mrclam": _mrclam_fleet,
 }
-"""Formats of drives -> reader."""
+"""Formats of drives -> reader; of MR.CLAM Vicon's truth, whose measurements `coopoc run real` takes."""
+ENDINGS = {".parquet": "table", ".csv": "table", ".xml": "fcd", ".npz": "fleet", ".tum": "tum", ".txt": "tum"}
 
 
 def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
@@ -102,7 +86,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     Args:
         name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
-            CSV, Parquet or Excel, TUM, SUMO FCD, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
+            CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
             (`load_log`). Options may stand behind a question mark, as in "drive.csv?dt=0.1&columns=t:time".
         format: one of DRIVES or LOGS, instead of the one found from name and contents.
         options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness; of all, since and
@@ -123,20 +107,17 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
         return made
     path = Path(name)
     if not path.exists():
-        known = names("coopoc.datasets")
-        allowed = f"must be one of {', '.join(known)} or the path of a file or folder"
-        hint = suggestion(name, known, "List the bundled fleets with coopoc data list, or check the path.")
+        registered = names("coopoc.datasets")
+        allowed = f"must be one of {', '.join(registered)} or the path of a file or folder"
+        hint = suggestion(name, registered, "List the bundled fleets with coopoc data list, or check the path.")
         raise InputError("data", repr(name), allowed, hint)
     chosen = chosen or detect(path, options.get("columns"))
-    if chosen in LOGS:
-        truth = _read(LOGS[chosen], path, options).truth
-        if truth is None:
-            hint = "Add a table truth.csv to its folder, pass truth=, or take co.load_recording."
-            raise InputError(path.name, "no truth", "is a log without one: there is nothing to score against", hint)
-    elif chosen in DRIVES:
-        truth = _read(DRIVES[chosen], path, options)
-    else:
+    if chosen not in DRIVES and chosen not in LOGS:
         raise unknown("format", chosen, (*DRIVES, *LOGS), "Or leave it out.")
+    truth = _read(DRIVES[chosen], path, options) if chosen in DRIVES else _read(LOGS[chosen], path, options).truth
+    if truth is None:
+        hint = "Add a table truth.csv to its folder, pass truth=, or take co.load_recording."
+        raise InputError(path.name, "no truth", "is a log without one: there is nothing to score against", hint)
     fleet: Fleet = parted(truth, **part)
     return fleet
 
@@ -145,33 +126,20 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
-        name_or_path: tables, NMEA and bags (`read_log`), an MR.CLAM folder, a PyFG file (in body frames), an .npz of
-            `save_recording`; options may stand behind a question mark, as in "drive?dt=0.1".
+        name_or_path: tables, NMEA and bags (`read_log`), a PyFG file (in body frames), an .npz of `save_recording`;
+            options may stand behind a question mark, as in "drive?dt=0.1".
         options: of the reader; of all, since and until, s after the first step, of the part that is kept.
 
     Raises:
         InputError: no such path, an unknown option, or a file with a fault.
     """
     name, options, part = _split(name_or_path, options)
-    log: Log = _read(LOGS.get(_real(Path(name)), read_log), Path(name), options)
+    kind = _real(Path(name))
+    if kind == "mrclam":
+        hint = "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam."
+        raise InputError("data", name, "is a folder of MR.CLAM, whose noise has to be calibrated first", hint)
+    log: Log = _read(LOGS.get(kind, read_log), Path(name), options)
     return log.part(**part)
-
-
-def recorder(name_or_path: str | Path) -> Callable[..., Recording] | None:
-    """For data with real measurements: (v2x, *, runs, seed) -> Recording; None where `observe` has to simulate them.
-
-    >>> recorder("town10") is None
-    True
-    """
-    chosen = kind_of(name_or_path)
-    if chosen not in LOGS:
-        return None
-    if chosen == "mrclam":  # the only one with a part that is simulated
-        name, options, part = _split(name_or_path, {})
-        log_of_all = _read(read_mrclam, Path(name), options)
-        return lambda *args, **draws: parted(recording(log_of_all, *args, **draws), **part)
-    log = load_log(name_or_path)
-    return partial(under, log.recording, logged=log.messages)
 
 
 def kind_of(name_or_path: str | Path) -> str:
@@ -196,14 +164,12 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     >>> detect(Path("drive.parquet"))
     'table'
     """
-    ending = {".parquet": "table", ".csv": "table", ".xlsx": "table", ".xml": "fcd", ".npz": "fleet"}
-    ending |= dict.fromkeys((".tum", ".txt"), "tum")
-    found = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ending.get(path.suffix))
-    if found is None:
-        endings = ".csv, .parquet, .tum, .txt, .xml, .xlsx, .nmea, .bag, .pyfg or .npz"
+    kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix))
+    if kind is None:
+        endings = ".csv, .parquet, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
         allowed = f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files"
         raise InputError("data", path.name, allowed, f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.")
-    return found
+    return kind
 
 
 def list_datasets() -> list[dict[str, Any]]:
@@ -213,7 +179,7 @@ def list_datasets() -> list[dict[str, Any]]:
     ['town04', 'town10']
     """
     columns = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
-    return [{name: getattr(dataset.card(), name) for name in columns} for dataset in DATASETS.values()]
+    return [{column: card(name)[column] for column in columns} for name in DATASETS]
 
 
 def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:
@@ -221,23 +187,23 @@ def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:
 
     Args:
         name_or_path: as in `load_fleet`.
-        out: .csv or .parquet file, or a folder (no suffix) for one TUM file per vehicle.
+        out: .csv or .parquet file.
         options: of the reader.
 
     Raises:
-        InputError: as `load_fleet`, another ending of `out`, or ids that are no file names for TUM.
+        InputError: as `load_fleet`, or another ending of `out`.
     """
     path = given_path(out)
-    if path.suffix not in (".csv", ".parquet", ""):
-        raise InputError("out", path.name, "must end in .csv or .parquet, or be a folder for TUM files", "Rename it.")
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError("out", path.name, "must end in .csv or .parquet", "Rename it.")
     fleet = load_fleet(name_or_path, **options)
     path.parent.mkdir(parents=True, exist_ok=True)
-    (write_table if path.suffix else write_tum)(fleet, path)
+    write_table(fleet, path)
     return fleet
 
 
 def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
-    """Format of real measurements, "" for anything else."""
+    """Format of measurements, "" for anything else."""
     if (path / "Barcodes.dat").is_file():
         return "mrclam"
     if path.suffix == ".npz":
@@ -257,20 +223,20 @@ def _split(name_or_path: str | Path, options: dict[str, Any]) -> tuple[str, dict
 
 def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
     """What a reader returns; InputError for an option that it does not have."""
-    known = [name for name in inspect.signature(read).parameters if name not in ("path", "folder")]
-    if "options" in known:
-        known[known.index("options") :] = ["dt", "max_gap", "any_scale"]
+    accepted = [name for name in inspect.signature(read).parameters if name != "path"]
+    if "options" in accepted:
+        accepted[accepted.index("options") :] = ["dt", "max_gap", "any_scale"]
     for name in options:
-        if name not in known:
-            raise unknown("option", name, known or ["(none)"], suggestion(name, known, "Leave it out."))
+        if name not in accepted:
+            raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
     if not path.exists():
         raise InputError("data", str(path), "must be the path of a file or folder", "Check the path.")
     return read(path, **options)
 
 
-def _made(found: Any, name: str) -> Fleet:
-    """A Fleet, what loads one as a Dataset does, or what makes one when it is called."""
-    fleet = found if isinstance(found, Fleet) else found.load() if hasattr(found, "load") else found()
+def _made(registered: Any, name: str) -> Fleet:
+    """A registered Fleet, or the one that a registered function returns."""
+    fleet = registered if isinstance(registered, Fleet) else registered()
     if not isinstance(fleet, Fleet):
         raise InputError("data", repr(name), f"gives a {type(fleet).__name__}, no Fleet", "Return coopoc.Fleet(...).")
     return fleet

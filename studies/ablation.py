@@ -47,7 +47,7 @@ def cell(p: Params) -> list[Row]:
     if p["choice"] in ("none", "noise_model"):
         return lineup.cell(p)
     value: Any = bool(p["value"]) if p["choice"] in FIELDS else int(p["value"])
-    options = {FIELDS.get(p["choice"], p["choice"]): value}
+    options: dict[str, Any] = {FIELDS.get(p["choice"], str(p["choice"])): value}
     return lineup.rows(p, made=[(None, find("coopoc.methods", p["method"])(lineup.noise_model(p), **options))])
 
 

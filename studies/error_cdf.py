@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Where, interval, listed, mean, present, ratio, seed_std, verdict
+from coopoc.study.numbers import Number, Where, interval, listed, mean, present, ratio, seed_std, verdict
 from coopoc.study.study import Params
 
 from . import lineup, scene, weights
@@ -50,7 +50,7 @@ def _relative(results: Results, where: Where) -> float | None:
     return ratio(_reduction(results, where), _reduction(results, {**where, **of("kalman", "fitted")}))
 
 
-COLUMNS = {
+COLUMNS: dict[str, Number] = {
     "RT-LE [m]": interval,
     "Seed std [m]": seed_std,
     "Maximum [m]": partial(interval, value="max_error_m"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING
 
-from coopoc.study.numbers import Where, interval, mean, ran, ratio, rms, seed_means, seed_std
+from coopoc.study.numbers import Number, Where, interval, mean, ran, ratio, rms, seed_means, seed_std
 from coopoc.study.style import look
 
 from . import lineup, scene
@@ -52,7 +52,7 @@ def times(results: Results, where: Where) -> float | None:
 
 def _table(at: Where) -> TableView:
     rows = [((look(m).label, known, text), of(m, known, **at)) for (m, known), text in ASSUMED.items()]
-    columns = {
+    columns: dict[str, Number] = {
         "RT-LE [m]": interval,
         "Seed std [m]": seed_std,
         f"× {_words(at)}": times,

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -14,7 +13,7 @@ import numpy as np
 from coopoc.arrays import Bools
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
-from coopoc.data.registry import kind_of, load_fleet, load_log, recorder
+from coopoc.data.registry import LOGS, kind_of, load_fleet, load_log
 from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
@@ -55,12 +54,12 @@ def fleet(data: str) -> Fleet:
 
 @lru_cache(maxsize=2)
 def _log(data: str) -> Log | None:
-    """The log of a name or a path that holds one; None for anything else, MR.CLAM included.
+    """The log of a name or a path that holds one; None for anything else.
 
     Raises:
         InputError: one in body frames.
     """
-    if kind_of(data) not in ("log", "pyfg", "recording"):
+    if kind_of(data) not in LOGS:
         return None
     log = load_log(data)
     if log.recording.body is not None:
@@ -71,20 +70,17 @@ def _log(data: str) -> Log | None:
 
 def is_real(data: str) -> bool:
     """True for data that holds real measurements between vehicles, which are not simulated."""
-    return _recorder(data) is not None
-
-
-@lru_cache(maxsize=4)
-def _recorder(data: str) -> Callable[..., Recording] | None:
-    log = _log(data)
-    return recorder(data) if log is None else partial(under, log.recording, logged=log.messages)
+    return _log(data) is not None
 
 
 @lru_cache(maxsize=4)
 def measured(data: str) -> Recording | None:
     """One run of real data with all that its vehicles measured of each other; None where that is simulated."""
-    real = _recorder(data)
-    return None if real is None else real(V2X(len(fleet(data).ids), radius=float("inf")), runs=1, seed=0)
+    log = _log(data)
+    if log is None:
+        return None
+    everything = V2X(len(fleet(data).ids), radius=float("inf"))
+    return under(log.recording, everything, runs=1, seed=0, logged=log.messages)
 
 
 @lru_cache(maxsize=4)
@@ -271,16 +267,9 @@ def facts(p: Params) -> Mapping[str, str]:
 
 @lru_cache(maxsize=4)
 def _digests(data: str) -> Mapping[str, str]:
-    real = measured(data)
-    if real is None:
-        return {"fleet": fleet(data).digest}
     log = _log(data)
-    if log is not None:
-        return {"fleet": fleet(data).digest, "recording": digest(log.recording)}
-    links, sha = real.links, hashlib.sha256(repr(real.sensors).encode())
-    for array in (real.gnss, real.velocity, real.relative, links.step, links.observer, links.neighbour):
-        sha.update(np.ascontiguousarray(array).tobytes())
-    return {"fleet": fleet(data).digest, "recording": sha.hexdigest()}
+    measurements = {} if log is None else {"recording": digest(log.recording)}
+    return {"fleet": fleet(data).digest, **measurements}
 
 
 def recording(p: Params) -> Recording:
@@ -301,7 +290,7 @@ def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
 def _recording(
     data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None
 ) -> Recording:
-    real = _recorder(data)
-    if real is not None:
-        return real(v2x, runs=runs, seed=seed)
+    log = _log(data)
+    if log is not None:
+        return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
     return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers)

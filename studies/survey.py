@@ -56,7 +56,8 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
-    from coopoc.data.registry import DATASETS
+    from coopoc.data.fleet_store import in_words
+    from coopoc.data.registry import DATASETS, card
 
     def answers(results: Mapping[str, Results]) -> dict[str, str]:
         return {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
@@ -71,7 +72,7 @@ def paper(
         answers,
         title="Collaborative training against collaborative decision",
         lead=[text.format(where=where) for text in LEAD],
-        cards={name: DATASETS[name].card().fields() for name in bundled},
+        cards={name: in_words(card(name)) for name in bundled},
     )
 
 

@@ -138,17 +138,6 @@ def test_a_reader_that_leaves_early_is_no_error(folder: Path, format: str) -> No
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_dry_run_counts(folder: Path) -> None:
-    plan = json.loads(coopoc("run", "small", "--set", "runs=3", "--dry-run", cwd=folder).stdout)
-    assert (plan["cells"], plan["finished"], plan["to_compute"]) == (9, 6, 3)
-
-
-def test_a_report(folder: Path) -> None:
-    done = coopoc("report", "runs/small", "--out", "r.html", cwd=folder)
-    assert done.stdout == "r.html\n"
-    assert (folder / "r.html").read_text().startswith("<!DOCTYPE html>")
-
-
 def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     done = coopoc("list", cwd=tmp_path)
     assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
@@ -177,50 +166,12 @@ def test_bad_usage_is_one_readable_line(
     assert out == ""
 
 
-def test_a_mistake_in_a_process_of_its_own(tmp_path: Path) -> None:
-    done = coopoc("run", "smal", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("coopoc: study = 'smal': must be one of")
-
-
-def test_an_unknown_option_is_usage(tmp_path: Path) -> None:
-    assert coopoc("run", "small", "--job", "2", cwd=tmp_path).returncode == 2
-
-
 def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("raise")
     done = coopoc("run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
     assert "coopoc: failed: FloatingPointError: the filter diverged at step 3 (max_neighbours = 1, met" in done.stderr
     assert "cells failed: 1, try them again with --retry-failed" in done.stderr
-
-
-@pytest.mark.slow
-def test_a_failed_cell_is_repeated_when_asked(tmp_path: Path) -> None:
-    (tmp_path / "trouble").write_text("raise")
-    words = ["run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}"]
-    coopoc(*words, cwd=tmp_path)
-    (tmp_path / "trouble").unlink()
-    assert json.loads(coopoc(*words, "--dry-run", cwd=tmp_path).stdout)["to_compute"] == 0
-    assert json.loads(coopoc(*words, "--dry-run", "--retry-failed", cwd=tmp_path).stdout)["to_compute"] == 1
-    assert coopoc(*words, "--retry-failed", cwd=tmp_path).returncode == 0
-
-
-@pytest.mark.slow
-def test_shards_are_merged_and_two_runs_compared(tmp_path: Path) -> None:
-    for index in (1, 2):
-        done = coopoc("run", "small", "--shard", f"{index}/2", "--out", f"m{index}", "--set", "runs=2", cwd=tmp_path)
-        assert (done.returncode, done.stdout) == (0, "")
-        assert f"coopoc: shard {index}/2 is in m{index}/small. When all shards are:" in done.stderr
-    done = coopoc("merge", "m1/small", "m2/small", "--out", "all", cwd=tmp_path)
-    assert done.stdout == "all/small\n"
-    assert "9 of 9 cells finished, 0 failed, 0 to compute. Tables: coopoc run small --out all" in done.stderr
-    assert "| Neighbours K" in coopoc("run", "small", "--out", "all", "--set", "runs=2", cwd=tmp_path).stdout
-    words = ["--value", "max_error_m", "--where", "method=kalman", "--format", "csv"]
-    done = coopoc("compare", "all/small", "m1/small", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("Neighbours K,Method,A,B,B - A,B - A low,B - A high,Change\n0,KF,")
-    assert "\n1,KF,finished,not computed\n" in done.stdout
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from coopoc.data import fleet_store as store
-from coopoc.data.registry import DATASETS, FLEETS, convert, detect, list_datasets, load_fleet
+from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, list_datasets, load_fleet
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
@@ -25,29 +25,29 @@ def test_the_four_fleets_are_bundled_in_less_than_4_mb() -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
-    fleet, card = load_fleet(name), DATASETS[name].card()
-    assert fleet.digest == card.sha256
-    assert (fleet.name, fleet.licence) == (name, card.map_licence)
-    assert card.map in fleet.source
-    assert str(card.recipe["seed"]) in fleet.source
-    assert card.fields()["sha256"] == card.sha256
+    fleet, stated = load_fleet(name), card(name)
+    assert fleet.digest == stated["sha256"]
+    assert (fleet.name, fleet.licence) == (name, stated["map_licence"])
+    assert stated["map"] in fleet.source
+    assert str(stated["recipe"]["seed"]) in fleet.source
+    assert store.facts(fleet) == {key: stated[key] for key in store.facts(fleet)}
 
 
 @pytest.mark.parametrize("name", ["town10", "town10-validation", "town04"])
 def test_card_counts_the_neighbours_that_a_kd_tree_finds(name: str) -> None:
     """Independent check: SciPy's cKDTree."""
-    fleet, card = load_fleet(name), DATASETS[name].card()
+    fleet = load_fleet(name)
     counts = np.array([[len(n) - 1 for n in cKDTree(x).query_ball_point(x, 30.0)] for x in fleet.position[::25]])
-    assert np.mean(np.minimum(counts, 10)) == pytest.approx(card.neighbours["mean"], rel=0.05)
+    assert np.mean(np.minimum(counts, 10)) == pytest.approx(card(name)["neighbours"]["mean"], rel=0.05)
 
 
 def test_town10_is_dense_and_urban() -> None:
-    fleet, card = load_fleet("town10"), DATASETS["town10"].card()
+    fleet, stated = load_fleet("town10"), card("town10")
     assert fleet.position.shape == (900, 60, 3)
     assert fleet.present.all()
-    assert 5 <= card.neighbours["mean"] <= 7
-    assert card.speed["max"] < 11.1
-    assert card.speed["standing"] < 0.3
+    assert 5 <= stated["neighbours"]["mean"] <= 7
+    assert stated["speed"]["max"] < 11.1
+    assert stated["speed"]["standing"] < 0.3
     path = np.linalg.norm(np.diff(fleet.position, axis=0), axis=2).sum(axis=0)
     assert path.min() > 90, "every vehicle drives, m in 90 s"
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +14,7 @@ import pytest
 from logs import drive
 
 import coopoc as co
+from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 
 
@@ -254,3 +255,31 @@ def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.bag").write_bytes(b"no bag")
     with pytest.raises(co.InputError, match=r"a\.bag = .*must be a ROS bag"):
         read_log(tmp_path / "a.bag")
+
+
+FOOT = 0.3048
+NMEA: dict[str, tuple[Callable[[list[str]], list[str]], str]] = {
+    "latitude and longitude swapped": (lambda w: [*w[:2], w[4], "N", w[2], "E", *w[6:]], "0 fixes"),
+    "decimal commas": (lambda w: [word.replace(".", ",") for word in w], "0 fixes"),
+    "degrees for degrees and minutes": (lambda w: [*w[:2], "34.375284", w[3], "108.899189", *w[5:]], "0 fixes"),
+}
+INVISIBLE: dict[str, Callable[[list[str]], list[str]]] = {
+    "S for N": lambda w: [*w[:3], "S", *w[4:]],
+    "heights in feet": lambda w: [*w[:9], f"{float(w[9]) / FOOT:.3f}", *w[10:]],
+}
+"""Fixes alone have nothing to be compared with: docs/your_data.md lists these."""
+
+
+@pytest.mark.parametrize("mistake", [*NMEA, *INVISIBLE, "none"])
+def test_a_mistake_in_nmea_of_a_receiver(shared: Path, tmp_path: Path, mistake: str) -> None:
+    """CATS, two receivers, two minutes; checksums are those of the changed sentences."""
+    change = NMEA[mistake][0] if mistake in NMEA else INVISIBLE.get(mistake, lambda words: words)
+    for name in ("AV_veh1", "AV_veh2"):
+        lines = (shared / "cats_nmea" / f"{name}.nmea").read_text().splitlines()[:1200]
+        changed = "".join(sentence(",".join(change(line[1:].partition("*")[0].split(",")))) for line in lines)
+        (tmp_path / f"{name}.nmea").write_text(changed)
+    if mistake in NMEA:
+        with pytest.raises(co.InputError, match=NMEA[mistake][1]):
+            read_log(tmp_path)
+    else:
+        assert all("smaller than stated" in warning for warning in check(read_log(tmp_path)).warnings)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import warnings
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ from coopoc.data.assemble import interpolate
 from coopoc.data.fleet_files import read_tum
 from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
+from coopoc.formats.trajectories import Trajectory, write_tum
 from coopoc.world.fleet import Fleet
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
@@ -29,13 +29,16 @@ def test_tables_come_back_bit_by_bit(tmp_path: Path, name: str, out: str) -> Non
 
 def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
     """Independent check: evo reads the file that we write (evo is a tool of the tests only)."""
+    fleet = load_fleet("town10-clients")
+    x = fleet.position[:1550, 0]
+    write_tum(Trajectory(fleet.t[:1550], x, np.tile(np.eye(3), (1550, 1, 1))), tmp_path / "car.tum")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface")
-        fleet = convert("town10-clients", tmp_path / "folder")
-        path = file_interface.read_tum_trajectory_file(str(tmp_path / "folder" / f"{fleet.ids[0]}.tum"))
-    np.testing.assert_array_equal(path.positions_xyz, fleet.position[:1550, 0])
+        path = file_interface.read_tum_trajectory_file(str(tmp_path / "car.tum"))
+    np.testing.assert_array_equal(path.positions_xyz, x)
     np.testing.assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
+    np.testing.assert_array_equal(load_fleet(tmp_path).position[:, 0], x)
 
 
 def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path: Path) -> None:
@@ -146,8 +149,8 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
         (FCD.replace('angle="0"', ""), "angle"),
         (FCD[:-9], "XML"),
         ("<a/>", "0 rows"),
-        (FCD.replace('"10.7"', '"ten"'), "vehicle e at time 0.10 s = 0.10 ten"),
-        (FCD.replace('"0.10"', '"nan"'), "vehicle e at time nan s"),
+        (FCD.replace('"10.7"', '"ten"'), "row 2, column x = ten"),
+        (FCD.replace('"0.10"', '"nan"'), "row 2, column t = nan"),
     ],
 )
 def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
@@ -180,8 +183,8 @@ def test_a_table_of_carla_is_a_right_handed_fleet(tmp_path: Path, order: str, le
     fleet = load_fleet("town10").between(0, 100).select(range(0, 60, 6))
     frame = carla(fleet, left, order)
     frame.to_csv(tmp_path / "carla.csv")
-    frame.to_excel(tmp_path / "locations.xlsx")
-    for name in ("carla.csv", "locations.xlsx"):
+    frame.to_parquet(tmp_path / "locations.parquet")
+    for name in ("carla.csv", "locations.parquet"):
         read = load_fleet(f"{tmp_path / name}?dt=0.1&handedness={'left' if left else 'right'}")
         np.testing.assert_allclose(read.position, fleet.position, atol=1e-9)
         np.testing.assert_allclose(read.velocity, fleet.velocity, atol=1e-9)
@@ -254,7 +257,6 @@ def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | Non
         ("a,0.1,1_0,0,0", r"row 2, column x = 1_0"),
         ("a,0.1,١,0,0", r"row 2, column x = ١"),
         ("a,0.1,1e308,0,0", r"row 2, column x = 1e\+308"),
-        (f"{'a' * 5000},0.1,1,0,0", r"row 2, column id = a+\.\.\.: must have at most 200 characters"),
     ],
 )
 def test_a_row_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:
@@ -290,23 +292,3 @@ def test_what_no_memory_holds_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"header = 'x' twice"):
         load_fleet(tmp_path / "b.csv")
     assert time.process_time() - began < 5.0
-
-
-@pytest.mark.parametrize("cell", ["XFD1048576", "A1048576"])
-def test_a_small_spreadsheet_does_not_claim_all_memory(tmp_path: Path, cell: str) -> None:
-    openpyxl = pytest.importorskip("openpyxl")
-    book = openpyxl.Workbook()
-    book.active.append(["id", "x"])
-    book.save(tmp_path / "a.xlsx")
-    with zipfile.ZipFile(tmp_path / "a.xlsx") as source, zipfile.ZipFile(tmp_path / "b.xlsx", "w") as target:
-        for part in source.namelist():
-            text = source.read(part)
-            if part.endswith("sheet1.xml"):
-                far = f'<row r="1048576"><c r="{cell}"><v>1</v></c></row></sheetData>'.encode()
-                text = text.replace(b'<dimension ref="A1:B1"', f'<dimension ref="A1:{cell}"'.encode())
-                text = text.replace(b"</sheetData>", far)
-            target.writestr(part, text)
-    began = time.process_time()
-    with pytest.raises(InputError, match=r"b\.xlsx"):
-        load_fleet(tmp_path / "b.xlsx")
-    assert time.process_time() - began < 8.0

@@ -14,7 +14,6 @@ from coopoc import (
     Fleet,
     InputError,
     JointFilter,
-    Kalman,
     Sensors,
     bound_rt_le,
     fleet_bound,
@@ -60,13 +59,6 @@ def test_drift_is_each_receivers_and_the_common_error_everyones() -> None:
     assert alike.std() == pytest.approx(2.0, rel=0.15)
     assert abs(np.corrcoef(apart[:, -1, 0, 0], apart[:, -1, 1, 0])[0, 1]) < 0.5
     np.testing.assert_allclose(alike[:, :, 0], alike[:, :, 1], atol=1e-12)
-
-
-def test_draws_of_white_noise_stay() -> None:
-    fleet = convoy()
-    np.testing.assert_array_equal(observe(fleet, WHITE, runs=2).velocity, observe(fleet, OWN, runs=2).velocity)
-    added = observe(fleet, OWN, runs=3).gnss - observe(fleet, WHITE, runs=3).gnss
-    np.testing.assert_allclose(added[:2], observe(fleet, OWN, runs=2).gnss - observe(fleet, WHITE, runs=2).gnss)
 
 
 def test_without_drift_it_is_the_joint_filter() -> None:
@@ -126,13 +118,6 @@ def test_neighbours_help_against_what_they_do_not_share() -> None:
     assert together[COMMON] > 0.9 * alone[COMMON]
     whole = fleet_bound(fleet, COMMON, V2X(3, 60.0))[:, 0]
     assert bound_rt_le(whole) <= together[COMMON] * (1 + 1e-9)
-
-
-def test_white_filters_take_the_whole_error_as_white() -> None:
-    known = NoiseModel.nominal(BOTH)
-    assert known.gnss_std == pytest.approx((np.sqrt(1.5**2 + 4 + 1),) * 3)
-    seen = observe(convoy(), BOTH, V2X(0), runs=20)
-    assert np.nanmean(nees(Kalman()(seen, [0]), convoy())) > 6  # and are far too sure of themselves
 
 
 def test_what_cannot_be_is_refused() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,7 @@ from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagatio
 from coopoc.world import sensing
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
-from coopoc.world.links import Links, spherical, wrap
-from coopoc.world.sensors import stream
+from coopoc.world.links import Links
 from coopoc.world.v2x import FIX_AND_VELOCITY, Message
 
 S2 = Sensors.paper_scenario2()
@@ -60,24 +58,6 @@ def test_neighbours_on_cell_borders_and_at_equal_distances_come_by_column() -> N
     assert assert_same_links(fleet, range(20), 3, 30.0) > 200
     assert assert_same_links(fleet, range(20), 10, np.hypot(30, 30)) > 300
     assert assert_same_links(fleet, range(20), 4, np.nextafter(30.0, 0)) == 0
-
-
-def test_blocks_of_steps_and_coarse_cells_change_nothing(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    far = replace(crossing, position=crossing.position * [5, 1, 1])
-    for fleet in (crossing, far):
-        monkeypatch.setattr(sensing, "PAIRS", 150)
-        assert assert_same_links(fleet, range(8), 3, 20.0) > 20
-
-
-def test_draws_are_those_of_their_streams(crossing: Fleet) -> None:
-    recording = observe(crossing, S2, V2X(max_neighbours=3), runs=2, seed=5)
-    links = recording.links
-    for link in (0, 100, len(links) - 1):
-        t, i, j = (int(a[link]) for a in (links.step, links.observer, links.neighbour))
-        draws = stream(5, "relative", 1, crossing.ids[i], crossing.ids[j]).standard_normal((t + 1, 3))
-        d, az, inc = spherical(*(crossing.position[t, j] - crossing.position[t, i]))
-        wanted = np.array([d, az, inc]) + draws[t] * S2.relative_std
-        assert recording.relative[1, link] == pytest.approx([abs(wanted[0]), wrap(wanted[1]), wanted[2]], abs=1e-12)
 
 
 def test_bytes_have_closed_forms() -> None:

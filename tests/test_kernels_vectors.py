@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
@@ -124,12 +123,3 @@ def test_angles_side_by_side_are_those_of_atan2() -> None:
         out = np.empty(4)
         call(np.sin(turns), np.cos(turns), out)
         np.testing.assert_allclose(out, turns, rtol=1e-15)
-
-
-def test_sine_and_cosine_are_those_of_the_library() -> None:
-    from coopoc.kernels.stars.relative import sine_and_cosine
-
-    turns = np.concatenate([np.linspace(-7, 7, 2001), np.linspace(-1e4, 1e4, 301), np.arange(-8, 9) * math.pi / 4])
-    for turn in turns:
-        assert sine_and_cosine(turn) == pytest.approx((math.sin(turn), math.cos(turn)), rel=4e-16, abs=1e-300)
-    assert np.isnan(sine_and_cosine(np.nan)).all()

@@ -27,7 +27,6 @@ KNOWN = {"nominal": "nominal", "identity": "identity", "fitted": NoiseModel("fit
 METHODS = {
     "gbp": GaussianBeliefPropagation,
     "gbp-damped": lambda known: GaussianBeliefPropagation(known, rounds=2, damping=0.4),
-    "gbp-belief": lambda known: GaussianBeliefPropagation(known, rounds=2, carry="belief"),
     "admm": lambda known: ConsensusADMM(known, rounds=2, rho=0.7),
     "central-filter": CentralFilter,
     "batch-smoother": lambda known: BatchSmoother(known, exact_steps=12, settle=1e-9),
@@ -74,7 +73,7 @@ def compare(name: str, known: str | NoiseModel, recording: Recording, near: floa
     for run in range(recording.runs):
         one = Drive(recording, noise, met, arrival[run], run)
         if name.startswith("gbp"):
-            x, P = gbp(one, method.rounds, method.damping, method.carry)
+            x, P = gbp(one, method.rounds, method.damping)
         elif name == "admm":
             x, P = admm(one, method.rounds, method.rho)
         elif name == "central-filter":

@@ -136,16 +136,6 @@ def test_zero_noise_gives_zero_error(method, crossing: Fleet) -> None:
     assert worst < 1e-5
 
 
-@pytest.mark.parametrize("method", METHODS, ids=label)
-def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> None:
-    budget = V2X(max_neighbours=4, loss=0.2, latency=0.1)
-    fleet = brief(method, crossing)
-    many = method(observe(fleet, S2, budget, runs=3), [0]).x
-    assert method(observe(fleet, S2, budget, runs=1), [0]).x == pytest.approx(many[:1], abs=1e-7)
-    short = method(observe(fleet.between(0, 8), S2, budget, runs=3), [0]).x
-    assert short == pytest.approx(many[:, :8], abs=1e-7)
-
-
 @pytest.mark.parametrize("channel", [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0)], ids=["alone", "deaf"])
 @pytest.mark.parametrize("method", METHODS, ids=label)
 def test_without_messages_it_is_the_solo_method(method, channel: V2X, crossing: Fleet) -> None:

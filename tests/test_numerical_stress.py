@@ -187,13 +187,6 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 
 
-def test_usual_sensors_are_assumed_as_stated() -> None:
-    for sensors in (co.Sensors(), co.Sensors.paper_scenario2(), co.Sensors(range_std=0.3, azimuth_std=0.05)):
-        seen = observed(in_line(4, 10.0), sensors)
-        assert not co.JointFilter()(seen, [0]).notes
-    assert not co.JointFilter()(without_azimuth(observed(in_line(4, 10.0), co.Sensors())), [0]).notes
-
-
 def test_ranges_that_noise_reflects_at_zero_are_noted() -> None:
     seen = observed(in_line(4, 10.0), co.Sensors(range_std=1e3))
     assert any("none is negative" in note for note in co.JointFilter()(seen, [0]).notes)

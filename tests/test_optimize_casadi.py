@@ -12,15 +12,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from coopoc import V2X, Fleet, InputError, Sensors, observe
-from coopoc.optimize import Loss, Problem, Status, solve, solve_batch
-from coopoc.optimize.backends import casadi as casadi_backend
-from coopoc.optimize.backends.casadi import DENSE, programme
+from coopoc.optimize import Loss, Problem, Status, solve
+from coopoc.optimize.backends.casadi import programme
 from coopoc.optimize.graphs import Objective, from_graph
 from coopoc.optimize.model.symbolic import _chart
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.recording import Recording
 
-METHODS = ["auto", "fatrop", "ipopt"]
 ROBUST = [Loss("huber", 1.0), Loss("cauchy", 2.0), Loss("geman-mcclure", 3.0)]
 
 
@@ -64,11 +62,10 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("case", CASES)
-def test_it_ends_where_gauss_newton_ends(dense: Recording, case: str, method: str) -> None:
+def test_it_ends_where_gauss_newton_ends(dense: Recording, case: str) -> None:
     problem = CASES[case](dense)
-    ours, theirs = solve(problem), solve(problem, "casadi", method=method)
+    ours, theirs = solve(problem), solve(problem, "casadi")
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)
     assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-6)
@@ -80,15 +77,14 @@ def test_it_ends_where_gauss_newton_ends(dense: Recording, case: str, method: st
     assert theirs.extras["rounds"] == (2 if problem.poses else 1)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
+def test_a_structure_is_built_once(dense: Recording) -> None:
     programme.cache_clear()
     for run in (0, 1):
         for step in (3, 10):
-            solve(Problem.from_snapshot(dense, step, 0, run), "casadi", method=method)
+            solve(Problem.from_snapshot(dense, step, 0, run), "casadi")
     assert programme.cache_info()[:2] == (3, 1)
     problem = Problem.from_snapshot(dense, 3, 0)
-    solve(replace(problem, x0=solve(problem).x + 0.1), "casadi", method=method)
+    solve(replace(problem, x0=solve(problem).x + 0.1), "casadi")
     assert programme.cache_info()[:2] == (4, 1)
     for other in (
         robust(problem, ROBUST[0]),
@@ -96,22 +92,19 @@ def test_a_structure_is_built_once(dense: Recording, method: str) -> None:
         replace(problem, x0=solve(problem).x, fixed=(1,)),
     ):
         before = programme.cache_info().misses
-        solve(other, "casadi", method=method)
+        solve(other, "casadi")
         assert programme.cache_info().misses == before + 1
 
 
 @pytest.mark.parametrize("start", [None, 20.0])
-def test_ranges_end_where_ipopt_and_scipy_end(start: float | None) -> None:
-    """From the linear start and from 20 m off; SciPy's trust region may go elsewhere from there, ipopt may not."""
+def test_ranges_end_where_scipy_ends(start: float | None) -> None:
+    """From the linear start and from 20 m off; SciPy's trust region may go elsewhere from there."""
     for seed in range(12):
         problem, rng = ranges_only(seed), np.random.default_rng(seed)
         if start is not None:
             problem = replace(problem, x0=problem.factors[0].z + rng.normal(0, start, (9, 3)))
-        found, ipopt = solve(problem, "casadi"), solve(problem, "casadi", method="ipopt")
-        assert found.extras["method"] == "fatrop"
-        assert "failed_first" not in found.extras
-        assert found.cost == pytest.approx(ipopt.cost, rel=1e-9)
-        assert found.x == pytest.approx(ipopt.x, abs=1e-6)
+        found = solve(problem, "casadi")
+        assert found.status is Status.SOLVED
         if start is None:
             scipys = least_squares(
                 lambda v, p=problem: p.whiten(v.reshape(9, 3))[0],
@@ -123,43 +116,9 @@ def test_ranges_end_where_ipopt_and_scipy_end(start: float | None) -> None:
             assert found.cost == pytest.approx(scipys.cost, rel=1e-9)
 
 
-def test_inequalities_and_many_numbers_are_ipopts(dense: Recording) -> None:
-    problem = ranges_only(0)
-    equal = problem.constrain("range", ("a", "b"), lower=12.0, upper=12.0)
-    long = Problem.from_window(dense, 20, 0, 1 + DENSE // 33)
-    for case, method in (
-        (problem, "fatrop"),
-        (equal, "fatrop"),
-        (long, "ipopt"),
-        (problem.constrain("range", ("a", "b"), upper=12.0), "ipopt"),
-    ):
-        solution = solve(case, "casadi")
-        assert solution.status is Status.SOLVED
-        assert solution.extras["method"] == method
-    with pytest.raises(InputError, match=r"fatrop.*does not hold inequalities"):
-        solve(problem.constrain("range", ("a", "b"), upper=12.0), "casadi", method="fatrop")
-
-
-def test_an_answer_that_is_none_is_found_out(monkeypatch: pytest.MonkeyPatch, dense: Recording) -> None:
-    """A solver that is content with any gradient: ipopt takes over, one by one and in a batch."""
-    monkeypatch.setitem(casadi_backend.FATROP, "tolerance", 1e6)
-    programme.cache_clear()
-    stars = Problem.from_snapshot(dense, 10, 0, run=None)
-    problem = stars.pick(1)
-    found, batch, best = solve(problem, "casadi"), solve_batch(stars, "casadi"), solve_batch(stars)
-    programme.cache_clear()
-    assert found.extras["failed_first"] == "fatrop: FAILED"
-    assert found.x == pytest.approx(solve(problem).x, abs=1e-6)
-    assert batch.again.all()
-    assert not best.again.any()
-    assert batch.converged.all()
-    assert batch.x == pytest.approx(best.x, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"method": "snopt"}, "must be one of"),
         ({"max_iterations": -1}, "must be a whole number"),
         ({"tolerance": 0}, "must be a number > 0"),
     ],

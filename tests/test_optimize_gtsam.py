@@ -63,9 +63,7 @@ def natives(d: int) -> dict[str, tuple]:
     found = {
         "position": ("position", [("a",), ("d",)], {"cov": np.stack([spd(d), 2 * spd(d)])}, True),
         "displacement of points": ("displacement", [("d", "e")], {"cov": spd(d)}, True),
-        "displacement of poses": ("displacement", BETWEEN, {"cov": spd(d)}, True),
         "range": ("range", PAIRS, {"std": 0.3}, True),
-        "speed": ("speed", PAIRS, {"std": 0.3}, True),
         "relative position": ("relative_position", BETWEEN, {"std": 0.3}, True),
         "relative pose": ("relative_pose", BETWEEN, {"cov": apart(0.09 * np.eye(d), turn)}, False),
         "relative pose log": ("relative_pose_log", BETWEEN, {"cov": spd(3 * d - 3, 0.01)}, True),
@@ -229,12 +227,11 @@ CASES: dict[str, Callable[[Fleet], Problem]] = {
 }
 
 
-@pytest.mark.parametrize("optimizer", ["auto", "elimination"])
 @pytest.mark.parametrize("case", CASES)
-def test_optimizers_find_the_minimum_of_gauss_newton(formation: Fleet, case: str, optimizer: str) -> None:
+def test_optimizers_find_the_minimum_of_gauss_newton(formation: Fleet, case: str) -> None:
     """Cost to 1e-9, estimates and covariances to 1e-6, before any refinement of ours."""
     problem = CASES[case](formation)
-    ours, theirs = solve(problem), solve(problem, "gtsam", optimizer=optimizer)
+    ours, theirs = solve(problem), solve(problem, "gtsam")
     assert theirs.status is Status.SOLVED
     assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
     assert theirs.x == pytest.approx(ours.x, abs=1e-6)
@@ -344,21 +341,6 @@ def test_an_endless_lag_is_the_whole_problem() -> None:
     every = smoother.estimate(problem.names)
     assert every.x == pytest.approx(whole.x, abs=1e-6)
     assert every.covariance == pytest.approx(whole.covariance, rel=0.05, abs=1e-3)  # their chord's J^T J, not ours
-
-
-def test_a_short_lag_keeps_landmarks_and_comes_near_the_whole() -> None:
-    problem = plane(odometry=(0.1, 0.05, 0.02))  # not GTSAM's: linearised once, when it comes
-    problem = problem.add("position", 16, problem.x0[16, :2], std=3.0)
-    whole, smoother, blind = solve(problem), FixedLag(2.5), FixedLag(2.5)
-    for piece, stamps in pieces(problem, 8):
-        old = np.isin(piece.names, list(blind.stamps))
-        elsewhere = np.where(old[:, None], pose([99.0, -99.0], 1.0), piece.x0)
-        newest = smoother.update(piece, stamps, tuple(stamps))
-        same = blind.update(replace(piece, x0=elsewhere), stamps, tuple(stamps))
-        assert same.x == pytest.approx(newest.x, abs=1e-12)
-    assert set(smoother.stamps) == {"5", "6", "7", "13", "14", "15", "16"}
-    gap = np.abs(newest.x[:, :2] - whole.position[[7, 15, 16]]).max(axis=1)
-    assert (gap < 0.25 * np.sqrt(whole.covariance[[7, 15, 16], 0, 0])).all()
 
 
 def test_points_and_poses_in_space_are_linearised_in_gtsams_directions() -> None:

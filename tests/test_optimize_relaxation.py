@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from coopoc import InputError
 from coopoc.arrays import Floats
-from coopoc.optimize import Problem, Solution, Status, pose, solve
+from coopoc.optimize import Problem, Solution, Status, solve
 from coopoc.optimize.convex import certify, newton, shor, staircase
 from coopoc.optimize.convex.newton import Reduced
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
@@ -341,49 +341,6 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
         start, jacobian = rng.uniform(-20, 20, 12), lambda y: problem.whiten(y.reshape(6, 2))[1].toarray()
         found = least_squares(lambda y: problem.whiten(y.reshape(6, 2))[0], start, jac=jacobian)
         assert found.cost >= verdict.lower_bound * (1 - 1e-9)
-
-
-def ring(steps: int, d: int, seed: int = 0) -> Problem:
-    """Poses around a loop with its closure, and ranges across it; more than DENSE constrained rows for many steps."""
-    rng = np.random.default_rng(seed)
-    angle = 2 * np.pi * np.arange(steps) / steps
-    at = np.zeros((steps, d))
-    at[:, :2] = 0.2 * steps * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    truth = pose(at, angle if d == 2 else np.stack([0 * angle, 0 * angle, angle], axis=1))
-    names = tuple(f"x{k}" for k in range(steps))
-    problem = Problem(names, x0=truth, dimension=d, poses=names, fixed=(0,))  # type: ignore[arg-type]
-    pairs = [(k, (k + 1) % steps) for k in range(steps)]
-    turned = truth[:, d:].reshape(-1, d, d)
-    z = np.array([np.concatenate([turned[i].T @ (at[j] - at[i]), (turned[i].T @ turned[j]).ravel()]) for i, j in pairs])
-    z[:, :d] += 0.02 * rng.standard_normal((steps, d))
-    problem = problem.add("relative_pose_chordal", pairs, z, [0.02] * d + [0.01] * d * d)
-    across = [(k, (k + steps // 2) % steps) for k in range(0, steps // 2, 5)]
-    ranges = [np.linalg.norm(at[i] - at[j]) + 0.1 * rng.standard_normal() for i, j in across]
-    return problem.add("range", across, np.abs(ranges)[:, None], 0.1)
-
-
-@pytest.mark.parametrize(("steps", "d"), [(12, 3), (40, 2), (260, 2)])
-def test_loops_of_poses_are_certified(steps: int, d: int) -> None:
-    problem = ring(steps, d)
-    solution = solve(problem)
-    verdict = certify(problem, solution)
-    assert verdict.certified, str(verdict)
-    assert (quadratic(problem).bound > newton.DENSE) == (steps == 260)
-
-
-def test_a_loop_wound_the_wrong_way_is_refused() -> None:
-    """Started with every heading turned by one more revolution around the loop: a local minimum of pose graphs."""
-    steps = 24
-    problem = ring(steps, 2)
-    assert problem.x0 is not None
-    lap = 2 * np.pi * np.arange(steps) / steps
-    wound = pose(problem.x0[:, :2] * 0.2, 2 * lap)
-    wound[0] = problem.x0[0]
-    local = solve(replace(problem, x0=wound), throw=False)
-    best = solve(problem)
-    assert certify(problem, best).certified
-    assert local.cost > 10 * best.cost
-    assert not certify(problem, local).certified
 
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "range_only.py"

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import json
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +16,7 @@ import coopoc as co
 from coopoc.data.commands import check as data_check
 from coopoc.data.graphs import graph_recording
 from coopoc.data.registry import load_log
+from coopoc.formats.g2o import write_g2o
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.body_frames import body_motion
 
@@ -86,3 +91,39 @@ def test_points_and_poses_of_others_are_ranges_and_bearings(shared: Path) -> Non
     log = load_log(shared / "pyfg" / "mrclam6.pyfg")
     assert log.summary.read == {"ranges": 16381, "bearings": 12905}
     assert sum(number for number, _ in log.summary.refused.values()) == 13121 + 3537 - 16381
+
+
+def without_stamps(part: Any) -> Any:
+    """A graph as g2o can hold it."""
+    if not is_dataclass(part):
+        return part
+    changes = {f.name: without_stamps(getattr(part, f.name)) for f in fields(part)}
+    if isinstance(changes.get("stamps"), np.ndarray):
+        changes["stamps"] = np.full_like(changes["stamps"], np.nan)
+    return replace(part, **changes)  # type: ignore[type-var]
+
+
+def inverted(line: str) -> str:
+    """An edge of poses in the plane with the covariance in the place of the information."""
+    words = line.split()
+    if words[0] == "EDGE_SE2":
+        matrix = np.zeros((3, 3))
+        matrix[np.triu_indices(3)] = [float(word) for word in words[6:12]]
+        covariance = np.linalg.inv(matrix + np.triu(matrix, 1).T)
+        words[6:12] = [f"{value:.12g}" for value in covariance[np.triu_indices(3)]]
+    return " ".join(words)
+
+
+def test_covariances_for_information_are_named_where_a_graph_is_solved(shared: Path, tmp_path: Path) -> None:
+    write_g2o(without_stamps(read_pyfg(shared / "pyfg" / "mrclam5a.pyfg")), tmp_path / "right.g2o")
+    lines = (tmp_path / "right.g2o").read_text().splitlines()
+    (tmp_path / "wrong.g2o").write_text("\n".join(map(inverted, lines)) + "\n")
+    found = {}
+    for name in ("right", "wrong"):
+        command = [sys.executable, "-m", "coopoc.cli", "solve", f"{name}.g2o", "--objective", "geodesic"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        found[name] = json.loads(done.stdout)["misfit"], "covariances where the format has information" in done.stderr
+    assert 0.1 < found["right"][0] < 1.0
+    assert not found["right"][1]
+    assert found["wrong"][0] < 1 / 30
+    assert found["wrong"][1]

@@ -101,14 +101,6 @@ def _shown(page: Any) -> list[str]:
     return [panel.get_attribute("data-noise_model") for panel in page.locator(".panel").all() if panel.is_visible()]
 
 
-def test_a_row_under_the_pointer_is_marked(page: Any) -> None:
-    cell = page.locator("#small-table-rt_le tbody td").first
-    color = "cell => getComputedStyle(cell).backgroundColor"
-    before = cell.evaluate(color)
-    cell.hover()
-    assert cell.evaluate(color) != before
-
-
 @pytest.mark.parametrize(
     ("title", "upwards", "downwards"),
     [
@@ -177,13 +169,6 @@ def test_a_figure_can_be_enlarged_on_a_phone(page: Any) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     figure.get_by_role("button", name="Fit").click()
     assert figure.locator("img").bounding_box()["width"] == fits
-
-
-def test_the_contents_stay_in_sight_on_a_wide_screen(page: Any) -> None:
-    page.evaluate("document.getElementById('data').scrollIntoView({behavior: 'instant'})")
-    page.wait_for_function("document.querySelector('nav [aria-current]')")
-    top = page.locator("nav").bounding_box()["y"]
-    assert (top >= 0) == (page.viewport_size["width"] > 1200)
 
 
 def test_without_javascript_everything_is_there(browser: Any, page_file: Path) -> None:

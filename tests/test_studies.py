@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -264,40 +262,3 @@ def test_mistakes_end_with_a_sentence_and_status_2(arguments: list[str], words: 
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_real_measurements_run_and_say_what_is_simulated(shared: Path, tmp_path: Path) -> None:
-    """MR.CLAM set 6: K <= 4, real range and bearing, labels on every table, no bound; what was fitted elsewhere."""
-    results = run_study(
-        study(
-            "neighbours",
-            data=str(shared / "mrclam" / "MRCLAM_Dataset6"),
-            method="gnss,kalman,joint,bound",
-            max_neighbours="0,4",
-            runs=2,
-            egos="2",
-            weights=str(tmp_path / "weights"),
-        ),
-        out=tmp_path,
-        progress=False,
-    )
-    assert results.frame["max_neighbours"].max() == 4
-    assert "bound" not in set(results.frame["method"])
-    kalman = results.interval("rt_le_m", method="kalman", noise_model="nominal", max_neighbours=0)
-    joint = results.interval("rt_le_m", method="joint", noise_model="nominal", max_neighbours=4)
-    assert joint.mean < kalman.mean < 0.12
-    shown = published(tmp_path / "neighbours")
-    assert all("GNSS is simulated" in view["caption"] for view in shown["tables"])
-
-
-def test_another_measurement_between_robots_is_another_cell(shared: Path, tmp_path: Path) -> None:
-    """The truth stays as it is and so does the fleet; what a robot measured does not."""
-    folder = shutil.copytree(shared / "mrclam" / "MRCLAM_Dataset6", tmp_path / "MRCLAM_Dataset6")
-    p = {**study("error_cdf", data=str(folder), egos="1").settings, "scenario": 1, "velocity_ratio": 0.15}
-    before, file = scene.facts(p), folder / "Robot1_Measurement.dat"
-    file.write_text(re.sub(r"([0-9.]+)(\s+\S+\s*)$", r"9\1\2", file.read_text(), count=1, flags=re.M))
-    for cached in (scene.fleet, scene._recorder, scene.measured, scene._digests):
-        cached.cache_clear()
-    after = scene.facts(p)
-    assert after["fleet"] == before["fleet"]
-    assert after["recording"] != before["recording"]

@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from coopoc.errors import InputError, MissingLibraryError
+from coopoc.errors import InputError
 from coopoc.study.compute import WorkerDiedError
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Study
@@ -164,10 +164,3 @@ def test_a_cluster_that_cannot_compute_is_named_before_any_work(
     end(several)
     worker(PYTHONPATH="")
     refused("that cannot load the study .*small_study.*Install the same coopoc")
-
-
-def test_dask_is_asked_for_only_by_who_needs_it(study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingLibraryError, match=r"--cluster needs dask.*pip install 'coopoc\[cluster\]'"):
-        run_study(study, tmp_path, progress=False, cluster="tcp://127.0.0.1:8786")
-    assert run_study(study, tmp_path, progress=False).failed == 0

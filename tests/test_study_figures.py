@@ -106,13 +106,6 @@ def test_facets_are_panels_of_one_scale_and_the_caption_names_the_selection(resu
     assert "at Noise model = identity or fitted, Method = KF." in plot.caption
 
 
-def test_knowledge_is_told_by_the_line_style(results: Results) -> None:
-    axes = figures.sweep(results, "max_neighbours", where={"method": "kalman"}).figure.axes[0]
-    assert len({line.get_linestyle() for line in axes.lines}) == 2
-    assert {line.get_color() for line in axes.lines} == {look("kalman").color}
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["KF", "identity", "fitted"]
-
-
 def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
     axes = figures.cdf(results, where={"max_neighbours": 2, "method": "joint"}).figure.axes[0]
     curve, mark = axes.lines

@@ -15,7 +15,6 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.manifest import read
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Params, Row, Study
 
@@ -148,15 +147,6 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
     assert not list((tmp_path / "small").glob("failed/*"))
     run_study(study, tmp_path / "whole", progress=False)
     assert views(tmp_path / "small") == views(tmp_path / "whole/small")
-
-
-def test_a_manifest_survives_whoever_is_killed_while_writing_it(study: Study, tmp_path: Path) -> None:
-    run_study(study, tmp_path, progress=False)
-    left = tmp_path / "small" / ".manifest.json.abc.part"
-    left.write_text('{"half": ')
-    assert read(tmp_path / "small").study == "small"
-    run_study(study, tmp_path, progress=False)
-    assert not left.exists()
 
 
 def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(study: Study, tmp_path: Path) -> None:

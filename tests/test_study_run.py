@@ -14,7 +14,7 @@ import pytest
 
 from coopoc.errors import InputError
 from coopoc.study import store
-from coopoc.study.compute import WorkerDiedError, compute, schedule
+from coopoc.study.compute import WorkerDiedError, schedule
 from coopoc.study.publish import views
 from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
@@ -126,24 +126,6 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     assert len(second.frame) == 9 * 2 * 4
     assert not list((tmp_path / "small/failed").iterdir())
     assert {name: files(tmp_path / "small")[name] for name in finished} == finished
-
-
-def test_a_plan_says_what_becomes_of_failed_cells(study: Study, tmp_path: Path) -> None:
-    trouble = tmp_path / "trouble"
-    trouble.write_text("raise")
-    run_study(study, tmp_path, settings={"trouble": str(trouble), "max_neighbours": "0,1"}, progress=False)
-    left = plan(study, tmp_path, {"trouble": str(trouble)})
-    again = plan(study, tmp_path, {"trouble": str(trouble)}, retry_failed=True)
-    for found, todo in ((left, 3), (again, 4)):
-        assert (found["cells"], found["finished"], found["failed_before"], found["to_compute"]) == (9, 5, 1, todo)
-        assert found["failures"] == [
-            {
-                "max_neighbours": 1,
-                "method": "kalman",
-                "repeated": found is again,
-                "reason": "FloatingPointError: the filter diverged at step 3",
-            }
-        ]
 
 
 def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, tmp_path: Path) -> None:
@@ -273,18 +255,6 @@ def test_two_runs_do_not_share_a_folder(study: Study, tmp_path: Path) -> None:
     assert run_study(study, tmp_path, settings={"runs": 2}, progress=False).failed == 0
 
 
-def test_the_damaged_row_of_a_failure_hides_nothing(study: Study, tmp_path: Path) -> None:
-    trouble = tmp_path / "trouble"
-    trouble.write_text("raise")
-    run_study(study, tmp_path, settings={"trouble": str(trouble)}, progress=False)
-    next((tmp_path / "small/failed").iterdir()).write_bytes(b"")
-    with pytest.warns(RuntimeWarning, match="damaged and will be computed again"):
-        found = Results.load(tmp_path / "small")
-    assert (found.failed, found.pending, len(found.frame)) == (0, 1, 8 * 2 * 4)
-    with pytest.warns(RuntimeWarning, match="damaged"):
-        assert plan(study, tmp_path, {"trouble": str(trouble)})["to_compute"] == 1
-
-
 @pytest.mark.parametrize("name", ["manifest.json", "views.json"])
 def test_a_damaged_description_is_named_and_mended_by_the_next_run(study: Study, tmp_path: Path, name: str) -> None:
     run_study(study, tmp_path, progress=False)
@@ -304,17 +274,3 @@ def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study: Stud
     run_study(study, tmp_path, progress=False)
     left = {path.name for path in (tmp_path / "small/tables").iterdir()}
     assert left == {"rt_le.md", "rt_le.csv", "rt_le.tex", "rt_le.html", "mine.md"}
-
-
-def test_results_of_a_folder_that_holds_none(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"holds no manifest\.json"):
-        Results.load(tmp_path)
-
-
-@pytest.mark.slow
-def test_a_worker_may_hold_a_large_recording(study: Study) -> None:
-    """loky would end a worker that has grown by 300 MB, and what it holds for the next cell would be made again."""
-    grow = importlib.import_module("small_study").grow
-    cells = Study("large", "What?", grow, {"x": tuple(range(6))}).cells()
-    rows = [row for outcome in compute(grow, cells, 2) for row in outcome.rows.to_pylist()]
-    assert len({row["process"] for row in rows}) <= 2

@@ -12,7 +12,7 @@ import pytest
 from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.compute import part_of
-from coopoc.study.manifest import Manifest, locked, read
+from coopoc.study.manifest import Manifest, locked
 from coopoc.study.merge import merge
 from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
@@ -113,16 +113,6 @@ def test_who_else_may_come_in_while_a_shard_is_at_work(study: Study, tmp_path: P
     assert Results.load(folder).pending == 6
 
 
-def test_a_shard_speaks_of_its_own_cells(study: Study, tmp_path: Path) -> None:
-    trouble = tmp_path / "trouble"
-    trouble.write_text("raise")
-    changes = {"trouble": str(trouble)}
-    assert plan(study, tmp_path, changes, shard="2/3")["cells"] == 3
-    parts = [run_study(study, tmp_path, settings=changes, progress=False, shard=f"{i}/3") for i in (1, 2, 3)]
-    assert [part.failed for part in parts] == [0, 1, 0]
-    assert run_study(study, tmp_path, settings=changes, progress=False).failed == 1
-
-
 def test_folders_of_several_machines_merge_to_the_tables_of_one_run(study: Study, tmp_path: Path) -> None:
     run_study(study, tmp_path / "whole", progress=False)
     for index in (1, 2, 3):
@@ -181,17 +171,6 @@ def test_a_cell_with_two_sets_of_numbers_is_named(study: Study, tmp_path: Path) 
         merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "all")
     kept = store.load(tmp_path / "all/small", cell.name)
     assert kept.equals(store.load(tmp_path / "a/small", cell.name))
-
-
-def test_every_environment_that_worked_on_the_same_cells_is_named(
-    study: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    here = run_study(study, tmp_path, progress=False, shard="1/3").environment
-    monkeypatch.setattr("coopoc.study.run.environment", lambda: {**here, "processor": "another one"})
-    run_study(study, tmp_path, progress=False, shard="2/3")
-    assert read(tmp_path / "small").environment["processor"] == f"{here['processor']}; another one"
-    assert read(tmp_path / "small").environment["python"] == here["python"]
-    assert run_study(study, tmp_path, settings={"runs": 2}, progress=False).environment["processor"] == "another one"
 
 
 @pytest.mark.slow

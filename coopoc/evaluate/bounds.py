@@ -236,7 +236,7 @@ def pose_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints
     own, d = _own(sensors, lasting), 4 + len(lasting)
     prior = np.concatenate([[0, 0, 0, UNKNOWN_HEADING], 1.0 / np.square([acting[kind] for kind in lasting])])
     motion, process = _motion(fleet, sensors, lasting)
-    stages: list[Stage] = []
+    stages = list[Stage]()
     for now, previous, edges in steps_of(fleet, links, members):
         t, n = len(stages), len(now)
         gained = edge_information(edges, (n, d), sensors.relative_std, posed=True) + diagonal(np.tile(own, (n, 1, 1)))

@@ -157,22 +157,7 @@ def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Wa
     if not bytes_ > 0:
         raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
     rate = online.rate(kind, way)
-    return bytes_ / rate if rate else float("inf")
-
-
-def payload(on_air: Floats, message: Message, overhead: int) -> Floats:
-    """Of bytes on air, those that the method adds: all messages are of one size.
-
-    Raises:
-        InputError: a message as long as the neighbourhood under an overhead.
-
-    >>> payload(np.array([382.0]), Message("fix", 8), 350)
-    array([32.])
-    """
-    if message.per_neighbour and overhead:
-        raise InputError("message", message.name, "must have one size under an overhead", "Use overhead = 0.")
-    size = message.size(overhead)
-    return on_air * (message.size() / size) if size else on_air
+    return bytes_ / rate if rate else np.inf
 
 
 def of_drive(
@@ -191,7 +176,9 @@ def of_drive(
     Raises:
         InputError: as in `of_track`.
     """
-    moved = np.zeros((2, 2, 2, len(received), len(names)))
+    if message.per_neighbour and overhead:
+        raise InputError("message", message.name, "must have one size under an overhead", "Use overhead = 0.")
+    size, moved = message.size(overhead), np.zeros((2, 2, 2, len(received), len(names)))
     for k, on_air in enumerate((sent, received)):
-        moved[k, 1] = payload(on_air, message, overhead), on_air
+        moved[k, 1] = on_air * (message.size() / size if size else 1.0), on_air
     return Ledger(tuple(names), np.broadcast_to(np.asarray(seconds, float), len(names)), moved[0], moved[1])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 
 import numpy as np
 from scipy import stats
 
-from ..arrays import Bools, Floats, checked, instance, number, refuse
+from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
-from ..kernels.scores import distances, normalised, root_mean_squares
+from ..kernels.scores import normalised
 from ..methods.track import Track
 from ..plugins import find
 from ..world.body_frames import true_heading, turned
@@ -21,7 +22,7 @@ from ..world.recording import Recording
 def errors(track: Track, fleet: Fleet) -> Floats:
     """Distance between estimate and truth, (R, T, E) m."""
     truth = _truth(track, fleet)
-    return distance(track.x, truth)
+    return np.asarray(np.linalg.norm(track.x - truth, axis=-1))
 
 
 def _truth(track: Track, fleet: Fleet) -> Floats:
@@ -34,18 +35,6 @@ def _truth(track: Track, fleet: Fleet) -> Floats:
         raise InputError("track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps", hint)
     refuse("track.egos", egos, egos >= len(fleet.ids), f"must be columns of the fleet, 0..{len(fleet.ids) - 1}", hint)
     return fleet.position[:, egos]
-
-
-def distance(x: Floats, truth: Floats) -> Floats:
-    """(R, T, E) m between estimates (R, T, E, 3) and the truth (T, E, 3).
-
-    >>> distance(np.zeros((1, 1, 1, 3)), np.array([[[1.0, 2.0, 2.0]]])).item()
-    3.0
-    """
-    if x.shape[1:] != truth.shape:
-        allowed = f"must have shape (T, E, 3) = {x.shape[1:]}"
-        raise InputError("truth", f"shape {truth.shape}", allowed, "Give the truth of the same egos and steps.")
-    return distances(np.ascontiguousarray(x), np.ascontiguousarray(truth))
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
@@ -81,7 +70,11 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     mine = [recording.links.of(ego) for ego in track.egos]
     links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
-    return root_mean_squares(np.ascontiguousarray(track.neighbours), truth, ends)
+    square = np.square(track.neighbours - truth).sum(axis=-1)
+    parts = [square[:, first:last] for first, last in pairwise(ends)]
+    with np.errstate(invalid="ignore"):
+        mean = [np.nansum(part, axis=1) / np.isfinite(part).sum(axis=1) for part in parts]
+    return np.asarray(np.sqrt(np.stack(mean, axis=1)))
 
 
 def nees(track: Track, fleet: Fleet) -> Floats:
@@ -186,7 +179,7 @@ def pose_covariance(track: Track) -> Floats:
 METRICS: Mapping[str, Callable[[Track, Fleet], Floats]] = {
     "rt_le_m": rt_le,
     "max_error_m": max_error,
-    "nees": lambda track, fleet: np.asarray(np.nanmean(nees(track, fleet), axis=1)),
+    "nees": lambda track, fleet: np.nanmean(nees(track, fleet), axis=1),
 }
 """Column of a table -> function of a Track and its Fleet; a unit that is not SI stands in the name."""
 
@@ -257,11 +250,9 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
         aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])
         cross = shared[..., :, None] * aside[..., None, :]
         covariance += cross + np.swapaxes(cross, -1, -2) + variance * aside[..., :, None] * aside[..., None, :]
-    there: Bools = np.asarray(np.isfinite(innovation[:, 1:]).all(axis=-1))
-    found = np.full(innovation.shape[:3], np.nan)
-    d = np.where(there[..., None], innovation[:, 1:], 0.0)
+    found, d = np.full(innovation.shape[:3], np.nan), innovation[:, 1:]
     square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
-    found[:, 1:] = np.where(there, square / dimensions(recording), np.nan)
+    found[:, 1:] = square / dimensions(recording)
     return found
 
 

@@ -13,7 +13,7 @@ from ..methods.track import Method, Track
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from .ledger import Kind, Way, of_track
-from .metrics import distance, errors, measure, nees, neighbour_rt_le, rt_le, share_of_average
+from .metrics import errors, measure, nees, neighbour_rt_le, rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
@@ -25,8 +25,6 @@ BYTES: Mapping[str, tuple[Kind, Way]] = {
 SLAB = 2**25
 """Bytes of a Track, about: runs are scored while the cache still holds them, and memory does not grow with the number
 of runs."""
-LANES = 4
-"""Runs that kernels follow beside each other."""
 
 
 def rows_of(columns: Mapping[str, AnyArray], who: Sequence[str], **more: Any) -> list[dict[str, Any]]:
@@ -106,8 +104,7 @@ def scored(
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
     """The recording in parts of some runs each, as many as the cache holds."""
-    per_run = 8 * (12 * len(recording.t) * egos + 3 * len(recording.links))
-    runs = max(1, SLAB // (LANES * per_run)) * LANES
+    runs = max(1, SLAB // (4 * 8 * (12 * len(recording.t) * egos + 3 * len(recording.links)))) * 4
     for first in range(0, recording.runs, runs):
         yield recording.of_runs(slice(first, first + runs)) if runs < recording.runs else recording
 
@@ -116,7 +113,7 @@ def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, q
     """Columns that need no average over runs."""
     error, mine = errors(track, drive), list(track.egos)
     level = np.sqrt((error**2).mean(axis=1))
-    fixes = np.sqrt((distance(recording.gnss.take(mine, axis=2), drive.position[:, mine]) ** 2).mean(axis=1))
+    fixes = np.sqrt((np.square(recording.gnss.take(mine, axis=2) - drive.position[:, mine]).sum(axis=-1)).mean(axis=1))
     account = of_track(track, recording, method.message)
     found = {
         "rt_le_m": level,

@@ -134,7 +134,7 @@ def _interval(resampled: Floats, mean: float, values: Floats, level: float) -> I
     number("level", level, 1e-9, 1 - 1e-9, allowed=LEVEL, hint="0.95 is the default.")
     n = values.shape[0] if values.shape[0] > 1 else values.shape[1]
     if n < 2:
-        return Interval(mean, float("nan"), float("nan"), values.size)
+        return Interval(mean, math.nan, math.nan, values.size)
     low = stats.norm.cdf(np.sqrt(n / (n - 1)) * stats.t.ppf((1 - level) / 2, n - 1))
     ends = np.quantile(resampled, [low, 1 - low])
     return Interval(mean, float(ends[0]), float(ends[1]), values.size)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
@@ -60,7 +60,6 @@ def align(estimate: Floats, truth: Floats, *, scale: bool = False) -> Alignment:
     >>> align(x, x + 5.0).translation
     array([5., 5.])
     """
-    instance("scale", scale, bool, "Give True or False.")
     x, y = _pair(estimate, truth)
     mean_x, mean_y = x.mean(axis=-2, keepdims=True), y.mean(axis=-2, keepdims=True)
     cov = np.einsum("...ti,...tj->...ij", y - mean_y, x - mean_x) / x.shape[-2]
@@ -257,7 +256,7 @@ class Score:
     ape_max_m: float
     rpe_m: float | None
     nees: float | None
-    remarks: tuple[str, ...] = field(default=())
+    remarks: tuple[str, ...] = ()
 
 
 def scores(
@@ -439,11 +438,12 @@ def _stamps(stamps: tuple[Floats, Floats], met: int, max_diff: float) -> str:
     if 2 * met >= count:
         return ""
     long, true = (float(t[-1] - t[0]) for t in stamps)
+    ratio = long / max(true, 1e-12)
     looks = "another clock (offset), or rates that do not meet (max_diff)?"
     for factor, unit in UNITS.items():
-        if 0.5 * factor < long / max(true, 1e-12) < 2 * factor:
+        if 0.5 < ratio / factor < 2:
             looks = f"the estimate looks like {unit}."
-        if 0.5 * factor < true / max(long, 1e-12) < 2 * factor:
+        if 0.5 < ratio * factor < 2:
             looks = f"the truth looks like {unit}."
     return f"{met} of {count} stamps meet within {max_diff:g} s: {span(stamps[0])} and {span(stamps[1])}; {looks}"
 

@@ -1,13 +1,12 @@
-"""Errors and NEES of a track in one pass."""
+"""NEES of a track, and whether its covariances are some, in one pass."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats
+from ..arrays import Floats
 from .compiling.compile import compiled, part
 
 LIMIT = 1.0 + 1e-9
@@ -15,25 +14,13 @@ LIMIT = 1.0 + 1e-9
 
 
 @part
-def less(a: AnyArray, b: AnyArray) -> Any:
+def less(a: Floats, b: Floats) -> tuple[float, float, float]:
     """a - b, three numbers."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
 @compiled
-def distances(x: AnyArray, truth: AnyArray) -> Floats:
-    """(R, T, E) m between x (R, T, E, 3) and truth (T, E, 3)."""
-    found = np.empty(x.shape[:3])
-    for run in range(len(x)):
-        for t in range(x.shape[1]):
-            for e in range(x.shape[2]):
-                a, b, c = less(x[run, t, e], truth[t, e])
-                found[run, t, e] = math.sqrt(a * a + b * b + c * c)
-    return found
-
-
-@compiled
-def normalised(x: AnyArray, truth: AnyArray, cov: AnyArray) -> tuple[Floats, bool]:
+def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
     """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero, and whether every other P could be inverted."""
     found, sound = np.empty(x.shape[:3]), True
     for run in range(len(x)):
@@ -54,7 +41,7 @@ def normalised(x: AnyArray, truth: AnyArray, cov: AnyArray) -> tuple[Floats, boo
 
 
 @compiled
-def unsound(cov: AnyArray) -> int:
+def unsound(cov: Floats) -> int:
     """Number of covariances (n, 3, 3) that are not finite, symmetric and positive semidefinite to a share of 1e-9."""
     found = 0
     for p in cov:
@@ -65,20 +52,4 @@ def unsound(cov: AnyArray) -> int:
         sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - LIMIT) * a * b * c
         if not (sound and skew <= (LIMIT - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
             found += 1
-    return found
-
-
-@compiled
-def root_mean_squares(theirs: AnyArray, truth: AnyArray, ends: AnyArray) -> Floats:
-    """(R, E) m: root mean square over the links ends[e]:ends[e + 1] of what is known in (R, L, 3); NaN for nothing."""
-    found = np.empty((len(theirs), len(ends) - 1))
-    for run in range(len(theirs)):
-        for e in range(len(ends) - 1):
-            total, count = 0.0, 0
-            for link in range(ends[e], ends[e + 1]):
-                a, b, c = less(theirs[run, link], truth[link])
-                square = a * a + b * b + c * c
-                if math.isfinite(square):
-                    total, count = total + square, count + 1
-            found[run, e] = math.sqrt(total / count) if count else np.nan
     return found

@@ -94,7 +94,7 @@ def step(state: AxisState, moved: float, process: float, fix: float, late: float
 
 
 @compiled
-def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, x: Floats, p: Floats) -> Floats:
+def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints, x: Floats, p: Floats) -> Floats:
     """Fill x m and p m^2 of the vehicles, and return the estimated variance of a fix at each step, if it is estimated.
 
     A vehicle that was absent starts at its first fix.
@@ -103,7 +103,8 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, x: Floats, p
         seen: the vehicles and their measurements.
         rule: noise of the fixes.
         known: whether x[:, 0] is given and exact; if not, it is a fix.
-        x: (R, T, E, 3).
+        index: (E,) of the vehicles in x and p.
+        x: (R, T, E or N, 3).
         p: the same.
     """
     runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], len(seen.columns)
@@ -112,22 +113,22 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, x: Floats, p
     for run in range(runs):
         for t in range(steps):
             for e in range(vehicles):
-                n = seen.columns[e]
+                n, at = seen.columns[e], index[e]
                 q = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
                 for c in range(3):
                     fix, now = seen.gnss[run, t, n, c], states[e, c]
                     moved = seen.dt * seen.velocity[run, t, n, c]
                     if t == 0 and known:
-                        state = start_state(x[run, 0, e, c], 0.0, True, rule.variance[c], rule.weight)
+                        state = start_state(x[run, 0, at, c], 0.0, True, rule.variance[c], rule.weight)
                     elif t == 0 or math.isnan(now[0] + moved):
                         state = start_state(fix, 0.0, False, rule.variance[c], rule.weight)
                     else:
                         before = now[0], now[1], now[2], now[3], now[4]
                         state = step(before, moved, seen.process[run, t, n, c] + q[c], fix, 0.0, rule.window)
                     put(now, state)
-                    x[run, t, e, c], p[run, t, e, c] = state[0], state[1] * state[3] + state[2]
+                    x[run, t, at, c], p[run, t, at, c] = state[0], state[1] * state[3] + state[2]
                     if adaptive:
-                        noise[run, t, e, c] = state[3]
+                        noise[run, t, at, c] = state[3]
     return noise
 
 

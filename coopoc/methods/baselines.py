@@ -102,7 +102,5 @@ def solo_estimates(recording: Recording, known: NoiseModel, egos: Sequence[int])
     of some egos (columns)."""
     links = recording.links
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    x, p, _ = solo_filter(recording, members, known, FixNoise(known.gnss_variance))
-    all_x, all_p = np.empty(recording.gnss.shape), np.empty(recording.gnss.shape)  # of others nothing is read
-    all_x[:, :, members], all_p[:, :, members] = x, p
-    return assumptions(recording, known)._replace(broadcast=all_p), all_x
+    x, p, _ = solo_filter(recording, members, known, FixNoise(known.gnss_variance), in_place=True)
+    return assumptions(recording, known)._replace(broadcast=p), x

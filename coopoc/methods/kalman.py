@@ -190,6 +190,8 @@ def solo_filter(
     noise: NoiseModel | MotionNoise,
     fixes: FixNoise,
     x0: Floats | None = None,
+    *,
+    in_place: bool = False,
 ) -> tuple[Floats, Floats, Floats]:
     """Run a solo filter axis by axis: all covariances are diagonal, so that the three axes do not couple.
 
@@ -199,9 +201,11 @@ def solo_filter(
         noise: of the motion.
         fixes: noise of the fixes, known or estimated.
         x0: (..., E, 3) m, exact at step 0; None starts at the first fix.
+        in_place: leave the vehicles at their columns among all N; of others nothing is written.
 
     Returns:
-        Position m, variance m^2, and estimated variance of a fix m^2 (of no length where it is known), (R, T, E, 3).
+        Position m, variance m^2, and estimated variance of a fix m^2 (of no length where it is known), (R, T, E, 3) or
+        (R, T, N, 3).
 
     Raises:
         InputError: x0 of another shape.
@@ -213,7 +217,8 @@ def solo_filter(
     shape = *gnss.shape[:2], len(columns), 3
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
-    x, p = np.empty(shape), np.empty(shape)
+    index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
+    x, p = np.empty(size), np.empty(size)
     if x0 is not None:
         x[:, 0] = x0
-    return x, p, run_filter(seen, fixes, x0 is not None, x, p)
+    return x, p, run_filter(seen, fixes, x0 is not None, index, x, p)

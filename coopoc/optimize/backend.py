@@ -52,9 +52,7 @@ class Capabilities:
         kinds: of measurement; None: all that are registered, those of other distributions too.
         losses: robust losses; None: all.
         poses: nodes may have a rotation.
-        dimensions: of the space.
         constraints: "none", "linear" (on kinds whose formula is linear) or "all".
-        inequalities: the two sides of a constraint may differ.
     """
 
     batched: bool = False
@@ -62,9 +60,7 @@ class Capabilities:
     kinds: tuple[str, ...] | None = None
     losses: tuple[str, ...] | None = None
     poses: bool = True
-    dimensions: tuple[int, ...] = (2, 3)
     constraints: Literal["none", "linear", "all"] = "none"
-    inequalities: bool = True
 
     def lacking(self, problem: Problem) -> list[str]:
         """The needs of the problem that these capabilities lack, in words; empty if the problem can be solved.
@@ -78,18 +74,14 @@ class Capabilities:
             kinds = {f.kind for f in problem.factors} - {*self.kinds}
         if self.losses is not None:
             losses = {f.loss.name for f in problem.factors if f.loss is not None} - {*self.losses}
-        barred = [c for c in problem.constraints if not self._can_hold(c.measurement.linear, bool(c.equality.all()))]
+        held = {"none": (), "linear": (True,), "all": (True, False)}[self.constraints]
+        barred = [c for c in problem.constraints if c.measurement.linear not in held]
         return [
             *(f"kind {kind}" for kind in sorted(kinds)),
             *(f"loss {loss}" for loss in sorted(losses)),
             *(["poses"] if problem.poses and not self.poses else []),
-            *([f"dimension {problem.dimension}"] if problem.dimension not in self.dimensions else []),
             *(f"a constraint on {kind}" for kind in sorted({c.kind for c in barred})),
         ]
-
-    def _can_hold(self, linear: bool, equality: bool) -> bool:
-        held = self.constraints == "all" or (self.constraints == "linear" and linear)
-        return held and (equality or self.inequalities)
 
 
 @dataclass(frozen=True)
@@ -102,7 +94,6 @@ class Backend:
         purpose: one line for lists.
         library: that it imports, None if it needs none but those of coopoc.
         capabilities: which problems it can solve.
-        fallback: (problem, options) -> options with which to try again where an answer fails the checks, or None.
     """
 
     name: str
@@ -110,7 +101,6 @@ class Backend:
     purpose: str = ""
     library: str | None = None
     capabilities: Capabilities = Capabilities()
-    fallback: Callable[[Problem, Options], Options | None] = lambda problem, options: None
 
     @property
     def installed(self) -> bool:
@@ -142,7 +132,7 @@ def looped(solver: Solver) -> Solver:
     """The solver of single problems as one of B realisations."""
 
     def each(problem: Problem, x: Floats) -> SolverResult:
-        parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+        parts = problem.realisations
         ends = [solver(part, start) for part, start in zip(parts, x, strict=True)]
         iterations, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
         return SolverResult(np.stack([end.x for end in ends]), iterations, infeasible.astype(bool), ends[0].extras)

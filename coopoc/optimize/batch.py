@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..short_repr import short_repr
 from .algebra.star import is_star, star_at
 from .assess.assess import INFLATION, assess
-from .backend import Backend, Options, require_backend
+from .backend import Backend, require_backend
 from .model.problem import Problem
 from .solve import POSITION_TOLERANCE
 from .starts.initial import initial_guess, somewhere
@@ -28,7 +28,6 @@ class Batch:
     converged: a Gauss-Newton step from x would move no node by more than the tolerance of the options (at least
     1e-6 m); where a node is unobservable it is False and the covariance NaN. Unlike `solve` it does not check whether
     the stationary point is a saddle.
-    again: the first try did not converge, and the backend's fallback options were tried (see `solve`).
     """
 
     x: Floats
@@ -36,7 +35,6 @@ class Batch:
     cost: Floats
     iterations: Ints
     converged: Bools
-    again: Bools
 
     __repr__ = short_repr
 
@@ -60,14 +58,14 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
     >>> solve_batch(problem).x.shape
     (2, 1, 3)
     """
-    known = require_backend(backend)
+    solver_backend = require_backend(backend)
     instance("problem", problem, Problem)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if problem.constraints:
         hint = "Solve one realisation after the other: solve(problem.pick(run), ...)."
         raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", hint)
-    solver = known.solver(problem, options)
+    solver = solver_backend.solver(problem, options)
     count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
     per = max(1, CHUNK // sum(factor.nodes.size for factor in problem.factors))
     parts = []
@@ -76,28 +74,17 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
         end = solver(part, (somewhere if part.linear else initial_guess)(part))
         cost, cov, left = (_checked_stars if is_star(part) else _checked)(part, end.x)
         there = ~np.isnan(left) & (left <= reach)
-        parts.append((end.x, cov, cost, end.iterations, there, np.zeros(len(there), dtype=bool)))
-    found = Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    other = None if found.converged.all() else known.fallback(problem, options)
-    return found if other is None else _repeated(found, problem, known, other)
-
-
-def _repeated(found: Batch, problem: Problem, backend: Backend, options: Options) -> Batch:
-    """The batch with the realisations that did not converge solved with the fallback options."""
-    which = np.flatnonzero(~found.converged)
-    better = solve_batch(problem.pick(which) if problem.batch else problem, backend, **options)
-    for field in fields(Batch):
-        getattr(found, field.name)[which] = getattr(better, field.name)
-    found.again[which] = True
-    return found
+        parts.append((end.x, cov, cost, end.iterations, there))
+    return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def _checked(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
     """Cost, covariance and largest move of a Gauss-Newton step of each realisation; NaN where one is unobservable."""
-    singles = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
-    each = [assess(single, at) for single, at in zip(singles, x, strict=True)]
-    cov = np.stack([one.covariance for one in each])
-    return np.array([one.cost for one in each]), cov, np.array([one.remaining for one in each])
+    singles = problem.realisations
+    assessments = [assess(single, at) for single, at in zip(singles, x, strict=True)]
+    cov = np.stack([assessment.covariance for assessment in assessments])
+    cost = np.array([assessment.cost for assessment in assessments])
+    return cost, cov, np.array([assessment.remaining for assessment in assessments])
 
 
 def _checked_stars(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:

@@ -130,7 +130,7 @@ def misfit(problem: Problem, solution: Solution) -> float | None:
 def described(solution: Solution) -> dict[str, Any]:
     """Status, cost and times of a solution, without its nodes."""
     named = ("backend", "cost", "gradient_norm", "iterations", "build_seconds", "solve_seconds")
-    found = {"status": solution.status.name, "sentence": solution.status.value}
+    found: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
     found |= {name: getattr(solution, name) for name in named}
     found |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}
     return found | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}

@@ -34,9 +34,7 @@ FEASIBLE = 1e-6
 def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool = True, **options: Any) -> Solution:
     """The most probable positions: a minimum of the problem's cost, by the named backend.
 
-    Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver. Where the
-    answer is no minimum and the backend has fallback options, those are tried, and extras["failed_first"] has the
-    status of the first try.
+    Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver.
 
     Args:
         problem: a single one; `solve_batch` takes B realisations.
@@ -64,8 +62,6 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     problem = fused(problem)
     solution = _solved(problem, known, options)
-    if solution.status is not Status.SOLVED and (other := known.fallback(problem, options)) is not None:
-        solution = _after(solution, _solved(problem, known, other))
     if problem.search.start:
         solution = _with_search(solution, problem.search)
     if throw and solution.status is not Status.SOLVED:
@@ -104,16 +100,6 @@ def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
         space=problem.space,
         violation=truth.violation,
         extras=found.extras | violated,
-    )
-
-
-def _after(first: Solution, second: Solution) -> Solution:
-    """The second, with what became of the first and the time of both."""
-    return replace(
-        second,
-        build_seconds=first.build_seconds + second.build_seconds,
-        solve_seconds=first.solve_seconds + second.solve_seconds,
-        extras=second.extras | {"failed_first": f"{first.extras.get('method', first.backend)}: {first.status.name}"},
     )
 
 

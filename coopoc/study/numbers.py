@@ -143,7 +143,7 @@ def per_seed(results: Results, where: Where) -> Floats:
 def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
     """A number for each training seed; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
-    wheres = [{**where, "train_seed": seed} for seed in seeds] or [where]
+    wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
     return [value for each in wheres if (value := number(results, each)) is not None]
 
 

@@ -64,8 +64,8 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
                     store.write(folder / "tables" / f"{name}.{suffix}", table.render(form))
                 shown["tables"].append({"name": name, "caption": " ".join(table.words), "table": vars(table)})
             bar.update()
-        for name, view in study.figures.items():
-            if (plot := made(name, view)) is not None:
+        for name, figure in study.figures.items():
+            if (plot := made(name, figure)) is not None:
                 shown["figures"].append({"name": name, "caption": plot.save(folder / "figures" / name)})
             bar.update()
     with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers

@@ -91,12 +91,11 @@ def _sound(read: Number) -> Number:
     """A number as `save` wrote it; InputError for a field of another kind."""
     instance("where", read.where, dict)
     instance("metric", read.metric, str)
+    instance("runs", read.runs, int)
     if read.better not in ("lower", "higher"):
         number("better", read.better, -np.inf, np.inf, allowed="lower, higher or a number")
-    number("value", read.value, -np.inf, np.inf, allowed="no NaN")
-    number("runs", read.runs, 1, 2**53, kind=int, allowed=">= 1")
-    for field in ("run_std", "tolerance"):
-        number(field, getattr(read, field), high=1e100)
+    for field in ("value", "runs", "run_std", "tolerance"):
+        number(field, getattr(read, field), 1 if field == "runs" else -np.inf, np.inf, allowed="a number, runs >= 1")
     return read
 
 

@@ -139,10 +139,6 @@ class Results:
             rows.append([*names, found.mean, found.low, found.high, found.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
-    def parsed(self, texts: Sequence[str]) -> dict[str, Any]:
-        """["method=okf,kalman"] as a selection: each value read as the type of its column."""
-        return {name: list(values) for name, values in parsed([self.frame], texts).items()}
-
     def to_parquet(self, path: str | Path) -> None:
         """Write all rows as Parquet."""
         store.write(given_path(path), lambda file: self.frame.to_parquet(file, index=False))

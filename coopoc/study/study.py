@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from .tables import Table
 
 
+__all__ = ["Cell", "Params", "Row", "Scalar", "Study", "find_study"]
+
+
 def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:
     pass
 

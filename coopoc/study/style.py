@@ -31,11 +31,11 @@ class Panel:
         ticks: place -> text; default matplotlib's ticks, or the places if there are at most eight.
     """
 
-    x: Mapping[float, Mapping[str, Any]]
+    x: Mapping[Any, Mapping[str, Any]]
     where: Mapping[str, Any] = field(default_factory=dict)
     title: str = ""
     xlabel: str = ""
-    ticks: Mapping[float, str] = field(default_factory=dict)
+    ticks: Mapping[Any, str] = field(default_factory=dict)
 
 
 NEUTRAL = "#9DB0C3"
@@ -47,7 +47,7 @@ UNITS = {column: tuple(each) for column, each in DATA["columns"].items()}
 """Column -> (words, unit)."""
 TERMS: dict[str, str] = DATA["terms"]
 """Term -> meaning, which a page shows where a reader points at it."""
-RC: dict[str, Any] = DATA["matplotlib"]
+RC: Any = DATA["matplotlib"]
 """Options of matplotlib."""
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008): distinguishable under the common forms of colour blindness."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ..arrays import Ints
-from ..kernels.bucket import nearest_first
 from .recording import Recording
 
 
@@ -29,9 +28,6 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: 
     if not np.isfinite(cap) or not size.any():
         return arrival
     depth = float(max(cap, int(size.max()))) if cap else 0.0
-    if recording.v2x.schedule == "nearest":
-        steps, bytes_, first = (np.ascontiguousarray(values, dtype=np.int64) for values in (arrival, size, start))
-        return nearest_first(steps, bytes_, first, cap * recording.dt, depth)
     accepted, last_accepted = np.full_like(arrival, -1), np.full((len(arrival), len(recording.ids)), -1)
     tokens, last = np.full(len(arrival), depth), 0
     for t, span in enumerate(map(slice, start[:-1].tolist(), start[1:].tolist())):
@@ -42,8 +38,8 @@ def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: 
         tokens, last = np.minimum(tokens + cap * recording.dt * (now - last), depth), now
         while (fits := left & (size[span] <= tokens[:, None] + 1e-9)).any():
             run = np.flatnonzero(fits.any(axis=1))
-            waited = np.where(fits, t - last_accepted[:, sender[span]], -1)[run]
-            best = waited.argmax(axis=1)
+            waited = 0 if recording.v2x.schedule == "nearest" else t - last_accepted[:, sender[span]]
+            best = np.where(fits, waited, -1)[run].argmax(axis=1)
             message = span.start + best
             last_accepted[run, sender[message]] = t
             left[run, best] = False

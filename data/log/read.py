@@ -105,7 +105,7 @@ def read_log(
     any_scale: bool = False,
     frame: Frame = "world",
 ) -> Log:
-    """Read a file or a folder of logged measurements: tables (CSV, Parquet, Excel), NMEA, or a ROS bag.
+    """Read a file or a folder of logged measurements: tables (CSV, Parquet), NMEA, or a ROS bag.
 
     docs/your_data.md describes the tables. A file named truth in a folder holds the truth.
 

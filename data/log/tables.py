@@ -55,7 +55,7 @@ def read_log_table(
     kinds: Mapping[str, str] | None = None,
     ignore: Sequence[str] = (),
 ) -> Rows:
-    """Rows of a CSV, Parquet or Excel table, long if it has a column kind, else wide.
+    """Rows of a CSV or Parquet table, long if it has a column kind, else wide.
 
     Args:
         path: of the file. Without a column vehicle, the file is named after its vehicle.

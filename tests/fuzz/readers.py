@@ -70,7 +70,7 @@ READERS: Mapping[str, Reader] = {
     "g2o": Reader({"a.g2o": good.G2O}, lambda d: read_graph(d / "a.g2o")),
     "pyfg": Reader({"a.pyfg": good.PYFG}, lambda d: read_graph(d / "a.pyfg")),
     "pyfg recording": Reader({"a.pyfg": good.ROBOTS}, lambda d: load_log(d / "a.pyfg")),
-    "mrclam": Reader(good.MRCLAM, load_log),
+    "mrclam": Reader(good.MRCLAM, load_fleet),
     "log": Reader({"log.csv": good.LOG}, lambda d: read_log(d / "log.csv", any_scale=True)),
     "wide log": Reader({"car.csv": good.WIDE}, lambda d: read_log(d / "car.csv", columns=NAMES)),
     "nmea": Reader({"car.nmea": good.NMEA}, lambda d: read_log(d / "car.nmea")),

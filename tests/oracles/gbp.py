@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 
-def gbp(drive, rounds, damping=0.0, carry="own"):  # type: ignore[no-untyped-def]
+def gbp(drive, rounds, damping=0.0):  # type: ignore[no-untyped-def]
     """Positions (T, N, 3) and covariances (T, N, 3, 3) of one run."""
     x = np.full((drive.steps, drive.vehicles, 3), np.nan)
     P = np.full((*x.shape, 3), np.nan)
@@ -40,5 +40,4 @@ def gbp(drive, rounds, damping=0.0, carry="own"):  # type: ignore[no-untyped-def
             L, eta = belief(n)
             P[t, n] = np.linalg.inv(L)
             x[t, n] += P[t, n] @ eta
-        own = P[t].copy() if carry == "belief" else own
     return x, P

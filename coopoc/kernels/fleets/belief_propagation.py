@@ -26,9 +26,11 @@ class Gaussians(NamedTuple):
 
 @compiled
 def run_filter(
-    measured: Measured, pairs: Pairs, assumed: Assumed, edges: Edges, rounds: int, damping: float, carry_belief: bool
+    measured: Measured, pairs: Pairs, assumed: Assumed, edges: Edges, rounds: int, damping: float
 ) -> tuple[Floats, Floats]:
     """Positions (R, T, 3 N) m and covariances (R, T, 9 N) m^2 of all vehicles, NaN m where inactive.
+
+    The covariance of the vehicle's own filter goes on to the next step.
 
     Args:
         measured: what the fleet measured.
@@ -37,7 +39,6 @@ def run_filter(
         edges: memory.
         rounds: of messages a step.
         damping: share of the old message in the new one.
-        carry_belief: whether the belief's covariance goes on to the next step, or that of the vehicle's own filter.
     """
     runs, steps, vehicles = measured.active.shape
     x, cov = np.empty((runs, steps, 3 * vehicles)), np.zeros((runs, steps, 9 * vehicles))
@@ -62,8 +63,6 @@ def run_filter(
                     store(cov[run, t], n, posterior)
                     moved = apply(posterior, load(beliefs.vector, n, VECTOR))
                     store(x[run, t], n, add(load(x[run, t], n, VECTOR), moved))
-            if carry_belief:
-                copy(cov[run, t], own, len(own))
     return x, cov
 
 

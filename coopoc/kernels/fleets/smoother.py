@@ -279,14 +279,10 @@ def add_information(t: int, factors: RunFactors, weight: Floats, total: Floats) 
                     total[b + r, b + c] += weight[9 * k + 3 * r + c]
 
 
-@compiled
 def sum_vectors(x: Floats, factors: RunFactors, eta: Floats) -> Floats:
     """(T, N, 3) 1/m, information vectors of fixes and pairs at every position."""
-    pairs = factors.pairs
-    total: Floats = factors.fix_weight * (factors.fix - x)
-    for t in range(len(x)):
-        for k in range(pairs.start[t], pairs.start[t + 1]):
-            for c in range(3 if pairs.alive[0, k] else 0):
-                total[t, pairs.first[k], c] -= eta[k, c]
-                total[t, pairs.second[k], c] += eta[k, c]
+    pairs, total = factors.pairs, factors.fix_weight * (factors.fix - x)
+    step = np.repeat(np.arange(len(x)), np.diff(pairs.start))
+    np.subtract.at(total, (step, pairs.first), eta)
+    np.add.at(total, (step, pairs.second), eta)
     return total

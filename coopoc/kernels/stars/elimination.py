@@ -70,33 +70,24 @@ def substitute(factor: Floats, x: Floats, n: int, stride: int, block: Numbers, r
 
 
 @inner
-def predict(
-    a: Floats, n: int, stride: int, process: Floats, memory: Floats, block: Numbers, row: Numbers, keep: int = 0
-) -> None:
+def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats, block: Numbers, row: Numbers) -> None:
     """Information (A^-1 + Q)^-1 in place of A, Q^-1 = diag(process): with infinite process noise (0) a block is
     forgotten, one after the other as a rank-d update. `memory` holds 2 n blocks.
 
     With E_k the columns of block k and W_k = Q_k^-1, A <- A - A E_k (E_k^T A E_k + W_k)^-1 E_k^T A.
-
-    Args:
-        keep: n + 1 to keep, for a way back, E_k^T A and minus the inverse pivot of every k in `memory`, n + 1 blocks
-            each after the first n.
     """
     for k in range(n):
-        kept = n + k * keep
         for i in range(k):
-            store(memory, kept + i, transpose(load(a, i * stride + k, block)))
+            store(memory, n + i, transpose(load(a, i * stride + k, block)))
         for j in range(k + 1, n):
-            store(memory, kept + j, load(a, k * stride + j, block))
+            store(memory, n + j, load(a, k * stride + j, block))
         own = mirrored(load(a, k * stride + k, block))
-        store(memory, kept + k, own)
+        store(memory, n + k, own)
         pivot = negate(inverse(add_diagonal(own, load(process, k, row))))
-        if keep > 0:
-            store(memory, kept + n, pivot)
         for j in range(n):
-            store(memory, j, minus_product(pivot, load(memory, kept + j, block)))
+            store(memory, j, minus_product(pivot, load(memory, n + j, block)))
         for i in range(n):
-            left = load(memory, kept + i, block)
+            left = load(memory, n + i, block)
             for j in range(i, n):
                 at = i * stride + j
                 store(a, at, less_transposed_product(load(a, at, block), left, load(memory, j, block)))

@@ -18,6 +18,7 @@ from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, load, scale, store
 from ..compiling.vectors import LANES, choose, put, take
 from ..motion import MotionNoise, process_variance
+from .relative import Five
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
 """Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
@@ -30,7 +31,6 @@ NOWHERE = 1e18
 Index: TypeAlias = Any
 """An integer, NumPy's unsigned one where the compiler need not look for negative ones."""
 Three: TypeAlias = tuple[float, float, float]
-Five: TypeAlias = tuple[float, float, float, float, float]
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
 ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8

@@ -256,7 +256,7 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 @inner
 def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
     """w of least trace in [LEAST, 1]."""
-    low, high = 0.0 * w + LEAST, 0.0 * w + 1.0
+    low, high, going = 0.0 * w + LEAST, 0.0 * w + 1.0, 0.0 * w + 1.0
     for round_ in range(ROUNDS):
         first, second = derivatives(fusion, fixed, n, w)
         low, high = choose(first, low, w), choose(-first, high, w)
@@ -264,8 +264,9 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         inside_low, inside_high = newton - low, high - newton
         middle = 0.5 * (low + high)
         below, above = (low, high) if round_ < BISECT else (middle, middle)
-        before, w = w, choose(inside_low, choose(inside_high, newton, above), below)
-        if abs(w - before) <= 0.0 * w + TOLERANCE:
+        before, w = w, choose(going, choose(inside_low, choose(inside_high, newton, above), below), w)
+        going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
+        if going <= 0.0 * w:
             break
     return w
 

@@ -10,67 +10,45 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numba.extending import overload
-from numpy import uint64
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.vectors import LANES, Batched, choose, lane, less, pack, plus, put
+from ..compiling.vectors import Batched, choose, lane, less, pack, plus
 
+Five: TypeAlias = tuple[float, float, float, float, float]
 Numbers: TypeAlias = tuple[float, ...]
 """A vector or a matrix; each number a float, or one of LANES runs side by side."""
-QUARTER = (math.pi / 2, 6.123233995736766e-17)
-"""Of a turn, rad: the nearest number, and what it lacks."""
 
 
 @as_written
 def components(relative: Floats, links: Ints) -> Floats:
-    """(R, M, 5) range m, sine and cosine of azimuth and of inclination, of some of (R, L, 3) measurements.
+    """(R, M, 5) `five` numbers of some of (R, L, 3) measurements."""
+    measured = np.empty((relative.shape[0], len(links), 5))
+    for run in range(len(measured)):
+        for k in range(len(links)):
+            d, azimuth, inclination = relative[run, links[k]]
+            for i, value in enumerate(five(d, azimuth, inclination)):
+                measured[run, k, i] = value
+    return measured
 
-    A missing range is -1, sine and cosine of a missing angle are 0. LANES links side by side.
-    """
-    seen, found = np.empty((relative.shape[0], len(links), 5)), np.empty(4 * LANES)
-    for run in range(len(seen)):
-        for k in range(0, len(links), LANES):
-            last = len(links) - 1
-            a, b, c, d = links[k], links[min(k + 1, last)], links[min(k + 2, last)], links[min(k + 3, last)]
-            for angle in range(2):
-                turn = pack(
-                    relative[run, a, angle + 1],
-                    relative[run, b, angle + 1],
-                    relative[run, c, angle + 1],
-                    relative[run, d, angle + 1],
-                )
-                sine, cosine = sine_and_cosine(turn)
-                put(found, uint64(2 * angle), sine)
-                put(found, uint64(2 * angle + 1), cosine)
-            for j in range(min(LANES, last + 1 - k)):
-                seen[run, k + j, 0] = or_else(relative[run, links[k + j], 0], -1.0)
-                for i in range(4):
-                    seen[run, k + j, i + 1] = or_else(found[LANES * i + j], 0.0)
-    return seen
+
+@inside
+def five(d: float, azimuth: float, inclination: float) -> Five:
+    """Range m, sine and cosine of azimuth and of inclination; a missing range is -1, sine and cosine of a missing
+    angle are 0."""
+    return (
+        or_else(d, -1.0),
+        or_else(math.sin(azimuth), 0.0),
+        or_else(math.cos(azimuth), 0.0),
+        or_else(math.sin(inclination), 0.0),
+        or_else(math.cos(inclination), 0.0),
+    )
 
 
 @inside
 def or_else(value: float, missing: float) -> float:
     """Another number for NaN."""
     return missing if math.isnan(value) else value
-
-
-@as_written
-def sine_and_cosine(turn: float) -> tuple[float, float]:
-    """By their Taylor series within an eighth of a turn of a multiple of a quarter, exact to the last bit there."""
-    quarters = 1.0 * math.floor(turn * (2.0 / math.pi) + 0.5)
-    x = less(less(turn, quarters, QUARTER[0]), quarters, QUARTER[1])
-    s = x * x
-    sine = less(1 / 6227020800, s, less(1 / 1307674368000, s, 1 / 355687428096000))
-    sine = less(1 / 6, s, less(1 / 120, s, less(1 / 5040, s, less(1 / 362880, s, less(1 / 39916800, s, sine)))))
-    cosine = less(1 / 479001600, s, less(1 / 87178291200, s, 1 / 20922789888000))
-    cosine = less(1 / 24, s, less(1 / 720, s, less(1 / 40320, s, less(1 / 3628800, s, cosine))))
-    sine, cosine = less(x, x * s, sine), less(1.0, s, less(0.5, s, cosine))
-    rest = quarters - 4.0 * math.floor(0.25 * quarters)
-    odd = 0.5 - abs(abs(rest - 2.0) - 1.0)
-    one, other = choose(odd, cosine, sine), choose(odd, sine, cosine)
-    return choose(rest - 1.5, -one, one), choose(1.0 - abs(rest - 1.5), -other, other)
 
 
 @inner
@@ -203,7 +181,7 @@ def incomplete(seen: Numbers) -> bool:
 
 
 @inner
-def completed(seen: Numbers, gap: Numbers) -> tuple[float, float, float, float, float]:
+def completed(seen: Numbers, gap: Numbers) -> Five:
     """The measurement, its missing components (of infinite deviation) those of the vector `gap`."""
     d, sa, ca, si, ci = direction(gap[0], gap[1], gap[2])
     limit = 0.0 * d + 1e300
@@ -218,7 +196,7 @@ def completed(seen: Numbers, gap: Numbers) -> tuple[float, float, float, float, 
 
 
 @inner
-def direction(x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
+def direction(x: float, y: float, z: float) -> Five:
     """Length of a vector, sine and cosine of its azimuth and of its inclination."""
     flat2 = plus(x * x, y, y)
     flat, d = math.sqrt(flat2), math.sqrt(plus(x * x + y * y, z, z))

@@ -32,7 +32,7 @@ from .messages import (
     measured,
     star_in,
 )
-from .relative import or_else, sine_and_cosine
+from .relative import five
 
 RELATIVE, MESSAGE, MESSAGE_AGE, VELOCITY, FIX = slice(0, 3), 3, 4, slice(5, 8), slice(8, 11)
 """Where a neighbour's input stands in its row: the measurement, 1 for a message, its age s, velocity m/s, fix m."""
@@ -206,14 +206,6 @@ def set_neighbour(star: Star, noise: Noise, row: Floats, k: int, dt: float) -> N
     for c in range(3):
         position = row[8 + c] if there else 0.0
         set_axis(star, k, c, row[11 + c], variance[c] * share * share, position, noise.known.broadcast[0, 0, 0, c])
-    measure(star, row, noise.known.relative_std, k)
-
-
-@inner
-def measure(star: Star, row: Floats, std: Floats, k: int) -> None:
-    """Range m, azimuth and inclination rad of member k, with which a row begins; NaN is what was not measured."""
-    sa, ca = sine_and_cosine(row[1])
-    si, ci = sine_and_cosine(row[2])
-    seen = or_else(row[0], -1.0), or_else(sa, 0.0), or_else(ca, 0.0), or_else(si, 0.0), or_else(ci, 0.0)
+    seen = five(row[0], row[1], row[2])
     for lane in range(LANES):
-        measured(star.relative, seen, std, k, lane)
+        measured(star.relative, seen, noise.known.relative_std, k, lane)

@@ -3,11 +3,6 @@
 The expressions (see `symbolic`) are differentiated once per structure; measurements, weights, bounds and the start are
 parameters, so that the next problem of the structure pays for its solution only. Poses are steps in a chart around a
 centre that moves to each answer until the step is below the tolerance.
-
-Two methods. "ipopt" is an interior-point method: robust, the one for inequalities and for many unknowns. "fatrop" is
-the same algorithm with dense elimination, which takes a fifth of the time for a star; without inequalities it ends in
-the same minimum, with them it often does not end and is refused. "auto" takes fatrop where that is at its best and
-ipopt elsewhere. Where an answer fails the checks of `solve`, ipopt has another try (see `fallback`).
 """
 
 from __future__ import annotations
@@ -19,22 +14,18 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ...plugins import one_of
+from ..algebra.sparse import structure_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..model.factor import steerable
 from ..model.problem import Problem
-from ..model.symbolic import Structure, expressions, parameters, structure_of
+from ..model.symbolic import Structure, expressions, numbers_of
 
-DENSE = 200
-"""Numbers that can move up to which fatrop is faster than ipopt: 2.0 against 3.8 ms for 165 of a window, 6.6 against
-2.3 for 330."""
 ROUNDS = 10
 """Moves of the chart of the poses, at most."""
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
-METHODS = ("auto", "fatrop", "ipopt")
-QUIET = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
+QUIET: dict[str, Any] = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
 IPOPT = {
     "print_level": 0,
     "sb": "yes",
@@ -49,22 +40,18 @@ IPOPT = {
     "acceptable_compl_inf_tol": 1e-17,
 }
 """For a cost scaled to a curvature of 1; what `tol` asks may lie below rounding, hence the acceptable level."""
-FATROP = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "acceptable_iter": 3}
 
 
-def prepare(
-    structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, method: str = "auto"
-) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
     """Solver of a structure.
 
     Args:
         structure: a problem whose structure counts, and which of its constraints are equalities.
         max_iterations: of the method's own.
         tolerance: m or rad, step of a pose below which its chart is kept.
-        method: "auto", "fatrop" or "ipopt".
 
     Raises:
-        InputError: an unknown method, inequalities for fatrop, more equalities than numbers that can move.
+        InputError: more equalities than numbers that can move.
 
     >>> from coopoc.optimize import solve
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -72,10 +59,7 @@ def prepare(
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    one_of("method", method, METHODS)
     form, sides = structure_of(structure), _sides(structure)
-    if method == "fatrop" and not np.array_equal(*sides):
-        raise InputError("method", repr(method), "does not hold inequalities", "Leave it out: ipopt takes those.")
     equal, moving = int((sides[0] == sides[1]).sum()), int(form.movable.sum())
     if equal > moving:
         raise InputError(
@@ -84,32 +68,15 @@ def prepare(
             f"must be at most the {moving} numbers that can move",
             "Leave out those that follow from the others.",
         )
-    method = _chosen(form, sides, method)
-    nlp = NlpSolver(programme(form, method, int(max_iterations)))
+    nlp = NlpSolver(programme(form, int(max_iterations)))
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        parts = [problem.pick(b) if problem.batch else problem for b in range(len(x))]
-        given = zip(parts, _numbers(problem, x), x, strict=True)
+        given = zip(problem.realisations, _numbers(problem, x), x, strict=True)
         ends = [_run(form, nlp, *each, sides, tolerance) for each in given]
         counts, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
-        extras = ends[0].extras | {"method": method}
-        return SolverResult(np.stack([end.x for end in ends]), counts, infeasible.astype(bool), extras)
+        return SolverResult(np.stack([end.x for end in ends]), counts, infeasible.astype(bool), ends[0].extras)
 
     return solver
-
-
-def fallback(problem: Problem, options: dict[str, Any]) -> dict[str, Any] | None:
-    """The options with which `solve` tries again where an answer fails its checks: ipopt's, None where it was that."""
-    if _chosen(structure_of(problem), _sides(problem), options.get("method", "auto")) == "ipopt":
-        return None
-    return {**options, "method": "ipopt"}
-
-
-def _chosen(structure: Structure, sides: tuple[Floats, Floats], method: str) -> str:
-    """The method of "auto"."""
-    if method != "auto":
-        return method
-    return "fatrop" if structure.movable.sum() <= DENSE and np.array_equal(*sides) else "ipopt"
 
 
 def _run(
@@ -137,9 +104,13 @@ def _run(
 
 
 def _numbers(problem: Problem, x: Floats) -> Floats:
-    """(B, .) the parameters around x (B, n, ambient), and last by what the cost is multiplied: 1 / max diag J^T J."""
+    """(B, .) parameters around x (B, n, ambient): x, numbers of the factors, constants of the constraints, and last by
+    what the cost is multiplied: 1 / max diag J^T J."""
     curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
-    return np.append(parameters(problem, x), 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
+    parts = [x.swapaxes(1, 2), *map(numbers_of, problem.factors)]
+    parts += [c.constants.T for c in problem.constraints if c.constants is not None]
+    flat = [np.broadcast_to(p, (len(x), *p.shape[-2:])).reshape(len(x), -1) for p in parts]
+    return np.concatenate([*flat, 1.0 / np.maximum(curvature, 1e-12)[:, None]], axis=1)
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
@@ -192,31 +163,24 @@ class NlpSolver:
         self._found["x"][:] = np.nan
         self._evaluate()
         stats = self._buffer.stats()
-        status = stats["return_status"]
-        if isinstance(status, int):  # fatrop has one number for all that is not a success
-            status = "Solve_Succeeded" if stats["success"] else "Not_Solved"
-        return self._found["x"].copy(), self._found["lam_g"].copy(), int(stats["iter_count"]), status
+        return self._found["x"].copy(), self._found["lam_g"].copy(), int(stats["iter_count"]), stats["return_status"]
 
 
 @lru_cache(maxsize=64)
-def programme(structure: Structure, method: str, max_iterations: int) -> Any:
+def programme(structure: Structure, max_iterations: int) -> Any:
     """CasADi's nlpsol of a structure, kept for the next problems that share it."""
     import casadi as ca
 
     found, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**found, "p": ca.vertcat(found["p"], scale), "f": scale * found["f"]}
-    own: dict[str, dict[str, Any]] = {
-        "ipopt": {"ipopt": {**IPOPT, "max_iter": max_iterations}},
-        "fatrop": {"structure_detection": "none", "fatrop": {**FATROP, "max_iter": max_iterations}},
-    }
-    return ca.nlpsol("solver", method, nlp, {**QUIET, **own[method]})
+    options: dict[str, Any] = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
+    return ca.nlpsol("solver", "ipopt", nlp, options)
 
 
 BACKEND = Backend(
     "casadi",
     prepare,
-    "nonlinear programming by FATROP or IPOPT, any constraints",
+    "nonlinear programming by IPOPT, any constraints",
     "casadi",
     Capabilities(batched=True, losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
-    fallback,
 )

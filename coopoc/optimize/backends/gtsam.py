@@ -14,70 +14,51 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ...plugins import one_of
 from ..algebra.sparse import sparse
-from ..backend import Backend, Capabilities, Options, Solver, SolverResult
+from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
 from ..descent.trust_region import arrive
 from ..model.linear import Linear
 from ..model.problem import Problem
 from .gtsam_factors import estimate, forms, graph_of, values, which_turn
 
+MOST = 100
+"""Iterations of GTSAM's own optimiser, its default."""
 PATIENCE = 12
 """Eliminations before the exact Hessian takes over."""
 
 
-def prepare(
-    structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, optimizer: str = "auto"
-) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
     """Solver of a structure.
+
+    GTSAM's own Levenberg-Marquardt goes first where it has every factor of a single problem that is not linear; then,
+    and for every other problem, our loop with GTSAM's elimination. Where that creeps, as with large residuals, the last
+    steps are those of the exact Hessian, which GTSAM does not have (extras["newton_steps"]).
 
     Args:
         structure: a problem whose structure counts.
         max_iterations: of linear solves.
         tolerance: m or rad, largest move of a node in the last step.
-        optimizer: "auto" is GTSAM's own Levenberg-Marquardt with its own settings where it has every factor of a single
-            problem that is not linear, and then "elimination" for the last digits. "elimination" is our loop with
-            GTSAM's elimination, for every problem. Where that creeps, as with large residuals, the last steps are those
-            of the exact Hessian, which GTSAM does not have (extras["newton_steps"]).
-
-    Raises:
-        InputError: an unknown optimizer.
     """
     check_limits(max_iterations, tolerance)
-    one_of("optimizer", optimizer, ("auto", "elimination"))
-    step, own = linear_step(structure), optimizer == "auto" and _own(structure)
+    step, own = linear_step(structure), not structure.linear and structure.batch is None
+    own = own and not any(isinstance(form, str) for form in forms(structure))
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         used = 0
         if own and max_iterations:
-            x, used = levenberg_marquardt(problem, x, max_iterations)
+            x, used = levenberg_marquardt(problem, x, min(max_iterations, MOST))
         left = max_iterations - used
-        system = None if problem.batch else sparse(problem)
-        patience = left if system is None else min(left, PATIENCE)
+        patience = left if problem.batch is not None else min(left, PATIENCE)
         end = minimise(problem, step, x, patience, tolerance)
-        if system is not None and int(np.max(end.iterations)) >= PATIENCE:
-            more = arrive(system, end.x[0], left - patience, tolerance)
+        if problem.batch is None and int(np.max(end.iterations)) >= PATIENCE:
+            more = arrive(sparse(problem), end.x[0], left - patience, tolerance)
             extras = end.extras | {"newton_steps": more.newton_steps}
             end = replace(end, x=more.x[None], iterations=end.iterations + more.iterations, extras=extras)
         method = {"method": "lm", "lm_iterations": used} if own else {"method": "elimination"}
         return replace(end, iterations=end.iterations + used, extras=end.extras | method)
 
     return solver
-
-
-def fallback(problem: Problem, options: Options) -> Options | None:
-    """Our loop with GTSAM's elimination, where GTSAM's own Levenberg-Marquardt did not arrive."""
-    if options.get("optimizer", "auto") != "auto" or not _own(problem):
-        return None
-    return {**options, "optimizer": "elimination"}
-
-
-def _own(problem: Problem) -> bool:
-    """Whether GTSAM has every factor of a single problem that is not linear."""
-    if problem.linear or problem.batch is not None:
-        return False
-    return not any(isinstance(form, str) for form in forms(problem))
 
 
 def levenberg_marquardt(problem: Problem, x: Floats, limit: int) -> tuple[Floats, int]:
@@ -147,5 +128,4 @@ BACKEND = Backend(
     "GTSAM's own factors and Levenberg-Marquardt where it has them all, else its elimination",
     "gtsam",
     Capabilities(batched=True),
-    fallback,
 )

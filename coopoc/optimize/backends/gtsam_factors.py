@@ -62,12 +62,11 @@ def forms(problem: Problem) -> list[Form]:
 def _form(problem: Problem, factor: Factor) -> Form:
     if factor.kind not in FORMS:
         return "GTSAM has no such factor"
-    kinds, form = [(POINT,) * factor.nodes.shape[1]], FORMS[factor.kind]
+    kinds = [(POINT,) * factor.nodes.shape[1]]
     if problem.poses:
         kinds = sorted(set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist())))
-        form = _displacement_of_poses if factor.kind == "displacement" and all(map(all, kinds)) else form
     shared = factor.std is not None and len(factor.std) == 1
-    parts = form(factor, factor.root[:1] if shared else factor.root, problem.dimension)
+    parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
     if isinstance(parts, str):
         return parts
     if len(parts) > 1 and factor.loss is not None:
@@ -100,24 +99,13 @@ def _displacement(factor: Factor, W: Floats, d: int) -> Form:
     return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda: zip(factor.z, strict=True), W)]
 
 
-def _displacement_of_poses(factor: Factor, W: Floats, d: int) -> Form:
-    """GTSAM's chord T_i - Z T_j with Z = (-z, I), whose translation is minus our residual."""
-    root = np.zeros((len(W), (d + 1) ** 2, (d + 1) ** 2))
-    root[:, -d - 1 : -1, -d - 1 : -1] = W
-    z = Space(d, has_rotation=True).join(-factor.z)
-    return [Part({(POSE, POSE): f"FrobeniusLeftBetweenFactorPose{d}"}, _poses(d, z), root)]
-
-
 def _range(factor: Factor, W: Floats, d: int) -> Form:
-    """A speed is a range over dt."""
-    dt = factor.constants if factor.kind == "speed" else np.ones((len(W), 1))
-    assert dt is not None
     names: Names = {
         (POINT, POINT): f"RangeFactor{d}",
         (POSE, POINT): f"RangeFactor{d}D",
         (POSE, POSE): f"RangeFactorPose{d}",
     }
-    return [Part(names, lambda: zip((factor.z * dt)[:, 0], strict=True), W / dt[:, :, None])]
+    return [Part(names, lambda: zip(factor.z[:, 0], strict=True), W)]
 
 
 def _bearing(factor: Factor, W: Floats, d: int) -> Form:
@@ -224,7 +212,6 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     "position": _position,
     "displacement": _displacement,
     "range": _range,
-    "speed": _range,
     "bearing": _bearing,
     "body_spherical": _bearing,
     "relative_position": _relative_position,

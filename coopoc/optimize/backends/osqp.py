@@ -24,8 +24,8 @@ from ..algebra.sparse import Layout, Sparse, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
-from ..model.factor import bounded
-from ..model.linear import Linear, local
+from ..model.factor import as_factor, bounded
+from ..model.linear import Linear, linearise
 from ..model.problem import Problem
 
 SETTINGS = {
@@ -57,25 +57,21 @@ NEGLIGIBLE = 1e-11
 """m, an error of a coordinate that no tolerance asks to be smaller."""
 CLOSE = 1e-9
 """m, by which a bound may be missed."""
+KKT = 1e-9
+"""Largest |P dx + q + C^T y| that is accepted, as a share of |q| or of the largest |P_ij dx_j|."""
 REPAIRS = 5
 """Continuations of a quadratic programme before its answer is refused."""
 FAR = 1e-6
 """Cost of a step of 1 m over that of a violation of 1 m, where none can be avoided."""
 
 
-def prepare(
-    structure: Problem,
-    max_iterations: int = MAX_ITERATIONS,
-    tolerance: float = TOLERANCE,
-    kkt_tolerance: float = 1e-9,
-) -> Solver:
+def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
     """Solver of a structure. A linear problem is a single quadratic programme.
 
     Args:
         structure: a problem whose structure counts, and its constraints.
         max_iterations: of quadratic programmes.
         tolerance: m, largest move of a point in the last step.
-        kkt_tolerance: largest |P dx + q + C^T y| that is accepted, as a share of |q| or of the largest |P_ij dx_j|.
 
     >>> from coopoc.optimize import solve
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -88,7 +84,7 @@ def prepare(
     def solver(problem: Problem, x: Floats) -> SolverResult:
         system = sparse(problem)
         if system.layout not in programmes:
-            programmes[system.layout] = _programme(system, limits, kkt_tolerance)
+            programmes[system.layout] = _programme(system, limits)
         programme = programmes[system.layout]
         programme.counts.update(osqp_iterations=0, repairs=0)
         if problem.constraints:
@@ -99,22 +95,22 @@ def prepare(
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
         step = partial(_step, system, limits, programme)
-        found = minimise(problem, step, x[None], max_iterations, tolerance)
-        extras = found.extras | dict(programme.counts)
-        return SolverResult(found.x[0], int(np.ravel(found.iterations)[0]), extras=extras)
+        result = minimise(problem, step, x[None], max_iterations, tolerance)
+        extras = result.extras | dict(programme.counts)
+        return SolverResult(result.x[0], int(np.ravel(result.iterations)[0]), extras=extras)
 
     return solver
 
 
-def _programme(system: Sparse, limits: _Limits, tolerance: float) -> Programme:
+def _programme(system: Sparse, limits: _Limits) -> Programme:
     """The quadratic programme of a structure."""
     from scipy.sparse import csc_matrix
 
     entries = system.entries
     if not len(limits.lower):
-        return unbounded(entries.indices.tobytes(), entries.indptr.tobytes(), tolerance, get_ident())
+        return unbounded(entries.indices.tobytes(), entries.indptr.tobytes(), get_ident())
     pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
-    return Programme(pattern, csc_matrix(limits.matrix[:, _moving(system)]), tolerance)
+    return Programme(pattern, csc_matrix(limits.matrix[:, _moving(system)]))
 
 
 def _moving(system: Sparse) -> Ints:
@@ -141,11 +137,10 @@ class Programme:
     Args:
         pattern: the upper triangle of P (CSC), any values.
         rows: C.
-        tolerance: of the KKT conditions.
     """
 
-    def __init__(self, pattern: Any, rows: Any, tolerance: float) -> None:
-        self._pattern, self._rows, self._tolerance = pattern, rows, tolerance
+    def __init__(self, pattern: Any, rows: Any) -> None:
+        self._pattern, self._rows = pattern, rows
         self._workspace: Any = None
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
@@ -156,9 +151,8 @@ class Programme:
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
         """
-        from scipy.sparse import csc_matrix
-
-        P = csc_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(len(q), len(q)))
+        P = self._pattern
+        P.data = values
         self._update(P, q, lower, upper)
         for attempt in range(REPAIRS + 1):
             end = self._workspace.solve(raise_error=False)
@@ -195,7 +189,7 @@ class Programme:
     def _holds(self, P: Any, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
         own, value = P.diagonal(), self._rows @ dx
-        weak = self._tolerance * max(np.abs(q).max(), np.abs(own * dx).max())  # a share of what adds up
+        weak = KKT * max(np.abs(q).max(), np.abs(own * dx).max())  # a share of what adds up
         rest = P @ dx + P.T @ dx - own * dx + q + self._rows.T @ y
         if not (np.abs(rest) <= weak + NEGLIGIBLE * own).all():
             return False
@@ -205,16 +199,16 @@ class Programme:
 
 
 @lru_cache(maxsize=64)
-def unbounded(indices: bytes, indptr: bytes, tolerance: float, thread: int) -> Programme:
+def unbounded(indices: bytes, indptr: bytes, thread: int) -> Programme:
     """The programme without bounds of a structure of P, its workspace set up once, its own for each thread."""
     from scipy.sparse import csc_matrix
 
     row, start = np.frombuffer(indices, np.int64), np.frombuffer(indptr, np.int64)
     size = len(start) - 1
     identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
-    found = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)), tolerance)
-    found.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
-    return found
+    programme = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)))
+    programme.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
+    return programme
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,8 +223,9 @@ class _Limits:
     def around(self, x: Floats) -> tuple[Floats, Floats]:
         """Bounds of C dx at x (n, ambient)."""
         space, constraints = self.problem.space, self.problem.constraints
-        seen = [local(space, c.measurement, x[None], c.nodes)[0][0][bounded(c)] for c in constraints]
-        value = np.concatenate([np.empty(0), *seen])
+        linear = linearise(space, [as_factor(c) for c in constraints], None, x[None])
+        parts = [h[0, bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
+        value = np.concatenate([np.empty(0), *parts])
         return self.lower - value, self.upper - value
 
 
@@ -253,11 +248,11 @@ def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:
         return x, True
     space, (rows, size) = limits.problem.space, limits.matrix.shape
     try:
-        programme = Programme(eye(size, format="csc"), limits.matrix, CLOSE)
+        programme = Programme(eye(size, format="csc"), limits.matrix)
         return space.retract(x, programme.solve(np.ones(size), np.zeros(size), lower, upper).reshape(len(x), -1)), True
     except Infeasible:
         slack, weight = csc_matrix(hstack([limits.matrix, eye(rows)])), np.repeat([FAR, 1.0], [size, rows])
-        programme = Programme(diags(weight, format="csc"), slack, CLOSE)
+        programme = Programme(diags(weight, format="csc"), slack)
         step = programme.solve(weight, np.zeros(size + rows), lower, upper)[:size]
         return space.retract(x, step.reshape(len(x), -1)), False
 

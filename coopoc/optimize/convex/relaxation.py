@@ -163,9 +163,7 @@ def _rounded(problem: Problem, reduced: Reduced, Y: Floats, bound: float, began:
     return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
 
 
-def staircase(
-    problem: Problem, refine: bool = True, seed: int = 0, height: int = HEIGHT, seconds: float = np.inf
-) -> Relaxation:
+def staircase(problem: Problem, refine: bool = True, seed: int = 0, seconds: float = np.inf) -> Relaxation:
     """The semidefinite relaxation of `shor` with Z = Y Y^T, Y of a few columns (Burer and Monteiro), rounded and
     refined.
 
@@ -178,18 +176,15 @@ def staircase(
         problem: one that `quadratic` takes.
         refine: follow by `solve` from the rounded point.
         seed: of the random start.
-        height: columns beyond d at which to give up.
         seconds: after which to stop, with the best bound by then.
 
     Raises:
-        InputError: as `quadratic`; height below 1, seconds that are not positive.
+        InputError: as `quadratic`; seconds that are not positive.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> round(staircase(problem.add("range", ("a", "b"), 6.0, std=1.0)).lower_bound, 6)
     0.666667
     """
-    if not isinstance(height, int) or height < 1:
-        raise InputError("height", height, "must be a whole number >= 1", f"Leave it out for {HEIGHT}.")
     if not seconds > 0:
         raise InputError("seconds", seconds, "must be positive", "Leave it out for as long as it takes.")
     began, space = time.perf_counter(), problem.space
@@ -199,7 +194,7 @@ def staircase(
         Y = form.project(np.random.default_rng(seed).standard_normal((form.bound, form.columns + START)))
     else:
         Y = form.lift(space.position(problem.x0), space.rotation(problem.x0))[: form.bound]
-    found, bound = _climb(reduced, Y, form.columns + height, began + seconds)
+    found, bound = _climb(reduced, Y, form.columns + HEIGHT, began + seconds)
     return _rounded(problem, reduced, found.X, bound, began, refine)
 
 
