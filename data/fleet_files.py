@@ -124,7 +124,8 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
     """
     import pandas as pd
 
-    rows, now = [], ""
+    rows: list[list[str]] = []
+    now = ""
     try:
         for event, element in ElementTree.iterparse(path, events=("start", "end")):
             if event == "start" and element.tag == "timestep":
