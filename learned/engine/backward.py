@@ -79,7 +79,7 @@ def score(x: Floats, truth: Floats, r: Index, lane: Index) -> float:
             error = zero if np.isnan(truth[t, r, lane, i]) else x[t, r, lane, i] - truth[t, r, lane, i]
             x[t, r, lane, i] = scale * error
             squares += float(error * error)
-    return share * squares
+    return float(share * squares)
 
 
 @storage
