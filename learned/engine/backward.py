@@ -18,9 +18,13 @@ from coopoc.learned.engine.layers import (
     Plan,
     backward_layer,
     columns_of,
+    new_net,
     unpack,
 )
 from coopoc.learned.engine.optimiser import Found, Moments, Update, advance_row
+
+PRODUCT = 128
+"""Rows of the tape whose gradients are added to those of the weights at once: so few that the cache holds them."""
 
 
 @compiled
@@ -36,18 +40,18 @@ def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found:
         update: the optimiser step.
     """
     theta, (steps, _, lanes, _) = moments.theta, drives.gnss.shape
-    net = Net(np.empty(plan.parameters, theta.dtype), plan.layers, plan.columns)
+    net = new_net(plan, theta)
     most = min(LANES, lanes)
-    tape, gradient = (
-        np.zeros((steps * most, plan.width), theta.dtype),
-        np.zeros((steps * most, plan.width), theta.dtype),
-    )
+    together = min(steps, max(1, PRODUCT // most))
+    tape = np.zeros((steps * most, plan.width), theta.dtype)
+    gradient = np.zeros((together * most, plan.width), theta.dtype)
     x, state, adjoint = np.empty_like(drives.gnss), new_state(theta), new_state(theta)
     for r in range(len(update.rows)):
         unpack(theta[update.rows[r]], net)
         found.gradient[r] = 0.0
         loss = 0.0
         for first in range(0, lanes, LANES):
+            tape[:] = 0.0
             rows = (r, first, min(LANES, lanes - first))
             follow(net, tape, drives, x, rows, state, 1)
             for lane in range(first, first + rows[2]):
@@ -57,9 +61,14 @@ def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found:
                             x[t, r, lane, i] = target[t, r, lane, i]
                 else:
                     loss += score(x, target, r, lane)
-            gradient[:] = 0.0
-            back(net, tape, gradient, drives.gnss, x, rows, adjoint)
-            collect(net, tape[: steps * rows[2]], gradient, found.gradient[r])
+            for field in adjoint:
+                field[:] = 0.0
+            for end in range(steps, 0, -together):
+                begin = max(0, end - together)
+                part_of_tape = tape[begin * rows[2] : end * rows[2]]
+                gradient[:] = 0.0
+                back(net, part_of_tape, gradient, drives.gnss[:end], x, begin, rows, adjoint)
+                collect(net, part_of_tape, gradient, found.gradient[r])
         found.losses[r] = loss
         if update.step > 0:
             advance_row(moments, found, update, r)
@@ -119,6 +128,7 @@ def back(
     gradient: Floats,
     gnss: Floats,
     adjoints: Floats,
+    begin: Index,
     rows: tuple[Index, Index, Index],
     adjoint: State,
 ) -> None:
@@ -127,13 +137,8 @@ def back(
     `adjoint` is memory for the gradient with respect to the state after a step.
     """
     s, first, lanes = rows
-    for lane in range(lanes):
-        for j in range(CELLS):
-            adjoint.process[lane, j] = adjoint.prior[lane, j] = adjoint.innovation[lane, j] = 0.0
-        for i in range(3):
-            adjoint.x[lane, i] = adjoint.x_before[lane, i] = adjoint.prior_before[lane, i] = 0.0
-    for t in range(len(gnss) - 1, -1, -1):
-        row = t * lanes
+    for t in range(len(gnss) - 1, begin - 1, -1):
+        row = (t - begin) * lanes
         for lane in range(lanes):
             for i in range(3):
                 adjoint.x[lane, i] += adjoints[t, s, first + lane, i]

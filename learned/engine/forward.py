@@ -18,6 +18,7 @@ from coopoc.learned.engine.layers import (
     Net,
     Plan,
     forward_layer,
+    new_net,
     sigmoid,
     tanh,
     unpack,
@@ -55,11 +56,12 @@ def new_state(like: Floats) -> State:
 @compiled
 def forward(theta: Floats, plan: Plan, drives: Drives, x: Floats) -> None:
     """Estimates x (T, S, B, 3) m of the models of theta (S, P); the tape holds one step only."""
-    net = Net(np.empty(plan.parameters, x.dtype), plan.layers, plan.columns)
+    net = new_net(plan, x)
     tape, state = np.zeros((LANES, plan.width), x.dtype), new_state(x)
     for s in range(len(theta)):
         unpack(theta[s], net)
         for first in range(0, x.shape[2], LANES):
+            tape[:] = 0.0
             follow(net, tape, drives, x, (s, first, min(LANES, x.shape[2] - first)), state, 0)
 
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from coopoc.arrays import Floats, Ints
-from coopoc.kernels.compiling.compile import part, summing
+from coopoc.kernels.compiling.compile import part, storage, summing
 
 SIZE = 3
 """Components of state and measurement, m = n = 3."""
@@ -110,17 +110,20 @@ inputs and outputs on the tape, whether a ReLU follows."""
 
 
 class Plan(NamedTuple):
-    """For nets of one shape: layers (14, 8), first column of each field, columns of the tape, number of parameters."""
+    """For nets of one shape: layers (14, 8), first column of each field, columns of the tape, shape of `Net.matrices`,
+    number of parameters."""
 
     layers: Ints
     columns: Ints
     width: int
+    size: tuple[int, int, int]
     parameters: int
 
 
 class Net(NamedTuple):
-    """Weights (P,) of one net as its layers read them, and what `Plan` says of them."""
+    """Matrices of one net with padded rows, all its weights (P,), and what `Plan` says of them."""
 
+    matrices: Floats
     weights: Floats
     layers: Ints
     columns: Ints
@@ -146,21 +149,36 @@ def plan_of(shapes: Shapes) -> Plan:
         outputs, inputs = sizes[name]
         starts = begin[name], begin[name.replace("weight", "bias")]
         rows.append([*starts, outputs, inputs, outputs > inputs, columns[source] + first, columns[target], relu])
-    return Plan(np.array(rows), np.array(list(columns.values())), int(ends[-1]) + PAD, at)
+    longest = (max(max(sizes[name]) for name, *_ in LAYERS) // PAD + 2) * PAD
+    size = len(LAYERS), max(min(sizes[name]) for name, *_ in LAYERS) + CELLS, longest
+    return Plan(np.array(rows), np.array(list(columns.values())), int(ends[-1]) // PAD * PAD + 3 * PAD, size, at)
+
+
+@storage
+def new_net(plan: Plan, like: Floats) -> Net:
+    """Memory of the weights of one net."""
+    return Net(np.zeros(plan.size, like.dtype), np.zeros(plan.parameters, like.dtype), plan.layers, plan.columns)
 
 
 @part
 def unpack(theta: Floats, net: Net) -> None:
     """Copy flat weights (P,), with the matrices of tall layers transposed."""
-    weights, layers = net.weights, net.layers
     for i in range(len(theta)):
-        weights[i] = theta[i]
-    for layer in range(len(layers)):
-        if layers[layer, TALL]:
-            at, outputs, inputs = layers[layer, WEIGHT], layers[layer, OUTPUTS], layers[layer, INPUTS]
-            for o in range(outputs):
-                for i in range(inputs):
-                    weights[at + i * outputs + o] = theta[at + o * inputs + i]
+        net.weights[i] = theta[i]
+    for layer in range(len(net.layers)):
+        matrix, (at, _, outputs, inputs, tall, _, _, _) = net.matrices[layer], columns_of(net, layer)
+        for o in range(outputs):
+            for i in range(inputs):
+                if tall:
+                    matrix[i, o] = theta[at + o * inputs + i]
+                else:
+                    matrix[o, i] = theta[at + o * inputs + i]
+
+
+@part
+def whole(rows: Index) -> Index:
+    """Rows of a matrix with those of zeros behind it."""
+    return (rows + CELLS - 1) // CELLS * CELLS
 
 
 @part
@@ -173,17 +191,16 @@ def columns_of(net: Net, name: Index) -> tuple[Any, ...]:
 @part
 def forward_layer(net: Net, name: Index, tape: Floats, row: Index, lanes: Index) -> None:
     """y = W x + b of a layer at so many rows of the tape."""
-    weight, bias, outputs, inputs, tall, source, to, relu = columns_of(net, name)
-    start, matrix = net.weights[bias : bias + outputs], net.weights[weight : weight + outputs * inputs]
-    zero = tape.dtype.type(0.0)
+    _, bias, outputs, inputs, tall, source, to, relu = columns_of(net, name)
+    start, matrix, zero = net.weights[bias : bias + outputs], net.matrices[name], tape.dtype.type(0.0)
     for lane in range(row, row + lanes):
         y = tape[lane, to : to + outputs]
         for o in range(outputs):
             y[o] = start[o]
     if tall:
-        add_rows(tape, to, tape, source, matrix.reshape(inputs, outputs), row, lanes)
+        add_rows(tape, to, tape, source, matrix[: whole(inputs)], outputs, row, lanes)
     else:
-        add_dots(tape, to, tape, source, matrix.reshape(outputs, inputs), row, lanes)
+        add_dots(tape, to, tape, source, matrix[: whole(outputs)], inputs, row, lanes)
     if relu:
         for lane in range(row, row + lanes):
             y = tape[lane, to : to + outputs]
@@ -194,50 +211,57 @@ def forward_layer(net: Net, name: Index, tape: Floats, row: Index, lanes: Index)
 @part
 def backward_layer(net: Net, name: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
     """Add W^T dy to dx of a layer at so many rows; where its ReLU is shut dy becomes zero."""
-    weight, _, outputs, inputs, tall, source, to, relu = columns_of(net, name)
-    matrix, zero = net.weights[weight : weight + outputs * inputs], tape.dtype.type(0.0)
+    _, _, outputs, inputs, tall, source, to, relu = columns_of(net, name)
+    matrix, zero = net.matrices[name], tape.dtype.type(0.0)
     if relu:
         for lane in range(row, row + lanes):
             y, dy = tape[lane, to : to + outputs], gradient[lane, to : to + outputs]
             for o in range(outputs):
                 dy[o] = dy[o] if y[o] > zero else zero
     if tall:
-        add_dots(gradient, source, gradient, to, matrix.reshape(inputs, outputs), row, lanes)
+        add_dots(gradient, source, gradient, to, matrix[: whole(inputs)], outputs, row, lanes)
     else:
-        add_rows(gradient, source, gradient, to, matrix.reshape(outputs, inputs), row, lanes)
+        add_rows(gradient, source, gradient, to, matrix[: whole(outputs)], inputs, row, lanes)
 
 
 @summing
-def add_rows(target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, row: Index, lanes: Index) -> None:
-    """y (n,) += x (m,) M (m, n) in rows of two arrays; four rows of M at a time, which all lanes share."""
-    m, n = matrix.shape
-    whole = m - m % 4
-    for p in range(0, whole, 4):
+def add_rows(
+    target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, n: Index, row: Index, lanes: Index
+) -> None:
+    """y (n,) += x (m,) M (m, n) in rows of two arrays; nine rows of M at a time, which all lanes share.
+
+    The zeros behind a matrix let whole blocks of nine rows and PAD columns count.
+    """
+    m, n = len(matrix), (n + PAD - 1) // PAD * PAD
+    for p in range(0, m, 9):
+        w = matrix[p : p + 9]
         for lane in range(row, row + lanes):
-            x, y = given[lane, source + p : source + p + 4], target[lane, to : to + n]
-            x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
+            x, y = given[lane, source + p : source + p + 9], target[lane, to : to + n]
+            x0, x1, x2, x3, x4, x5, x6, x7, x8 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
             for j in range(n):
-                y[j] += (x0 * matrix[p, j] + x1 * matrix[p + 1, j]) + (x2 * matrix[p + 2, j] + x3 * matrix[p + 3, j])
-    for p in range(whole, m):
-        for lane in range(row, row + lanes):
-            x0, y = given[lane, source + p], target[lane, to : to + n]
-            for j in range(n):
-                y[j] += x0 * matrix[p, j]
+                s = x0 * w[0, j] + x1 * w[1, j] + x2 * w[2, j]
+                t = x3 * w[3, j] + x4 * w[4, j] + x5 * w[5, j]
+                y[j] += s + t + (x6 * w[6, j] + x7 * w[7, j] + x8 * w[8, j])
 
 
 @summing
-def add_dots(target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, row: Index, lanes: Index) -> None:
-    """y (m,) += M (m, n) x (n,), as `add_rows`; three rows of M at a time, since m is always a multiple of three."""
-    m, n = matrix.shape
-    for p in range(0, m, 3):
+def add_dots(
+    target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, n: Index, row: Index, lanes: Index
+) -> None:
+    """y (m,) += M (m, n) x (n,), as `add_rows`."""
+    m, n = len(matrix), (n + PAD - 1) // PAD * PAD
+    for p in range(0, m, 9):
+        w = matrix[p : p + 9]
         for lane in range(row, row + lanes):
-            x, y = given[lane, source : source + n], target[lane, to + p : to + p + 3]
-            s = t = u = target.dtype.type(0.0)
+            x, y = given[lane, source : source + n], target[lane, to + p : to + p + 9]
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = target.dtype.type(0.0)
             for j in range(n):
-                s += matrix[p, j] * x[j]
-                t += matrix[p + 1, j] * x[j]
-                u += matrix[p + 2, j] * x[j]
-            y[0], y[1], y[2] = y[0] + s, y[1] + t, y[2] + u
+                s0, s1, s2 = s0 + w[0, j] * x[j], s1 + w[1, j] * x[j], s2 + w[2, j] * x[j]
+                s3, s4, s5 = s3 + w[3, j] * x[j], s4 + w[4, j] * x[j], s5 + w[5, j] * x[j]
+                s6, s7, s8 = s6 + w[6, j] * x[j], s7 + w[7, j] * x[j], s8 + w[8, j] * x[j]
+            y[0], y[1], y[2] = y[0] + s0, y[1] + s1, y[2] + s2
+            y[3], y[4], y[5] = y[3] + s3, y[4] + s4, y[5] + s5
+            y[6], y[7], y[8] = y[6] + s6, y[7] + s7, y[8] + s8
 
 
 @part
