@@ -49,9 +49,9 @@ def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found:
     for r in range(len(update.rows)):
         unpack(theta[update.rows[r]], net)
         found.gradient[r] = 0.0
+        tape[:] = 0.0
         loss = 0.0
         for first in range(0, lanes, LANES):
-            tape[:] = 0.0
             rows = (r, first, min(LANES, lanes - first))
             follow(net, tape, drives, x, rows, state, 1)
             for lane in range(first, first + rows[2]):
@@ -134,7 +134,8 @@ def back(
 ) -> None:
     """The gradient of the tape, zero before, from that of the estimates (T, S, B, 3); `rows` as in `forward.follow`.
 
-    `adjoint` is memory for the gradient with respect to the state after a step.
+    Tape and gradient hold the steps from `begin` to the last of gnss; `adjoint` is the gradient in the state after
+    that, and becomes that before `begin`.
     """
     s, first, lanes = rows
     for t in range(len(gnss) - 1, begin - 1, -1):
